@@ -1,0 +1,1 @@
+"""REST, pages, command line, storage and dispatch."""

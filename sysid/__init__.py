@@ -1,0 +1,1 @@
+"""Identification of nonlinear systems with unknown time lags: the numerical core."""

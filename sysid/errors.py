@@ -1,0 +1,113 @@
+"""Every error the numerical core raises on purpose.
+
+* SysidError
+    - InvalidBounds        a parameter's search interval is empty or not finite
+    - InvalidModel         a model document has faults (each with its place)
+    - UnknownModel         no built-in model has that name
+    - InvalidRecord        a recording cannot be used: channels, times or values
+    - RecordTooShort       a record is shorter than the model's memory
+    - InvalidSettings      a setting of the search or of the problem is not usable
+    - DivergedEverywhere   no candidate of a search gave a finite simulation
+
+A message says what was wrong, what was found, and what would be right. Numerical kernels never
+raise: they return ``nan`` or ``inf``, and the caller decides.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+
+class SysidError(Exception):
+    """Base class of the errors that the numerical core raises on purpose."""
+
+
+class InvalidBounds(SysidError, ValueError):
+    """A parameter's search interval is empty or not finite."""
+
+    def __init__(self, name: str, lower: float, upper: float, detail: str = "") -> None:
+        need = detail or "need finite lower < upper"
+        super().__init__(f"parameter {name!r} has bounds [{lower:g}, {upper:g}]; {need}")
+        self.name, self.lower, self.upper = name, lower, upper
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing wrong with a document.
+
+    Attributes
+    ----------
+    pointer : str
+        JSON pointer of the field, such as ``/equations/v``.
+    detail : str
+        What was wrong, what was found, what would be right.
+    column : int or None
+        Column (from 1) inside the text of the field, for equations.
+    """
+
+    pointer: str
+    detail: str
+    column: int | None = None
+
+    def __str__(self) -> str:
+        place = self.pointer if self.column is None else f"{self.pointer}, column {self.column}"
+        return f"{place}: {self.detail}"
+
+
+class InvalidModel(SysidError, ValueError):
+    """A model document has faults."""
+
+    def __init__(self, faults: Iterable[Fault]) -> None:
+        self.faults = tuple(faults)
+        super().__init__("; ".join(str(fault) for fault in self.faults))
+
+
+class UnknownModel(SysidError, LookupError):
+    """No built-in model has that name."""
+
+    def __init__(self, name: str, known: Iterable[str]) -> None:
+        super().__init__(f"there is no model {name!r}{nearest(name, known)}")
+        self.name = name
+
+
+class InvalidRecord(SysidError, ValueError):
+    """A recording cannot be used: its channels, times or values."""
+
+
+class RecordTooShort(SysidError, ValueError):
+    """A record is shorter than the model's memory."""
+
+    def __init__(self, duration: float, needed: float, what: str) -> None:
+        super().__init__(
+            f"the record lasts {duration:g} s, but {what} needs more than {needed:g} s; "
+            "give a longer record or a smaller upper bound of the lag"
+        )
+        self.duration, self.needed = duration, needed
+
+
+class InvalidSettings(SysidError, ValueError):
+    """A setting of the search or of the problem is not usable."""
+
+    def __init__(self, pointer: str, detail: str) -> None:
+        super().__init__(f"{pointer}: {detail}")
+        self.pointer, self.detail = pointer, detail
+
+
+class DivergedEverywhere(SysidError, ArithmeticError):
+    """No candidate of a search gave a finite simulation."""
+
+    def __init__(self, evaluations: int) -> None:
+        super().__init__(
+            f"the model diverged for every one of {evaluations} candidates inside the bounds; "
+            "narrow the bounds, use a smaller step or check the equations and units"
+        )
+        self.evaluations = evaluations
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Suggestion to add to a message about an unknown name: the nearest known one, or all."""
+    names = sorted(known)
+    close = get_close_matches(name, names, n=1)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; known are {', '.join(names)}" if names else ""

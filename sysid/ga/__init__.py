@@ -1,0 +1,1 @@
+"""The genetic algorithm of the paper and its improvement, one island at a time."""

@@ -1,0 +1,1 @@
+"""Islands, their topologies and migration."""

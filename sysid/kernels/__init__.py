@@ -1,0 +1,1 @@
+"""From a checked model to machine code that simulates a population."""

@@ -1,0 +1,1 @@
+"""The model language: grammar, checks, expression trees."""

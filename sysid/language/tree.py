@@ -1,0 +1,81 @@
+"""The checked expression tree of the model language: what the grammar makes and the kernels read.
+
+After checking, every name is resolved and every past value is a `Past` with its fixed offset and
+its unknown lag apart, so that code generation never looks at text.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A literal or a model constant."""
+
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Symbol:
+    """A parameter, or one of the reserved quantities.
+
+    ``parameter``: its name; ``time``: ``t``, s from the start of the record; ``index``: ``k``, the
+    sample number; ``period``: ``h``, the sampling period in s.
+    """
+
+    name: str
+    kind: Literal["parameter", "time", "index", "period"]
+
+
+@dataclass(frozen=True, slots=True)
+class Past:
+    """The value of a state or an input, now or in the past.
+
+    Attributes
+    ----------
+    name : str
+        The signal.
+    kind : {"state", "input"}
+    offset : int
+        Whole samples back (difference form); 0 in the differential form.
+    lag : Expression or None
+        What is subtracted besides `offset`: in samples in the difference form (``L/h``), in
+        seconds in the differential form. Made of parameters, numbers and ``h`` only, never
+        negative inside the bounds. None: no unknown lag.
+    """
+
+    name: str
+    kind: Literal["state", "input"]
+    offset: int = 0
+    lag: "Expression | None" = None
+
+
+@dataclass(frozen=True, slots=True)
+class Unary:
+    """``-a`` or ``not a``."""
+
+    operator: Literal["-", "not"]
+    operand: "Expression"
+
+
+@dataclass(frozen=True, slots=True)
+class Binary:
+    """Arithmetic, comparison or logic of two operands; logic and comparisons only in `where`."""
+
+    operator: Literal["+", "-", "*", "/", "**", "<", "<=", ">", ">=", "==", "!=", "and", "or"]
+    left: "Expression"
+    right: "Expression"
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A function of the grammar; ``where(condition, a, b)`` has three arguments."""
+
+    function: Literal[
+        "sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "min", "max",
+        "where", "tanh", "atan",
+    ]  # fmt: skip
+    arguments: "tuple[Expression, ...]"
+
+
+Expression: TypeAlias = Number | Symbol | Past | Unary | Binary | Call

@@ -1,0 +1,1 @@
+"""The built-in systems, as documents in the model language."""

@@ -1,0 +1,152 @@
+"""Settings of a search and of the problem it solves, as frozen values.
+
+The field names are those of the job body; defaults are defined here once.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from sysid.errors import InvalidSettings
+
+SearchMethod = Literal["simple", "improved-paper", "improved"]
+TopologyName = Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"]
+Prediction = Literal["simulation", "one-step"]
+METHODS: tuple[SearchMethod, ...] = ("simple", "improved-paper", "improved")
+TOPOLOGIES: tuple[TopologyName, ...] = (
+    "one-way-ring", "ring", "fully-connected", "star", "unconnected",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceSearch:
+    """The paper's sequence search (Eq. 11, 12).
+
+    ``kind`` ``"paper"``: the step stays fixed; ``"adaptive"``: it learns step sizes and
+    directions. `beta` is the step, relative to the value (`relative`, Eq. 12) or to the range.
+    """
+
+    kind: Literal["paper", "adaptive"] = "adaptive"
+    beta: float = 0.01
+    relative: bool = True
+
+    def __post_init__(self) -> None:
+        _require(self.kind in ("paper", "adaptive"), "sequence/kind", self.kind, "paper, adaptive")
+        _require(0 < self.beta < 1, "sequence/beta", self.beta, "between 0 and 1")
+
+
+@dataclass(frozen=True, slots=True)
+class Migration:
+    """Every how many generations, along which topology, how many migrants (pagmo's words)."""
+
+    every: int = 25
+    topology: TopologyName = "one-way-ring"
+    migrants: int = 2
+
+    def __post_init__(self) -> None:
+        _require(self.every >= 1, "migration/every", self.every, "1 or more")
+        _require(self.topology in TOPOLOGIES, "migration/topology", self.topology,
+                 ", ".join(TOPOLOGIES))  # fmt: skip
+        _require(self.migrants >= 0, "migration/migrants", self.migrants, "0 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """End conditions besides the generations; whichever comes first. None: not used."""
+
+    evaluations: int | None = None
+    seconds: float | None = None
+    rms: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("evaluations", "seconds", "rms"):
+            value = getattr(self, name)
+            _require(value is None or value > 0, f"stop/{name}", value, "positive")
+
+
+@dataclass(frozen=True, slots=True)
+class IslandChange:
+    """What one island does otherwise; None: as the archipelago."""
+
+    method: SearchMethod | None = None
+    bits: int | None = None
+    mutation: tuple[tuple[int, float], ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GeneticAlgorithm:
+    """A whole search: the paper's genetic algorithm, its improvement, and the islands.
+
+    Attributes
+    ----------
+    population : int
+        Individuals in all, dealt over the islands as evenly as possible, so that the budget of
+        evaluations does not depend on the number of islands.
+    mutation : tuple of (generation, rate)
+        Schedule: from that generation on, that probability of one flipped bit in a child.
+    stagnation : int
+        Generations without a better champion before the sequence search begins.
+    islands : int or tuple of IslandChange or None
+        None: 4 for ``improved``, 1 for the two methods of the paper, which knows no islands.
+    safe_limit : float or None
+        Fitness above which an individual is invalid (section 3), in the output's unit.
+    """
+
+    method: SearchMethod = "improved"
+    population: int = 50
+    generations: int = 400
+    bits: int = 24
+    selection_rate: float = 0.5
+    mutation: tuple[tuple[int, float], ...] = ((0, 0.2), (50, 0.8))
+    stagnation: int = 30
+    sequence: SequenceSearch = field(default_factory=SequenceSearch)
+    islands: int | tuple[IslandChange, ...] | None = None
+    migration: Migration = field(default_factory=Migration)
+    refine: bool = True
+    safe_limit: float | None = None
+    stop: Stop = field(default_factory=Stop)
+
+    def __post_init__(self) -> None:
+        _require(self.method in METHODS, "method", self.method, ", ".join(METHODS))
+        _require(self.population >= 4, "population", self.population, "4 or more")
+        _require(self.generations >= 1, "generations", self.generations, "1 or more")
+        _require(1 <= self.bits <= 32, "bits", self.bits, "1 to 32")
+        _require(0 < self.selection_rate < 1, "selection_rate", self.selection_rate,
+                 "between 0 and 1")  # fmt: skip
+        _require(self.stagnation >= 1, "stagnation", self.stagnation, "1 or more")
+        generations = [generation for generation, _ in self.mutation]
+        _require(bool(generations) and generations[0] == 0
+                 and generations == sorted(set(generations))
+                 and all(0 <= rate <= 1 for _, rate in self.mutation),
+                 "mutation", self.mutation,
+                 "[generation, rate] pairs from generation 0 up, rates 0 to 1")  # fmt: skip
+        _require(self.safe_limit is None or self.safe_limit > 0, "safe_limit", self.safe_limit,
+                 "positive")  # fmt: skip
+        _require(self.n_islands >= 1, "islands", self.islands, "1 or more")
+        _require(self.population >= 4 * self.n_islands, "population", self.population,
+                 f"4 or more for each of the {self.n_islands} islands")  # fmt: skip
+
+    @property
+    def n_islands(self) -> int:
+        """Number of islands."""
+        if self.islands is None:
+            return 4 if self.method == "improved" and self.population >= 16 else 1
+        return self.islands if isinstance(self.islands, int) else len(self.islands)
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """What is minimised: squares (Eq. 10), or soft-l1 with a scale in the output's unit."""
+
+    kind: Literal["squares", "soft-l1"] = "squares"
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("squares", "soft-l1"):
+            raise InvalidSettings("/loss/kind", f"{self.kind!r} is not 'squares' or 'soft-l1'")
+        if not self.scale > 0:
+            raise InvalidSettings("/loss/scale", f"{self.scale!r} is not a positive number")
+
+
+def _require(holds: bool, pointer: str, found: object, right: str) -> None:
+    if not holds:
+        raise InvalidSettings(f"/algorithm/{pointer}", f"found {found!r}; need {right}")

@@ -1,0 +1,1 @@
+"""Where and when islands run: Ray."""
