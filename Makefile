@@ -1,0 +1,65 @@
+# Everything starts here: `make demo`, `make test`, `make serve`. Needs Python 3.11 or newer, and make.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+FAST   := not slow and not ray and not postgres and not browser and not data
+
+.DEFAULT_GOAL := help
+.PHONY: help demo serve test check format bench bench-full real-data clean
+
+help:
+	@echo "make demo        set up, run the paper's Example 1 through the service, print the table"
+	@echo "make serve       set up, keep the service up on http://127.0.0.1:8000"
+	@echo "make test        set up, run the whole test suite"
+	@echo "make check       lint, types, import contracts, fast tests (before each commit)"
+	@echo "make bench       quick benchmarks; make bench-full for all; make real-data for measured records"
+
+$(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "lagid needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) -V). Try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	@echo "setting up $(VENV) (once, a minute or two)"
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+	@touch $@
+
+demo: $(READY)
+	@$(BIN)/lagid demo
+
+serve: $(READY)
+	@exec $(BIN)/lagid serve
+
+test: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest
+
+check: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -q -m "$(FAST)"
+
+format: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(READY)
+	$(BIN)/python benchmarks/kernels.py --quick
+	$(BIN)/python benchmarks/mcap.py --quick
+
+bench-full: $(READY)
+	$(BIN)/python benchmarks/kernels.py
+	$(BIN)/python benchmarks/mcap.py
+
+real-data: $(READY)
+	$(BIN)/python benchmarks/real_data/silverbox.py
+	$(BIN)/python benchmarks/real_data/pneuact_tube.py
+	$(BIN)/python benchmarks/real_data/dryer2.py
+
+clean:
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build ./*.egg-info

@@ -1,0 +1,93 @@
+"""The house rules that no linter knows, as small tests over the source tree."""
+
+import ast
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+CODE = ("sysid", "workers", "service", "migrations", "tests", "benchmarks")
+MACHINE = re.compile(
+    r"py[p]i\.org|python[h]osted|npm[j]s\.|deb\.[d]ebian|/wor[k]/|/far[m]/|/roo[t]/"
+)
+
+
+def _tracked() -> list[Path]:
+    listing = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return [ROOT / line for line in listing.stdout.splitlines() if (ROOT / line).is_file()]
+
+
+def _python() -> list[Path]:
+    return [path for part in CODE for path in (ROOT / part).rglob("*.py")]
+
+
+def test_no_file_is_over_400_lines() -> None:
+    long = {str(p.relative_to(ROOT)): p.read_text().count("\n") for p in _python()}
+    assert {name: lines for name, lines in long.items() if lines > 400} == {}
+
+
+def test_no_function_is_over_60_lines() -> None:
+    long = []
+    for path in _python():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or node.lineno) - node.lineno + 1
+                if lines > 60:
+                    long.append(f"{path.relative_to(ROOT)}:{node.lineno} {node.name} ({lines})")
+    assert long == []
+
+
+def test_nothing_names_a_registry_or_a_path_of_the_developers_machine() -> None:
+    named = []
+    for path in _tracked():
+        try:
+            text = path.read_text()
+        except UnicodeDecodeError:
+            continue
+        named += [
+            f"{path.relative_to(ROOT)}:{number}"
+            for number, line in enumerate(text.splitlines(), 1)
+            if MACHINE.search(line)
+        ]
+    assert named == []
+
+
+def test_every_locked_dependency_carries_a_hash() -> None:
+    text = (ROOT / "requirements.lock").read_text().replace("\\\n", " ")
+    bare = [line for line in text.splitlines() if "==" in line and "--hash=sha256:" not in line]
+    assert bare == []
+
+
+def test_every_package_on_disk_is_listed_for_installation() -> None:
+    listed = re.search(r"packages = \[(.*?)\n\]", (ROOT / "pyproject.toml").read_text(), re.DOTALL)
+    assert listed
+    names = set(re.findall(r'"([\w.]+)"', listed[1]))
+    on_disk = {
+        ".".join(init.parent.relative_to(ROOT).parts)
+        for part in ("sysid", "workers", "service", "migrations")
+        for init in (ROOT / part).rglob("__init__.py")
+    }
+    assert names == on_disk
+
+
+@pytest.mark.parametrize("call", ["eval(", "exec(", "pickle.loads("])
+def test_the_core_never_runs_text_as_code(call: str) -> None:
+    pattern = re.compile(rf"(?<![\w.]){re.escape(call)}")
+    users = [
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "sysid").rglob("*.py")
+        if pattern.search(path.read_text())
+    ]
+    assert users == []
+
+
+def test_the_compose_file_starts_the_same_commands_as_the_readme() -> None:
+    services = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text())["services"]
+    assert {"web", "dispatcher", "database"} <= set(services)
+    assert services["web"]["command"][:2] == ["lagid", "serve"]
+    assert services["dispatcher"]["command"][:2] == ["lagid", "dispatcher"]
