@@ -1,0 +1,110 @@
+"""Settings of the service, from the environment (``LAGID_…``) or the file ``lagid.env``."""
+
+import os
+from ipaddress import ip_address
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from service.errors import Misconfigured
+
+
+class Settings(BaseSettings):
+    """Where things are kept, where the service listens, and its limits.
+
+    Attributes
+    ----------
+    data_dir : Path
+        Folder of everything that the embedded service keeps.
+    database_url, store_url : str or None
+        None: SQLite and a folder of objects inside `data_dir`.
+    ray_address : str or None
+        None: a local Ray of this process.
+    cpus : int or None
+        Workers of the local Ray; None: all cores.
+    require_keys : bool or None
+        None: API keys are off on loopback and required elsewhere.
+    allow_open : bool
+        Serve other hosts although this version has no API keys yet.
+    lease_seconds : float
+        How long a job stays with a dispatcher that is not heard of.
+    data : Path or None
+        Folder of measured records, for tests and benchmarks.
+    """
+
+    model_config = SettingsConfigDict(env_prefix="LAGID_", env_file="lagid.env", extra="ignore")
+
+    data_dir: Path = Path("lagid-data")
+    database_url: str | None = None
+    store_url: str | None = None
+    ray_address: str | None = None
+    cpus: int | None = Field(default=None, ge=1)
+    host: str = "127.0.0.1"
+    port: int = Field(default=8000, ge=0, le=65535)
+    require_keys: bool | None = None
+    allow_open: bool = False
+    max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
+    max_runs_per_job: int = Field(default=100_000, ge=1)
+    lease_seconds: float = Field(default=30.0, gt=0)
+    max_attempts: int = Field(default=3, ge=1)
+    poll_seconds: float = Field(default=0.3, gt=0)
+    data: Path | None = None
+
+    @property
+    def database(self) -> str:
+        """SQLAlchemy address of the database."""
+        folder = self.data_dir.absolute()
+        return self.database_url or f"sqlite:///{folder / 'lagid.db'}"
+
+    @property
+    def store(self) -> str:
+        """Address of the object store."""
+        return self.store_url or (self.data_dir.absolute() / "objects").as_uri()
+
+    def prepare_folder(self) -> None:
+        """Make the data folder if it is not there.
+
+        Raises
+        ------
+        Misconfigured
+            If it cannot be made or written.
+        """
+        folder = self.data_dir.absolute()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise Misconfigured(
+                f"the data folder {folder} cannot be made: {error.strerror}"
+            ) from error
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise Misconfigured(
+                f"the data folder {folder} is not writable; choose another with --data-dir"
+            )
+
+    def check_exposure(self) -> None:
+        """Refuse to serve other hosts without keys.
+
+        Raises
+        ------
+        Misconfigured
+            If the host is not loopback, or keys are required: this version knows no keys.
+        """
+        if self.require_keys:
+            raise Misconfigured("this version has no API keys yet; unset LAGID_REQUIRE_KEYS")
+        if not is_loopback(self.host) and not self.allow_open:
+            raise Misconfigured(
+                f"host {self.host} can be reached from other machines, and this version has no "
+                "API keys yet; serve on 127.0.0.1, or set LAGID_ALLOW_OPEN=true if the network "
+                "around it is trusted"
+            )
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host name or address reaches this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return False
