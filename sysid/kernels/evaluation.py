@@ -1,0 +1,61 @@
+"""Fitness and predictions of a population, as compiled functions that a search calls.
+
+A result of one individual does not depend on the others: not on how many they are, nor on their
+order, nor on the copies that fill the last lanes.
+"""
+
+import numpy as np
+
+from sysid.kernels.calls import LANES, call_kernel, compiled
+from sysid.kernels.evaluator import Evaluator
+from sysid.types import FloatArray
+
+
+@compiled
+def expanded(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """All parameters of (P, D) individuals as the kernel wants them: (K, P rounded up)."""
+    individuals, free = theta.shape
+    stride = (individuals + LANES - 1) // LANES * LANES
+    full = np.empty((evaluator.template.size, stride))
+    for row in range(evaluator.template.size):
+        full[row, :] = evaluator.template[row]
+    for column in range(free):
+        row = evaluator.rows[column]
+        for p in range(stride):
+            full[row, p] = theta[min(p, individuals - 1), column]
+    return full
+
+
+@compiled
+def _run(evaluator: Evaluator, full: FloatArray, predictions: FloatArray) -> FloatArray:
+    loss = np.zeros(full.shape[1])
+    if full.shape[1] == 0:
+        return loss
+    work = np.empty(evaluator.n_work)
+    for e in range(evaluator.plans.shape[0]):
+        call_kernel(
+            evaluator.kernel, full,
+            evaluator.ints, evaluator.plans[e, 0], evaluator.floats, evaluator.plans[e, 1],
+            work, predictions, evaluator.plans[e, 2], loss,
+        )  # fmt: skip
+    return loss
+
+
+@compiled
+def population_fitness(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """J of each individual (Eq. 10; smaller is better): (P, D) → (P,), inf where it diverges."""
+    loss = _run(evaluator, expanded(evaluator, theta), np.empty((0, 1)))
+    fitness = np.empty(theta.shape[0])
+    for p in range(theta.shape[0]):
+        value = np.sqrt(loss[p] / evaluator.n_weight)
+        fitness[p] = value if np.isfinite(value) else np.inf
+    return fitness
+
+
+@compiled
+def population_predictions(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """Simulated value at each measured time: (P, D) → (P, M); not finite where it diverges."""
+    full = expanded(evaluator, theta)
+    predictions = np.empty((evaluator.n_measured, full.shape[1]))
+    _run(evaluator, full, predictions)
+    return np.ascontiguousarray(predictions[:, : theta.shape[0]].T)
