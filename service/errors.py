@@ -11,6 +11,7 @@
     - InvalidRequest         422  the body or a query value cannot be used, with every fault
     - Unavailable            503  a part the service needs is down
     - Misconfigured               the settings cannot be used (command line only)
+    - ServiceDidNotStart          `lagid serve` ended or did not get ready (command line only)
 
 One handler (`service.api.problems`) makes the RFC 9457 problem document. This module imports
 nothing but the standard library, so that the light client can use it.
@@ -144,3 +145,13 @@ class Misconfigured(ServiceError):
     """The settings cannot be used."""
 
     kind, title = "misconfigured", "The settings cannot be used"
+
+
+class ServiceDidNotStart(ServiceError):
+    """A service that was started as a child ended, or did not get ready in time."""
+
+    kind, title = "did-not-start", "The service did not start"
+
+    def __init__(self, reason: str, log: str = "") -> None:
+        super().__init__(f"the service did not start: {reason}" + (f"\n{log}" if log else ""))
+        self.reason, self.log = reason, log

@@ -1,8 +1,8 @@
 """Settings of the service, from the environment (``LAGID_…``) or the file ``lagid.env``."""
 
-import os
 from ipaddress import ip_address
 from pathlib import Path
+from tempfile import TemporaryFile
 
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -68,19 +68,18 @@ class Settings(BaseSettings):
         Raises
         ------
         Misconfigured
-            If it cannot be made or written.
+            If it cannot be made or written to.
         """
         folder = self.data_dir.absolute()
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            with TemporaryFile(dir=folder):
+                pass  # only a try shows it: permissions, a full disk, a read-only file system
         except OSError as error:
             raise Misconfigured(
-                f"the data folder {folder} cannot be made: {error.strerror}"
+                f"the data folder {folder} is not writable ({error.strerror}); "
+                "choose another with --data-dir"
             ) from error
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise Misconfigured(
-                f"the data folder {folder} is not writable; choose another with --data-dir"
-            )
 
     def check_exposure(self) -> None:
         """Refuse to serve other hosts without keys.

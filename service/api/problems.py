@@ -1,0 +1,139 @@
+"""RFC 9457 problem documents: the one place where an error becomes an answer."""
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.responses import JSONResponse, Response
+
+from service.api.pointers import known_fields, pointer_into
+from service.errors import FieldError, InvalidRequest, ServiceError
+from sysid.errors import (
+    InvalidBounds,
+    InvalidModel,
+    InvalidSettings,
+    SysidError,
+    UnknownModel,
+    nearest,
+)
+
+log = logging.getLogger(__name__)
+
+PROBLEM_TYPE = "application/problem+json"
+KINDS = {
+    404: "not-found",
+    405: "method-not-allowed",
+    413: "too-large",
+    415: "unsupported-media-type",
+}
+
+
+def problem(
+    request: Request,
+    status: int,
+    kind: str,
+    title: str,
+    detail: str,
+    errors: Sequence[FieldError] = (),
+    headers: Mapping[str, str] | None = None,
+) -> Response:
+    """Answer with a problem document; its `type` is a path of this server, one per kind."""
+    content: dict[str, Any] = {
+        "type": f"/problems/{kind}",
+        "title": title,
+        "status": status,
+        "detail": detail,
+        "instance": request.url.path,
+    }
+    if errors:
+        content["errors"] = [error.as_dict() for error in errors]
+    return JSONResponse(content, status, dict(headers or {}), media_type=PROBLEM_TYPE)
+
+
+def of_sysid(error: SysidError) -> InvalidRequest:
+    """An error of the numerical core as an invalid request, with its place in the body."""
+    match error:
+        case InvalidModel():
+            faults = [FieldError(f.pointer, f.detail, f.column) for f in error.faults]
+            return InvalidRequest(faults)
+        case InvalidSettings():
+            return InvalidRequest.at(error.pointer, error.detail)
+        case InvalidBounds():
+            return InvalidRequest.at(f"/parameters/{error.name}", str(error))
+        case UnknownModel():
+            return InvalidRequest.at("/model", str(error))
+    return InvalidRequest.at("", str(error))
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of the application a problem document."""
+    app.add_exception_handler(ServiceError, _service_error)
+    app.add_exception_handler(SysidError, _sysid_error)
+    app.add_exception_handler(RequestValidationError, _validation_error)
+    app.add_exception_handler(HTTPException, _http_error)
+    app.add_exception_handler(Exception, _unexpected)
+
+
+def _service_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, ServiceError)
+    return problem(
+        request, error.status, error.kind, error.title, error.detail, error.errors, error.headers
+    )
+
+
+def _sysid_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, SysidError)
+    return _service_error(request, of_sysid(error))
+
+
+def _http_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    status = HTTPStatus(error.status_code)
+    kind = KINDS.get(status, status.phrase.lower().replace(" ", "-"))
+    detail = error.detail
+    if status in (HTTPStatus.NOT_FOUND, HTTPStatus.METHOD_NOT_ALLOWED):
+        detail = f"{request.method} {request.url.path}: {status.phrase.lower()}; see /docs"
+    return problem(request, status, kind, status.phrase, detail, headers=error.headers)
+
+
+def _validation_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError)
+    return _service_error(request, InvalidRequest(_field_errors(request, error)))
+
+
+def _unexpected(request: Request, error: Exception) -> Response:
+    # Starlette logs the traceback of what reaches this border; the caller learns no inner detail.
+    log.error("%s %s failed: %r", request.method, request.url.path, error)
+    detail = "an unexpected error; it is in the log of the server"
+    return problem(request, 500, "internal", "The service failed", detail)
+
+
+def _field_errors(request: Request, error: RequestValidationError) -> Iterator[FieldError]:
+    seen: set[str] = set()
+    for entry in error.errors():
+        place, loc = entry["loc"][0], entry["loc"][1:]
+        if entry["type"] == "json_invalid":
+            yield FieldError("", f"the body is not JSON: {entry['ctx']['error']} at {loc[0]}")
+            continue
+        if place == "body":
+            pointer = pointer_into(error.body, loc)
+            known = known_fields(request.scope.get("endpoint"), loc[:-1])
+        else:
+            pointer, known = f"?{loc[-1] if loc else ''}", []
+        # A union gives one entry per member; the first is about the member most often meant.
+        if pointer not in seen:
+            seen.add(pointer)
+            yield FieldError(pointer, _detail(entry, known))
+
+
+def _detail(entry: Mapping[str, Any], known: Sequence[str]) -> str:
+    if entry["type"] == "extra_forbidden":
+        return f"unknown field {entry['loc'][-1]!r}{nearest(str(entry['loc'][-1]), known)}"
+    if entry["type"] == "missing":
+        return "this field is required"
+    found = repr(entry.get("input"))
+    return f"{entry['msg']}; found {found if len(found) <= 80 else found[:77] + '…'}"

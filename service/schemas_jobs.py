@@ -1,0 +1,203 @@
+"""The job body and what is told about a job.
+
+Defaults stand here a second time, beside those of `sysid.settings`, so that the OpenAPI document
+shows them and a client needs no NumPy; a test compares the two.
+"""
+
+from datetime import datetime
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from service.schemas import Answer, Body, Pointer
+
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Mutation = Annotated[list[tuple[int, float]], Field(min_length=1)]
+
+
+class ParameterIn(Body):
+    """Changes of one parameter of the model."""
+
+    lower: float | None = None
+    upper: float | None = None
+    scale: Literal["linear", "log"] | None = None
+    fixed: float | None = None
+
+
+class ValidationIn(Body):
+    """Data kept for validation: other datasets, or the last fraction of each record."""
+
+    datasets: list[str] | None = Field(default=None, min_length=1)
+    fraction: float | None = Field(default=None, gt=0, lt=1)
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        if (self.datasets is None) == (self.fraction is None):
+            raise PydanticCustomError("one_of", "give either 'datasets' or 'fraction'")
+        return self
+
+
+class LossIn(Body):
+    """What is minimised: squares, or soft-l1 with a scale in the output's unit."""
+
+    kind: Literal["squares", "soft-l1"] = "squares"
+    scale: float = Field(default=1.0, gt=0)
+
+
+class NoiseIn(Body):
+    """Noise added to the measured outputs before fitting, for sensitivity studies."""
+
+    sigma: float = Field(default=0.0, ge=0)
+    seed: Seed = 0
+
+
+class SequenceIn(Body):
+    """The sequence search."""
+
+    kind: Literal["paper", "adaptive"] = "adaptive"
+    beta: float = Field(default=0.01, gt=0, lt=1)
+    relative: bool = True
+
+
+class MigrationIn(Body):
+    """Exchange between islands."""
+
+    every: int = Field(default=25, ge=1)
+    topology: Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"] = (
+        "one-way-ring"
+    )
+    migrants: int = Field(default=2, ge=0)
+
+
+class StopIn(Body):
+    """End conditions besides the generations."""
+
+    evaluations: int | None = Field(default=None, ge=1)
+    seconds: float | None = Field(default=None, gt=0)
+    rms: float | None = Field(default=None, gt=0)
+
+
+class IslandIn(Body):
+    """What one island does otherwise."""
+
+    method: Literal["simple", "improved-paper", "improved"] | None = None
+    bits: int | None = Field(default=None, ge=1, le=32)
+    mutation: Mutation | None = None
+
+
+class AlgorithmIn(Body):
+    """Settings of the search."""
+
+    method: Literal["simple", "improved-paper", "improved"] = "improved"
+    population: int = Field(default=50, ge=4, le=100_000)
+    generations: int = Field(default=400, ge=1, le=10_000_000)
+    bits: int = Field(default=24, ge=1, le=32)
+    selection_rate: float = Field(default=0.5, gt=0, lt=1)
+    mutation: Mutation = Field(default=[(0, 0.2), (50, 0.8)])
+    stagnation: int = Field(default=30, ge=1)
+    sequence: SequenceIn = SequenceIn()
+    islands: int | list[IslandIn] | None = None
+    migration: MigrationIn = MigrationIn()
+    refine: bool = True
+    safe_limit: float | None = Field(default=None, gt=0)
+    stop: StopIn = StopIn()
+
+
+class Axis(Body):
+    """One axis of a sweep: the field it changes and the values it takes.
+
+    Exactly one of `values`, `range` (start, stop[, step]; whole numbers, stop left out) and `log`
+    (start, stop, count; both ends taken) is given. Axes of one `zip` name step together; all
+    others are crossed. `labels` belong to the values, one each.
+    """
+
+    path: Pointer
+    values: list[Any] | None = Field(default=None, min_length=1)
+    range: list[int] | None = Field(default=None, min_length=2, max_length=3)
+    log: tuple[float, float, int] | None = None
+    zip: str | None = None
+    labels: list[dict[str, float | str]] | None = None
+
+    @model_validator(mode="after")
+    def _one_kind_of_values(self) -> Self:
+        given = [n for n in ("values", "range", "log") if getattr(self, n) is not None]
+        if len(given) != 1:
+            raise PydanticCustomError(
+                "one_of",
+                "give exactly one of 'values', 'range' and 'log'; found {found}",
+                {"found": " and ".join(given) or "none"},
+            )
+        return self
+
+
+class SweepIn(Body):
+    """A job of many runs: the crossed axes give one run a cell."""
+
+    axes: list[Axis] = Field(default=[], max_length=16)
+
+
+def _model_reference(value: Any) -> Any:
+    if not isinstance(value, str | dict):
+        raise PydanticCustomError(
+            "model_reference",
+            "need the name of a model, 'name@version', or a model document (an object)",
+        )
+    return value
+
+
+class JobIn(Body):
+    """A job: what is to be identified, from which data, and how."""
+
+    name: str | None = Field(default=None, max_length=200)
+    model: Annotated[Any, AfterValidator(_model_reference)]
+    datasets: list[str] = Field(min_length=1, max_length=1000)
+    channels: dict[str, str] = Field(default={})
+    validation: ValidationIn | None = None
+    parameters: dict[str, ParameterIn] = Field(default={})
+    prediction: Literal["simulation", "one-step"] = "simulation"
+    loss: LossIn = LossIn()
+    weights: dict[str, float] | None = None
+    skip: int = Field(default=0, ge=0)
+    noise: NoiseIn = NoiseIn()
+    algorithm: AlgorithmIn = AlgorithmIn()
+    seed: Seed = 1
+    priority: int = Field(default=0, ge=-100, le=100)
+    sweep: SweepIn = SweepIn()
+
+    def normal_form(self) -> dict[str, Any]:
+        """The body with every default written out, as it is stored and handed to workers."""
+        document = self.model_dump(mode="json")
+        document["parameters"] = {
+            name: change.model_dump(mode="json", exclude_none=True)
+            for name, change in self.parameters.items()
+        }
+        return document
+
+
+class Progress(Answer):
+    """How far a job has come."""
+
+    runs: int
+    finished: int
+    failed: int
+    best_rms: float | None = None
+    evaluations: int = 0
+
+
+class JobOut(Answer):
+    """A job and its state."""
+
+    id: str
+    name: str
+    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
+    cancel_requested: bool = False
+    created_at: datetime
+    started_at: datetime | None = None
+    finished_at: datetime | None = None
+    attempt: int
+    error: str | None = None
+    model: str
+    priority: int
+    progress: Progress
+    request: dict[str, Any] | None = None
