@@ -1,0 +1,101 @@
+"""What the programs on measured records share: the folder, a service, one job over REST."""
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from service.client import Client
+
+from benchmarks.table import Row
+from service.embedded import embedded_service
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def data_folder() -> Path | None:
+    """Return the folder of measured records (`LAGID_DATA`), or None when it is absent."""
+    folder = Path(os.environ.get("LAGID_DATA", ROOT.parent / "shared" / "data"))
+    return folder if folder.is_dir() else None
+
+
+@contextmanager
+def service() -> Iterator[tuple[Client, Path]]:
+    """Start a service in a temporary folder; give a client and that folder."""
+    with (
+        tempfile.TemporaryDirectory(prefix="lagid-") as folder,
+        embedded_service(Path(folder)) as url,
+        Client(url) as client,
+    ):
+        yield client, Path(folder)
+
+
+def identify(client: Client, body: Mapping[str, Any]) -> dict[str, Any]:
+    """Submit a job of one run over REST, wait for it, and return the run's result."""
+    job = client.submit(body)
+    ended = client.wait(job["id"], progress=lambda _: PEAK.sample())
+    (run,) = client.runs(job["id"])
+    if ended["state"] != "succeeded":
+        raise SystemExit(f"job {body['name']!r} {ended['state']}: {ended.get('error')}")
+    return client.run(run["id"])
+
+
+def print_estimates(title: str, run: Mapping[str, Any]) -> None:
+    """Print the estimates with standard errors, the fit, and the warnings of a run."""
+    print(f"\n### {title}: {run['evaluations']} simulations, {run['seconds']:.1f} s\n")
+    print("| parameter | estimate | standard error | unit | status |")
+    print("|---|--:|--:|---|---|")
+    for one in run["parameters"]:
+        error = "–" if one["stderr"] is None else f"{one['stderr']:.4g}"
+        print(f"| {one['name']} | {one['value']:.6g} | {error} | {one['unit']} | {one['status']} |")
+    for warning in run["warnings"]:
+        print(f"- {warning}")
+
+
+def parameter(run: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return the entry of one parameter."""
+    return next(dict(one) for one in run["parameters"] if one["name"] == name)
+
+
+def peak_memory_row() -> Row:
+    """Peak of the memory that this machine's processes of the service held together, in GB."""
+    return Row("peak memory, all processes", PEAK.gigabytes, "GB", 1.5)
+
+
+class _Peak:
+    """The largest sum of the proportional set sizes of this process's descendants seen so far."""
+
+    gigabytes = 0.0
+
+    def sample(self) -> None:
+        """Look once."""
+        self.gigabytes = max(self.gigabytes, _family_pss_bytes() / 1e9)
+
+
+PEAK = _Peak()
+
+
+def _family_pss_bytes() -> float:
+    parents: dict[int, int] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                stat = (entry / "stat").read_text()
+            except OSError:
+                continue  # it ended meanwhile
+            parents[int(entry.name)] = int(stat.rpartition(")")[2].split()[1])
+    family = {os.getpid()}
+    for _ in range(8):  # generations of processes; Ray's depth is 4
+        family |= {child for child, parent in parents.items() if parent in family}
+    return sum(_pss_bytes(process) for process in family)
+
+
+def _pss_bytes(process: int) -> float:
+    try:
+        text = Path(f"/proc/{process}/smaps_rollup").read_text()
+    except OSError:
+        return 0.0
+    lines = (line.split() for line in text.splitlines())
+    return sum(1024.0 * float(line[1]) for line in lines if line[0] == "Pss:")
