@@ -1,0 +1,1 @@
+"""Programs on measured records, through the service."""
