@@ -25,7 +25,7 @@ class Settings(BaseSettings):
         Workers of the local Ray; None: all cores.
     require_keys : bool or None
         None: API keys are off on loopback and required elsewhere.
-    allow_open : bool
+    allow_open_host : bool
         Serve other hosts although this version has no API keys yet.
     lease_seconds : float
         How long a job stays with a dispatcher that is not heard of.
@@ -43,7 +43,7 @@ class Settings(BaseSettings):
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535)
     require_keys: bool | None = None
-    allow_open: bool = False
+    allow_open_host: bool = False
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
     max_runs_per_job: int = Field(default=100_000, ge=1)
     lease_seconds: float = Field(default=30.0, gt=0)
@@ -91,11 +91,11 @@ class Settings(BaseSettings):
         """
         if self.require_keys:
             raise Misconfigured("this version has no API keys yet; unset LAGID_REQUIRE_KEYS")
-        if not is_loopback(self.host) and not self.allow_open:
+        if not is_loopback(self.host) and not self.allow_open_host:
             raise Misconfigured(
                 f"host {self.host} can be reached from other machines, and this version has no "
-                "API keys yet; serve on 127.0.0.1, or set LAGID_ALLOW_OPEN=true if the network "
-                "around it is trusted"
+                "API keys yet; serve on 127.0.0.1, or set LAGID_ALLOW_OPEN_HOST=true if something "
+                "in front of it asks who is there"
             )
 
 

@@ -1,0 +1,166 @@
+"""The REST calls as values, shared by the synchronous and the asynchronous client."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, TypeAlias
+
+import httpx
+
+Document: TypeAlias = dict[str, Any]
+
+TERMINAL = frozenset({"succeeded", "failed", "cancelled"})
+PIECE = 1 << 20
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+MEDIA_TYPES = {".csv": "text/csv", ".txt": "text/csv", ".mcap": "application/x-mcap"}
+
+
+class ClientError(Exception):
+    """Base class of what a client raises on purpose: ProblemError, ServerUnreachable."""
+
+
+class ProblemError(ClientError):
+    """The server refused a request.
+
+    Attributes
+    ----------
+    status : int
+    document : dict
+        The RFC 9457 problem document; ``errors`` lists each fault with its JSON pointer.
+    """
+
+    def __init__(self, status: int, document: Document) -> None:
+        self.status, self.document = status, document
+        faults = [_fault(entry) for entry in document.get("errors", [])]
+        head = f"{document.get('title', 'error')} ({status})"
+        super().__init__(f"{head}: {'; '.join(faults) or document.get('detail', '')}")
+
+
+class ServerUnreachable(ClientError):
+    """No server answers at the address."""
+
+    def __init__(self, url: str, reason: str) -> None:
+        super().__init__(
+            f"no lagid server answers at {url} ({reason}); start one with `lagid serve`, "
+            "or name another with --url or LAGID_URL"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """One request, not yet sent."""
+
+    method: str
+    path: str
+    params: Mapping[str, Any] = field(default_factory=dict)
+    json: Any = None
+    content: bytes | Path | None = None
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+def read(*parts: str, **params: Any) -> Call:
+    """GET of a path made of parts; parameters that are None are left out."""
+    given = {name: value for name, value in params.items() if value is not None}
+    return Call("GET", "/v1/" + "/".join(_quoted(part) for part in parts), given)
+
+
+def act(what: str, name: str, verb: str, body: Any = None) -> Call:
+    """POST of an action upon one thing, such as ``/v1/jobs/job_…:cancel``."""
+    return Call("POST", f"/v1/{what}/{_quoted(name)}:{verb}", json=body)
+
+
+def create(what: str, body: Any, headers: Mapping[str, str] | None = None) -> Call:
+    """POST of a new thing."""
+    return Call("POST", f"/v1/{what}", json=body, headers=headers or {})
+
+
+def upload(
+    source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
+) -> Call:
+    """POST of a recording, from a file or from bytes; its kind follows from suffix or content."""
+    content: bytes | Path
+    if isinstance(source, bytes):
+        content = source
+        kind = "application/x-mcap" if content.startswith(MCAP_MAGIC) else "text/csv"
+    else:
+        content = Path(source)
+        kind = MEDIA_TYPES.get(content.suffix.lower(), "application/octet-stream")
+        name = name or content.stem
+    given = {"name": name, "segments": segments, "sample_time": sample_time}
+    params = {key: value for key, value in given.items() if value is not None}
+    return Call("POST", "/v1/datasets", params, content=content, headers={"content-type": kind})
+
+
+@contextmanager
+def opened(content: bytes | Path | None) -> Iterator[bytes | BinaryIO | None]:
+    """Content to send; a file is read piece by piece while it is sent."""
+    if isinstance(content, Path):
+        with content.open("rb") as file:
+            yield file
+    else:
+        yield content
+
+
+def pieces(content: bytes | Path | None) -> bytes | AsyncIterator[bytes] | None:
+    """Content to send from an asynchronous client."""
+    return _read_pieces(content) if isinstance(content, Path) else content
+
+
+def checked(answer: httpx.Response) -> httpx.Response:
+    """The answer, unless it is an error.
+
+    Raises
+    ------
+    ProblemError
+        With the problem document; one is made where something else than lagid answered.
+    """
+    if answer.is_success:
+        return answer
+    try:
+        document = answer.json()
+    except ValueError:
+        document = None
+    if not isinstance(document, dict):
+        document = {"title": answer.reason_phrase, "status": answer.status_code,
+                    "detail": answer.text[:200]}  # fmt: skip
+    raise ProblemError(answer.status_code, document)
+
+
+async def _read_pieces(path: Path) -> AsyncIterator[bytes]:
+    with path.open("rb") as file:
+        while piece := await asyncio.to_thread(file.read, PIECE):
+            yield piece
+
+
+class EventParser:
+    """Server-sent events from lines; `feed` gives an event when a line completes one."""
+
+    def __init__(self) -> None:
+        self._fields: dict[str, str] = {}
+
+    def feed(self, line: str) -> Iterator[Document]:
+        """Take one line; yield the event it completes, with its data decoded from JSON."""
+        if line:
+            key, _, value = line.partition(":")
+            if key:  # a line that begins with a colon is a comment that keeps the line open
+                self._fields[key] = value.removeprefix(" ")
+            return
+        fields, self._fields = self._fields, {}
+        if "data" in fields:
+            yield {
+                "id": fields.get("id"),
+                "event": fields.get("event", "message"),
+                "data": json.loads(fields["data"]),
+            }
+
+
+def _fault(entry: Mapping[str, Any]) -> str:
+    column = f", column {entry['column']}" if entry.get("column") is not None else ""
+    return f"{entry.get('pointer') or 'body'}{column}: {entry.get('detail')}"
+
+
+def _quoted(part: str) -> str:
+    return httpx.URL("/").copy_with(path="/" + part).raw_path.decode().removeprefix("/")

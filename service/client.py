@@ -1,0 +1,342 @@
+"""The light client of the service: httpx only, without NumPy or Ray.
+
+All methods take and return plain documents with the names of the REST interface.
+"""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+
+from service import calls
+from service.calls import TERMINAL, Call, ClientError, Document, ProblemError, ServerUnreachable
+
+__all__ = ["AsyncClient", "Client", "ClientError", "ProblemError", "ServerUnreachable"]
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+POLL_S = 0.3
+TIMEOUT_S = 60.0
+PAGE = 500
+
+
+def _headers(key: str | None) -> dict[str, str]:
+    return {"Authorization": f"Bearer {key}"} if key else {}
+
+
+class Client:
+    """The service from a program.
+
+    Parameters
+    ----------
+    url : str
+        Address of the server.
+    key : str, optional
+        API key, where the server asks for one.
+    transport : httpx.BaseTransport, optional
+        Another way to the server, for tests.
+
+    Raises
+    ------
+    ProblemError
+        From every method, if the server refuses; it carries the problem document.
+    ServerUnreachable
+        From every method, if no server answers.
+    """
+
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        key: str | None = None,
+        *,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        self.url = url.rstrip("/")
+        self._http = httpx.Client(
+            base_url=self.url, headers=_headers(key), timeout=TIMEOUT_S, transport=transport
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def send(self, call: Call) -> httpx.Response:
+        """Send one call; errors are raised."""
+        try:
+            with calls.opened(call.content) as content:
+                answer = self._http.request(
+                    call.method, call.path, params=dict(call.params), json=call.json,
+                    content=content, headers=dict(call.headers),
+                )  # fmt: skip
+        except httpx.TransportError as error:
+            raise ServerUnreachable(self.url, str(error) or type(error).__name__) from error
+        return calls.checked(answer)
+
+    def _json(self, call: Call) -> Document:
+        document: Document = self.send(call).json()
+        return document
+
+    def _all(self, *parts: str, **filters: Any) -> list[Document]:
+        items: list[Document] = []
+        cursor: str | None = None
+        while True:
+            page = self._json(calls.read(*parts, cursor=cursor, limit=PAGE, **filters))
+            items += page["items"]
+            cursor = page["next"]
+            if cursor is None:
+                return items
+
+    # ---- datasets
+    def add_dataset(
+        self,
+        source: str | Path | bytes,
+        name: str | None = None,
+        *,
+        segments: str | None = None,
+        sample_time: float | None = None,
+    ) -> Document:
+        """Store a recording, CSV or MCAP, from a file or from bytes."""
+        return self._json(calls.upload(source, name, segments, sample_time))
+
+    def simulate_dataset(self, body: Mapping[str, Any]) -> Document:
+        """Make a dataset from a model, its true parameters, inputs and noise."""
+        return self._json(calls.create("datasets:simulate", body))
+
+    def derive(self, dataset: str, steps: list[Document], name: str | None = None) -> Document:
+        """Make a dataset from another: noise, resample, trim, select, pool, and so on."""
+        return self._json(calls.act("datasets", dataset, "derive", {"name": name, "steps": steps}))
+
+    def datasets(self) -> list[Document]:
+        """All datasets, newest first."""
+        return self._all("datasets")
+
+    def dataset(self, name: str) -> Document:
+        """One dataset by id."""
+        return self._json(calls.read("datasets", name))
+
+    def signals(self, dataset: str, max_points: int = 1000) -> Document:
+        """Signals of a dataset, reduced to at most so many points a channel."""
+        return self._json(calls.read("datasets", dataset, "signals", max_points=max_points))
+
+    def lineage(self, dataset: str) -> Document:
+        """What a dataset was made from, and what was made from it."""
+        return self._json(calls.read("datasets", dataset, "lineage"))
+
+    def content(self, dataset: str) -> bytes:
+        """A dataset as an MCAP file."""
+        return self.send(calls.read("datasets", dataset, "content")).content
+
+    # ---- models
+    def models(self) -> list[Document]:
+        """Catalogue and own models."""
+        return self._all("models")
+
+    def model(self, name: str) -> Document:
+        """One model with its document."""
+        return self._json(calls.read("models", name))
+
+    def add_model(self, document: Mapping[str, Any]) -> Document:
+        """Store an own model; a changed document becomes its next version."""
+        return self._json(calls.create("models", document))
+
+    def check_model(self, document: Mapping[str, Any]) -> Document:
+        """Whether a model document can be used, with every error and its column."""
+        return self._json(calls.create("models:check", document))
+
+    # ---- jobs
+    def submit(self, job: Mapping[str, Any], *, idempotency_key: str | None = None) -> Document:
+        """Queue a job."""
+        headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
+        return self._json(calls.create("jobs", job, headers))
+
+    def jobs(self) -> list[Document]:
+        """All jobs, newest first."""
+        return self._all("jobs")
+
+    def job(self, name: str) -> Document:
+        """One job with its state and progress."""
+        return self._json(calls.read("jobs", name))
+
+    def cancel(self, job: str) -> Document:
+        """Cancel a job; what it has found so far stays."""
+        return self._json(calls.act("jobs", job, "cancel"))
+
+    def resume(self, job: str) -> Document:
+        """Queue a failed or cancelled job again, from where it stopped."""
+        return self._json(calls.act("jobs", job, "resume"))
+
+    def clone(self, job: str) -> Document:
+        """Queue the same request as a new job."""
+        return self._json(calls.act("jobs", job, "clone"))
+
+    def report(self, job: str) -> str:
+        """The report of a job, as HTML."""
+        return self.send(calls.read("jobs", job, "report")).text
+
+    def wait(
+        self,
+        job: str,
+        progress: Callable[[Document], object] | None = None,
+        *,
+        poll: float = POLL_S,
+    ) -> Document:
+        """Wait until a job has ended; `progress` hears its state at every look."""
+        while True:
+            state = self.job(job)
+            if progress is not None:
+                progress(state)
+            if state["state"] in TERMINAL:
+                return state
+            time.sleep(poll)
+
+    def events(self, job: str, after: str | None = None) -> Iterator[Document]:
+        """Events of a job as they come, until its end; `after` is the id of the last one known."""
+        call, parser = calls.read("jobs", job, "events"), calls.EventParser()
+        headers = {"Last-Event-ID": after} if after else {}
+        with self._http.stream("GET", call.path, headers=headers, timeout=None) as stream:
+            if not stream.is_success:
+                stream.read()
+                calls.checked(stream)
+            for line in stream.iter_lines():
+                yield from parser.feed(line)
+
+    # ---- runs
+    def runs(self, job: str, **filters: Any) -> list[Document]:
+        """All runs of a job."""
+        return self._all("jobs", job, "runs", **filters)
+
+    def run(self, name: str) -> Document:
+        """One run's result."""
+        return self._json(calls.read("runs", name))
+
+    def history(self, run: str) -> Document:
+        """Improvements of each island's champion."""
+        return self._json(calls.read("runs", run, "history"))
+
+    def response(self, run: str, max_points: int = 1000) -> Document:
+        """Measured and simulated outputs."""
+        return self._json(calls.read("runs", run, "response", max_points=max_points))
+
+    def migrations(self, run: str) -> Document:
+        """The migration log."""
+        return self._json(calls.read("runs", run, "migrations"))
+
+
+class AsyncClient:
+    """The service from an asynchronous program; methods as those of `Client`, with ``await``.
+
+    Parameters and errors are those of `Client`.
+    """
+
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        key: str | None = None,
+        *,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self.url = url.rstrip("/")
+        self._http = httpx.AsyncClient(
+            base_url=self.url, headers=_headers(key), timeout=TIMEOUT_S, transport=transport
+        )
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self._http.aclose()
+
+    async def send(self, call: Call) -> httpx.Response:
+        """Send one call; errors are raised."""
+        try:
+            answer = await self._http.request(
+                call.method, call.path, params=dict(call.params), json=call.json,
+                content=calls.pieces(call.content), headers=dict(call.headers),
+            )  # fmt: skip
+        except httpx.TransportError as error:
+            raise ServerUnreachable(self.url, str(error) or type(error).__name__) from error
+        return calls.checked(answer)
+
+    async def _json(self, call: Call) -> Document:
+        document: Document = (await self.send(call)).json()
+        return document
+
+    async def add_dataset(
+        self,
+        source: str | Path | bytes,
+        name: str | None = None,
+        *,
+        segments: str | None = None,
+        sample_time: float | None = None,
+    ) -> Document:
+        """Store a recording, CSV or MCAP, from a file or from bytes."""
+        return await self._json(calls.upload(source, name, segments, sample_time))
+
+    async def submit(
+        self, job: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a job."""
+        headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
+        return await self._json(calls.create("jobs", job, headers))
+
+    async def job(self, name: str) -> Document:
+        """One job with its state and progress."""
+        return await self._json(calls.read("jobs", name))
+
+    async def cancel(self, job: str) -> Document:
+        """Cancel a job; what it has found so far stays."""
+        return await self._json(calls.act("jobs", job, "cancel"))
+
+    async def wait(
+        self,
+        job: str,
+        progress: Callable[[Document], object] | None = None,
+        *,
+        poll: float = POLL_S,
+    ) -> Document:
+        """Wait until a job has ended; `progress` hears its state at every look."""
+        while True:
+            state = await self.job(job)
+            if progress is not None:
+                progress(state)
+            if state["state"] in TERMINAL:
+                return state
+            await asyncio.sleep(poll)
+
+    async def runs(self, job: str) -> AsyncIterator[Document]:
+        """Runs of a job, page by page."""
+        cursor: str | None = None
+        while True:
+            page = await self._json(calls.read("jobs", job, "runs", cursor=cursor, limit=PAGE))
+            for item in page["items"]:
+                yield item
+            cursor = page["next"]
+            if cursor is None:
+                return
+
+    async def run(self, name: str) -> Document:
+        """One run's result."""
+        return await self._json(calls.read("runs", name))
+
+    async def history(self, run: str) -> Document:
+        """Improvements of each island's champion."""
+        return await self._json(calls.read("runs", run, "history"))

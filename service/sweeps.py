@@ -1,0 +1,185 @@
+"""A sweep: from axes to cells, and from a cell to the body of its run."""
+
+from collections.abc import Iterator, Mapping
+from copy import deepcopy
+from dataclasses import dataclass, field
+from itertools import product
+from math import exp, log, prod
+from typing import Any
+
+from service.errors import FieldError, InvalidRequest
+from service.schemas_jobs import Axis, JobIn
+from sysid.errors import nearest
+
+# Fields that decide on the job as a whole; a cell of it cannot have its own.
+FIXED_FIELDS = ("name", "priority", "sweep")
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One run of a sweep: the value of each axis' field, and labels for tables and plots."""
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    labels: Mapping[str, float | str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What one position of one group of axes sets, and where in the body it was written."""
+
+    pointer: str
+    cell: Cell
+
+
+def steps_of(job: JobIn) -> list[list[Step]]:
+    """Groups of axes that step together; the groups are crossed.
+
+    Raises
+    ------
+    InvalidRequest
+        If a path is not a field of the body, axes of one zip differ in length, or labels in
+        number from values.
+    """
+    groups: dict[str, list[int]] = {}
+    for number, axis in enumerate(job.sweep.axes):
+        groups.setdefault(f"zip {axis.zip}" if axis.zip else f"axis {number}", []).append(number)
+    errors = list(_faults(job))
+    if errors:
+        raise InvalidRequest(errors)
+    return [_zipped(job.sweep.axes, numbers) for numbers in groups.values()]
+
+
+def count(groups: list[list[Step]]) -> int:
+    """Number of runs that the crossed groups give."""
+    return prod(len(group) for group in groups)
+
+
+def expand(groups: list[list[Step]]) -> Iterator[Cell]:
+    """Cells of the crossed groups, the last group fastest; one empty cell without axes."""
+    for steps in product(*groups):
+        values: dict[str, Any] = {}
+        labels: dict[str, float | str] = {}
+        for step in steps:
+            values.update(step.cell.values)
+            labels.update(step.cell.labels)
+        yield Cell(values, labels)
+
+
+def body_of(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Body of one run: the job's normal form with the cell's values put in."""
+    body = deepcopy({name: value for name, value in document.items() if name != "sweep"})
+    for path, value in values.items():
+        *parents, last = _parts(path)
+        here: Any = body
+        for part in parents:
+            here = here[int(part)] if isinstance(here, list) else _child(here, part)
+        if isinstance(here, list):
+            here[int(last)] = value
+        else:
+            here[last] = [value] if path == "/datasets" and isinstance(value, str) else value
+    return body
+
+
+def values_of(axis: Axis) -> list[Any]:
+    """Values of an axis."""
+    if axis.values is not None:
+        return axis.values
+    if axis.range is not None:
+        return list(range(*axis.range))
+    assert axis.log is not None
+    start, stop, points = axis.log
+    ratio = log(stop / start) / max(points - 1, 1)
+    return [start * exp(ratio * i) for i in range(points - 1)] + [stop]
+
+
+def _child(here: dict[str, Any], part: str) -> Any:
+    if here.get(part) is None:
+        here[part] = {}
+    return here[part]
+
+
+def _zipped(axes: list[Axis], numbers: list[int]) -> list[Step]:
+    columns = [(n, axes[n], values_of(axes[n])) for n in numbers]
+    steps = []
+    for position in range(len(columns[0][2])):
+        labels: dict[str, float | str] = {}
+        for _, axis, _ in columns:
+            labels.update(axis.labels[position] if axis.labels else {})
+        cell = Cell({axis.path: values[position] for _, axis, values in columns}, labels)
+        steps.append(Step(_pointer(numbers[0], axes[numbers[0]], position), cell))
+    return steps
+
+
+def _pointer(number: int, axis: Axis, position: int) -> str:
+    kind = next(n for n in ("values", "range", "log") if getattr(axis, n) is not None)
+    return f"/sweep/axes/{number}/{kind}" + (f"/{position}" if kind == "values" else "")
+
+
+def _faults(job: JobIn) -> Iterator[FieldError]:
+    document = job.normal_form()
+    lengths: dict[str, int] = {}
+    seen: set[str] = set()
+    for number, axis in enumerate(job.sweep.axes):
+        place = f"/sweep/axes/{number}"
+        detail = _unknown_path(document, axis.path)
+        if axis.path in seen:
+            detail = f"{axis.path!r} is already an axis of this sweep"
+        if detail:
+            yield FieldError(f"{place}/path", detail)
+        seen.add(axis.path)
+        detail = _bad_spacing(axis)
+        if detail:
+            yield FieldError(f"{place}/{'log' if axis.log else 'range'}", detail)
+            continue
+        n = len(values_of(axis))
+        if axis.labels is not None and len(axis.labels) != n:
+            found = f"found {len(axis.labels)} labels for {n} values; need one each"
+            yield FieldError(f"{place}/labels", found)
+        if axis.zip is not None and lengths.setdefault(axis.zip, n) != n:
+            yield FieldError(
+                f"{place}/zip",
+                f"axes of zip {axis.zip!r} step together: found {n} values beside "
+                f"{lengths[axis.zip]}; need as many",
+            )
+
+
+def _bad_spacing(axis: Axis) -> str | None:
+    if axis.log is not None:
+        start, stop, points = axis.log
+        if not (start > 0 and stop > 0 and points >= 1):
+            return f"found {list(axis.log)}; need [start, stop, count] with start > 0, stop > 0"
+        return f"found {points} values; at most 1000000" if points > 1_000_000 else None
+    if axis.range is not None:
+        if axis.range[2:] == [0] or not range(*axis.range):
+            return f"the range {axis.range} is empty; need [start, stop] or [start, stop, step]"
+        if len(range(*axis.range)) > 1_000_000:
+            return f"the range {axis.range} has over 1000000 values"
+    return None
+
+
+def _unknown_path(document: Mapping[str, Any], path: str) -> str | None:
+    """Why a path is not a field of the body, or None."""
+    parts = _parts(path)
+    if parts[0] in FIXED_FIELDS:
+        return f"{path!r} cannot be swept"
+    if parts[0] in ("channels", "weights") and len(parts) == 2:
+        return None  # which signals there are, the check of each value tells
+    if parts[0] == "parameters" and len(parts) == 3:
+        return None
+    here: Any = document
+    for part in parts:
+        known = _children(here)
+        if part not in known:
+            return f"the job has no field {path!r}{nearest(part, known)}"
+        here = here[int(part)] if isinstance(here, list) else here[part]
+    return None
+
+
+def _children(value: Any) -> list[str]:
+    if isinstance(value, list):
+        return [str(index) for index in range(len(value))]
+    return list(value) if isinstance(value, dict) else []
+
+
+def _parts(path: str) -> list[str]:
+    return [part.replace("~1", "/").replace("~0", "~") for part in path.split("/")[1:]]
