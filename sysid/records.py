@@ -1,16 +1,44 @@
 """Recordings: channels on their own times, segments, and the record a model is compared with."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sysid.errors import InvalidRecord, nearest
+from sysid.errors import InvalidRecord, InvalidSettings, nearest
 from sysid.types import FloatArray
 
 Hold = Literal["zero", "first", "band-limited"]
 HOLDS: tuple[Hold, ...] = ("zero", "first", "band-limited")
+
+REGULAR_WITHIN = 1e-3
+"""Times are regular when none is further than this part of a period from its place."""
+
+
+class Sampling(NamedTuple):
+    """How a signal was sampled; `period` (s) is the median distance where it is irregular."""
+
+    samples: int
+    period: float
+    is_regular: bool
+
+    def __str__(self) -> str:
+        if self.samples < 2:
+            return "one sample"
+        kind = "every" if self.is_regular else "irregular, median"
+        return f"{self.samples} samples, {kind} {self.period:.6g} s"
+
+
+def sampling_of(times: FloatArray) -> Sampling:
+    """How times (s) are spaced."""
+    if times.size < 2:
+        return Sampling(times.size, float("nan"), is_regular=False)
+    period = float(times[-1] - times[0]) / (times.size - 1)
+    grid = times[0] + period * np.arange(times.size)
+    if period > 0 and float(np.max(np.abs(times - grid))) <= REGULAR_WITHIN * period:
+        return Sampling(times.size, period, is_regular=True)
+    return Sampling(times.size, float(np.median(np.diff(times))), is_regular=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +77,27 @@ class Channel:
         if not np.all(np.isfinite(self.times)) or np.any(np.diff(self.times) < 0):
             raise InvalidRecord(f"the times of channel {self.name!r} decrease or are not finite")
 
+    @property
+    def sampling(self) -> Sampling:
+        """How this channel was sampled."""
+        return sampling_of(self.times)
+
+    def between(self, start: float, stop: float) -> "Channel":
+        """Return the samples with `start` ≤ time ≤ `stop`.
+
+        Raises
+        ------
+        InvalidRecord
+            If there is none.
+        """
+        first, last = np.searchsorted(self.times, [start, np.nextafter(stop, np.inf)])
+        if first == last:
+            raise InvalidRecord(
+                f"channel {self.name!r} has no sample from {start:g} to {stop:g} s; "
+                f"its samples are from {self.times[0]:g} to {self.times[-1]:g} s"
+            )
+        return replace(self, times=self.times[first:last], values=self.values[first:last])
+
 
 @dataclass(frozen=True, slots=True)
 class Segment:
@@ -82,8 +131,107 @@ class Recording:
         for channel in self.channels:
             if channel.name == name:
                 return channel
-        known = [channel.name for channel in self.channels]
-        raise InvalidRecord(f"the recording has no channel {name!r}{nearest(name, known)}")
+        raise InvalidRecord(f"the recording has no channel {name!r}{nearest(name, self.names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the channels, in their order."""
+        return tuple(channel.name for channel in self.channels)
+
+    @property
+    def start(self) -> float:
+        """First time of any channel, in s."""
+        return min(float(channel.times[0]) for channel in self.channels)
+
+    @property
+    def stop(self) -> float:
+        """Last time of any channel, in s."""
+        return max(float(channel.times[-1]) for channel in self.channels)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last sample of any channel."""
+        return self.stop - self.start
+
+    @property
+    def samples(self) -> int:
+        """Samples of the longest channel."""
+        return max(channel.times.size for channel in self.channels)
+
+    @property
+    def sampling(self) -> Sampling:
+        """How the longest channel was sampled."""
+        return max(self.channels, key=lambda channel: channel.times.size).sampling
+
+    def record(
+        self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
+    ) -> "Record":
+        """Return the recording as one experiment of a model.
+
+        Parameters
+        ----------
+        inputs, outputs : mapping of str to str
+            Which channel is which signal of the model: model's name → channel's name.
+
+        Raises
+        ------
+        InvalidRecord
+            If a channel is not there, an input has missing values, an output has no value, or
+            the recording consists of several segments.
+        """
+        if len(self.segments) > 1:
+            raise InvalidRecord(
+                f"the recording has {len(self.segments)} segments, each measured on its own; "
+                "derive one record with 'pool' or 'select', or use every segment as an experiment"
+            )
+        return Record(
+            tuple(_as_input(self.channel(ours), role) for role, ours in inputs.items()),
+            tuple(_as_output(self.channel(ours), role) for role, ours in outputs.items()),
+            name,
+        )
+
+    def records(
+        self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
+    ) -> tuple["Record", ...]:
+        """Return every segment as one experiment, on its own times; without segments, one."""
+        return tuple(part.record(inputs, outputs, name) for part in self.pieces())
+
+    def pieces(self) -> tuple["Recording", ...]:
+        """Return every segment as a recording on its own times; without segments, this one."""
+        if not self.segments:
+            return (self,)
+        return tuple(self._piece(segment) for segment in self.segments)
+
+    def _piece(self, segment: Segment) -> "Recording":
+        cut = [channel.between(segment.start, segment.stop) for channel in self.channels]
+        return Recording(tuple(replace(one, times=own_times(one.times, segment)) for one in cut))
+
+
+def own_times(times: FloatArray, segment: Segment) -> FloatArray:
+    """Times of a segment as they were measured, to the nanosecond.
+
+    The rounding takes away what the place on the recording's axis added to the last digits.
+    """
+    return np.round(times - segment.start + segment.origin, 9)
+
+
+def _as_input(channel: Channel, role: str) -> Channel:
+    missing = np.flatnonzero(~np.isfinite(channel.values))
+    if missing.size:
+        raise InvalidRecord(
+            f"input {role!r} (channel {channel.name!r}) has {missing.size} missing values (NaN), "
+            f"the first at t = {channel.times[missing[0]]:g} s; an input must be known "
+            "everywhere: trim the recording or fill the gaps"
+        )
+    return replace(channel, name=role)
+
+
+def _as_output(channel: Channel, role: str) -> Channel:
+    if not np.any(np.isfinite(channel.values)):
+        raise InvalidRecord(
+            f"output {role!r} (channel {channel.name!r}) has no value: all are missing (NaN)"
+        )
+    return replace(channel, name=role)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,3 +241,62 @@ class Record:
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     name: str = ""
+
+    @property
+    def start(self) -> float:
+        """First time of any channel, in s."""
+        return min(float(one.times[0]) for one in (*self.inputs, *self.outputs))
+
+    @property
+    def stop(self) -> float:
+        """Last time of any channel, in s."""
+        return max(float(one.times[-1]) for one in (*self.inputs, *self.outputs))
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last sample of any channel."""
+        return self.stop - self.start
+
+
+def split_record(record: Record, fraction: float) -> tuple[Record, Record]:
+    """Split a record in time: first the part for estimation, then `fraction` for validation.
+
+    The cut lies at a sample of the longest output, which begins the validation part.
+
+    Raises
+    ------
+    InvalidSettings
+        If the fraction is not between 0 and 1, or leaves a channel of a part without samples.
+    """
+    cut = time_of_cut(max((one.times for one in record.outputs), key=len), fraction)
+    parts = []
+    for start, stop in ((-np.inf, np.nextafter(cut, -np.inf)), (cut, np.inf)):
+        try:
+            parts.append(
+                replace(
+                    record,
+                    inputs=tuple(one.between(start, stop) for one in record.inputs),
+                    outputs=tuple(one.between(start, stop) for one in record.outputs),
+                )
+            )
+        except InvalidRecord as error:
+            raise InvalidSettings("/validation/fraction", f"found {fraction!r}: {error}") from None
+    return parts[0], parts[1]
+
+
+def time_of_cut(times: FloatArray, fraction: float, pointer: str = "/validation/fraction") -> float:
+    """Time (s) of the sample at which the last `fraction` of the samples begins.
+
+    Raises
+    ------
+    InvalidSettings
+        If the fraction is not between 0 and 1, or one part would be empty.
+    """
+    if not 0 < fraction < 1:
+        raise InvalidSettings(pointer, f"found {fraction!r}; need a number between 0 and 1")
+    first = times.size - round(fraction * times.size)
+    if not 0 < first < times.size:
+        raise InvalidSettings(
+            pointer, f"found {fraction!r}: one part of {times.size} samples would be empty"
+        )
+    return float(times[first])
