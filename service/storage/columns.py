@@ -1,0 +1,88 @@
+"""Column types that mean the same on SQLite and on PostgreSQL."""
+
+import json
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Any, TypeAlias
+
+from sqlalchemy import JSON, BigInteger, DateTime, Dialect, Enum, Integer, String, TypeDecorator
+from sqlalchemy.dialects.postgresql import JSONB
+
+from service.storage.errors import UnstorableValue
+
+Document: TypeAlias = dict[str, Any]
+"""A JSON object."""
+
+DocumentType = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql")
+"""JSON text on SQLite, JSONB on PostgreSQL; None is NULL."""
+
+LargeInteger = BigInteger().with_variant(Integer(), "sqlite")
+"""64 bits on both: SQLite calls that INTEGER, and numbers rows by no other type."""
+
+
+def utc_now() -> datetime:
+    """The present, with its time zone."""
+    return datetime.now(UTC)
+
+
+class UtcDateTime(TypeDecorator[datetime]):
+    """A moment. It goes in with a time zone and comes out in UTC, on SQLite as well."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """The moment in UTC; SQLite keeps no zone, so that all its texts compare as times."""
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise UnstorableValue(f"the time {value.isoformat()} has no time zone")
+        moment = value.astimezone(UTC)
+        return moment.replace(tzinfo=None) if dialect.name == "sqlite" else moment
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """The stored moment, aware and in UTC."""
+        if value is None:
+            return None
+        return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
+
+
+class Text(TypeDecorator[str]):
+    """A text that both databases can keep: no NUL, no half of a surrogate pair."""
+
+    impl = String
+    cache_ok = True
+
+    def process_bind_param(self, value: str | None, dialect: Dialect) -> str | None:
+        """The same text, once it is known to be storable."""
+        if value is not None:
+            _require_storable(value)
+        return value
+
+
+def to_json(value: object) -> str:
+    """JSON text of a document, refused where PostgreSQL would refuse or alter it."""
+    try:
+        text = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    except ValueError as error:
+        raise UnstorableValue(f"a document holds NaN or an infinite number: {error}") from error
+    # json.dumps escapes NUL as \u0000; an escaped backslash before u0000 is an ordinary text.
+    _require_storable(text, nul="\\u0000" in text.replace("\\\\", ""))
+    return text
+
+
+def state_type(states: type[StrEnum]) -> Enum:
+    """Column type of a state: its text, without a database type that a migration must alter."""
+    return Enum(
+        states,
+        native_enum=False,
+        length=16,
+        values_callable=lambda kind: [one.value for one in kind],
+    )
+
+
+def _require_storable(text: str, *, nul: bool = False) -> None:
+    if nul or "\x00" in text:
+        raise UnstorableValue("a text holds the character NUL (U+0000); remove it")
+    if not text.isascii() and any("\ud800" <= one <= "\udfff" for one in text):
+        raise UnstorableValue("a text holds half of a surrogate pair; it is not valid Unicode")

@@ -1,0 +1,121 @@
+"""Every error the storage raises on purpose.
+
+* StorageError
+    - NotFound             there is no such row, or it belongs to another project
+    - Conflict             the row's state does not allow the change
+        - KeyReused        an idempotency key came again with another request
+    - InvalidCursor        a list's cursor was not given out by that list
+    - UnstorableValue      a text or document holds what no database can keep
+    - LeaseLost            a dispatcher writes for a job that is no longer its own
+    - InvalidStoreUrl      a store's address is of an unknown kind
+    - ObjectMissing        the object store has no object of that hash
+    - ObjectStoreFailed    the object store did not answer, refused, or is not writable
+    - DatabaseNotAtHead    the tables are not those of this version of the program
+
+`status` is the HTTP status that fits when the error reaches a client.
+"""
+
+from typing import ClassVar
+
+from sqlalchemy.exc import DontWrapMixin
+
+
+class StorageError(Exception):
+    """Base class of the errors that the storage raises on purpose."""
+
+    status: ClassVar[int] = 500
+
+
+class NotFound(StorageError, LookupError):
+    """There is no such row, or it belongs to another project, or it was deleted."""
+
+    status = 404
+
+    def __init__(self, kind: str, identity: object) -> None:
+        super().__init__(f"there is no {kind} {identity!s}")
+        self.kind, self.identity = kind, identity
+
+
+class Conflict(StorageError):
+    """The row's state does not allow the change."""
+
+    status = 409
+
+
+class KeyReused(Conflict):
+    """An idempotency key came again with another request."""
+
+    status = 422
+
+    def __init__(self, key: str) -> None:
+        super().__init__(
+            f"the Idempotency-Key {key!r} was used before with another request body; "
+            "send the same body, or a new key"
+        )
+        self.key = key
+
+
+class InvalidCursor(StorageError, ValueError):
+    """A list's cursor was not given out by that list."""
+
+    status = 422
+
+    def __init__(self, cursor: str) -> None:
+        super().__init__(f"{cursor!r} is not a cursor; use the `next` of the page before")
+        self.cursor = cursor
+
+
+class UnstorableValue(StorageError, ValueError, DontWrapMixin):
+    """A text or document holds what no database can keep: NUL, half a surrogate, NaN."""
+
+    status = 422
+
+
+class LeaseLost(StorageError):
+    """A dispatcher writes for a job that is no longer its own: it must stop at once."""
+
+    status = 409
+
+    def __init__(self, job_id: str, attempt: int) -> None:
+        super().__init__(
+            f"attempt {attempt} of {job_id} no longer holds the lease; "
+            "it expired, or the job was cancelled or finished"
+        )
+        self.job_id, self.attempt = job_id, attempt
+
+
+class InvalidStoreUrl(StorageError, ValueError):
+    """A store's address is of an unknown kind."""
+
+    def __init__(self, url: str, detail: str) -> None:
+        super().__init__(f"{url!r} is no object store: {detail}")
+        self.url = url
+
+
+class ObjectMissing(StorageError, LookupError):
+    """The object store has no object of that hash."""
+
+    status = 404
+
+    def __init__(self, sha256: str) -> None:
+        super().__init__(f"the object store has no object {sha256}")
+        self.sha256 = sha256
+
+
+class ObjectStoreFailed(StorageError):
+    """The object store did not answer, refused, or is not writable."""
+
+    status = 503
+
+
+class DatabaseNotAtHead(StorageError):
+    """The tables are not those of this version of the program."""
+
+    status = 503
+
+    def __init__(self, found: str | None, head: str | None) -> None:
+        super().__init__(
+            f"the database is at revision {found or 'none'}, this program needs {head}; "
+            "run `lagid db upgrade`"
+        )
+        self.found, self.head = found, head

@@ -1,0 +1,60 @@
+"""What happens to a job, in order: the source of the event stream."""
+
+from typing import Literal
+
+from sqlalchemy import delete, func, select
+from sqlalchemy.orm import Session
+
+from service.storage.columns import Document
+from service.storage.tables import OPEN, Event, Job
+
+EventKind = Literal["state", "progress", "log", "end"]
+
+
+class EventRepository:
+    """Events in one session.
+
+    An event is added only while its job's row is locked by the same transaction. So the events
+    of one job become visible in the order of their numbers, and a reader that asks for those
+    after the last one it saw misses none.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+
+    def append(self, job_id: str, kind: EventKind, data: Document) -> Event:
+        """Add an event to a job."""
+        self._session.execute(
+            select(Job.id).where(Job.id == job_id).with_for_update(key_share=True)
+        )
+        event = Event(job_id=job_id, kind=kind, data=data)
+        self._session.add(event)
+        self._session.flush()
+        return event
+
+    def append_state(self, job: Job) -> None:
+        """Tell the job's new state, and when it is a terminal one, that no event follows."""
+        data = {"state": job.state.value, "attempt": job.attempt, "error": job.error}
+        self.append(job.id, "state", data)
+        if job.state not in OPEN:
+            self.append(job.id, "end", data)
+
+    def after(self, job_id: str, last_id: int = 0, limit: int = 500) -> list[Event]:
+        """A job's events after the one numbered `last_id`, oldest first."""
+        newer = select(Event).where(Event.job_id == job_id, Event.id > last_id)
+        return list(self._session.scalars(newer.order_by(Event.id).limit(limit)))
+
+    def last_id(self, job_id: str) -> int:
+        """Number of a job's latest event; 0 when there is none."""
+        latest = select(func.max(Event.id)).where(Event.job_id == job_id)
+        return self._session.scalar(latest) or 0
+
+    def prune_progress(self, job_id: str) -> int:
+        """Delete the progress events of a finished job but the last; how many went."""
+        finished = select(Job.id).where(Job.id == job_id, Job.state.not_in(OPEN))
+        if self._session.scalar(finished) is None:
+            return 0
+        progress = (Event.job_id == job_id, Event.kind == "progress")
+        latest = select(func.max(Event.id)).where(*progress).scalar_subquery()
+        gone = delete(Event).where(*progress, Event.id < latest).returning(Event.id)
+        return len(self._session.scalars(gone).all())

@@ -1,0 +1,213 @@
+"""Runs as the dispatcher writes them. Every write holds the job's lease; most are in bulk."""
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from sqlalchemy import delete, func, select, update
+from sqlalchemy.orm import Session
+
+from service.storage.columns import Document, utc_now
+from service.storage.ids import new_ids
+from service.storage.queue import Clock, Lease, Outcome, Queue, smaller
+from service.storage.statements import CHUNK, IN_PLACE, chunks, insert_missing, upsert
+from service.storage.tables import OPEN, Checkpoint, Job, MigrationLog, Run, RunHistory, State
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """One run to be made: its place in the sweep and what distinguishes it."""
+
+    number: int
+    cell: Document = field(default_factory=dict)
+    labels: Document = field(default_factory=dict)
+    spec_hash: str | None = None
+    method: str | None = None
+    seed: int | None = None
+    sigma: float | None = None
+
+
+class HistoryPoint(NamedTuple):
+    """A better champion of an island; `number` counts them on the island from 0."""
+
+    run_id: str
+    island: int
+    number: int
+    generation: int
+    evaluations: int
+    rms: float
+    phase: str
+    parameters: list[float]
+
+
+class MigrantPoint(NamedTuple):
+    """One migrant of a run; `number` counts them from 0."""
+
+    run_id: str
+    number: int
+    epoch: int
+    source: int
+    destination: int
+    fitness: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunOutcome:
+    """How a run ended. `result` is the document of the run result; None when it failed."""
+
+    run_id: str
+    state: Outcome
+    error: str | None = None
+    result: Document | None = None
+    valid: bool | None = None
+    best_rms: float | None = None
+    fit_estimation: float | None = None
+    fit_validation: float | None = None
+    evaluations: int = 0
+    generations: int = 0
+    seconds: float | None = None
+    signals_sha256: str | None = None
+
+
+class RunLedger:
+    """Writes to the runs of one leased job, in one writing session.
+
+    Every method locks the job's row first and raises `LeaseLost` when the lease is not held.
+    """
+
+    def __init__(self, session: Session, lease: Lease, clock: Clock = utc_now) -> None:
+        self._session, self._lease, self._clock = session, lease, clock
+        self._queue = Queue(session, clock)
+
+    def create(self, cells: Iterable[Cell]) -> None:
+        """Make the job's runs; those that are there already stay, so a second call is harmless."""
+        add_runs(self._session, self._queue.hold(self._lease), cells)
+
+    def pending(self, limit: int = CHUNK, after: int = -1) -> list[Run]:
+        """Unfinished runs with a `number` above `after`, in order."""
+        self._queue.hold(self._lease)
+        left = select(Run).where(
+            Run.job_id == self._lease.job_id, Run.state.in_(OPEN), Run.number > after
+        )
+        return list(self._session.scalars(left.order_by(Run.number).limit(limit)))
+
+    def start(self, run_ids: Collection[str]) -> None:
+        """Mark queued runs as running."""
+        self._queue.hold(self._lease)
+        for chunk in chunks(run_ids):
+            begun = update(Run).where(self._is_mine(chunk), Run.state == State.QUEUED).values(
+                state=State.RUNNING, attempt=self._lease.attempt,
+                started_at=func.coalesce(Run.started_at, self._clock()),
+            )  # fmt: skip
+            self._session.execute(begun, execution_options=IN_PLACE)
+
+    def record(
+        self,
+        outcomes: Sequence[RunOutcome],
+        history: Iterable[HistoryPoint] = (),
+        migrants: Iterable[MigrantPoint] = (),
+    ) -> tuple[str, ...]:
+        """End runs: results, states, history, the job's counts, all in this transaction.
+
+        A run that has ended already keeps its result. Gives the identifiers of those written.
+        """
+        self._queue.hold(self._lease)
+        open_ids = self._open_ids([one.run_id for one in outcomes])
+        fresh = [one for one in outcomes if one.run_id in open_ids]
+        self._insert(history, migrants)
+        if not fresh:
+            return ()
+        now, attempt = self._clock(), self._lease.attempt
+        self._session.execute(update(Run), [_ended(one, now, attempt) for one in fresh])
+        self._count(fresh)
+        for chunk in chunks(open_ids):
+            self._session.execute(delete(Checkpoint).where(Checkpoint.run_id.in_(chunk)))
+        self._session.expire_all()
+        return tuple(one.run_id for one in fresh)
+
+    def append(
+        self, history: Iterable[HistoryPoint], migrants: Iterable[MigrantPoint] = ()
+    ) -> None:
+        """Add to the history of runs; points that are there already stay as they are.
+
+        A run that goes on from a checkpoint finds the same points again, bit for bit.
+        """
+        self._queue.hold(self._lease)
+        self._insert(history, migrants)
+
+    def save(self, states: Iterable[tuple[str, int, bytes]]) -> None:
+        """Replace the checkpoints of runs, given as (run, evaluations, state)."""
+        self._queue.hold(self._lease)
+        now = self._clock()
+        rows = (
+            {"run_id": run_id, "job_id": self._lease.job_id, "attempt": self._lease.attempt,
+             "evaluations": evaluations, "state": state, "created_at": now}
+            for run_id, evaluations, state in states
+        )  # fmt: skip
+        upsert(self._session, Checkpoint, rows)
+
+    def checkpoints(self) -> dict[str, bytes]:
+        """The states from which unfinished runs of the job can go on, by run."""
+        self._queue.hold(self._lease)
+        query = select(Checkpoint.run_id, Checkpoint.state).where(
+            Checkpoint.job_id == self._lease.job_id
+        )
+        return {run_id: state for run_id, state in self._session.execute(query)}
+
+    def _is_mine(self, run_ids: Collection[str]) -> Any:
+        return (Run.job_id == self._lease.job_id) & Run.id.in_(run_ids)
+
+    def _open_ids(self, run_ids: Iterable[str]) -> set[str]:
+        found: set[str] = set()
+        for chunk in chunks(run_ids):
+            query = select(Run.id).where(self._is_mine(chunk), Run.state.in_(OPEN))
+            found.update(self._session.scalars(query))
+        return found
+
+    def _insert(self, history: Iterable[HistoryPoint], migrants: Iterable[MigrantPoint]) -> None:
+        insert_missing(self._session, RunHistory, (point._asdict() for point in history))
+        insert_missing(self._session, MigrationLog, (point._asdict() for point in migrants))
+
+    def _count(self, ended: Sequence[RunOutcome]) -> None:
+        values: dict[str, Any] = {
+            "n_done": Job.n_done + len(ended),
+            "n_failed": Job.n_failed + sum(one.state is State.FAILED for one in ended),
+        }
+        found = [one.best_rms for one in ended if one.best_rms is not None]
+        if found:
+            values["best_rms"] = smaller(min(found))
+        changed = update(Job).where(*self._lease.fence()).values(values)
+        self._session.execute(changed, execution_options=IN_PLACE)
+
+
+def add_runs(session: Session, job: Job, cells: Iterable[Cell]) -> None:
+    """Make the queued runs of a job, in bulk; those that are there already stay as they are."""
+    now = utc_now()
+    for chunk in chunks(cells):
+        rows = [
+            {**_shallow(cell), "id": run_id, "project_id": job.project_id, "job_id": job.id,
+             "state": State.QUEUED, "created_at": now}
+            for cell, run_id in zip(chunk, new_ids("run", len(chunk)), strict=True)
+        ]  # fmt: skip
+        insert_missing(session, Run, rows)
+
+
+def _ended(one: RunOutcome, now: Any, attempt: int) -> dict[str, Any]:
+    values = {name: getattr(one, name) for name in RunOutcome.__slots__ if name != "run_id"}
+    return {
+        **values, "id": one.run_id, "estimates": _estimates(one.result), "attempt": attempt,
+        "finished_at": now,
+    }  # fmt: skip
+
+
+def _shallow(cell: Cell) -> dict[str, Any]:
+    return {name: getattr(cell, name) for name in Cell.__slots__}
+
+
+def _estimates(result: Document | None) -> Document | None:
+    if result is None or "parameters" not in result:
+        return None
+    return {
+        one["name"]: {"value": one["value"], "stderr": one.get("stderr")}
+        for one in result["parameters"]
+    }

@@ -1,0 +1,243 @@
+"""The queue: leases on jobs, fenced by the attempt.
+
+A dispatcher claims a job for a time and renews all its leases with one statement. When it falls
+silent, the reaper gives its jobs back. Each claim raises the job's `attempt`, and every later
+write carries it: a dispatcher that comes back late hits no row and learns that it must stop.
+
+Times are those of the caller's clock: a wrong clock delays or hastens the reaper, but which
+dispatcher may write is decided by the attempt alone.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from typing import Any, Literal
+
+from sqlalchemy import ColumnElement, case, func, select, update
+from sqlalchemy.orm import Session, aliased
+
+from service.storage.columns import Document, utc_now
+from service.storage.errors import Conflict, LeaseLost
+from service.storage.events import EventKind, EventRepository
+from service.storage.jobs import close_runs, notify_queue
+from service.storage.statements import IN_PLACE
+from service.storage.tables import OPEN, Job, Run, State
+
+LEASE = timedelta(seconds=30)
+Clock = Callable[[], datetime]
+Outcome = Literal[State.SUCCEEDED, State.FAILED, State.CANCELLED]
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """The right to write for a job; `attempt` is its fencing token."""
+
+    job_id: str
+    attempt: int
+    owner: str
+
+    def fence(self) -> tuple[ColumnElement[bool], ...]:
+        """Condition under which a row of `jobs` is still this lease's."""
+        return Job.id == self.job_id, Job.attempt == self.attempt, Job.state == State.RUNNING
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A job that was just claimed, and the lease on it."""
+
+    lease: Lease
+    job: Job
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A lease that a heartbeat renewed, and whether its job is to be cancelled."""
+
+    lease: Lease
+    cancel_requested: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a job has come, over all its runs."""
+
+    evaluations: int
+    generation: int = 0
+    best_rms: float | None = None
+    seconds_left: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Reaped:
+    """What became of the jobs whose leases had expired."""
+
+    requeued: tuple[str, ...]
+    failed: tuple[str, ...]
+    cancelled: tuple[str, ...]
+
+
+class Queue:
+    """The jobs of all projects as dispatchers see them, in one writing session."""
+
+    def __init__(self, session: Session, clock: Clock = utc_now) -> None:
+        self._session, self._clock = session, clock
+        self._events = EventRepository(session)
+
+    def claim(self, owner: str, lease: timedelta = LEASE) -> Claim | None:
+        """Take the first queued job: the highest priority, then the oldest. None if none waits."""
+        waiting = aliased(Job)
+        first = (
+            select(waiting.id)
+            .where(waiting.state == State.QUEUED)
+            .order_by(waiting.priority.desc(), waiting.id)
+            .limit(1)
+            .with_for_update(skip_locked=True)  # rivals take the next one; SQLite has no rivals
+        )
+        now = self._clock()
+        taken = update(Job).where(Job.id == first.scalar_subquery()).values(
+            state=State.RUNNING, attempt=Job.attempt + 1, lease_owner=owner,
+            lease_until=now + lease, started_at=func.coalesce(Job.started_at, now),
+        ).returning(Job)  # fmt: skip
+        job = self._session.scalar(taken, execution_options=IN_PLACE)
+        if job is None:
+            return None
+        self._events.append_state(job)
+        return Claim(Lease(job.id, job.attempt, owner), job)
+
+    def heartbeat(self, owner: str, lease: timedelta = LEASE) -> tuple[Held, ...]:
+        """Renew every lease of an owner; those it does not get back are lost."""
+        renewed = (
+            update(Job)
+            .where(Job.lease_owner == owner, Job.state == State.RUNNING)
+            .values(lease_until=self._clock() + lease)
+            .returning(Job.id, Job.attempt, Job.cancel_requested)
+        )
+        rows = self._session.execute(renewed, execution_options=IN_PLACE)
+        return tuple(Held(Lease(job, attempt, owner), stop) for job, attempt, stop in rows)
+
+    def hold(self, lease: Lease) -> Job:
+        """The job, locked against every other writer until the transaction ends.
+
+        Raises
+        ------
+        LeaseLost
+            When the job has another attempt or is no longer running.
+        """
+        held = select(Job).where(*lease.fence()).with_for_update(key_share=True)
+        job = self._session.scalar(held, execution_options={"populate_existing": True})
+        if job is None:
+            raise LeaseLost(lease.job_id, lease.attempt)
+        return job
+
+    def report(self, lease: Lease, progress: Progress) -> None:
+        """Write how far the job has come, and tell it as an event."""
+        values: dict[str, Any] = {
+            "evaluations": progress.evaluations, "generation": progress.generation,
+            "seconds_left": progress.seconds_left,
+        }  # fmt: skip
+        if progress.best_rms is not None:
+            values["best_rms"] = smaller(progress.best_rms)
+        job = self._change(lease, values)
+        data = {"n_runs": job.n_runs, "n_done": job.n_done, "n_failed": job.n_failed}
+        self._events.append(job.id, "progress", {**values, "best_rms": job.best_rms, **data})
+
+    def tell(self, lease: Lease, kind: EventKind, data: Document) -> None:
+        """Add an event to the job, such as a line of its log."""
+        self.hold(lease)
+        self._events.append(lease.job_id, kind, data)
+
+    def finish(self, lease: Lease, state: Outcome, error: str | None = None) -> Job:
+        """End a job. Its unfinished runs end with it, unless it succeeded: then none may be left.
+
+        Raises
+        ------
+        LeaseLost
+            When the job is no longer this lease's; nothing is written.
+        Conflict
+            When the job is to succeed and has runs that did not finish.
+        """
+        job = self._change(
+            lease,
+            {"state": state, "error": error, "finished_at": self._clock(), "lease_until": None,
+             "lease_owner": None, "seconds_left": None},
+        )  # fmt: skip
+        if state is State.SUCCEEDED:
+            self._require_finished_runs(job.id)
+        else:
+            close_runs(self._session, job.id, state, error)
+        self._events.append_state(job)
+        return job
+
+    def release(self, lease: Lease) -> None:
+        """Give a job back unharmed, because the dispatcher is shutting down."""
+        job = self.hold(lease)
+        if job.cancel_requested:
+            self._end(job, State.CANCELLED, None)
+        else:
+            self._requeue(job)
+
+    def reap(self) -> Reaped:
+        """Give back the jobs whose leases have expired, or end them.
+
+        A job that was to be cancelled is cancelled; one that lost its lease `max_attempts` times
+        fails with that reason; any other is queued and goes on from its checkpoints.
+        """
+        expired = (
+            select(Job)
+            .where(Job.state == State.RUNNING, Job.lease_until < self._clock())
+            .with_for_update(skip_locked=True, key_share=True)
+        )
+        fates: dict[State, list[str]] = {state: [] for state in State}
+        for job in self._session.scalars(expired, execution_options={"populate_existing": True}):
+            fates[self._bury(job)].append(job.id)
+        queued, failed, cancelled = State.QUEUED, State.FAILED, State.CANCELLED
+        return Reaped(tuple(fates[queued]), tuple(fates[failed]), tuple(fates[cancelled]))
+
+    def n_queued(self) -> int:
+        """How many jobs wait, over all projects."""
+        return self._session.scalar(select(func.count()).where(Job.state == State.QUEUED)) or 0
+
+    def _change(self, lease: Lease, values: dict[str, Any]) -> Job:
+        changed = update(Job).where(*lease.fence()).values(values).returning(Job)
+        job = self._session.scalar(changed, execution_options=IN_PLACE)
+        if job is None:
+            raise LeaseLost(lease.job_id, lease.attempt)
+        return job
+
+    def _require_finished_runs(self, job_id: str) -> None:
+        left = select(func.count()).where(Run.job_id == job_id, Run.state.in_(OPEN))
+        n_left = self._session.scalar(left)
+        if n_left:
+            raise Conflict(f"{job_id} cannot succeed: {n_left} of its runs did not finish")
+
+    def _bury(self, job: Job) -> State:
+        job.lost_leases += 1
+        if job.cancel_requested:
+            self._end(job, State.CANCELLED, None)
+        elif job.lost_leases >= job.max_attempts:
+            self._end(
+                job, State.FAILED,
+                f"the dispatcher fell silent {job.lost_leases} times, the last was "
+                f"{job.lease_owner}; see its log, and resume the job when the cause is gone",
+            )  # fmt: skip
+        else:
+            self._requeue(job)
+        return job.state
+
+    def _end(self, job: Job, state: State, error: str | None) -> None:
+        job.state, job.error, job.finished_at = state, error, self._clock()
+        job.lease_owner = job.lease_until = job.seconds_left = None
+        close_runs(self._session, job.id, state, error)
+        self._events.append_state(job)
+
+    def _requeue(self, job: Job) -> None:
+        job.state, job.lease_owner, job.lease_until = State.QUEUED, None, None
+        running = update(Run).where(Run.job_id == job.id, Run.state == State.RUNNING)
+        self._session.execute(running.values(state=State.QUEUED), execution_options=IN_PLACE)
+        self._events.append_state(job)
+        notify_queue(self._session)
+
+
+def smaller(rms: float) -> ColumnElement[Any]:
+    """The smaller of the job's `best_rms` and this one, for an UPDATE."""
+    return case((Job.best_rms <= rms, Job.best_rms), else_=rms)

@@ -1,0 +1,104 @@
+"""Engines and sessions: one transaction per session, opened for reading or for writing."""
+
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Engine, create_engine, event, make_url
+from sqlalchemy.engine.interfaces import DBAPIConnection
+from sqlalchemy.orm import Session, sessionmaker
+from sqlalchemy.pool import ConnectionPoolEntry
+
+from service.storage.columns import to_json
+
+BUSY_SECONDS = 30.0
+_READ = {"lagid_reads": True, "postgresql_readonly": True}
+
+
+class Database:
+    """The way into SQL.
+
+    ``with database.write() as session`` commits at the end, or rolls back on an error. On SQLite
+    a writing session begins with ``BEGIN IMMEDIATE``: it waits for its turn at the start, and
+    never meets a deadlock later. A reading session sees one state and cannot write.
+    """
+
+    def __init__(self, url: str, **options: Any) -> None:
+        self.engine = _engine(url, **options)
+        self._write = sessionmaker(self.engine, expire_on_commit=False)
+        self._read = sessionmaker(
+            self.engine.execution_options(**_READ), expire_on_commit=False, autoflush=False
+        )
+
+    @property
+    def is_sqlite(self) -> bool:
+        """Whether this is SQLite (else PostgreSQL)."""
+        return self.engine.dialect.name == "sqlite"
+
+    @contextmanager
+    def write(self) -> Iterator[Session]:
+        """A session that commits when the block ends well."""
+        with self._write.begin() as session:
+            yield session
+
+    @contextmanager
+    def read(self) -> Iterator[Session]:
+        """A session that only reads."""
+        with self._read.begin() as session:
+            yield session
+
+    def dispose(self) -> None:
+        """Close every pooled connection."""
+        self.engine.dispose()
+
+
+def sqlite_url(path: Path) -> str:
+    """The address of a SQLite file."""
+    return f"sqlite:///{path.absolute()}"
+
+
+def _engine(url: str, **options: Any) -> Engine:
+    address = make_url(url)
+    if address.get_backend_name() == "sqlite":
+        settings = {"timeout": BUSY_SECONDS, "check_same_thread": False}
+        engine = create_engine(address, json_serializer=to_json, connect_args=settings, **options)
+        event.listen(engine, "connect", _prepare_sqlite)
+        event.listen(engine, "begin", _begin_sqlite)
+        return engine
+    if address.drivername == "postgresql":
+        address = address.set(drivername="postgresql+psycopg")
+    # A pooled connection may have died with a restarted server: ask before use.
+    return create_engine(address, json_serializer=to_json, pool_pre_ping=True, **options)
+
+
+def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) -> None:
+    assert isinstance(connection, sqlite3.Connection)
+    connection.isolation_level = None  # sqlite3 must not begin transactions of its own kind
+    connection.execute(f"PRAGMA busy_timeout = {int(1000 * BUSY_SECONDS)}")
+    _enter_wal(connection)
+    connection.execute("PRAGMA synchronous = NORMAL")
+    connection.execute("PRAGMA foreign_keys = ON")
+
+
+def _enter_wal(connection: sqlite3.Connection) -> None:
+    """Switch the file to a write-ahead log, unless it is one already.
+
+    The switch does not honour the busy timeout when two processes open a new file at once.
+    """
+    deadline = time.monotonic() + BUSY_SECONDS
+    while connection.execute("PRAGMA journal_mode").fetchone()[0] not in ("wal", "memory"):
+        try:
+            connection.execute("PRAGMA journal_mode = WAL")
+        except sqlite3.OperationalError:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.01)
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    reads = connection.get_execution_options().get("lagid_reads", False)
+    connection.exec_driver_sql(f"PRAGMA query_only = {'ON' if reads else 'OFF'}")
+    connection.exec_driver_sql("BEGIN" if reads else "BEGIN IMMEDIATE")

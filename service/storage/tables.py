@@ -1,0 +1,309 @@
+"""The tables. Times are UTC, identifiers sort by time, and what a user owns names its project."""
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Any
+
+from sqlalchemy import ForeignKey, Index, LargeBinary, MetaData, UniqueConstraint, text
+from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
+
+from service.storage.columns import (
+    Document,
+    DocumentType,
+    LargeInteger,
+    Text,
+    UtcDateTime,
+    state_type,
+    utc_now,
+)
+
+DEFAULT_PROJECT = "proj_default"
+
+
+class State(StrEnum):
+    """How far a job or a run has come."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def is_terminal(self) -> bool:
+        """Whether no dispatcher will ever change it again."""
+        return self not in OPEN
+
+
+OPEN = (State.QUEUED, State.RUNNING)
+
+
+class Base(DeclarativeBase):
+    """Base class of the tables."""
+
+    metadata = MetaData(
+        naming_convention={  # Alembic can only drop what has a name
+            "ix": "ix_%(column_0_N_label)s",
+            "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+            "ck": "ck_%(table_name)s_%(constraint_name)s",
+            "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+            "pk": "pk_%(table_name)s",
+        }
+    )
+    type_annotation_map = {  # noqa: RUF012 - SQLAlchemy's declaration
+        str: Text,
+        datetime: UtcDateTime,
+        dict[str, Any]: DocumentType,
+        list[Any]: DocumentType,
+        State: state_type(State),
+    }
+
+
+class Project(Base):
+    """Owner of everything a user makes."""
+
+    __tablename__ = "projects"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    name: Mapped[str]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class ApiKey(Base):
+    """A key to a project; only its digest is kept."""
+
+    __tablename__ = "api_keys"
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"), index=True)
+    name: Mapped[str]
+    digest: Mapped[str] = mapped_column(unique=True)
+    scopes: Mapped[list[Any]]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    expires_at: Mapped[datetime | None]
+    revoked_at: Mapped[datetime | None]
+
+
+class Dataset(Base):
+    """A stored recording: what is in it, and the hash of the object that holds it.
+
+    `sha256` names the MCAP object; `source_key` is a hash of what it was made from (the uploaded
+    bytes and how they were read, or the derivation), so that the same source gives the same
+    dataset. `sample_time` is None where the channels are irregular.
+    """
+
+    __tablename__ = "datasets"
+    __table_args__ = (
+        Index("ix_datasets_project_id_id", "project_id", "id"),
+        Index(
+            "uq_datasets_project_id_source_key", "project_id", "source_key", unique=True,
+            sqlite_where=text("deleted_at IS NULL"), postgresql_where=text("deleted_at IS NULL"),
+        ),
+    )  # fmt: skip
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
+    name: Mapped[str]
+    kind: Mapped[str]
+    sha256: Mapped[str] = mapped_column(index=True)
+    source_key: Mapped[str]
+    size_bytes: Mapped[int] = mapped_column(LargeInteger)
+    n_channels: Mapped[int]
+    n_samples: Mapped[int] = mapped_column(LargeInteger)
+    duration: Mapped[float]
+    sample_time: Mapped[float | None]
+    channels: Mapped[list[Any]]
+    details: Mapped[Document]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    deleted_at: Mapped[datetime | None]
+
+
+class LineageEdge(Base):
+    """`child` was made from `parent`; the prefix of each identifier says what it is."""
+
+    __tablename__ = "lineage_edges"
+
+    child: Mapped[str] = mapped_column(primary_key=True)
+    parent: Mapped[str] = mapped_column(primary_key=True, index=True)
+    relation: Mapped[str] = mapped_column(primary_key=True)
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class Model(Base):
+    """One version of a user's own model document."""
+
+    __tablename__ = "models"
+    __table_args__ = (UniqueConstraint("project_id", "name", "version"),)
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
+    name: Mapped[str]
+    version: Mapped[int]
+    document: Mapped[Document]
+    document_hash: Mapped[str]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    deleted_at: Mapped[datetime | None]
+
+
+class Job(Base):
+    """What a user submitted: one or more runs, and the lease of the dispatcher that has them.
+
+    `attempt` counts the claims and is the fencing token. `lost_leases` counts the dispatchers
+    that fell silent; at `max_attempts` of them the job fails. `evaluations`, `generation` and
+    `seconds_left` are progress over all runs, `best_rms` the smallest of any run so far.
+    """
+
+    __tablename__ = "jobs"
+    __table_args__ = (
+        Index("ix_jobs_project_id_id", "project_id", "id"),
+        Index("ix_jobs_state_priority_id", "state", "priority", "id"),
+        Index("ix_jobs_lease_owner_state", "lease_owner", "state"),
+    )
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
+    name: Mapped[str]
+    state: Mapped[State] = mapped_column(default=State.QUEUED)
+    spec: Mapped[Document]
+    priority: Mapped[int] = mapped_column(default=0)
+    max_attempts: Mapped[int] = mapped_column(default=3)
+    attempt: Mapped[int] = mapped_column(default=0)
+    lost_leases: Mapped[int] = mapped_column(default=0)
+    lease_owner: Mapped[str | None]
+    lease_until: Mapped[datetime | None]
+    cancel_requested: Mapped[bool] = mapped_column(default=False)
+    n_runs: Mapped[int]
+    n_done: Mapped[int] = mapped_column(default=0)
+    n_failed: Mapped[int] = mapped_column(default=0)
+    best_rms: Mapped[float | None]
+    evaluations: Mapped[int] = mapped_column(LargeInteger, default=0)
+    generation: Mapped[int] = mapped_column(default=0)
+    seconds_left: Mapped[float | None]
+    error: Mapped[str | None]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    started_at: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+    deleted_at: Mapped[datetime | None]
+
+
+class Run(Base):
+    """One identification: one cell of a job's sweep, and what it gave.
+
+    `number` is the cell's place in the sweep. `result` is the document of the run result;
+    `estimates` repeats {name: {"value", "stderr"}} of it for summaries over many runs.
+    """
+
+    __tablename__ = "runs"
+    __table_args__ = (
+        UniqueConstraint("job_id", "number"),
+        Index("ix_runs_job_id_state_number", "job_id", "state", "number"),
+        Index("ix_runs_project_id_id", "project_id", "id"),
+    )
+
+    id: Mapped[str] = mapped_column(primary_key=True)
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    number: Mapped[int]
+    cell: Mapped[Document]
+    labels: Mapped[Document]
+    spec_hash: Mapped[str | None]
+    method: Mapped[str | None]
+    seed: Mapped[int | None] = mapped_column(LargeInteger)
+    sigma: Mapped[float | None]
+    state: Mapped[State] = mapped_column(default=State.QUEUED)
+    attempt: Mapped[int] = mapped_column(default=0)
+    valid: Mapped[bool | None]
+    best_rms: Mapped[float | None]
+    fit_estimation: Mapped[float | None]
+    fit_validation: Mapped[float | None]
+    evaluations: Mapped[int] = mapped_column(LargeInteger, default=0)
+    generations: Mapped[int] = mapped_column(default=0)
+    seconds: Mapped[float | None]
+    estimates: Mapped[Document | None]
+    result: Mapped[Document | None]
+    signals_sha256: Mapped[str | None] = mapped_column(index=True)
+    error: Mapped[str | None]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+    started_at: Mapped[datetime | None]
+    finished_at: Mapped[datetime | None]
+
+
+class RunHistory(Base):
+    """A better champion of one island of a run; `number` counts them on the island from 0."""
+
+    __tablename__ = "run_history"
+
+    run_id: Mapped[str] = mapped_column(ForeignKey("runs.id"), primary_key=True)
+    island: Mapped[int] = mapped_column(primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True)
+    generation: Mapped[int]
+    evaluations: Mapped[int] = mapped_column(LargeInteger)
+    rms: Mapped[float]
+    phase: Mapped[str]
+    parameters: Mapped[list[Any]]
+
+
+class MigrationLog(Base):
+    """One migrant of a run; `number` counts them from 0."""
+
+    __tablename__ = "migrations_log"
+
+    run_id: Mapped[str] = mapped_column(ForeignKey("runs.id"), primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True)
+    epoch: Mapped[int]
+    source: Mapped[int]
+    destination: Mapped[int]
+    fitness: Mapped[float]
+
+
+class Checkpoint(Base):
+    """Where an unfinished run can go on; only the last one is kept."""
+
+    __tablename__ = "checkpoints"
+
+    run_id: Mapped[str] = mapped_column(ForeignKey("runs.id"), primary_key=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"), index=True)
+    attempt: Mapped[int]
+    evaluations: Mapped[int] = mapped_column(LargeInteger)
+    state: Mapped[bytes] = mapped_column(LargeBinary)
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class Event(Base):
+    """Something that happened to a job; numbered in the order in which it can be seen."""
+
+    __tablename__ = "events"
+    __table_args__ = (
+        Index("ix_events_job_id_id", "job_id", "id"),
+        {"sqlite_autoincrement": True},  # a number is never used twice, so no event is missed
+    )
+
+    id: Mapped[int] = mapped_column(LargeInteger, primary_key=True)
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    kind: Mapped[str]
+    data: Mapped[Document]
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class IdempotencyKey(Base):
+    """A submission that was made under a client's key."""
+
+    __tablename__ = "idempotency_keys"
+
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"), primary_key=True)
+    key: Mapped[str] = mapped_column(primary_key=True)
+    request_hash: Mapped[str]
+    job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id"))
+    created_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
+class Dispatcher(Base):
+    """A dispatcher that has shown itself, so that health can say whether one is alive."""
+
+    __tablename__ = "dispatchers"
+
+    owner: Mapped[str] = mapped_column(primary_key=True)
+    details: Mapped[Document]
+    started_at: Mapped[datetime]
+    seen_at: Mapped[datetime]
