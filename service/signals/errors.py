@@ -39,13 +39,6 @@ class InvalidUpload(InvalidRequest, ValueError):
         self.args = (detail,)
         self.what, self.row, self.column, self.byte = what, row, column, byte
 
-    def __reduce__(self) -> tuple[object, ...]:
-        return _rebuild, (self.what, self.row, self.column, self.byte)
-
-
-def _rebuild(what: str, row: int | None, column: str | None, byte: int | None) -> InvalidUpload:
-    return InvalidUpload(what, row=row, column=column, byte=byte)
-
 
 def _place(row: int | None, column: str | None, byte: int | None) -> str:
     if byte is not None:
