@@ -1,0 +1,122 @@
+"""Sums of products of powers, collected: how ``k - (1 + L/h)`` is told apart into k, 1 and L/h.
+
+A polynomial maps each monomial to its coefficient. A monomial is a tuple of (factor, whole
+exponent), negative exponents included; the empty one stands for the constant. What is neither a
+sum nor a product, such as ``sqrt(L)``, is a factor of its own.
+"""
+
+from functools import reduce
+from typing import TypeAlias
+
+from sysid.language.tree import Binary, Expression, Number, Unary
+
+Monomial: TypeAlias = tuple[tuple[Expression, int], ...]
+Polynomial: TypeAlias = dict[Monomial, float]
+
+CONSTANT: Monomial = ()
+
+_MAX_TERMS = 64
+"""A product that would have more terms is kept as one factor."""
+
+
+def collect(expression: Expression) -> Polynomial:
+    """The expression as a polynomial; equal terms are added, ``h/h`` is 1."""
+    match expression:
+        case Number(value):
+            return {CONSTANT: value} if value else {}
+        case Unary("-", operand):
+            return scale(collect(operand), -1.0)
+        case Binary("+", left, right):
+            return add(collect(left), collect(right))
+        case Binary("-", left, right):
+            return add(collect(left), scale(collect(right), -1.0))
+        case Binary("*", left, right):
+            return _product(collect(left), collect(right), expression)
+        case Binary("/", left, right):
+            return _product(collect(left), _reciprocal(right), expression)
+        case Binary("**", base, Number(value)) if value.is_integer() and 0 < value <= 8:
+            return _power(collect(base), int(value), expression)
+        case _:
+            return {((expression, 1),): 1.0}
+
+
+def add(a: Polynomial, b: Polynomial) -> Polynomial:
+    """Sum, without the terms that cancel."""
+    total = dict(a)
+    for monomial, coefficient in b.items():
+        total[monomial] = total.get(monomial, 0.0) + coefficient
+    return {monomial: value for monomial, value in total.items() if value}
+
+
+def scale(a: Polynomial, factor: float) -> Polynomial:
+    """Product with a number."""
+    return {monomial: value * factor for monomial, value in a.items()}
+
+
+def times(a: Polynomial, factor: Expression) -> Polynomial:
+    """Product with one factor."""
+    return {_merged(monomial, ((factor, 1),)): value for monomial, value in a.items()}
+
+
+def rebuild(a: Polynomial) -> Expression:
+    """The polynomial as a tree; the constant comes last."""
+    ordered = sorted(a.items(), key=lambda term: term[0] == CONSTANT)
+    if not ordered:
+        return Number(0.0)
+    first, *others = ordered
+    return reduce(_with_term, others, _term(*first))
+
+
+def _with_term(tree: Expression, term: tuple[Monomial, float]) -> Expression:
+    monomial, value = term
+    return Binary("-" if value < 0 else "+", tree, _term(monomial, abs(value)))
+
+
+def _term(monomial: Monomial, coefficient: float) -> Expression:
+    above = [_raised(factor, power) for factor, power in monomial if power > 0]
+    below = [_raised(factor, -power) for factor, power in monomial if power < 0]
+    if coefficient == -1.0 and above:
+        above[0] = Unary("-", above[0])
+    elif coefficient != 1.0 or not above:
+        above.insert(0, Number(coefficient))
+    return reduce(lambda a, b: Binary("/", a, b), below, reduce(_multiplied, above))
+
+
+def _multiplied(a: Expression, b: Expression) -> Expression:
+    return Binary("*", a, b)
+
+
+def _raised(factor: Expression, power: int) -> Expression:
+    return factor if power == 1 else Binary("**", factor, Number(float(power)))
+
+
+def _merged(a: Monomial, b: Monomial) -> Monomial:
+    powers = dict(a)
+    for factor, power in b:
+        powers[factor] = powers.get(factor, 0) + power
+    # Sorted by text, not by hash: the same model must give the same tree in every process.
+    return tuple(sorted(((f, p) for f, p in powers.items() if p), key=lambda item: repr(item)))
+
+
+def _product(a: Polynomial, b: Polynomial, whole: Expression) -> Polynomial:
+    if len(a) * len(b) > _MAX_TERMS:
+        return {((whole, 1),): 1.0}
+    total: Polynomial = {}
+    for monomial, value in a.items():
+        total = add(total, {_merged(monomial, m): value * v for m, v in b.items()})
+    return total
+
+
+def _power(base: Polynomial, exponent: int, whole: Expression) -> Polynomial:
+    total = base
+    for _ in range(exponent - 1):
+        total = _product(total, base, whole)
+    return total
+
+
+def _reciprocal(divisor: Expression) -> Polynomial:
+    terms = collect(divisor)
+    if len(terms) != 1:
+        return {((divisor, -1),): 1.0}
+    [(monomial, value)] = terms.items()
+    return {tuple((factor, -power) for factor, power in monomial): 1.0 / value}

@@ -1,0 +1,167 @@
+"""Tokens to syntax, by operator precedence. No text ever reaches Python's own parser.
+
+From loose to tight: ``or``, ``and``, ``not``, comparison, ``+ -``, ``* /``, unary ``-``, ``**``.
+"""
+
+from collections.abc import Sequence
+
+from sysid.language.lexer import Token, tokens
+from sysid.language.syntax import (
+    MAX_DEPTH,
+    MAX_LENGTH,
+    Apply,
+    Infix,
+    Literal,
+    Name,
+    Prefix,
+    Syntax,
+    SyntaxFault,
+    TextFault,
+)
+
+_OR, _AND, _NOT, _COMPARE, _SUM, _PRODUCT, _SIGN, _POWER = range(1, 9)
+
+_LEVEL = {
+    "or": _OR, "and": _AND, "+": _SUM, "-": _SUM, "*": _PRODUCT, "/": _PRODUCT, "**": _POWER,
+    **dict.fromkeys(("<", "<=", ">", ">=", "==", "!="), _COMPARE),
+}  # fmt: skip
+
+_OPPOSITE = {"+": "-", "-": "+", "*": "/", "/": "*"}
+
+_FOLD = 8
+"""Chains up to this length are computed as written, left to right; longer ones in halves."""
+
+
+def parse(text: str) -> tuple[Syntax | None, list[TextFault]]:
+    """Syntax of a text, or None, and what is wrong with it."""
+    if len(text) > MAX_LENGTH:
+        detail = f"the text has {len(text)} characters; at most {MAX_LENGTH} are allowed"
+        return None, [TextFault(1, detail)]
+    words, faults = tokens(text)
+    try:
+        return _Parser(words).whole(), faults
+    except SyntaxFault as error:
+        # After a foreign token, what follows is a consequence and would only confuse.
+        return None, faults or [error.fault]
+
+
+class _Parser:
+    """One pass over the tokens of one text."""
+
+    def __init__(self, words: Sequence[Token]) -> None:
+        self._words = words
+        self._next = 0
+        self._depth = 0
+
+    def whole(self) -> Syntax:
+        """The syntax of the whole text."""
+        if self._peek().kind == "end":
+            raise SyntaxFault(1, "the expression is empty")
+        found = self._expression(_OR)
+        word = self._peek()
+        if word.kind != "end":
+            raise SyntaxFault(word.column, _unexpected(word))
+        return found
+
+    def _expression(self, floor: int) -> Syntax:
+        """An expression of operators that bind at least as tightly as `floor`."""
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            detail = f"the expression is nested deeper than {MAX_DEPTH} levels"
+            raise SyntaxFault(self._peek().column, detail)
+        left = self._operand()
+        while (level := _LEVEL.get(self._peek().text, 0)) >= floor:
+            left = self._chain(left, level)
+        self._depth -= 1
+        return left
+
+    def _chain(self, first: Syntax, level: int) -> Syntax:
+        """What follows `first` at one level of precedence: ``a - b + c``."""
+        links: list[tuple[Token, Syntax]] = []
+        while _LEVEL.get(self._peek().text, 0) == level:
+            operator = self._advance()
+            if level == _COMPARE and links:
+                detail = "comparisons do not chain; write a < b and b < c"
+                raise SyntaxFault(operator.column, detail)
+            # ** groups to the right: a**b**c is a**(b**c).
+            links.append((operator, self._expression(level if level == _POWER else level + 1)))
+        return _folded(first, links)
+
+    def _operand(self) -> Syntax:
+        word = self._advance()
+        if word.kind == "number":
+            return Literal(float(word.text), word.column)
+        if word.text == "-":
+            return Prefix("-", self._expression(_SIGN), word.column)
+        if word.text == "not":
+            return Prefix("not", self._expression(_COMPARE), word.column)
+        if word.text == "(":
+            inner = self._expression(_OR)
+            self._close(word)
+            return inner
+        if word.kind == "name" and word.text not in _LEVEL:
+            return self._named(word)
+        raise SyntaxFault(word.column, _missing_operand(word))
+
+    def _named(self, word: Token) -> Syntax:
+        if self._peek().text != "(":
+            return Name(word.text, word.column)
+        opening = self._advance()
+        arguments: list[Syntax] = []
+        if self._peek().text != ")":
+            arguments.append(self._expression(_OR))
+            while self._peek().text == ",":
+                self._advance()
+                arguments.append(self._expression(_OR))
+        self._close(opening)
+        return Apply(word.text, tuple(arguments), word.column)
+
+    def _close(self, opening: Token) -> None:
+        word = self._peek()
+        if word.text == ")":
+            self._advance()
+        elif word.kind == "end":
+            detail = f"the parenthesis opened at column {opening.column} is not closed"
+            raise SyntaxFault(opening.column, detail)
+        else:
+            raise SyntaxFault(word.column, _unexpected(word))
+
+    def _peek(self) -> Token:
+        return self._words[self._next]
+
+    def _advance(self) -> Token:
+        word = self._peek()
+        if word.kind != "end":
+            self._next += 1
+        return word
+
+
+def _folded(first: Syntax, links: Sequence[tuple[Token, Syntax]]) -> Syntax:
+    """``first op a op b …`` as a tree whose depth grows with the logarithm of a long chain."""
+    if len(links) < _FOLD or links[0][0].text not in _OPPOSITE:
+        tree = first
+        for operator, operand in links:
+            tree = Infix(operator.text, tree, operand, operator.column)
+        return tree
+    middle = len(links) // 2
+    joint, head = links[middle]
+    tail = links[middle + 1 :]
+    if joint.text in "-/":  # a - b + c = a - (b - c)
+        tail = [(word._replace(text=_OPPOSITE[word.text]), operand) for word, operand in tail]
+    return Infix(joint.text, _folded(first, links[:middle]), _folded(head, tail), joint.column)
+
+
+def _unexpected(word: Token) -> str:
+    if word.text == ")":
+        return "')' closes a parenthesis that was never opened"
+    if word.text == ",":
+        return "',' is only for the arguments of a function"
+    return f"unexpected {word.text!r}; an operator such as * is missing before it"
+
+
+def _missing_operand(word: Token) -> str:
+    if word.kind == "end":
+        return "the expression ends where a number, a name or a parenthesis should follow"
+    if word.text == "+":
+        return "'+' has nothing on its left; leave it out"
+    return f"unexpected {word.text!r} where a number, a name or a parenthesis should be"

@@ -1,0 +1,58 @@
+"""The names an expression may use, and what each of them stands for."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+FUNCTIONS: Mapping[str, tuple[int, int | None]] = {
+    "sin": (1, 1), "cos": (1, 1), "tan": (1, 1), "exp": (1, 1), "log": (1, 1), "sqrt": (1, 1),
+    "abs": (1, 1), "sign": (1, 1), "tanh": (1, 1), "atan": (1, 1),
+    "min": (2, None), "max": (2, None), "where": (3, 3),
+}  # fmt: skip
+"""Functions of the grammar, with the fewest and the most arguments."""
+
+WORDS = ("and", "or", "not")
+
+Timing = Literal["difference", "differential"]
+
+
+def reserved(form: Timing) -> tuple[str, ...]:
+    """Names that a model of this form cannot give to something of its own."""
+    own = ("k", "h") if form == "difference" else ()
+    return ("t", "pi", *own, *FUNCTIONS, *WORDS)
+
+
+@dataclass(frozen=True, slots=True)
+class Scope:
+    """Names that are declared where an expression stands.
+
+    Attributes
+    ----------
+    form : {"difference", "differential"}
+        Whether past values count samples or seconds.
+    states, inputs : tuple of str
+    parameters : mapping of str to (lower, upper)
+    constants : mapping of str to float
+    """
+
+    form: Timing
+    states: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    parameters: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    constants: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """States and inputs."""
+        return (*self.states, *self.inputs)
+
+    @property
+    def clock(self) -> str:
+        """The name from which past values are counted: ``k`` or ``t``."""
+        return "k" if self.form == "difference" else "t"
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """Every name that is not a function."""
+        own = ("k", "h") if self.form == "difference" else ()
+        return (*self.signals, *self.parameters, *self.constants, "t", "pi", *own)
