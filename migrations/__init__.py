@@ -1,1 +1,1 @@
-"""Database migrations (Alembic)."""
+"""Alembic's migrations of the storage; the service runs them at its start."""

@@ -1,1 +1,1 @@
-"""One module per migration."""
+"""The revisions, oldest first by number."""

@@ -122,7 +122,6 @@ class RunLedger:
         self._count(fresh)
         for chunk in chunks(open_ids):
             self._session.execute(delete(Checkpoint).where(Checkpoint.run_id.in_(chunk)))
-        self._session.expire_all()
         return tuple(one.run_id for one in fresh)
 
     def append(
@@ -152,7 +151,7 @@ class RunLedger:
         query = select(Checkpoint.run_id, Checkpoint.state).where(
             Checkpoint.job_id == self._lease.job_id
         )
-        return {run_id: state for run_id, state in self._session.execute(query)}
+        return dict(self._session.execute(query).tuples().all())
 
     def _is_mine(self, run_ids: Collection[str]) -> Any:
         return (Run.job_id == self._lease.job_id) & Run.id.in_(run_ids)

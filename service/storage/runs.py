@@ -87,7 +87,7 @@ class RunRepository:
     def counts(self, job_id: str) -> dict[State, int]:
         """How many runs of a job are in each state."""
         query = select(Run.state, func.count()).where(*self._of(job_id)).group_by(Run.state)
-        found = {state: n for state, n in self._session.execute(query)}
+        found = dict(self._session.execute(query).tuples().all())
         return {state: found.get(state, 0) for state in State}
 
     def table(self, job_id: str) -> list[RunRow]:
@@ -134,11 +134,11 @@ def _sqlite_entry_equals(
 
 
 def _ordered(
-    query: Select[tuple[Run]],
+    query: Select[Run],
     column: InstrumentedAttribute[Any],
     descending: bool,
     cursor: str | None,
-) -> Select[tuple[Run]]:
+) -> Select[Run]:
     by = column.desc() if descending else column.asc()
     query = query.order_by(column.is_(None), by, Run.number)
     if cursor is None:
