@@ -1,0 +1,252 @@
+"""Content-addressed objects in a local folder or in an S3 bucket.
+
+An object's name is the SHA-256 of its bytes: ``sha256/ab/<hash>.mcap``. So it never changes, may
+be written twice without harm, and its hash is its ETag. Objects are written before the row that
+names them; those that no row names are garbage (`service.storage.garbage`).
+"""
+
+import hashlib
+import os
+import re
+import tempfile
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, final
+from urllib.parse import unquote, urlsplit
+
+import obstore
+from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError
+from obstore.store import LocalStore, S3Store
+
+from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
+
+if TYPE_CHECKING:
+    from obstore.store import RetryConfig
+
+_ROOT = "sha256"
+_HASH = re.compile(r"[0-9a-f]{64}")
+_BLOCK = 1 << 20
+_SINGLE_PUT = 64 << 20
+"""Largest object that is sent in one request, and so held in memory."""
+_STALE_SECONDS = 24 * 3600
+_RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=30)}
+
+
+@dataclass(frozen=True, slots=True)
+class StoredObject:
+    """An object in the store; `size` in bytes."""
+
+    sha256: str
+    size: int
+    modified_at: datetime | None = None
+
+
+class ObjectStore(ABC):
+    """What a folder and a bucket have in common: everything but the last step of a write."""
+
+    def __init__(self, backend: Any, temporary: Path) -> None:
+        self._backend, self._temporary = backend, temporary
+
+    def put_bytes(self, data: bytes) -> StoredObject:
+        """Store bytes."""
+        return self.put_stream([data])
+
+    def put_file(self, path: Path) -> StoredObject:
+        """Store a copy of a file."""
+        with path.open("rb") as file:
+            return self.put_stream(_blocks(file))
+
+    def put_stream(self, blocks: Iterable[bytes]) -> StoredObject:
+        """Store blocks of bytes as they come; they are never in memory all at once."""
+        digest, size = hashlib.sha256(), 0
+        with _failures("write an object"), self._new_file() as file:
+            for block in blocks:
+                digest.update(block)
+                size += file.write(block)
+            file.flush()
+            os.fsync(file.fileno())
+            sha256 = digest.hexdigest()
+            self._publish(Path(file.name), _name(sha256), size)
+        return StoredObject(sha256, size)
+
+    def get(self, sha256: str) -> bytes:
+        """A whole object; `ObjectMissing` when there is none."""
+        with _failures("read an object", sha256):
+            return bytes(obstore.get(self._backend, _name(sha256)).bytes())
+
+    def get_range(self, sha256: str, start: int, length: int) -> bytes:
+        """`length` bytes from `start`; fewer at the end of the object."""
+        length = min(length, self.size(sha256) - start)
+        if length <= 0:
+            return b""
+        with _failures("read an object", sha256):
+            name = _name(sha256)
+            return bytes(obstore.get_range(self._backend, name, start=start, length=length))
+
+    def stream(self, sha256: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
+        """The object's bytes from `start`, in blocks."""
+        end = self.size(sha256) if length is None else start + length
+        while start < end and (block := self.get_range(sha256, start, min(_BLOCK, end - start))):
+            yield block
+            start += len(block)
+
+    def size(self, sha256: str) -> int:
+        """Size in bytes; `ObjectMissing` when there is none."""
+        with _failures("look up an object", sha256):
+            return int(obstore.head(self._backend, _name(sha256))["size"])
+
+    def exists(self, sha256: str) -> bool:
+        """Whether there is such an object."""
+        try:
+            self.size(sha256)
+        except ObjectMissing:
+            return False
+        return True
+
+    def delete(self, sha256: str) -> None:
+        """Delete an object; nothing when there is none."""
+        with suppress(ObjectMissing), _failures("delete an object", sha256):
+            obstore.delete(self._backend, _name(sha256))
+
+    def objects(self) -> Iterator[StoredObject]:
+        """Every object, in no order."""
+        with _failures("list the objects"):
+            for chunk in obstore.list(self._backend, prefix=_ROOT):
+                for entry in chunk:
+                    sha256 = Path(entry["path"]).stem
+                    if _HASH.fullmatch(sha256):
+                        yield StoredObject(sha256, entry["size"], entry["last_modified"])
+
+    @abstractmethod
+    def check_writable(self) -> None:
+        """Nothing, when an object could be written now; else `ObjectStoreFailed`."""
+
+    @abstractmethod
+    def _publish(self, source: Path, name: str, size: int) -> None:
+        """Make a finished, synced file an object, without replacing one of the same name."""
+
+    @contextmanager
+    def _new_file(self) -> Iterator[BinaryIO]:
+        with tempfile.NamedTemporaryFile(dir=self._temporary) as file:
+            yield file  # type: ignore[misc]  # the wrapper has all of BinaryIO, undeclared
+
+
+@final
+class FolderStore(ObjectStore):
+    """Objects as files.
+
+    A power cut leaves whole objects or none: a file is synced before it is linked into place,
+    and the folders after it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder.absolute()
+        temporary = self._folder / "tmp"
+        with _failures("create its folder"):
+            temporary.mkdir(parents=True, exist_ok=True)
+            _clear_stale(temporary)
+            super().__init__(LocalStore(self._folder), temporary)
+
+    def check_writable(self) -> None:
+        """Nothing, when an object could be written now; else `ObjectStoreFailed`."""
+        with _failures("write"), self._new_file() as file:
+            file.write(b"probe")
+
+    def _publish(self, source: Path, name: str, size: int) -> None:
+        target = self._folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileExistsError):  # the same bytes, by another writer
+            os.link(source, target)
+        for folder in (target.parent, target.parent.parent, self._folder):
+            _sync_folder(folder)
+
+
+@final
+class BucketStore(ObjectStore):
+    """Objects in an S3-compatible bucket; `options` go to `obstore.store.S3Store`.
+
+    Credentials, region and endpoint come from the usual ``AWS_…`` variables.
+    """
+
+    def __init__(self, url: str, **options: Any) -> None:
+        try:
+            backend = S3Store.from_url(url, retry_config=_RETRIES, **options)
+        except (BaseError, ValueError) as error:
+            raise InvalidStoreUrl(url, _first_line(error)) from error
+        super().__init__(backend, Path(tempfile.gettempdir()))
+
+    def check_writable(self) -> None:
+        """Nothing, when an object could be written now; else `ObjectStoreFailed`."""
+        with _failures("write"):
+            obstore.put(self._backend, "probe", b"probe")
+            obstore.delete(self._backend, "probe")
+
+    def _publish(self, source: Path, name: str, size: int) -> None:
+        if size <= _SINGLE_PUT:
+            with suppress(AlreadyExistsError):  # the same bytes, by another writer
+                obstore.put(self._backend, name, source, mode="create", use_multipart=False)
+        elif not self.exists(Path(name).stem):
+            # In parts there is no create-only put; a rival writes the same bytes to this name.
+            obstore.put(self._backend, name, source, use_multipart=True)
+
+
+def open_store(url: str, **options: Any) -> ObjectStore:
+    """The store at ``file:///folder`` or ``s3://bucket/prefix``."""
+    parts = urlsplit(url)
+    if parts.scheme == "file":
+        if parts.netloc not in ("", "localhost") or not parts.path.startswith("/"):
+            raise InvalidStoreUrl(url, "write file:// and an absolute path, as file:///data")
+        return FolderStore(Path(unquote(parts.path)))
+    if parts.scheme == "s3":
+        return BucketStore(url, **options)
+    raise InvalidStoreUrl(url, "use file:///folder or s3://bucket/prefix")
+
+
+def _name(sha256: str) -> str:
+    if not _HASH.fullmatch(sha256):
+        raise ObjectMissing(sha256)
+    return f"{_ROOT}/{sha256[:2]}/{sha256}.mcap"
+
+
+def _blocks(file: BinaryIO) -> Iterator[bytes]:
+    while block := file.read(_BLOCK):
+        yield block
+
+
+@contextmanager
+def _failures(doing: str, sha256: str = "") -> Iterator[None]:
+    try:
+        yield
+    except (NotFoundError, FileNotFoundError) as error:
+        if not sha256:
+            raise ObjectStoreFailed(_cannot(doing, error)) from error
+        raise ObjectMissing(sha256) from error
+    except (BaseError, OSError) as error:
+        raise ObjectStoreFailed(_cannot(doing, error)) from error
+
+
+def _cannot(doing: str, error: Exception) -> str:
+    return f"the object store cannot {doing}: {_first_line(error)}"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0].strip()
+
+
+def _clear_stale(temporary: Path) -> None:
+    for path in temporary.iterdir():
+        if time.time() - path.stat().st_mtime > _STALE_SECONDS:
+            path.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
