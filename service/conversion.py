@@ -6,6 +6,8 @@ It stands apart from the wire types, so that a client loads no NumPy.
 from collections.abc import Mapping
 from typing import Any
 
+from service.errors import FieldError
+from sysid.errors import InvalidBounds, InvalidModel, InvalidSettings, SysidError, UnknownModel
 from sysid.settings import (
     GeneticAlgorithm,
     IslandChange,
@@ -43,6 +45,20 @@ def loss_of(document: Mapping[str, Any]) -> Loss:
         If its kind or scale cannot be used.
     """
     return Loss(**document)
+
+
+def faults_of(error: SysidError) -> list[FieldError]:
+    """What an error of the numerical core says of a job or model document, with its places."""
+    match error:
+        case InvalidModel():
+            return [FieldError(f.pointer, f.detail, f.column) for f in error.faults]
+        case InvalidSettings():
+            return [FieldError(error.pointer, error.detail)]
+        case InvalidBounds():
+            return [FieldError(f"/parameters/{error.name}", str(error))]
+        case UnknownModel():
+            return [FieldError("/model", str(error))]
+    return [FieldError("", str(error))]
 
 
 def _island(change: Mapping[str, Any]) -> IslandChange:

@@ -3,7 +3,6 @@
 * ServiceError
     - NotFound               404  no such dataset, model, job or run
     - Conflict               409  the state of the thing does not allow it
-        - LeaseLost               a dispatcher wrote with an old fencing token
     - StaleVersion           412  a precondition (If-Match) does not hold
     - TooLarge               413  more than a stated limit
     - UnsupportedMediaType   415  a body of a kind that is not read
@@ -78,12 +77,6 @@ class Conflict(ServiceError):
     """The state of the thing does not allow it."""
 
     status, kind, title = 409, "conflict", "The state does not allow it"
-
-
-class LeaseLost(Conflict):
-    """A dispatcher wrote with an old fencing token: another has the job now, or it ended."""
-
-    kind, title = "lease-lost", "The lease of this job is lost"
 
 
 class StaleVersion(ServiceError):

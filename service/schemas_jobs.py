@@ -183,6 +183,8 @@ class Progress(Answer):
     failed: int
     best_rms: float | None = None
     evaluations: int = 0
+    generation: int = 0
+    seconds_left: float | None = None
 
 
 class JobOut(Answer):

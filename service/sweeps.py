@@ -25,10 +25,14 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What one position of one group of axes sets, and where in the body it was written."""
+    """What one position of one group of axes sets, and where in the body it was written.
+
+    `is_listed`: the values were written out one by one, so that each may be wrong on its own.
+    """
 
     pointer: str
     cell: Cell
+    is_listed: bool = True
 
 
 def steps_of(job: JobIn) -> list[list[Step]]:
@@ -106,7 +110,8 @@ def _zipped(axes: list[Axis], numbers: list[int]) -> list[Step]:
         for _, axis, _ in columns:
             labels.update(axis.labels[position] if axis.labels else {})
         cell = Cell({axis.path: values[position] for _, axis, values in columns}, labels)
-        steps.append(Step(_pointer(numbers[0], axes[numbers[0]], position), cell))
+        is_listed = any(axis.values is not None for _, axis, _ in columns)
+        steps.append(Step(_pointer(numbers[0], axes[numbers[0]], position), cell, is_listed))
     return steps
 
 

@@ -10,16 +10,18 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
-from service.api.pointers import known_fields, pointer_into
-from service.errors import FieldError, InvalidRequest, ServiceError
-from sysid.errors import (
-    InvalidBounds,
-    InvalidModel,
-    InvalidSettings,
-    SysidError,
-    UnknownModel,
-    nearest,
+from service.pointers import known_fields, pointer_into
+from service.conversion import faults_of
+from service.errors import (
+    Conflict,
+    FieldError,
+    InvalidRequest,
+    NotFound,
+    ServiceError,
+    Unavailable,
 )
+from service.storage.errors import StorageError
+from sysid.errors import SysidError, nearest
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +31,11 @@ KINDS = {
     405: "method-not-allowed",
     413: "too-large",
     415: "unsupported-media-type",
+}
+
+STORAGE_KINDS = {
+    known.status: (known.kind, known.title)
+    for known in (NotFound, Conflict, InvalidRequest, Unavailable)
 }
 
 
@@ -54,24 +61,10 @@ def problem(
     return JSONResponse(content, status, dict(headers or {}), media_type=PROBLEM_TYPE)
 
 
-def of_sysid(error: SysidError) -> InvalidRequest:
-    """An error of the numerical core as an invalid request, with its place in the body."""
-    match error:
-        case InvalidModel():
-            faults = [FieldError(f.pointer, f.detail, f.column) for f in error.faults]
-            return InvalidRequest(faults)
-        case InvalidSettings():
-            return InvalidRequest.at(error.pointer, error.detail)
-        case InvalidBounds():
-            return InvalidRequest.at(f"/parameters/{error.name}", str(error))
-        case UnknownModel():
-            return InvalidRequest.at("/model", str(error))
-    return InvalidRequest.at("", str(error))
-
-
 def install(app: FastAPI) -> None:
     """Make every error of the application a problem document."""
     app.add_exception_handler(ServiceError, _service_error)
+    app.add_exception_handler(StorageError, _storage_error)
     app.add_exception_handler(SysidError, _sysid_error)
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(HTTPException, _http_error)
@@ -85,9 +78,17 @@ def _service_error(request: Request, error: Exception) -> Response:
     )
 
 
+def _storage_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, StorageError)
+    if error.status >= HTTPStatus.INTERNAL_SERVER_ERROR:
+        log.error("%s %s: %s", request.method, request.url.path, error)
+    kind, title = STORAGE_KINDS.get(error.status, ("internal", "The service failed"))
+    return problem(request, error.status, kind, title, str(error))
+
+
 def _sysid_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, SysidError)
-    return _service_error(request, of_sysid(error))
+    return _service_error(request, InvalidRequest(faults_of(error)))
 
 
 def _http_error(request: Request, error: Exception) -> Response:

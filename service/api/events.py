@@ -1,0 +1,72 @@
+"""Server-sent events of a job, read from the events table."""
+
+import json
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+import anyio
+from fastapi import APIRouter, Header
+from fastapi.responses import Response, StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from service.api.deps import Parts, PartsDep
+from service.errors import InvalidRequest
+from service.storage.events import EventRepository
+from service.storage.jobs import JobRepository
+from service.storage.tables import Event
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+KEEP_ALIVE_S = 15.0
+BATCH = 500
+NO_BUFFER = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
+
+
+@router.get("/{job_id}/events", response_class=StreamingResponse)
+async def follow(
+    job_id: str, parts: PartsDep, last_event_id: Annotated[str | None, Header()] = None
+) -> Response:
+    """Events as they happen: state, progress, log, end. Goes on after `Last-Event-ID`."""
+    last = _number(last_event_id)
+    batch, is_over = await run_in_threadpool(_look, parts, job_id, last)
+    if is_over and not batch:
+        return Response(status_code=204)  # tells an EventSource not to come again
+    stream = _stream(parts, job_id, last)
+    return StreamingResponse(stream, media_type="text/event-stream", headers=NO_BUFFER)
+
+
+async def _stream(parts: Parts, job_id: str, last: int) -> AsyncIterator[str]:
+    poll, quiet = parts.settings.poll_seconds, 0.0
+    yield "retry: 1000\n\n"
+    while not parts.stopping.is_set():
+        batch, is_over = await run_in_threadpool(_look, parts, job_id, last)
+        for event in batch:
+            last, quiet = event.id, 0.0
+            yield _text(event)
+        if is_over and len(batch) < BATCH:
+            return
+        if quiet >= KEEP_ALIVE_S:
+            yield ": still here\n\n"
+            quiet = 0.0
+        await anyio.sleep(poll)
+        quiet += poll
+
+
+def _look(parts: Parts, job_id: str, last: int) -> tuple[list[Event], bool]:
+    """Newer events, and whether the job has ended, as of one moment."""
+    with parts.database.read() as session:
+        job = JobRepository(session).get(job_id)
+        return EventRepository(session).after(job_id, last, BATCH), job.state.is_terminal
+
+
+def _text(event: Event) -> str:
+    data = {**event.data, "at": event.created_at.isoformat()}
+    return f"id: {event.id}\nevent: {event.kind}\ndata: {json.dumps(data)}\n\n"
+
+
+def _number(text: str | None) -> int:
+    if not text:
+        return 0
+    if not text.isdecimal() or int(text) >= 2**63:
+        raise InvalidRequest.at("?Last-Event-ID", f"found {text!r}; need the id of an event")
+    return int(text)

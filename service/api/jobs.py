@@ -1,0 +1,90 @@
+"""Routes of jobs."""
+
+from typing import Annotated
+
+from fastapi import APIRouter, Header, Query, Response, status
+
+from service import jobs, runs
+from service.api.deps import Cursor, Limit, PartsDep, ReadSession, WriteSession
+from service.schemas import Page
+from service.schemas_jobs import JobIn, JobOut
+from service.schemas_runs import RunOut
+from service.storage.jobs import JobRepository
+from service.storage.runs import RunOrder
+from service.storage.tables import Job, State
+
+router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
+
+Key = Annotated[str | None, Header(max_length=200, description="same key, same job")]
+States = Annotated[list[State] | None, Query(description="only jobs or runs in these states")]
+Filter = Annotated[
+    list[str] | None,
+    Query(description="`/noise/sigma=0.1` keeps the cells with that value; may be repeated"),
+]
+
+
+@router.post("", status_code=status.HTTP_202_ACCEPTED)
+def submit(
+    body: JobIn,
+    parts: PartsDep,
+    session: WriteSession,
+    response: Response,
+    idempotency_key: Key = None,
+) -> JobOut:
+    """Queue a job. Everything that can be wrong with it is told now."""
+    found = jobs.submit(session, body, parts.settings, idempotency_key)
+    return _accepted(found.job, response)
+
+
+@router.get("")
+def page(
+    session: ReadSession, cursor: Cursor = None, limit: Limit = 50, state: States = None
+) -> Page[JobOut]:
+    """Jobs, latest first."""
+    return jobs.page(session, cursor, limit, state or [])
+
+
+@router.get("/{job_id}")
+def read(job_id: str, session: ReadSession) -> JobOut:
+    """One job: state, progress, and the exact request."""
+    return jobs.told(JobRepository(session).get(job_id), with_request=True)
+
+
+@router.post("/{job_id}:cancel")
+def cancel(job_id: str, session: WriteSession) -> JobOut:
+    """Cancel a job: at once if it is queued, within a moment if it runs."""
+    return jobs.told(JobRepository(session).cancel(job_id))
+
+
+@router.post("/{job_id}:resume", status_code=status.HTTP_202_ACCEPTED)
+def resume(job_id: str, session: WriteSession, response: Response) -> JobOut:
+    """Queue a failed or cancelled job again; it goes on from its last checkpoints."""
+    return _accepted(JobRepository(session).resume(job_id), response)
+
+
+@router.post("/{job_id}:clone", status_code=status.HTTP_202_ACCEPTED)
+def clone(job_id: str, parts: PartsDep, session: WriteSession, response: Response) -> JobOut:
+    """Queue the same request as a new job."""
+    return _accepted(jobs.clone(session, job_id, parts.settings), response)
+
+
+@router.get("/{job_id}/runs")
+def runs_of(
+    job_id: str,
+    session: ReadSession,
+    cursor: Annotated[str | None, Query(max_length=200)] = None,
+    limit: Limit = 50,
+    state: States = None,
+    cell: Filter = None,
+    label: Filter = None,
+    order: RunOrder = "number",
+    descending: bool = False,
+) -> Page[RunOut]:
+    """Runs of a job; filter by axis values, labels or state."""
+    choice = runs.Choice(state or [], cell or [], label or [], order, descending)
+    return runs.page(session, job_id, cursor, limit, choice)
+
+
+def _accepted(job: Job, response: Response) -> JobOut:
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    return jobs.told(job)

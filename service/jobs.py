@@ -1,0 +1,157 @@
+"""Use cases of jobs: submit, read, cancel, resume, clone."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service.checks import JobChecker, value_faults
+from service.errors import FieldError, InvalidRequest
+from service.schemas import Page
+from service.schemas_jobs import JobIn, JobOut, Progress
+from service.settings import Settings
+from service.storage.jobs import JobRepository, NewJob, Submission
+from service.storage.ledger import Cell as StoredCell
+from service.storage.ledger import add_runs
+from service.storage.lineage import LineageRepository
+from service.storage.tables import Job, State
+from service.sweeps import Cell, Step, body_of, count, expand, steps_of
+
+# Any number does for these; to check each of a hundred thousand seeds would only take time.
+UNCHECKED = ("/seed", "/noise/seed", "/noise/sigma", "/priority")
+
+
+def submit(session: Session, body: JobIn, settings: Settings, key: str | None = None) -> Submission:
+    """Queue a job with all its runs.
+
+    Raises
+    ------
+    InvalidRequest
+        With every fault that can be known before the job runs.
+    KeyReused
+        If the idempotency key was used with another body.
+    """
+    document = body.normal_form()
+    digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    groups = steps_of(body)
+    n_runs = count(groups)
+    if n_runs > settings.max_runs_per_job:
+        raise InvalidRequest.at(
+            "/sweep/axes",
+            f"the sweep has {n_runs} runs; at most {settings.max_runs_per_job} a job",
+        )
+    checker = JobChecker(session)
+    _check(checker, document, groups)
+    spec = checker.resolved(document)
+    new = NewJob(
+        name=body.name or _name(checker, spec), spec=spec, n_runs=n_runs, priority=body.priority,
+        max_attempts=settings.max_attempts,
+    )  # fmt: skip
+    submission = JobRepository(session).submit(new, key=key, request_hash=digest)
+    if submission.is_new:
+        cells = (_resolved(checker, cell) for cell in expand(groups))
+        add_runs(session, submission.job, _stored(spec, cells))
+        lineage = LineageRepository(session)
+        lineage.link(submission.job.id, spec["datasets"], "estimation")
+        kept = (spec["validation"] or {}).get("datasets") or []
+        lineage.link(submission.job.id, kept, "validation")
+    return submission
+
+
+def clone(session: Session, job_id: str, settings: Settings) -> Job:
+    """Queue the same request as a new job."""
+    old = JobRepository(session).get(job_id)
+    body = JobIn.model_validate({**old.spec, "name": old.name})
+    return submit(session, body, settings).job
+
+
+def told(job: Job, *, with_request: bool = False) -> JobOut:
+    """A job as it is told."""
+    model = job.spec["model"]
+    return JobOut(
+        id=job.id, name=job.name, state=job.state.value, cancel_requested=job.cancel_requested,
+        created_at=job.created_at, started_at=job.started_at, finished_at=job.finished_at,
+        attempt=job.attempt, error=job.error,
+        model=model["name"] if isinstance(model, Mapping) else model, priority=job.priority,
+        progress=Progress(
+            runs=job.n_runs, finished=job.n_done, failed=job.n_failed, best_rms=job.best_rms,
+            evaluations=job.evaluations, generation=job.generation,
+            seconds_left=job.seconds_left,
+        ),
+        request=job.spec if with_request else None,
+    )  # fmt: skip
+
+
+def page(session: Session, cursor: str | None, limit: int, states: list[State]) -> Page[JobOut]:
+    """Jobs, latest first."""
+    found = JobRepository(session).page(cursor=cursor, limit=limit, states=states)
+    return Page(items=[told(job) for job in found.items], next=found.next)
+
+
+def _check(checker: JobChecker, document: dict[str, Any], groups: list[list[Step]]) -> None:
+    errors = checker.errors(body_of(document, {}))
+    if not errors:
+        errors = [fault for step in _worth_checking(groups)
+                  for fault in _step_faults(checker, document, step)]  # fmt: skip
+    if errors:
+        unique = dict.fromkeys(errors)
+        raise InvalidRequest(unique)
+
+
+def _worth_checking(groups: list[list[Step]]) -> Iterator[Step]:
+    for group in groups:
+        is_plain = all(path in UNCHECKED for path in group[0].cell.values)
+        yield from _ends(group) if is_plain and not group[0].is_listed else group
+
+
+def _ends(group: list[Step]) -> list[Step]:
+    return [group[0], group[-1]]
+
+
+def _step_faults(checker: JobChecker, document: dict[str, Any], step: Step) -> Iterator[FieldError]:
+    body = body_of(document, step.cell.values)
+    wrong = value_faults(step.pointer, body)
+    yield from wrong
+    if wrong or all(path in UNCHECKED for path in step.cell.values):
+        return
+    for fault in checker.errors(JobIn.model_validate(body).normal_form()):
+        yield FieldError(step.pointer, f"{fault.pointer}: {fault.detail}", fault.column)
+
+
+def _resolved(checker: JobChecker, cell: Cell) -> Cell:
+    """The cell with own models as documents and datasets as identifiers."""
+    values = dict(cell.values)
+    if "/model" in values:
+        model = checker.model(values["/model"])
+        values["/model"] = model[1] if isinstance(model, tuple) else values["/model"]
+    if "/datasets" in values:
+        named = values["/datasets"]
+        values["/datasets"] = checker.identifiers([named] if isinstance(named, str) else named)
+    return Cell(values, cell.labels)
+
+
+def _stored(spec: Mapping[str, Any], cells: Iterator[Cell]) -> Iterator[StoredCell]:
+    for number, cell in enumerate(cells):
+        yield StoredCell(
+            number=number, cell=dict(cell.values), labels=dict(cell.labels),
+            method=_field(spec, cell, "algorithm", "method"),
+            seed=_field(spec, cell, "seed"),
+            sigma=_field(spec, cell, "noise", "sigma"),
+        )  # fmt: skip
+
+
+def _field(spec: Mapping[str, Any], cell: Cell, *parts: str) -> Any:
+    """A field of the run's body, found without making the body."""
+    path = "/" + "/".join(parts)
+    if path in cell.values:
+        return cell.values[path]
+    whole = cell.values.get(f"/{parts[0]}", spec[parts[0]])
+    return whole.get(parts[1], spec[parts[0]][parts[1]]) if len(parts) > 1 else whole
+
+
+def _name(checker: JobChecker, spec: Mapping[str, Any]) -> str:
+    model = spec["model"]["name"] if isinstance(spec["model"], Mapping) else spec["model"]
+    data = checker.dataset(spec["datasets"][0])
+    return f"{model} on {data if isinstance(data, str) else data.name}"

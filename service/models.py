@@ -1,0 +1,130 @@
+"""Use cases of models: the catalogue, own models with versions, and the check of a document."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy.orm import Session
+from sysid.models.spec import parse_model
+
+from service.conversion import faults_of
+from service.errors import InvalidRequest, NotFound
+from service.schemas import FieldProblem, Page
+from service.schemas_models import CheckOut, ModelOut
+from service.storage import errors as storage_errors
+from service.storage.models import ModelRepository
+from service.storage.tables import Model as StoredModel
+from sysid.errors import SysidError, UnknownModel, nearest
+from sysid.models import library
+from sysid.models.model import Model
+
+
+def page(session: Session, cursor: str | None, limit: int) -> Page[ModelOut]:
+    """Built-in models on the first page, then every version of own ones, latest first."""
+    own = ModelRepository(session).page(cursor=cursor, limit=limit)
+    built_in = [] if cursor else [_built_in(name) for name in library.catalogue()]
+    return Page(items=built_in + [_stored(row) for row in own.items], next=own.next)
+
+
+def one(session: Session, reference: str) -> ModelOut:
+    """A model by ``name`` or ``name@version``.
+
+    Raises
+    ------
+    NotFound
+        With the nearest known name.
+    """
+    if reference in library.catalogue():
+        return _built_in(reference, with_document=True)
+    return _stored(_own(session, reference), with_document=True)
+
+
+def add(session: Session, document: Mapping[str, Any]) -> ModelOut:
+    """Store an own model; the same document again gives the same version.
+
+    Raises
+    ------
+    InvalidRequest
+        If it has faults, or its name is that of a built-in model.
+    """
+    model = parse_model(document)
+    if model.name in library.catalogue():
+        raise InvalidRequest.at(
+            "/name", f"{model.name!r} is the name of a built-in model; choose another"
+        )
+    stored = ModelRepository(session).add(model.name, dict(model.document))
+    return _stored(stored.model, with_document=True)
+
+
+def check(document: Any) -> CheckOut:
+    """Whether a model document can be used, and every fault in it."""
+    if not isinstance(document, Mapping):
+        found = f"a model is an object with 'equations' and more; found {document!r:.60}"
+        return CheckOut(valid=False, errors=[FieldProblem(pointer="", detail=found)])
+    try:
+        model = parse_model(document)
+    except SysidError as error:
+        problems = [FieldProblem(**fault.as_dict()) for fault in faults_of(error)]
+        return CheckOut(valid=False, errors=problems)
+    return CheckOut(valid=True, errors=[], normal_form=dict(model.document))
+
+
+def resolve(session: Session, reference: Any) -> tuple[Model, Any]:
+    """The model that a job names, and what to store for it.
+
+    A built-in model stays a name; an own one is stored as its document, so that a later version
+    does not change what was submitted.
+
+    Raises
+    ------
+    InvalidModel, UnknownModel
+        If a document has faults, or no model has that name.
+    """
+    if isinstance(reference, Mapping):
+        model = parse_model(reference)
+        return model, dict(reference)
+    if reference in library.catalogue():
+        return library.load_model(reference), reference
+    try:
+        row = _own(session, reference)
+    except NotFound:
+        raise UnknownModel(reference, _names(session)) from None
+    return parse_model(row.document), row.document
+
+
+def _own(session: Session, reference: str) -> StoredModel:
+    try:
+        return ModelRepository(session).get(reference)
+    except storage_errors.NotFound:
+        raise NotFound("model", reference, nearest(reference, _names(session))) from None
+
+
+def _names(session: Session) -> set[str]:
+    own = ModelRepository(session).page(limit=1000).items
+    return {*library.catalogue(), *(row.name for row in own)}
+
+
+def _built_in(name: str, *, with_document: bool = False) -> ModelOut:
+    return _told(library.load_model(name), 0, library.document(name) if with_document else None)
+
+
+def _stored(row: StoredModel, *, with_document: bool = False) -> ModelOut:
+    document = row.document if with_document else None
+    return _told(parse_model(row.document), row.version, document)
+
+
+def _told(model: Model, version: int, document: Mapping[str, Any] | None) -> ModelOut:
+    return ModelOut(
+        name=model.name,
+        version=version,
+        builtin=version == 0,
+        title=model.title,
+        form=model.form,
+        inputs={quantity.name: quantity.unit for quantity in model.inputs},
+        outputs={output.name: output.unit for output in model.outputs},
+        parameters={
+            p.name: {"lower": p.lower, "upper": p.upper, "unit": p.unit, "scale": p.scale,
+                     "fixed": p.fixed}
+            for p in model.parameters
+        },
+        document=None if document is None else dict(document),
+    )  # fmt: skip

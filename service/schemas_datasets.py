@@ -1,0 +1,150 @@
+"""What is sent and told about datasets."""
+
+from datetime import datetime
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from service.schemas import Answer, Body
+from service.schemas_jobs import NoiseIn, Seed
+
+MAX_SIMULATED_SAMPLES = 10_000_000
+
+
+class Wave(Body):
+    """offset + amplitude · cos(omega·t + phase); `omega` in rad/s or `frequency` in Hz."""
+
+    kind: Literal["cosine", "sine"]
+    amplitude: float = 1.0
+    omega: float | None = Field(default=None, ge=0)
+    frequency: float | None = Field(default=None, ge=0)
+    phase: float = 0.0
+    offset: float = 0.0
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        if (self.omega is None) == (self.frequency is None):
+            raise PydanticCustomError("one_of", "give either 'omega' (rad/s) or 'frequency' (Hz)")
+        return self
+
+
+class StepInput(Body):
+    """`offset` before `time` (s), `offset` + `amplitude` from then on."""
+
+    kind: Literal["step"]
+    amplitude: float = 1.0
+    time: float = 0.0
+    offset: float = 0.0
+
+
+class BinaryInput(Body):
+    """A random binary signal: ± `amplitude` around `offset`, drawn anew every `period` (s)."""
+
+    kind: Literal["binary"]
+    amplitude: float = 1.0
+    period: float = Field(gt=0)
+    offset: float = 0.0
+    seed: Seed = 0
+
+
+class ExpressionInput(Body):
+    """An expression of ``t`` (s) in the model language, such as ``10*cos(5*t)``."""
+
+    kind: Literal["expression"]
+    expression: str = Field(max_length=4000)
+
+
+class DatasetInput(Body):
+    """A channel of a stored dataset."""
+
+    kind: Literal["dataset"]
+    dataset: str
+    channel: str
+
+
+InputIn = Annotated[
+    Wave | StepInput | BinaryInput | ExpressionInput | DatasetInput, Field(discriminator="kind")
+]
+
+
+class SimulateIn(Body):
+    """A dataset made from a model: its true parameters, its inputs, the noise on its outputs."""
+
+    name: str | None = Field(default=None, max_length=200)
+    model: Any
+    parameters: dict[str, float] = Field(default={})
+    inputs: dict[str, InputIn] = Field(default={})
+    samples: int = Field(ge=2, le=MAX_SIMULATED_SAMPLES)
+    sample_time: float = Field(gt=0)
+    noise: NoiseIn = NoiseIn()
+
+
+class DeriveIn(Body):
+    """A dataset made from another by steps, each an object with one key: the step's name."""
+
+    name: str | None = Field(default=None, max_length=200)
+    steps: list[dict[str, Any]] = Field(min_length=1, max_length=32)
+
+
+class ChannelOut(Answer):
+    """One channel of a dataset. `sample_time` is None where the sampling is irregular."""
+
+    name: str
+    unit: str
+    hold: str
+    samples: int
+    start: float
+    stop: float
+    sample_time: float | None
+    missing: int
+
+
+class DatasetOut(Answer):
+    """A stored recording."""
+
+    id: str
+    name: str
+    kind: str
+    sha256: str
+    size_bytes: int
+    channels: list[ChannelOut]
+    samples: int
+    duration: float
+    sample_time: float | None
+    segments: list[dict[str, Any]]
+    warnings: list[str]
+    details: dict[str, Any]
+    created_at: datetime
+
+
+class Series(Answer):
+    """One line of a plot: at most as many points as were asked for."""
+
+    name: str
+    unit: str
+    times: list[float]
+    values: list[float | None]
+    samples: int
+
+
+class SignalsOut(Answer):
+    """Channels of a dataset, reduced so that extremes stay visible."""
+
+    id: str
+    channels: list[Series]
+
+
+class Edge(Answer):
+    """`child` was made from `parent`."""
+
+    parent: str
+    child: str
+    relation: str
+
+
+class LineageOut(Answer):
+    """Everything a dataset was made from and everything made from it."""
+
+    id: str
+    edges: list[Edge]

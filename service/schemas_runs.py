@@ -1,0 +1,90 @@
+"""What is told about runs. The result's names are those of the numerical core."""
+
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import ConfigDict, Field
+
+from service.schemas import Answer
+from service.schemas_datasets import Series
+
+RunState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+
+
+class RunOut(Answer):
+    """One identification: its cell of the sweep, how far it is, and what it gave.
+
+    The fields of the result document (estimates, fit, islands, warnings …) follow once there is
+    one; see the contract in the documentation of the interface.
+    """
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    id: str
+    job: str
+    number: int
+    cell: dict[str, Any]
+    labels: dict[str, Any]
+    state: RunState
+    valid: bool | None = None
+    rms: float | None = None
+    evaluations: int = 0
+    generations: int = 0
+    seconds: float | None = None
+    progress: float
+    error: str | None = None
+    created_at: datetime
+    started_at: datetime | None = None
+    finished_at: datetime | None = None
+    parameters: list[dict[str, Any]] = Field(default=[])
+
+
+class ImprovementOut(Answer):
+    """A better champion of one island."""
+
+    generation: int
+    evaluations: int
+    rms: float
+    phase: str
+    parameters: list[float]
+
+
+class HistoryOut(Answer):
+    """Improvements of every island; `names` are those of the columns of `parameters`."""
+
+    id: str
+    names: list[str]
+    islands: list[list[ImprovementOut]]
+
+
+class ExperimentOut(Answer):
+    """Measured and simulated outputs and the inputs of one experiment."""
+
+    dataset: str
+    role: Literal["estimation", "validation"]
+    inputs: list[Series]
+    measured: list[Series]
+    simulated: list[Series]
+
+
+class ResponseOut(Answer):
+    """Measured against simulated, experiment by experiment."""
+
+    id: str
+    experiments: list[ExperimentOut]
+
+
+class MigrantOut(Answer):
+    """One line of the migration log."""
+
+    epoch: int
+    source: int
+    destination: int
+    fitness: float
+
+
+class MigrationsOut(Answer):
+    """The migration log of a run."""
+
+    id: str
+    migrants: list[MigrantOut]
