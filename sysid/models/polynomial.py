@@ -1,0 +1,218 @@
+"""Kolmogorov–Gabor polynomials: a document of lags and a degree to one difference equation.
+
+The paper's Eq. 2–3 sum over all index pairs, which counts each mixed product twice. Here each
+monomial occurs once, i ≤ j ≤ …: C(s + m, m) - 1 coefficients for s past values and degree m.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import reduce
+from itertools import combinations_with_replacement
+from math import comb
+from typing import Any, NamedTuple, cast
+
+from sysid.errors import InvalidBounds, nearest
+from sysid.language.checker import check
+from sysid.language.lags import delay
+from sysid.language.printer import text
+from sysid.language.scope import Scope
+from sysid.language.tree import Binary, Expression, Number, Past, Symbol
+from sysid.models.equations import note
+from sysid.models.reader import Reader, pointer, shown
+from sysid.models.sections import MAX_PARAMETERS
+from sysid.parameters import Parameter, Scale
+
+FIELDS = ("output", "degree", "lags", "coefficients", "constant", "terms")
+
+_MAX_DEGREE = 9
+_NO_SELECTION = "term selection is not available yet; write 'all' or a list of terms"
+
+
+class Term(NamedTuple):
+    """A product of past values; the empty one is the constant 1."""
+
+    factors: tuple[Past, ...]
+
+    @property
+    def label(self) -> str:
+        """Text of the product, such as ``y(k-1)**2*u(k-1-dk)``."""
+        if not self.factors:
+            return "1"
+        powers = {text(factor).replace(" ", ""): 0 for factor in self.factors}
+        for factor in self.factors:
+            powers[text(factor).replace(" ", "")] += 1
+        return "*".join(f"{name}**{n}" if n > 1 else name for name, n in powers.items())
+
+    @property
+    def coefficient(self) -> str:
+        """Name of the term's coefficient: ``a[y(k-1)*u(k-1)]``."""
+        return f"a[{self.label}]"
+
+
+def expand(
+    reader: Reader, fields: Mapping[str, Any], scope: Scope
+) -> tuple[Expression, tuple[Parameter, ...]]:
+    """The right-hand side of y(k) = …, and its coefficients."""
+    terms = _terms(reader, fields, scope)
+    if _wants_constant(reader, fields):
+        terms = (*terms, Term(()))
+    if len(terms) > MAX_PARAMETERS:
+        detail = f"gives {len(terms)} coefficients; at most {MAX_PARAMETERS} are allowed"
+        reader.fault("/terms", detail)
+        terms = ()
+    coefficients = _coefficients(reader, fields.get("coefficients"), terms)
+    return _sum([_product(term) for term in terms]), coefficients
+
+
+def _wants_constant(reader: Reader, fields: Mapping[str, Any]) -> bool:
+    found = fields.get("constant", False)
+    if not isinstance(found, bool):
+        reader.fault("/constant", f"{shown(found)} is not true or false")
+    return found is True
+
+
+def _terms(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> tuple[Term, ...]:
+    written = fields.get("terms", "all")
+    if isinstance(written, list | tuple):
+        return _listed(reader, written, scope)
+    if isinstance(written, Mapping):
+        reader.fault("/terms/select" if "select" in written else "/terms", _NO_SELECTION)
+    elif written != "all":
+        reader.fault("/terms", f"{shown(written)} is not 'all' or a list of terms")
+    return _all_terms(reader, fields, scope)
+
+
+def _all_terms(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> tuple[Term, ...]:
+    highest = reader.required(fields, "degree", "", "it is the largest number of factors in a term")
+    degree = 1 if highest is None else reader.whole(highest, "/degree", 1, _MAX_DEGREE)
+    values = _regressors(reader, fields, scope)
+    count = comb(len(values) + degree, degree) - 1
+    if count > MAX_PARAMETERS:
+        detail = (
+            f"degree {degree} of {len(values)} past values gives {count} coefficients; at most "
+            f"{MAX_PARAMETERS} are allowed: lower it, or list the terms"
+        )
+        reader.fault("/degree", detail)
+        return ()
+    return tuple(
+        Term(factors)
+        for size in range(1, degree + 1)
+        for factors in combinations_with_replacement(values, size)
+    )
+
+
+def _regressors(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> tuple[Past, ...]:
+    """V1 … Vs of Eq. 2: the past values that the document's lags name."""
+    lags = reader.required(fields, "lags", "", "name the past values, such as {y: [1], u: [1]}")
+    found: list[Past] = []
+    for name, entries in reader.section(lags, "/lags").items():
+        place = pointer("lags", name)
+        if name not in scope.signals:
+            reader.fault(place, f"there is no such signal{nearest(name, scope.signals)}")
+        elif not isinstance(entries, list | tuple) or not entries:
+            reader.fault(place, f"{shown(entries)} is not a list of lags in samples")
+        else:
+            found += [
+                value
+                for number, entry in enumerate(entries)
+                if (value := _regressor(reader, name, entry, f"{place}/{number}", scope))
+            ]
+    for number, value in enumerate(found):
+        if value in found[:number]:
+            reader.fault(pointer("lags", value.name), f"{text(value)} is listed twice")
+    return tuple(found)
+
+
+def _regressor(reader: Reader, name: str, entry: object, place: str, scope: Scope) -> Past | None:
+    known = reader.count()
+    silent = Scope("difference", parameters=scope.parameters, constants=scope.constants)
+    checked = check(reader.expression(entry, place), silent)
+    note(reader, checked, place)
+    if reader.count() > known or checked.tree is None:
+        return None
+    found = delay(Binary("-", Symbol("k", "index"), checked.tree), scope)
+    if isinstance(found, str):
+        reader.fault(place, found)
+        return None
+    value = Past(name, "state" if name in scope.states else "input", *found)
+    return _not_present(reader, value, place)
+
+
+def _not_present(reader: Reader, value: Past, place: str) -> Past | None:
+    if value.kind == "state" and value.offset == 0:
+        detail = f"{text(value)} may reach the present {value.name}(k); need a lag of 1 or more"
+        reader.fault(place, detail)
+        return None
+    return value
+
+
+def _listed(reader: Reader, written: Sequence[object], scope: Scope) -> tuple[Term, ...]:
+    terms: list[Term] = []
+    if not written:
+        reader.fault("/terms", "the list is empty; name at least one term, such as y(k-1)")
+    for number, one in enumerate(written[: MAX_PARAMETERS + 1]):
+        place = f"/terms/{number}"
+        checked = check(reader.expression(one, place), scope)
+        note(reader, checked, place)
+        if checked.tree is None:
+            continue
+        factors = _factors(checked.tree)
+        if factors is None:
+            detail = "a term is a product of past values, such as y(k-1)*u(k-1-dk)**2"
+            reader.fault(place, detail)
+        elif Term(factors).label in {term.label for term in terms}:
+            reader.fault(place, f"{Term(factors).label} is listed twice")
+        elif all(_not_present(reader, value, place) for value in factors):
+            terms.append(Term(factors))
+    return tuple(terms)
+
+
+def _factors(tree: Expression) -> tuple[Past, ...] | None:
+    """The past values whose product a tree is, states first; None if it is none."""
+    match tree:
+        case Past():
+            return (tree,)
+        case Binary("*", left, right):
+            first, second = _factors(left), _factors(right)
+            if first is None or second is None:
+                return None
+            return tuple(sorted(first + second, key=lambda v: (v.kind == "input", text(v))))
+        case Binary("**", Past() as base, Number(power)) if power in range(1, _MAX_DEGREE + 1):
+            return (base,) * int(power)
+        case _:
+            return None
+
+
+def _coefficients(reader: Reader, entry: object, terms: Sequence[Term]) -> tuple[Parameter, ...]:
+    known = reader.count()
+    fields = reader.section(entry, "/coefficients", ("lower", "upper", "scale", "unit"))
+    ends = {}
+    for bound in ("lower", "upper"):
+        value = reader.required(fields, bound, "/coefficients", "it bounds every coefficient")
+        ends[bound] = 0.0 if value is None else reader.number(value, f"/coefficients/{bound}")
+    unit = reader.unit(fields.get("unit"), "/coefficients/unit")
+    scale = reader.choice(fields.get("scale", "linear"), ("linear", "log"), "/coefficients/scale")
+    if reader.count() > known:
+        return ()
+    try:
+        return tuple(
+            Parameter(term.coefficient, unit=unit, scale=cast(Scale, scale), **ends)
+            for term in terms
+        )
+    except InvalidBounds as error:
+        reader.fault("/coefficients", str(error))
+        return ()
+
+
+def _product(term: Term) -> Expression:
+    coefficient: Expression = Symbol(term.coefficient, "parameter")
+    return reduce(lambda a, b: Binary("*", a, b), term.factors, coefficient)
+
+
+def _sum(terms: Sequence[Expression]) -> Expression:
+    """The sum in halves: hundreds of terms, yet a shallow tree."""
+    if not terms:
+        return Number(0.0)
+    if len(terms) == 1:
+        return terms[0]
+    middle = len(terms) // 2
+    return Binary("+", _sum(terms[:middle]), _sum(terms[middle:]))
