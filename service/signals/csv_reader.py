@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from io import BytesIO, TextIOWrapper
 from itertools import chain, islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import numpy as np
 
@@ -98,7 +98,7 @@ def _lines(stream: TextIOWrapper) -> Iterator[str]:
         wrong = error.object[error.start]
         raise InvalidUpload(
             f"the file is not UTF-8 text (byte 0x{wrong:02x}); save it as CSV in UTF-8",
-            row=_row_of_bad_text(stream.buffer),
+            row=_row_of_bad_text(cast(BinaryIO, stream.buffer)),
         ) from None
 
 

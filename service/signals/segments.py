@@ -33,7 +33,8 @@ def lay_out(
     segments = []
     for i, (first, last) in enumerate(zip(starts, lasts, strict=True)):
         origin, start = float(times[first]), i * step
-        axis[first : last + 1] = start + (times[first : last + 1] - origin)
+        # To the nanosecond: what a file's clock holds, so that a stored time is the same again.
+        axis[first : last + 1] = np.round(start + (times[first : last + 1] - origin), 9)
         segments.append(Segment(start, float(axis[last]), origin, dict(labels[i])))
     return axis, tuple(segments)
 

@@ -1,0 +1,159 @@
+"""MCAP files as recordings: ours by their manifest, others by their schemas."""
+
+import io
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from service.signals.clock import TIME_FIELD
+from service.signals.errors import InvalidUpload
+from service.signals.limits import DEFAULT_LIMITS, Limits
+from service.signals.mcap_content import Content, Source, no_signals, read_content, sorted_columns
+from service.signals.topics import DATASET, ChannelEntry, Manifest, parse_manifest
+from service.signals.writer import FittedOutput
+from sysid.records import Channel, Recording
+from sysid.types import FloatArray
+
+CLOCK_FROM_NS = 10**17
+"""Log times from here on (three years) are a clock's: they are counted from the first."""
+
+Readable = str | os.PathLike[str] | bytes | BinaryIO
+
+
+def read_recording(source: Readable, limits: Limits = DEFAULT_LIMITS) -> Recording:
+    """Read a recording from an MCAP file (path, content, or seekable stream).
+
+    Raises
+    ------
+    InvalidUpload
+        If the file is damaged, too large, or holds no signal.
+    """
+    return read_mcap(source, limits)[0]
+
+
+def read_metadata(source: Readable, limits: Limits = DEFAULT_LIMITS) -> dict[str, str]:
+    """Read the record ``lagid.dataset`` of a file; empty if there is none."""
+    with _opened(source) as (binary, size):
+        return read_content(binary, size, limits).metadata.get(DATASET, {})
+
+
+def read_fit(source: Readable, limits: Limits = DEFAULT_LIMITS) -> tuple[FittedOutput, ...]:
+    """Read what `write_fit` wrote.
+
+    Raises
+    ------
+    InvalidUpload
+        If the file is damaged or of another kind.
+    """
+    recording = read_recording(source, limits)
+    fits = []
+    for channel in recording.channels:
+        named, _, what = channel.name.rpartition("/")
+        if what != "simulated":
+            continue
+        experiment, _, name = named.partition("/")
+        measured = recording.channel(f"{named}/measured").values
+        fits.append(
+            FittedOutput(experiment, name, channel.unit, channel.times, measured, channel.values)
+        )
+    if not fits:
+        raise InvalidUpload("the file holds no fitted signals")
+    return tuple(fits)
+
+
+def read_mcap(source: Readable, limits: Limits) -> tuple[Recording, tuple[str, ...]]:
+    """Read a recording, and notes on what was left out or changed.
+
+    Raises
+    ------
+    InvalidUpload
+        If the file is damaged, too large, or holds no signal.
+    """
+    with _opened(source) as (binary, size):
+        content = read_content(binary, size, limits)
+    metadata = content.metadata.get(DATASET)
+    return _foreign(content, limits) if metadata is None else (_ours(content, metadata), ())
+
+
+@contextmanager
+def _opened(source: Readable) -> Iterator[tuple[BinaryIO, int]]:
+    if isinstance(source, bytes):
+        yield io.BytesIO(source), len(source)
+    elif isinstance(source, str | os.PathLike):
+        with Path(source).open("rb") as stream:
+            yield stream, os.fstat(stream.fileno()).st_size
+    else:
+        size = source.seek(0, io.SEEK_END)
+        source.seek(0)
+        yield source, size
+
+
+def _ours(content: Content, metadata: Mapping[str, str]) -> Recording:
+    try:
+        manifest = parse_manifest(metadata)
+    except ValueError as error:
+        raise InvalidUpload(f"the metadata record {DATASET!r} cannot be used: {error}") from None
+    topics: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
+    for source in content.sources.values():
+        if source.topic in manifest.clocks:
+            topics[source.topic] = _topic(source, manifest)
+    channels = tuple(_channel(entry, topics) for entry in manifest.channels)
+    return Recording(channels, manifest.segments)
+
+
+def _topic(source: Source, manifest: Manifest) -> tuple[FloatArray, dict[str, FloatArray]]:
+    log_times, columns, _ = sorted_columns(source)
+    times = manifest.clocks[source.topic].times(log_times, columns.get(TIME_FIELD))
+    if not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
+        raise InvalidUpload(f"the times of topic {source.topic!r} decrease or are not finite")
+    return times, columns
+
+
+def _channel(
+    entry: ChannelEntry, topics: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]]
+) -> Channel:
+    times, columns = topics.get(entry.topic, (np.empty(0), {}))
+    if entry.field not in columns:
+        raise InvalidUpload(
+            f"channel {entry.name!r} should be field {entry.field!r} of topic {entry.topic!r}, "
+            "which the file does not hold"
+        )
+    return Channel(entry.name, times, columns[entry.field], entry.unit, entry.hold)
+
+
+def _foreign(content: Content, limits: Limits) -> tuple[Recording, tuple[str, ...]]:
+    read = [(source, *sorted_columns(source)) for source in content.sources.values()]
+    usable = [one for one in read if one[2]]
+    if not usable:
+        raise no_signals(content)
+    notes = [
+        f"topic {source.topic!r} is left out: {source.refused}"
+        for source in content.sources.values()
+        if source.refused
+    ]
+    notes += [f"topic {one[0].topic!r} was not in the order of time" for one in usable if one[3]]
+    first = min(int(times[0]) for _, times, _, _ in usable)
+    start = first if first >= CLOCK_FROM_NS else 0
+    if start:
+        notes.append(f"times are counted from the first, {start} ns of the file's clock")
+    channels: dict[str, Channel] = {}
+    for source, log_times, columns, _ in usable:
+        times = (log_times - np.uint64(start)).astype(np.float64) / 1e9
+        for field, values in columns.items():
+            name = _free_name(source.topic, field, alone=len(usable) == 1, taken=channels)
+            channels[name] = Channel(name, times, values)
+    if len(channels) > limits.channels:
+        raise InvalidUpload(f"the file has {len(channels)} signals; at most {limits.channels}")
+    return Recording(tuple(channels.values())), tuple(notes)
+
+
+def _free_name(topic: str, field: str, *, alone: bool, taken: Mapping[str, object]) -> str:
+    wanted = field if alone else f"{topic.strip('/')}.{field}"
+    number, name = 2, wanted
+    while name in taken:
+        name, number = f"{wanted}_{number}", number + 1
+    return name

@@ -1,0 +1,171 @@
+"""How a recording is laid out in a file: topics, fields, and the manifest that names them."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, get_args
+
+import numpy as np
+
+from service.signals.clock import TIME_FIELD, Clock, Nanoseconds, clock_for
+from service.signals.protobuf import identifiers
+from sysid.records import HOLDS, Channel, Recording, Segment
+from sysid.types import FloatArray
+
+DATASET = "lagid.dataset"
+"""Name of the metadata record that says what a file of ours holds."""
+
+FORMAT = "1"
+RESERVED = ("format", "sample_time", "channels", "topics", "segments")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Topic:
+    """Channels that share their times: one MCAP channel, one protobuf field for each.
+
+    `extra` is the times themselves when the file's clock cannot hold them exactly.
+    """
+
+    path: str
+    channels: tuple[Channel, ...]
+    fields: tuple[str, ...]
+    clock: Clock
+    log_times: Nanoseconds
+    extra: tuple[FloatArray, ...] = ()
+
+    @property
+    def columns(self) -> tuple[FloatArray, ...]:
+        """What is written for each of `all_fields`."""
+        return (*(channel.values for channel in self.channels), *self.extra)
+
+    @property
+    def all_fields(self) -> tuple[str, ...]:
+        """Names of the message's fields."""
+        return (*self.fields, TIME_FIELD) if self.extra else self.fields
+
+
+def make_topic(path: str, channels: Sequence[Channel], names: Sequence[str]) -> Topic:
+    """Topic of channels with equal times; `names` are what its fields are to be called."""
+    times = channels[0].times
+    clock, log_times = clock_for(times)
+    extra = (times,) if clock.rule == "field" else ()
+    fields = identifiers((TIME_FIELD, *names))[1:]
+    return Topic(path, tuple(channels), fields, clock, log_times, extra)
+
+
+def topics_of(recording: Recording, root: str = "/signals") -> tuple[Topic, ...]:
+    """Topics of a recording: `root` for the first channel and all that share its times."""
+    groups: list[list[Channel]] = []
+    for channel in recording.channels:
+        for group in groups:
+            if _same_times(group[0], channel):
+                group.append(channel)
+                break
+        else:
+            groups.append([channel])
+    paths = [root, *(f"{root}/{name}" for name in identifiers(g[0].name for g in groups[1:]))]
+    return tuple(
+        make_topic(path, group, [one.name for one in group])
+        for path, group in zip(paths, groups, strict=True)
+    )
+
+
+def _same_times(a: Channel, b: Channel) -> bool:
+    return a.times is b.times or np.array_equal(a.times, b.times)
+
+
+def manifest_of(
+    recording: Recording, topics: Sequence[Topic], metadata: Mapping[str, str]
+) -> dict[str, str]:
+    """Content of the record `DATASET`: everything that the messages themselves do not say.
+
+    Raises
+    ------
+    ValueError
+        If `metadata` uses a reserved key.
+    """
+    if taken := sorted(set(metadata) & set(RESERVED)):
+        raise ValueError(f"the metadata keys {', '.join(taken)} are the file's own")
+    order = [channel.name for channel in recording.channels]
+    entries = [
+        {"name": c.name, "unit": c.unit, "hold": c.hold, "topic": topic.path, "field": field}
+        for topic in topics
+        for c, field in zip(topic.channels, topic.fields, strict=True)
+    ]
+    entries.sort(key=lambda entry: order.index(entry["name"]))
+    sampling = recording.sampling
+    return {
+        "format": FORMAT,
+        "sample_time": f"{sampling.period:.12g}" if sampling.is_regular else "",
+        "channels": json.dumps(entries),
+        "topics": json.dumps({topic.path: topic.clock.as_dict() for topic in topics}),
+        "segments": json.dumps([asdict(segment) for segment in recording.segments]),
+        **metadata,
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelEntry:
+    """Where one channel of the recording stands in the file."""
+
+    name: str
+    unit: str
+    hold: Any
+    topic: str
+    field: str
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """The record `DATASET`, checked."""
+
+    channels: tuple[ChannelEntry, ...]
+    clocks: Mapping[str, Clock]
+    segments: tuple[Segment, ...]
+
+
+def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
+    """Check the content of a record `DATASET`.
+
+    Raises
+    ------
+    ValueError
+        If it is not what `manifest_of` writes; it may come from anyone.
+    """
+    try:
+        if metadata["format"] != FORMAT:
+            raise ValueError(f"its format is {metadata['format']!r}; this program reads {FORMAT!r}")
+        channels = tuple(_channel(entry) for entry in json.loads(metadata["channels"]))
+        clocks = json.loads(metadata["topics"])
+        segments = tuple(_segment(entry) for entry in json.loads(metadata["segments"]))
+        manifest = Manifest(
+            channels, {path: Clock.from_dict(entry) for path, entry in clocks.items()}, segments
+        )
+    except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise ValueError(f"{type(error).__name__}: {error}") from None
+    names = {one.name for one in channels}
+    if not names or len(names) != len(channels):
+        raise ValueError("its channels have no names, or the same name twice")
+    if any(one.topic not in manifest.clocks for one in channels):
+        raise ValueError("a channel names a topic that is not listed")
+    return manifest
+
+
+def _channel(entry: Mapping[str, Any]) -> ChannelEntry:
+    made = ChannelEntry(**entry)
+    texts = (made.name, made.unit, made.topic, made.field)
+    if not all(isinstance(text, str) for text in texts) or made.hold not in HOLDS:
+        raise ValueError(f"{entry!r} is not the entry of a channel")
+    return made
+
+
+def _segment(entry: Mapping[str, Any]) -> Segment:
+    made = Segment(**entry)
+    numbers = (made.start, made.stop, made.origin)
+    plain = all(isinstance(one, int | float) and np.isfinite(one) for one in numbers)
+    labels = isinstance(made.labels, dict) and all(
+        isinstance(one, (str, *get_args(int | float))) for one in made.labels.values()
+    )
+    if not plain or not labels or made.start > made.stop:
+        raise ValueError(f"{entry!r} is not a segment")
+    return made
