@@ -1,0 +1,398 @@
+"""The lease queue: what must hold on SQLite and on PostgreSQL alike."""
+
+import threading
+from datetime import timedelta
+
+import pytest
+
+from service.storage.errors import Conflict, LeaseLost, NotFound
+from service.storage.events import EventRepository
+from service.storage.jobs import JobRepository
+from service.storage.ledger import Cell, RunLedger, RunOutcome
+from service.storage.queue import Lease, Progress, Queue
+from service.storage.tables import Job, State
+from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
+
+LEASE = timedelta(seconds=30)
+ENDS = [State.SUCCEEDED, State.FAILED, State.CANCELLED]
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+def reap(database, clock):
+    with database.write() as session:
+        return Queue(session, clock).reap()
+
+
+def finish(database, lease, state=State.SUCCEEDED, error=None):
+    with database.write() as session:
+        Queue(session).finish(lease, state, error)
+
+
+def lose(database, clock):
+    """Claim whatever waits, fall silent, and be reaped."""
+    got = claim(database, "silent", clock)
+    clock.advance(31)
+    return got, reap(database, clock)
+
+
+def test_an_empty_queue_gives_nothing(database):
+    assert claim(database) is None
+
+
+def test_jobs_come_by_priority_then_by_age(database):
+    old, young = submit(database), submit(database)
+    urgent = submit(database, priority=5)
+    assert [claim(database).job.id for _ in range(3)] == [urgent, old, young]
+    assert claim(database) is None
+
+
+def test_a_claimed_job_runs_under_its_first_attempt(database, clock):
+    job_id = submit(database)
+    got = claim(database, "d1", clock)
+    assert got.lease == Lease(job_id, 1, "d1")
+    job = job_of(database, job_id)
+    assert (job.state, job.attempt, job.lease_owner) == (State.RUNNING, 1, "d1")
+    assert job.started_at == clock.now
+    assert job.lease_until == clock.now + LEASE
+
+
+def test_no_two_claimers_ever_get_the_same_job(database):
+    jobs = {submit(database) for _ in range(40)}
+    taken, start = [], threading.Barrier(4)
+
+    def work(owner):
+        start.wait()
+        while (got := claim(database, owner)) is not None:
+            taken.append(got.job.id)
+
+    threads = [threading.Thread(target=work, args=(f"d{i}",)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(taken) == len(jobs)
+    assert set(taken) == jobs
+
+
+@pytest.mark.postgres
+def test_a_claimer_does_not_wait_for_a_rival_that_has_not_committed(postgres_database):
+    first, second = submit(postgres_database), submit(postgres_database)
+    with postgres_database.write() as slow:
+        assert Queue(slow).claim("slow").job.id == first
+        assert claim(postgres_database, "quick").job.id == second
+        assert claim(postgres_database, "quick") is None
+
+
+def test_a_claim_that_is_rolled_back_leaves_the_job_queued(database):
+    job_id = submit(database)
+
+    def claim_and_crash():
+        with database.write() as session:
+            Queue(session).claim("d1")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        claim_and_crash()
+    assert claim(database).lease == Lease(job_id, 1, "d1")
+
+
+def test_one_heartbeat_renews_all_leases_of_its_owner_and_no_others(database, clock):
+    mine = {submit(database), submit(database)}
+    for _ in mine:
+        claim(database, "d1", clock)
+    other = submit(database)
+    claim(database, "d2", clock)
+    clock.advance(20)
+    with database.write() as session:
+        held = Queue(session, clock).heartbeat("d1")
+    assert {one.lease for one in held} == {Lease(job_id, 1, "d1") for job_id in mine}
+    clock.advance(11)
+    assert reap(database, clock).requeued == (other,)
+
+
+def test_a_heartbeat_tells_of_a_wish_to_cancel(database):
+    got, _ = claimed(database)
+    with database.write() as session:
+        JobRepository(session).cancel(got.job.id)
+    with database.write() as session:
+        (held,) = Queue(session).heartbeat("d1")
+    assert held.cancel_requested
+
+
+def test_a_heartbeat_does_not_get_back_a_lease_that_was_lost(database, clock):
+    submit(database)
+    lose(database, clock)
+    claim(database, "d2", clock)
+    with database.write() as session:
+        assert Queue(session, clock).heartbeat("silent") == ()
+
+
+def test_the_reaper_leaves_a_living_lease_alone(database, clock):
+    job_id = submit(database)
+    claim(database, "d1", clock)
+    clock.advance(29)
+    assert reap(database, clock).requeued == ()
+    assert state_of(database, job_id) is State.RUNNING
+
+
+def test_an_expired_job_is_queued_again_with_its_unfinished_runs(database, clock):
+    submit(database, n_runs=2)
+    got = claim(database, "d1", clock)
+    with database.write() as session:
+        ledger = RunLedger(session, got.lease)
+        ledger.create(Cell(number=i) for i in range(2))
+        first, second = (run.id for run in ledger.pending())
+        ledger.start([first, second])
+        ledger.record([RunOutcome(run_id=first, state=State.SUCCEEDED, best_rms=0.5)])
+    clock.advance(31)
+    assert reap(database, clock).requeued == (got.job.id,)
+    assert [run.state for run in runs_of(database, got.job.id)] == [State.SUCCEEDED, State.QUEUED]
+    again = claim(database, "d2", clock)
+    assert again.lease.attempt == 2
+    with database.write() as session:
+        assert [run.id for run in RunLedger(session, again.lease).pending()] == [second]
+
+
+def test_a_job_that_loses_its_lease_too_often_fails_and_says_why(database, clock):
+    job_id = submit(database, max_attempts=2)
+    assert lose(database, clock)[1].requeued == (job_id,)
+    assert lose(database, clock)[1].failed == (job_id,)
+    job = job_of(database, job_id)
+    assert job.state is State.FAILED
+    assert "fell silent 2 times" in job.error
+    assert "silent" in job.error
+    assert job.finished_at == clock.now
+    assert claim(database) is None
+
+
+def test_a_job_that_was_to_be_cancelled_is_never_retried(database, clock):
+    job_id = submit(database)
+    claim(database, "d1", clock)
+    with database.write() as session:
+        JobRepository(session).cancel(job_id)
+    clock.advance(31)
+    assert reap(database, clock).cancelled == (job_id,)
+    assert state_of(database, job_id) is State.CANCELLED
+
+
+def test_two_reapers_bury_a_job_once(database, clock):
+    submit(database)
+    claim(database, "d1", clock)
+    clock.advance(31)
+    reap(database, clock)
+    assert reap(database, clock).requeued == ()
+
+
+def test_a_released_job_is_queued_and_nothing_is_counted_against_it(database):
+    got, _ = claimed(database)
+    with database.write() as session:
+        Queue(session).release(got.lease)
+    job = job_of(database, got.job.id)
+    assert (job.state, job.lost_leases, job.lease_owner) == (State.QUEUED, 0, None)
+    assert claim(database).lease.attempt == 2
+
+
+def test_a_job_released_after_a_wish_to_cancel_is_cancelled(database):
+    got, _ = claimed(database)
+    with database.write() as session:
+        JobRepository(session).cancel(got.job.id)
+        Queue(session).release(got.lease)
+    assert state_of(database, got.job.id) is State.CANCELLED
+
+
+LATE_WRITES = {
+    "hold": lambda session, lease, _: Queue(session).hold(lease),
+    "report": lambda session, lease, _: Queue(session).report(lease, Progress(5)),
+    "tell": lambda session, lease, _: Queue(session).tell(lease, "log", {"line": "late"}),
+    "finish": lambda session, lease, _: Queue(session).finish(lease, State.FAILED, "late"),
+    "release": lambda session, lease, _: Queue(session).release(lease),
+    "start": lambda session, lease, run: RunLedger(session, lease).start([run]),
+    "pending": lambda session, lease, _: RunLedger(session, lease).pending(),
+    "create": lambda session, lease, _: RunLedger(session, lease).create([]),
+    "append": lambda session, lease, _: RunLedger(session, lease).append([]),
+    "save": lambda session, lease, run: RunLedger(session, lease).save([(run, 1, b"late")]),
+    "checkpoints": lambda session, lease, _: RunLedger(session, lease).checkpoints(),
+    "record": lambda session, lease, run: RunLedger(session, lease).record(
+        [RunOutcome(run_id=run, state=State.SUCCEEDED, best_rms=9.0)]
+    ),
+}
+
+
+@pytest.mark.parametrize("write", LATE_WRITES.values(), ids=LATE_WRITES)
+def test_a_late_writer_is_refused_and_changes_nothing(database, clock, write):
+    got, (run_id,) = claimed(database)
+    with database.write() as session:
+        Queue(session, clock).heartbeat("d1")  # in the past of the true clock: it expires
+    clock.advance(31)
+    assert reap(database, clock).requeued == (got.job.id,)
+    with database.read() as session:
+        before = EventRepository(session).last_id(got.job.id)
+    for rival in (None, "d2"):  # while it is queued again, and while another has it
+        if rival:
+            claim(database, rival, clock)
+            before += 1
+        with pytest.raises(LeaseLost, match="attempt 1"), database.write() as session:
+            write(session, got.lease, run_id)
+        (run,) = runs_of(database, got.job.id)
+        assert (run.state, run.best_rms, run.attempt) == (State.QUEUED, None, 0)
+        with database.read() as session:
+            assert EventRepository(session).last_id(got.job.id) == before
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_a_terminal_state_is_never_overwritten(database, clock, end):
+    got, (run_id,) = claimed(database)
+    with database.write() as session:
+        RunLedger(session, got.lease).record([RunOutcome(run_id=run_id, state=end)])
+        Queue(session).finish(got.lease, end, "as told")
+    for other in ENDS:
+        with pytest.raises(LeaseLost):
+            finish(database, got.lease, other)
+    clock.advance(10**9)
+    reap(database, clock)
+    assert claim(database) is None
+    job = job_of(database, got.job.id)
+    assert (job.state, job.error) == (end, "as told")
+    assert runs_of(database, got.job.id)[0].state is end
+
+
+def test_a_job_cannot_succeed_while_a_run_is_unfinished(database):
+    got, _ = claimed(database, n_runs=2)
+    with pytest.raises(Conflict, match="2 of its runs"):
+        finish(database, got.lease)
+    assert state_of(database, got.job.id) is State.RUNNING
+
+
+@pytest.mark.parametrize("end", [State.FAILED, State.CANCELLED])
+def test_unfinished_runs_end_with_their_job(database, end):
+    got, _ = claimed(database, n_runs=3)
+    finish(database, got.lease, end, "no memory")
+    assert {(run.state, run.error) for run in runs_of(database, got.job.id)} == {(end, "no memory")}
+
+
+def test_a_queued_job_is_cancelled_at_once(database):
+    job_id = submit(database)
+    with database.write() as session:
+        assert JobRepository(session).cancel(job_id).state is State.CANCELLED
+    assert claim(database) is None
+
+
+def test_a_running_job_goes_on_until_its_dispatcher_cancels_it(database):
+    got, _ = claimed(database)
+    with database.write() as session:
+        job = JobRepository(session).cancel(got.job.id)
+        assert (job.state, job.cancel_requested) == (State.RUNNING, True)
+    finish(database, got.lease, State.CANCELLED)
+    assert state_of(database, got.job.id) is State.CANCELLED
+
+
+def test_cancelling_twice_is_as_cancelling_once(database):
+    job_id = submit(database)
+    for _ in range(2):
+        with database.write() as session:
+            assert JobRepository(session).cancel(job_id).state is State.CANCELLED
+
+
+@pytest.mark.parametrize("end", [State.SUCCEEDED, State.FAILED])
+def test_a_finished_job_cannot_be_cancelled(database, end):
+    got, (run_id,) = claimed(database)
+    with database.write() as session:
+        RunLedger(session, got.lease).record([RunOutcome(run_id=run_id, state=end)])
+        Queue(session).finish(got.lease, end)
+    with pytest.raises(Conflict, match=end.value), database.write() as session:
+        JobRepository(session).cancel(got.job.id)
+
+
+def test_cancel_and_claim_at_once_never_lose_the_wish(database):
+    for _ in range(8):
+        job_id, start = submit(database), threading.Barrier(2)
+
+        def cancel(job_id=job_id, start=start):
+            start.wait()
+            with database.write() as session:
+                JobRepository(session).cancel(job_id)
+
+        thread = threading.Thread(target=cancel)
+        thread.start()
+        start.wait()
+        got = claim(database)
+        thread.join()
+        job = job_of(database, job_id)
+        assert job.cancel_requested
+        assert job.state is (State.RUNNING if got else State.CANCELLED)
+
+
+def test_cancel_and_finish_at_once_end_in_one_state_and_one_end_event(database):
+    for _ in range(8):
+        got, (run_id,) = claimed(database)
+        start = threading.Barrier(2)
+
+        def cancel(job_id=got.job.id, start=start):
+            start.wait()
+            try:
+                with database.write() as session:
+                    JobRepository(session).cancel(job_id)
+            except Conflict:
+                pass
+
+        thread = threading.Thread(target=cancel)
+        thread.start()
+        start.wait()
+        with database.write() as session:
+            RunLedger(session, got.lease).record([RunOutcome(run_id=run_id, state=State.SUCCEEDED)])
+            Queue(session).finish(got.lease, State.SUCCEEDED)
+        thread.join()
+        assert state_of(database, got.job.id) is State.SUCCEEDED
+        with database.read() as session:
+            kinds = [event.kind for event in EventRepository(session).after(got.job.id)]
+        assert kinds.count("end") == 1
+        assert kinds[-1] == "end"
+
+
+def test_progress_is_kept_and_told_and_the_best_never_rises(database):
+    got, _ = claimed(database)
+    for rms in (0.5, None, 0.2, 0.9):
+        with database.write() as session:
+            Queue(session).report(got.lease, Progress(100, 7, rms, 3.5))
+    job = job_of(database, got.job.id)
+    assert (job.evaluations, job.generation, job.best_rms, job.seconds_left) == (100, 7, 0.2, 3.5)
+    with database.read() as session:
+        events = EventRepository(session).after(got.job.id)
+    told = [event.data["best_rms"] for event in events if event.kind == "progress"]
+    assert told == [0.5, 0.5, 0.2, 0.2]
+
+
+def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
+    got, (done, bad, _) = claimed(database, n_runs=3)
+    with database.write() as session:
+        RunLedger(session, got.lease).record(
+            [RunOutcome(run_id=done, state=State.SUCCEEDED, best_rms=0.1),
+             RunOutcome(run_id=bad, state=State.FAILED, error="diverged")]
+        )  # fmt: skip
+        Queue(session).finish(got.lease, State.FAILED, "1 run failed")
+    with database.write() as session:
+        job = JobRepository(session).resume(got.job.id)
+        assert (job.state, job.n_done, job.n_failed, job.error) == (State.QUEUED, 1, 0, None)
+    states = [run.state for run in runs_of(database, got.job.id)]
+    assert states == [State.SUCCEEDED, State.QUEUED, State.QUEUED]
+    assert claim(database).lease.attempt == 2
+
+
+def test_only_a_failed_or_cancelled_job_can_be_resumed(database):
+    job_id = submit(database)
+    with pytest.raises(Conflict, match="queued"), database.write() as session:
+        JobRepository(session).resume(job_id)
+    with pytest.raises(NotFound), database.write() as session:
+        JobRepository(session).resume("job_none")
+
+
+def test_the_queue_counts_what_waits(database):
+    submit(database), submit(database)
+    claim(database)
+    with database.read() as session:
+        assert Queue(session).n_queued() == 1
+        assert session.query(Job).count() == 2

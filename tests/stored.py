@@ -1,0 +1,68 @@
+"""Short ways to put rows into a test's database and to look at them."""
+
+from datetime import UTC, datetime, timedelta
+
+from service.storage.datasets import NewDataset
+from service.storage.jobs import JobRepository, NewJob
+from service.storage.ledger import Cell, RunLedger
+from service.storage.queue import Claim, Queue
+from service.storage.runs import RunRepository
+from service.storage.sessions import Database
+from service.storage.tables import Job, Run, State
+
+
+class Clock:
+    """A clock that only tests move."""
+
+    def __init__(self) -> None:
+        self.now = datetime(2026, 1, 1, tzinfo=UTC)
+
+    def __call__(self) -> datetime:
+        return self.now
+
+    def advance(self, seconds: float) -> None:
+        self.now += timedelta(seconds=seconds)
+
+
+def submit(database: Database, name: str = "tube", **values) -> str:
+    with database.write() as session:
+        new = NewJob(name=name, spec={"model": "tube"}, **values)
+        return JobRepository(session).submit(new).job.id
+
+
+def claim(database: Database, owner: str = "d1", clock: Clock | None = None) -> Claim | None:
+    with database.write() as session:
+        return Queue(session, *([clock] if clock else [])).claim(owner)
+
+
+def claimed(database: Database, n_runs: int = 1, **values) -> tuple[Claim, list[str]]:
+    """A submitted and claimed job, and the identifiers of its runs."""
+    submit(database, n_runs=n_runs, **values)
+    got = claim(database)
+    with database.write() as session:
+        ledger = RunLedger(session, got.lease)
+        ledger.create(Cell(number=i, cell={"/seed": i}, seed=i) for i in range(n_runs))
+        return got, [run.id for run in ledger.pending()]
+
+
+def job_of(database: Database, job_id: str) -> Job:
+    with database.read() as session:
+        return JobRepository(session).get(job_id)
+
+
+def state_of(database: Database, job_id: str) -> State:
+    return job_of(database, job_id).state
+
+
+def runs_of(database: Database, job_id: str) -> list[Run]:
+    with database.read() as session:
+        return list(RunRepository(session).page(job_id, limit=10_000).items)
+
+
+def new_dataset(**values) -> NewDataset:
+    given = {
+        "name": "step", "kind": "upload", "sha256": "a" * 64, "source_key": "s1",
+        "size_bytes": 10, "n_samples": 5, "duration": 1.0, "sample_time": 0.25,
+        "channels": [{"name": "u", "unit": "V"}], **values,
+    }  # fmt: skip
+    return NewDataset(**given)
