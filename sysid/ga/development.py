@@ -1,0 +1,166 @@
+"""The development operator of the improved algorithm: an adaptive sequence search.
+
+Like the paper's sequence search it proposes neighbours of one individual, keeps the best and goes
+on while it gains; but direction and size of its steps come from the output's sensitivities (one
+Levenberg–Marquardt step a generation, several dampings tried at once).
+
+A lag makes the fitness over a whole record a comb of local minima, the denser the longer the
+record. Hence some developments begin with the first part of the record, where the comb is wide,
+from the best of fresh individuals, and take in the rest by and by.
+"""
+
+import numpy as np
+
+from sysid.ga.chromosome import coded, decoded, located
+from sysid.ga.gauss_newton import damped_step, normal_equations, partial_fitness, spread
+from sysid.ga.operators import rank
+from sysid.ga.random import DEVELOPMENT, below, draws, unit
+from sysid.ga.state import (
+    DAMPING, DIFFERENCE, DEVELOPMENTS, EVALUATIONS, FAILED, GENERATION, HORIZON, OLD, POINT, PROBES, SEQUENCE,
+    SETTLED, STEP, Plan,
+)  # fmt: skip
+from sysid.kernels.calls import compiled
+from sysid.kernels.evaluation import population_fitness, population_predictions
+from sysid.kernels.evaluator import Evaluator
+from sysid.types import FloatArray, IntArray, WordArray
+
+TRIALS = 3
+DIFFERENCE_STEP = 1e-6  # of the range: far above rounding, far below what curvature needs
+FACTOR = 10.0  # between the dampings of two trials
+FIRST_DAMPING = 1e-2
+N_HORIZONS = 5
+MOST_STEPS = 12
+ENOUGH = 1e-4  # relative gain of a step below which a full-record search ends
+ENOUGH_PART = 1e-2
+
+
+@compiled
+def _fresh(
+    evaluator: Evaluator, plan: Plan, shape: tuple[int, int], counters: IntArray, horizon: float
+) -> FloatArray:
+    """The best of a population of random places, judged by the record up to `horizon`."""
+    places = np.empty(shape)
+    for p in range(shape[0]):
+        for d in range(shape[1]):
+            draw = 1 + p * shape[1] + d
+            word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
+            places[p, d] = unit(word[0])
+    counters[EVALUATIONS] += shape[0]
+    predicted = population_predictions(evaluator, located(evaluator, places))
+    best, least = 0, np.inf
+    for p in range(shape[0]):
+        value = partial_fitness(evaluator, plan, predicted[p], horizon)
+        if value < least:
+            best, least = p, value
+    return places[best]
+
+
+@compiled
+def start_development(
+    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray,
+    counters: IntArray, memory: FloatArray,
+) -> None:  # fmt: skip
+    """Choose the point to begin with, and how much of the record counts at first."""
+    counters[DEVELOPMENTS] += 1
+    counters[SEQUENCE], counters[STEP], counters[FAILED] = 1, 0, 0
+    memory[DAMPING], memory[HORIZON] = FIRST_DAMPING, 1.0
+    memory[DIFFERENCE] = DIFFERENCE_STEP
+    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    chosen, counters[PROBES] = 0, 0
+    if counters[DEVELOPMENTS] % 2 == 0:
+        memory[HORIZON] = 0.5 ** below(word[0], N_HORIZONS)
+        chosen = below(word[1], 2 * words.shape[0])
+    elif counters[SETTLED]:
+        memory[DIFFERENCE] = 10.0 ** (-2.0 - 4.0 * unit(word[0]))
+        counters[PROBES] = words.shape[0]
+    if chosen < words.shape[0]:
+        memory[OLD] = fitness[chosen]
+        memory[POINT:] = decoded(words[chosen : chosen + 1], plan.bits)[0]
+    else:
+        memory[OLD] = np.inf
+        memory[POINT:] = _fresh(evaluator, plan, words.shape, counters, memory[HORIZON])
+
+
+@compiled
+def _keep(words: WordArray, fitness: FloatArray, memory: FloatArray, word: WordArray,
+          reached: float) -> None:  # fmt: skip
+    """Put a developed individual in the place of its former self, else of the worst."""
+    place = fitness.size - 1
+    for p in range(fitness.size - 1, -1, -1):
+        if fitness[p] == memory[OLD]:
+            place = p
+    if reached < fitness[place]:
+        words[place], fitness[place] = word, reached
+        rank(words, fitness)
+        memory[OLD] = reached
+
+
+@compiled
+def _next_part(counters: IntArray, memory: FloatArray, fitness: FloatArray) -> None:
+    """Take in more of the record; at its end, the development ends."""
+    counters[FAILED] = 0
+    memory[DAMPING] = FIRST_DAMPING
+    if memory[HORIZON] < 1.0:
+        memory[HORIZON] *= 2.0
+        return
+    counters[SEQUENCE], counters[STEP] = 0, 0
+    if memory[OLD] == fitness[0]:
+        counters[SETTLED] = 1
+
+
+@compiled
+def _trials(plan: Plan, counters: IntArray, memory: FloatArray, matrix: FloatArray,
+            gradient: FloatArray, base: float) -> FloatArray:  # fmt: skip
+    """Places to try: steps of several dampings, and probes spread as the estimate's covariance."""
+    point = memory[POINT:]
+    places = np.empty((TRIALS + counters[PROBES], point.size))
+    for t in range(TRIALS):
+        places[t] = damped_step(matrix, gradient, point, memory[DAMPING] * FACTOR ** (t - 1))
+    deviation = np.empty(point.size)
+    for t in range(TRIALS, places.shape[0]):
+        for d in range(point.size):
+            draw = 1 + t * point.size + d
+            word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
+            size = base * 10.0 ** (-2.0 * unit(word[2]))
+            deviation[d] = size * np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(
+                2.0 * np.pi * unit(word[1])
+            )
+        places[t] = spread(matrix, gradient, point, deviation)
+    return places
+
+
+@compiled
+def adaptive_sequence(
+    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray,
+    counters: IntArray, memory: FloatArray,
+) -> None:  # fmt: skip
+    """One generation of the adaptive search: sensitivities, then several steps at once."""
+    point, horizon = memory[POINT:], memory[HORIZON]
+    counters[STEP] += 1
+    counters[EVALUATIONS] += point.size + 1 + TRIALS + counters[PROBES]
+    matrix, gradient, base = normal_equations(
+        evaluator, plan, point, horizon, memory[DIFFERENCE]
+    )
+    proposals = coded(_trials(plan, counters, memory, matrix, gradient, base), plan.bits)
+    places = decoded(proposals, plan.bits)
+    if horizon < 1.0:
+        predicted = population_predictions(evaluator, located(evaluator, places))
+        reached = np.empty(places.shape[0])
+        for t in range(places.shape[0]):
+            reached[t] = partial_fitness(evaluator, plan, predicted[t], horizon)
+    else:
+        reached = population_fitness(evaluator, located(evaluator, places))
+    best = np.argmin(reached)
+    enough = ENOUGH if horizon == 1.0 else ENOUGH_PART
+    if reached[best] < base:
+        memory[POINT:] = places[best]
+        memory[DAMPING] *= FACTOR ** (min(best, TRIALS) - 2)
+        if horizon == 1.0:
+            _keep(words, fitness, memory, proposals[best], reached[best])
+        if reached[best] > base * (1.0 - enough) or counters[STEP] >= MOST_STEPS:
+            _next_part(counters, memory, fitness)
+        return
+    memory[DAMPING] *= FACTOR**TRIALS
+    counters[FAILED] += 1
+    if counters[FAILED] == 2 or not np.isfinite(base):
+        _next_part(counters, memory, fitness)
