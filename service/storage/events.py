@@ -1,5 +1,6 @@
 """What happens to a job, in order: the source of the event stream."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 from sqlalchemy import delete, func, select
@@ -43,6 +44,13 @@ class EventRepository:
         """A job's events after the one numbered `last_id`, oldest first."""
         newer = select(Event).where(Event.job_id == job_id, Event.id > last_id)
         return list(self._session.scalars(newer.order_by(Event.id).limit(limit)))
+
+    def latest(self, job_id: str, limit: int = 100, kinds: Sequence[EventKind] = ()) -> list[Event]:
+        """A job's last events of these kinds (of all, if none is named), oldest first."""
+        query = select(Event).where(Event.job_id == job_id).order_by(Event.id.desc()).limit(limit)
+        if kinds:
+            query = query.where(Event.kind.in_(kinds))
+        return list(self._session.scalars(query))[::-1]
 
     def last_id(self, job_id: str) -> int:
         """Number of a job's latest event; 0 when there is none."""

@@ -1,0 +1,127 @@
+"""Routes of the pages, of the figures that they show, and of the files that they load."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, Response
+
+from service.api.deps import Cursor, PartsDep, ReadSession
+from service.errors import NotFound
+from service.storage.tables import State
+from service.web import assets, figures, pages, report, results
+from service.web.results import FigureChoice, FigureName
+
+router = APIRouter()
+
+# Scripts and data come from here only. Plotly styles its own elements, hence the inline styles;
+# it writes pictures for download through blob: and data: addresses.
+PAGE_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' data: blob:; connect-src 'self'; form-action 'self'; base-uri 'none'; "
+        "frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+FOREVER = "public, max-age=31536000, immutable"
+
+
+class _Page(HTMLResponse):
+    """A page, with what a browser may load for it."""
+
+    def __init__(self, content: str) -> None:
+        super().__init__(content, headers=PAGE_HEADERS)
+
+
+Hidden: dict[str, Any] = {"include_in_schema": False, "response_class": HTMLResponse}
+StateFilter = Annotated[State | None, Query()]
+Choice = Annotated[FigureChoice, Query()]
+
+
+@router.get("/", **Hidden)
+def jobs_page(session: ReadSession, state: StateFilter = None, cursor: Cursor = None) -> Response:
+    """The list of jobs, and the form of a new identification."""
+    return _Page(pages.jobs_page(session, state, cursor))
+
+
+@router.get("/jobs/{job_id}", **Hidden)
+def job_page(
+    job_id: str, request: Request, session: ReadSession, cursor: Cursor = None
+) -> Response:
+    """One job with its runs."""
+    return _Page(pages.job_page(session, job_id, str(request.base_url), cursor=cursor))
+
+
+@router.get("/runs/{run_id}", **Hidden)
+def run_page(run_id: str, request: Request, session: ReadSession) -> Response:
+    """The job of one run, with this run in full."""
+    return _Page(pages.run_page(session, run_id, str(request.base_url)))
+
+
+@router.get("/datasets/{dataset_id}", **Hidden)
+def dataset_page(dataset_id: str, session: ReadSession) -> Response:
+    """One dataset: signals, channels, lineage."""
+    return _Page(pages.dataset_page(session, dataset_id))
+
+
+@router.get("/pages/models/{name}.yaml", **Hidden)
+def model_text(name: str, session: ReadSession) -> Response:
+    """A model as the text that the form shows."""
+    return PlainTextResponse(pages.model_text(session, name))
+
+
+@router.get("/static/{name}", **Hidden)
+def static(name: str, request: Request) -> Response:
+    """Our own files, and Plotly out of its installed wheel."""
+    if name == assets.plotly_name():
+        return _plotly(request)
+    found = assets.asset(name)
+    if found is None:
+        raise NotFound("file", name)
+    headers = {"ETag": found.etag, "Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
+    if found.etag in request.headers.get("if-none-match", ""):
+        return Response(status_code=304, headers=headers)
+    return Response(found.content, media_type=found.media_type, headers=headers)
+
+
+@router.get("/v1/runs/{run_id}/figures/{name}", tags=["runs"], response_class=JSONResponse)
+def run_figure(
+    run_id: str, name: FigureName, parts: PartsDep, session: ReadSession, choice: Choice
+) -> Response:
+    """A figure of a run as Plotly JSON, or the numbers it draws as CSV."""
+    return _figure(results.run_figure(session, parts.store, run_id, name, choice), name, choice)
+
+
+@router.get("/v1/datasets/{dataset_id}/figures/signals", tags=["datasets"],
+            response_class=JSONResponse)  # fmt: skip
+def dataset_figure(
+    dataset_id: str, parts: PartsDep, session: ReadSession, choice: Choice
+) -> Response:
+    """The signals of a dataset as Plotly JSON, or the numbers drawn as CSV."""
+    found = results.dataset_figure(session, parts.store, dataset_id, choice)
+    return _figure(found, "signals", choice)
+
+
+@router.get("/v1/jobs/{job_id}/report", tags=["jobs"], response_class=HTMLResponse)
+def job_report(job_id: str, parts: PartsDep, session: ReadSession) -> Response:
+    """The job as one HTML file that needs no server: tables, figures, the exact request."""
+    made = report.job_report(session, parts.store, job_id)
+    policy = {"Content-Security-Policy": report.policy(), "X-Content-Type-Options": "nosniff"}
+    return HTMLResponse(made, headers=policy)
+
+
+def _figure(figure: figures.Figure, name: str, choice: FigureChoice) -> Response:
+    if choice.format == "csv":
+        disposition = {"Content-Disposition": f'attachment; filename="{name}.csv"'}
+        return Response(figures.as_csv(figure), media_type="text/csv", headers=disposition)
+    return JSONResponse(figures.in_theme(figure, choice.theme))
+
+
+def _plotly(request: Request) -> Response:
+    headers = {"Cache-Control": FOREVER, "Vary": "Accept-Encoding"}
+    if "gzip" not in request.headers.get("accept-encoding", ""):
+        return FileResponse(assets.plotly_file(), media_type="text/javascript", headers=headers)
+    headers["Content-Encoding"] = "gzip"
+    return Response(assets.plotly_compressed(), media_type="text/javascript", headers=headers)

@@ -1,0 +1,98 @@
+"""What the figures and the tables of one run are made of: plain values, whoever stored them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Improvement:
+    """A better champion of one island; `parameters` in the order of the free parameters."""
+
+    generation: int
+    evaluations: int
+    rms: float
+    phase: str
+    parameters: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SoughtParameter:
+    """A free parameter: its bounds, and its estimate once there is one."""
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    scale: Literal["linear", "log"] = "linear"
+    value: float | None = None
+    stderr: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trace:
+    """One signal of the response on its own times (s)."""
+
+    name: str
+    unit: str
+    times: Floats
+    values: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OutputTraces:
+    """A measured output and what the identified model gives at the same times."""
+
+    measured: Trace
+    identified: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Experiment:
+    """One record as fitted or as kept for validation.
+
+    `validation_from` is the time (s) from which on the samples were not used for the estimate;
+    None: all were used; minus infinity: none was.
+    """
+
+    name: str
+    outputs: tuple[OutputTraces, ...]
+    inputs: tuple[Trace, ...]
+    validation_from: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RunEvidence:
+    """All that is known of one run's search and result.
+
+    Attributes
+    ----------
+    unit : str
+        Unit of the RMS.
+    history : sequence of sequence of Improvement
+        One sequence per island, in the order of the generations.
+    epoch : int
+        Generations between two migrations; 0 when no island sends any.
+    migrations : sequence of int
+        Epochs after which migrants went.
+    islands : sequence of (champion RMS, refined RMS or None)
+        What each island found.
+    correlation : mapping or None
+        ``{"names": [...], "matrix": [[...]]}``.
+    """
+
+    id: str
+    unit: str
+    generations: int = 0
+    evaluations: int = 0
+    parameters: Sequence[SoughtParameter] = ()
+    history: Sequence[Sequence[Improvement]] = ()
+    epoch: int = 0
+    migrations: Sequence[int] = ()
+    islands: Sequence[tuple[float, float | None]] = ()
+    correlation: Mapping[str, Any] | None = field(default=None)

@@ -1,0 +1,184 @@
+"""Figures over time: measured against identified output, and the signals of a dataset."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from service.web import theme
+from service.web.decimation import MAX_POINTS, extremes, window
+from service.web.evidence import Experiment, Floats, OutputTraces, Trace
+from service.web.figures import MARGIN, Figure, finite, layout
+
+_GAP_PX = 20
+_OUTPUT_PX, _RESIDUAL_PX, _INPUT_PX, _SIGNAL_PX = 240, 84, 110, 120
+
+
+def response(
+    experiment: Experiment, start: float | None = None, stop: float | None = None
+) -> Figure:
+    """Measured against identified outputs, residuals under each, inputs below, one time axis.
+
+    Parameters
+    ----------
+    start, stop : float, optional
+        Only this stretch (s), so that a zoom shows more of the samples.
+    """
+    figure = _stack(_response_rows(len(experiment.outputs), len(experiment.inputs)))
+    for number, output in enumerate(experiment.outputs):
+        span = window(output.measured.times, start, stop)
+        figure["data"] += _output_traces(output, span, f"y{2 * number + 1}", number == 0)
+        figure["data"].append(_residual(output, span, f"y{2 * number + 2}", number == 0))
+        unit = _bracketed(output.measured.unit)
+        _name_axis(figure, 2 * number + 1, f"{output.measured.name}{unit}")
+        _name_axis(figure, 2 * number + 2, "residual")
+    for number, signal in enumerate(experiment.inputs, 2 * len(experiment.outputs) + 1):
+        span = window(signal.times, start, stop)
+        figure["data"].append(_line(signal, span, f"y{number}", theme.GREEN, legend=True))
+        _name_axis(figure, number, f"{signal.name}{_bracketed(signal.unit)}")
+    figure["layout"].update(_shading(experiment))
+    traces = [output.measured for output in experiment.outputs] + list(experiment.inputs)
+    figure["layout"]["meta"] = {"thinned": _is_thinned(traces)}
+    return figure
+
+
+def response_height(n_outputs: int, n_inputs: int) -> int:
+    """Height (px) of a response, so that a page can leave room for it."""
+    return _height(_response_rows(n_outputs, n_inputs))
+
+
+def signals_height(n_channels: int) -> int:
+    """Height (px) of the channels of a dataset."""
+    return _height([_SIGNAL_PX] * n_channels)
+
+
+def signals(
+    channels: Sequence[Trace], start: float | None = None, stop: float | None = None
+) -> Figure:
+    """The channels of a dataset, one under the other."""
+    figure = _stack([_SIGNAL_PX] * len(channels))
+    for number, signal in enumerate(channels, 1):
+        span = window(signal.times, start, stop)
+        colour = theme.SERIES[(number - 1) % len(theme.SERIES)]
+        figure["data"].append(_line(signal, span, f"y{number}", colour, legend=False))
+        _name_axis(figure, number, f"{signal.name}{_bracketed(signal.unit)}")
+    figure["layout"]["meta"] = {"thinned": _is_thinned(channels)}
+    return figure
+
+
+def _response_rows(n_outputs: int, n_inputs: int) -> list[int]:
+    return [_OUTPUT_PX, _RESIDUAL_PX] * n_outputs + [_INPUT_PX] * n_inputs
+
+
+def _height(rows: Sequence[int]) -> int:
+    return sum(rows) + _GAP_PX * max(len(rows) - 1, 0) + MARGIN["t"] + MARGIN["b"]
+
+
+def _is_thinned(traces: Sequence[Trace]) -> bool:
+    """Whether a zoom would show samples that the whole does not."""
+    return any(trace.times.size > MAX_POINTS for trace in traces)
+
+
+def _stack(heights: Sequence[int]) -> Figure:
+    """Empty plots of these heights (px), one under the other over one time axis."""
+    total = sum(heights) + _GAP_PX * max(len(heights) - 1, 0)
+    shared: dict[str, Any] = layout(
+        _height(heights),
+        xaxis={"title": {"text": "time [s]"}, "anchor": f"y{max(len(heights), 1)}"},
+        hovermode="x",
+    )
+    top = total
+    for number, height in enumerate(heights, 1):
+        domain = [max((top - height) / total, 0.0), top / total]
+        shared[f"yaxis{number if number > 1 else ''}"] = {
+            "domain": domain, "anchor": "x", "nticks": 3 if height < _OUTPUT_PX else 7,
+        }  # fmt: skip
+        top -= height + _GAP_PX
+    return {"data": [], "layout": shared}
+
+
+def _name_axis(figure: Figure, number: int, text: str) -> None:
+    figure["layout"][f"yaxis{number if number > 1 else ''}"]["title"] = {
+        "text": text, "standoff": 6, "font": {"size": 11},
+    }  # fmt: skip
+
+
+def _bracketed(unit: str) -> str:
+    return "" if unit == "1" else f" [{unit}]"
+
+
+def _axis(name: str) -> str:
+    return "y" if name == "y1" else name
+
+
+def _output_traces(
+    output: OutputTraces, span: slice, axis: str, in_legend: bool
+) -> list[dict[str, Any]]:
+    times, values = output.measured.times[span], output.measured.values[span]
+    kept = extremes(values, MAX_POINTS)
+    identified = output.identified[span]
+    also = extremes(identified, MAX_POINTS)
+    shared = {"type": "scatter", "yaxis": _axis(axis), "showlegend": in_legend}
+    return [
+        {
+            **shared, "name": "measured", "x": finite(times[kept]), "y": finite(values[kept]),
+            **_measured_look(times, kept.size),
+            "hovertemplate": "%{y:.6g}<extra>measured</extra>",
+        },
+        {
+            **shared, "name": "identified", "mode": "lines",
+            "x": finite(times[also]), "y": finite(identified[also]),
+            "line": {"color": theme.BLUE, "width": 1.6},
+            "hovertemplate": "%{y:.6g}<extra>identified</extra>",
+        },
+    ]  # fmt: skip
+
+
+def _measured_look(times: Floats, drawn: int) -> dict[str, Any]:
+    """Points where single samples can be told apart or share a time, else a line."""
+    pooled = bool(np.any(np.diff(times) <= 0))
+    if pooled or drawn <= 400:
+        return {"mode": "markers", "marker": {"color": theme.GREY, "size": 3 if pooled else 4}}
+    return {"mode": "lines", "line": {"color": theme.GREY, "width": 2.4}}
+
+
+def _residual(output: OutputTraces, span: slice, axis: str, in_legend: bool) -> dict[str, Any]:
+    times = output.measured.times[span]
+    values = output.measured.values[span] - output.identified[span]
+    kept = extremes(values, MAX_POINTS)
+    return {
+        "type": "scatter", "mode": "lines", "name": "residual", "yaxis": _axis(axis),
+        "showlegend": in_legend, "x": finite(times[kept]), "y": finite(values[kept]),
+        "line": {"color": theme.VERMILLION, "width": 1},
+        "hovertemplate": "%{y:.4g}<extra>residual</extra>",
+    }  # fmt: skip
+
+
+def _line(signal: Trace, span: slice, axis: str, colour: str, *, legend: bool) -> dict[str, Any]:
+    times, values = signal.times[span], signal.values[span]
+    kept = extremes(values, MAX_POINTS)
+    return {
+        "type": "scatter", "mode": "lines", "name": signal.name, "yaxis": _axis(axis),
+        "showlegend": legend, "x": finite(times[kept]), "y": finite(values[kept]),
+        "line": {"color": colour, "width": 1.2},
+        "hovertemplate": f"%{{y:.6g}}<extra>{signal.name}</extra>",
+    }  # fmt: skip
+
+
+def _shading(experiment: Experiment) -> dict[str, Any]:
+    """Shade what was kept for validation, and say so."""
+    since = experiment.validation_from
+    if since is None or not experiment.outputs:
+        return {}
+    times = experiment.outputs[0].measured.times
+    first = float(max(since, times[0]))
+    return {
+        "shapes": [{
+            "type": "rect", "x0": first, "x1": float(times[-1]), "y0": 0, "y1": 1,
+            "yref": "paper", "fillcolor": theme.SHADE, "line": {"width": 0}, "layer": "below",
+        }],
+        "annotations": [{
+            "text": "validation", "x": first, "y": 1, "yref": "paper", "xanchor": "left",
+            "yanchor": "top", "xshift": 4, "showarrow": False, "font": {"size": 11},
+        }],
+    }  # fmt: skip

@@ -1,0 +1,193 @@
+"""The pages: what each template is given."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+from pprint import pformat
+from typing import Any
+from urllib.parse import urlencode
+
+import yaml
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from sqlalchemy.orm import Session
+
+from service import models
+from service.storage.datasets import DatasetRepository
+from service.storage.errors import NotFound
+from service.storage.events import EventRepository
+from service.storage.jobs import JobRepository
+from service.storage.lineage import LineageRepository
+from service.storage.runs import RunRepository
+from service.storage.tables import Dataset, Job, Run, State
+from service.web import assets, figures_signals, formats
+from service.web.figures import convergence_height, correlation_height
+from service.web.reading import model_of, run_body, sought_parameters, unit_of
+from service.web.views import JobView, RunView, event_view, job_view, run_view
+
+JOBS_PER_PAGE = 50
+RUNS_PER_PAGE = 100
+EVENTS_SHOWN = 100
+
+
+@cache
+def environment() -> Environment:
+    """The templates. Every text of a user is escaped, and a name that is not given is an error."""
+    made = Environment(
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    made.filters.update(formats.FILTERS)
+    made.globals.update(
+        static=lambda name: f"/static/{name}", plotly=f"/static/{assets.plotly_name()}"
+    )
+    return made
+
+
+def render(template: str, **context: Any) -> str:
+    """A template with its context, as of now."""
+    return environment().get_template(template).render(now=datetime.now(UTC), **context)
+
+
+def jobs_page(session: Session, state: State | None, cursor: str | None) -> str:
+    """The list of jobs and the form of a new identification."""
+    states = [state] if state else []
+    page = JobRepository(session).page(cursor=cursor, limit=JOBS_PER_PAGE, states=states)
+    now = datetime.now(UTC)
+    jobs = [job_view(job, unit_of(job.spec), now) for job in page.items]
+    chosen = {"state": state.value} if state else {}
+    return render(
+        "jobs.html", jobs=jobs, state=state.value if state else "",
+        states=[one.value for one in State], any_open=any(job.is_open for job in jobs),
+        cursor=cursor, filter_query=_query(chosen),
+        next=_query({**chosen, "cursor": page.next}) if page.next else "",
+    )  # fmt: skip
+
+
+def job_page(
+    session: Session, job_id: str, base_url: str, run_id: str | None = None,
+    cursor: str | None = None,
+) -> str:  # fmt: skip
+    """A job with its runs, one of them in full: the one asked for, else the best or the first."""
+    job = JobRepository(session).get(job_id)
+    runs = RunRepository(session)
+    page = runs.page(job.id, cursor=cursor, limit=RUNS_PER_PAGE)
+    chosen = runs.get(run_id) if run_id else _best(runs, job)
+    view = job_view(job, unit_of(job.spec), datetime.now(UTC))
+    return render(
+        "job.html", job=view, runs=[run_summary(job, run) for run in page.items],
+        run=run_in_full(job, chosen) if chosen else None,
+        next_runs=_query({"cursor": page.next}) if page.next else "",
+        datasets=dataset_links(session, job), commands=_commands(view, base_url),
+        events=[event_view(one) for one in _events(session, job)],
+    )  # fmt: skip
+
+
+def run_page(session: Session, run_id: str, base_url: str) -> str:
+    """The page of a run's job, with this run in full."""
+    run = RunRepository(session).get(run_id)
+    return job_page(session, run.job_id, base_url, run.id)
+
+
+def dataset_page(session: Session, dataset_id: str) -> str:
+    """A dataset: its signals, channels, and lineage."""
+    dataset = DatasetRepository(session).get(dataset_id)
+    lineage = LineageRepository(session)
+    edges = [("from", edge.parent, edge.relation) for edge in lineage.ancestors(dataset.id)
+             if edge.child == dataset.id]  # fmt: skip
+    edges += [("for", edge.child, edge.relation) for edge in lineage.descendants(dataset.id)
+              if edge.parent == dataset.id]  # fmt: skip
+    return render(
+        "dataset.html", dataset=dataset, height=figures_signals.signals_height(dataset.n_channels),
+        channels=dataset.channels,
+        lineage=[
+            {"direction": direction, "id": name, "relation": relation, "href": _href(name)}
+            for direction, name, relation in edges
+        ],
+    )  # fmt: skip
+
+
+def model_text(session: Session, name: str) -> str:
+    """A model as YAML, to be read in the form and changed there."""
+    document = models.one(session, name).document
+    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
+
+
+def run_summary(job: Job, run: Run) -> RunView:
+    """A run as a line of a table."""
+    return run_view(run, unit_of(run_body(job, run)), {})
+
+
+def run_in_full(job: Job, run: Run) -> RunView:
+    """A run with what its plots need to be laid out before they are drawn."""
+    body = run_body(job, run)
+    sought = sought_parameters(run, body)
+    heights = {
+        "response": figures_signals.response_height(*_counts(body)),
+        "convergence": convergence_height(len(sought), columns=3),
+        "correlation": correlation_height(len(sought)),
+    }
+    return run_view(run, unit_of(body), heights)
+
+
+def _counts(body: dict[str, Any]) -> tuple[int, int]:
+    model = model_of(body)
+    return (len(model.outputs), len(model.inputs)) if model else (1, 1)
+
+
+def _best(runs: RunRepository, job: Job) -> Run | None:
+    if job.n_runs == 1 or job.best_rms is None:
+        found: Sequence[Run] = runs.page(job.id, limit=1).items
+    else:
+        found = runs.page(job.id, limit=1, order="best_rms").items
+    return found[0] if found else None
+
+
+def _events(session: Session, job: Job) -> list[Any]:
+    # Progress is on the page already; what remains are the few lines that tell a story.
+    return EventRepository(session).latest(job.id, EVENTS_SHOWN, kinds=("state", "log", "end"))
+
+
+def dataset_links(session: Session, job: Job) -> list[dict[str, Any]]:
+    """Datasets of a job, each with its role, name and parents."""
+    kept = job.spec.get("validation") or {}
+    roles = [("estimation", one) for one in job.spec.get("datasets", [])]
+    roles += [("validation", one) for one in kept.get("datasets") or []]
+    lineage = LineageRepository(session)
+    return [
+        {"role": role, "id": one, "name": _dataset_name(session, one),
+         "parents": [e.parent for e in lineage.ancestors(one) if e.child == one]}
+        for role, one in roles
+    ]  # fmt: skip
+
+
+def _dataset_name(session: Session, dataset_id: str) -> str:
+    try:
+        found: Dataset = DatasetRepository(session).get(dataset_id)
+    except NotFound:
+        return "deleted"
+    return found.name
+
+
+def _commands(job: JobView, base_url: str) -> list[tuple[str, str, str]]:
+    url = base_url.rstrip("/")
+    body = job.request_text
+    curl = (
+        f"curl -X POST {url}/v1/jobs -H 'Content-Type: application/json' "
+        f"--data-binary @- <<'LAGID'\n{body}\nLAGID"
+    )
+    python = (
+        f'from service.client import Client\n\nclient = Client("{url}")\n'
+        f"job = client.submit({pformat(dict(job.request), width=92, sort_dicts=False)})\n"
+        'client.wait(job["id"])\n'
+    )
+    return [("as-curl", "The same with curl", curl), ("as-python", "The same in Python", python)]
+
+
+def _href(name: str) -> str:
+    kind = name.partition("_")[0]
+    return {"ds": "/datasets/", "job": "/jobs/", "run": "/runs/"}.get(kind, "/v1/") + name
+
+
+def _query(values: dict[str, Any]) -> str:
+    return f"?{urlencode(values)}" if values else ""

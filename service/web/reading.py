@@ -1,0 +1,148 @@
+"""From stored rows to what figures are made of."""
+
+import json
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from itertools import groupby
+from math import inf, nan
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service.storage.runs import RunRepository
+from service.storage.tables import Job, Run
+from service.sweeps import body_of
+from service.web.evidence import Improvement, RunEvidence, SoughtParameter
+from sysid.errors import SysidError
+from sysid.models.library import load_model
+from sysid.models.model import EstimatedInitial, Model
+from sysid.parameters import Parameter, override
+
+Body = Mapping[str, Any]
+
+
+def run_body(job: Job, run: Run) -> dict[str, Any]:
+    """The body of one run: the job's, with the values of the run's cell."""
+    return body_of(job.spec, run.cell)
+
+
+def model_of(body: Body) -> Model | None:
+    """The model of a body; None if this version of the program cannot read it any more."""
+    return _model(json.dumps(body["model"], sort_keys=True))
+
+
+@lru_cache(maxsize=256)
+def _model(reference: str) -> Model | None:
+    try:
+        return load_model(json.loads(reference))
+    except SysidError:
+        return None
+
+
+def unit_of(body: Body) -> str:
+    """Unit of the RMS: the output's, or standard deviations of several outputs together."""
+    model = model_of(body)
+    if model is None:
+        return "1"
+    return model.outputs[0].unit if len(model.outputs) == 1 else "σ"
+
+
+def sought_parameters(run: Run, body: Body) -> list[SoughtParameter]:
+    """The free parameters in the order of the history's columns.
+
+    The result names them once the run has ended; until then the model and the request do.
+    """
+    result = (run.result or {}).get("parameters")
+    if result:
+        return [_estimated(one) for one in result if one.get("status") != "fixed"]
+    model = model_of(body)
+    if model is None:
+        return []
+    free = [p for p in override(model.parameters, body.get("parameters", {})) if p.is_free]
+    return [*map(_sought, free), *_initial_states(model, len(body["datasets"]))]
+
+
+def evidence_of(session: Session, job: Job, run: Run) -> RunEvidence:
+    """All that is known of a run's search and result."""
+    body = run_body(job, run)
+    runs = RunRepository(session)
+    history = _islands(runs.history(run.id))
+    algorithm = body.get("algorithm", {})
+    result = run.result or {}
+    return RunEvidence(
+        id=run.id, unit=unit_of(body),
+        generations=run.generations or (job.generation if job.n_runs == 1 else 0),
+        evaluations=run.evaluations, history=history,
+        parameters=_covering(sought_parameters(run, body), history),
+        epoch=int((algorithm.get("migration") or {}).get("every", 0)),
+        migrations=sorted({one.epoch for one in runs.migrations(run.id)}),
+        islands=[(_or(one.get("champion_rms"), inf), one.get("refined_rms"))
+                 for one in result.get("islands", ())],
+        correlation=_correlation(result.get("correlation")),
+    )  # fmt: skip
+
+
+def _correlation(stored: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    if not stored:
+        return None
+    rows = [[_or(value, nan) for value in row] for row in stored["matrix"]]
+    return {"names": stored["names"], "matrix": rows}
+
+
+def _or(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value
+
+
+def _islands(rows: Sequence[Any]) -> list[list[Improvement]]:
+    found: list[list[Improvement]] = []
+    for island, points in groupby(rows, key=lambda row: row.island):
+        while len(found) < island:  # an island that has not told anything yet
+            found.append([])
+        found.append([
+            Improvement(p.generation, p.evaluations, p.rms, p.phase, tuple(p.parameters))
+            for p in points
+        ])  # fmt: skip
+    return found
+
+
+def _covering(
+    known: list[SoughtParameter], history: Sequence[Sequence[Improvement]]
+) -> list[SoughtParameter]:
+    """As many parameters as the history has columns, whatever the model says today."""
+    points = [point for island in history for point in island]
+    if not points:
+        return known
+    width = len(points[0].parameters)
+    unknown = range(min(len(known), width), width)
+    return known[:width] + [_by_its_values(points, column) for column in unknown]
+
+
+def _by_its_values(points: Sequence[Improvement], column: int) -> SoughtParameter:
+    values = [point.parameters[column] for point in points]
+    lower, upper = min(values), max(values)
+    return SoughtParameter(f"parameter {column + 1}", "1", lower, upper if upper > lower
+                           else lower + 1.0)  # fmt: skip
+
+
+def _estimated(one: Mapping[str, Any]) -> SoughtParameter:
+    return SoughtParameter(
+        one["name"], one.get("unit", "1"), one["lower"], one["upper"],
+        value=one["value"], stderr=one.get("stderr"),
+    )  # fmt: skip
+
+
+def _sought(parameter: Parameter) -> SoughtParameter:
+    return SoughtParameter(
+        parameter.name, parameter.unit, parameter.lower, parameter.upper, parameter.scale
+    )
+
+
+def _initial_states(model: Model, n_experiments: int) -> list[SoughtParameter]:
+    found = []
+    for experiment in range(n_experiments):
+        for state, start in zip(model.states, model.initial, strict=True):
+            if isinstance(start, EstimatedInitial):
+                place = f"[{experiment + 1}]" if n_experiments > 1 else ""
+                name = f"{state.name}(0){place}"
+                found.append(SoughtParameter(name, state.unit, start.lower, start.upper))
+    return found

@@ -1,0 +1,114 @@
+"""A job as one HTML file: it needs no server and no network, and runs no script but its own."""
+
+import base64
+import hashlib
+import json
+from datetime import UTC, datetime
+from functools import cache
+from typing import Any
+
+from markupsafe import Markup
+from sqlalchemy.orm import Session
+
+from service.storage.jobs import JobRepository
+from service.storage.objects import ObjectStore
+from service.storage.runs import RunOrder, RunRepository
+from service.storage.tables import Job, Run
+from service.web import assets, figures, figures_signals
+from service.web.figures import Figure
+from service.web.pages import dataset_links, render, run_in_full, run_summary
+from service.web.reading import evidence_of, unit_of
+from service.web.signals import experiments_of
+from service.web.theme import template
+from service.web.views import job_view
+
+RUNS_IN_TABLE = 1000
+RUNS_IN_FULL = 6
+EXPERIMENTS_SHOWN = 4
+
+
+def job_report(session: Session, store: ObjectStore, job_id: str) -> str:
+    """The report of a job: every run in a table, the few best of them in full."""
+    job = JobRepository(session).get(job_id)
+    runs = RunRepository(session).page(job.id, limit=RUNS_IN_TABLE).items
+    order: RunOrder = "number" if len(runs) <= RUNS_IN_FULL else "best_rms"
+    chosen = RunRepository(session).page(job.id, limit=RUNS_IN_FULL, order=order).items
+    made = datetime.now(UTC)
+    return render(
+        "report.html", job=job_view(job, unit_of(job.spec), made), made=made,
+        runs=[run_summary(job, run) for run in runs],
+        sections=[(run_in_full(job, run), _figures(session, store, job, run)) for run in chosen],
+        datasets=dataset_links(session, job), policy=policy(), style=_style(),
+        plotly_code=_plotly(), draw=_draw(),
+        templates=_json({"light": template("light"), "dark": template("dark")}),
+    )  # fmt: skip
+
+
+@cache
+def policy() -> str:
+    """Content security policy: the two scripts of the report by their hashes, nothing from afar."""
+    hashes = " ".join(f"'sha256-{_hash(script)}'" for script in (_plotly(), _draw()))
+    return (
+        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:"
+    )
+
+
+def _figures(
+    session: Session, store: ObjectStore, job: Job, run: Run
+) -> list[tuple[str, int, Markup]]:
+    """Title, height (px) and Plotly JSON of a run's figures, those with something to show."""
+    evidence = evidence_of(session, job, run)
+    made = [("RMS of every island", figures.history(evidence))]
+    for experiment in experiments_of(session, store, job, run)[:EXPERIMENTS_SHOWN]:
+        title = f"Measured against identified: {experiment.name}"
+        made.append((title, figures_signals.response(experiment)))
+    made += [
+        ("Convergence of the parameters", figures.convergence(evidence)),
+        ("Correlation of the estimates", figures.correlation(evidence)),
+        ("What each island found", figures.waterfall(evidence)),
+    ]
+    return [
+        (title, figure["layout"]["height"], _json(_bare(figure)))
+        for title, figure in made
+        if any(_has_points(trace) for trace in figure["data"])
+    ]
+
+
+def _has_points(trace: dict[str, Any]) -> bool:
+    return len(trace["x"]) > 0
+
+
+def _bare(figure: Figure) -> Figure:
+    """Without the template, which the report holds once for all its figures."""
+    kept = {name: value for name, value in figure["layout"].items() if name != "template"}
+    return {"data": figure["data"], "layout": kept}
+
+
+def _json(value: object) -> Markup:
+    """JSON inside a script element: no text in it can end the element."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
+
+
+@cache
+def _plotly() -> Markup:
+    return _script(assets.plotly_file().read_text(encoding="utf-8"))
+
+
+@cache
+def _draw() -> Markup:
+    return _script((assets.STATIC / "report.js").read_text(encoding="utf-8"))
+
+
+@cache
+def _style() -> Markup:
+    return Markup((assets.STATIC / "lagid.css").read_text(encoding="utf-8"))
+
+
+def _script(text: str) -> Markup:
+    # In a string or an expression of a script, <\/ means the same and does not end the element.
+    return Markup(text.replace("</script", "<\\/script"))
+
+
+def _hash(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(str(script).encode()).digest()).decode()

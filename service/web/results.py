@@ -1,0 +1,71 @@
+"""Use cases of figures: a figure of a run or of a dataset, as a request chose it."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
+
+from service.errors import NotFound
+from service.storage.datasets import DatasetRepository
+from service.storage.jobs import JobRepository
+from service.storage.objects import ObjectStore
+from service.storage.runs import RunRepository
+from service.web import figures, figures_signals
+from service.web.figures import Abscissa, Figure
+from service.web.reading import evidence_of
+from service.web.signals import experiments_of, traces_of
+from service.web.theme import Theme
+
+FigureName = Literal["history", "convergence", "response", "correlation", "waterfall"]
+
+
+class FigureChoice(BaseModel):
+    """What a request may choose about a figure."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    theme: Theme = Field(default="light", description="light or dark paper")
+    format: Literal["json", "csv"] = Field(default="json", description="Plotly JSON or numbers")
+    abscissa: Abscissa = Field(default="generations", description="of the RMS history")
+    columns: int = Field(default=3, ge=1, le=8, description="small plots side by side")
+    experiment: int = Field(default=0, ge=0, description="number of the record, from 0")
+    start: float | None = Field(default=None, allow_inf_nan=False, description="from here on, s")
+    stop: float | None = Field(default=None, allow_inf_nan=False, description="up to here, s")
+
+
+def run_figure(
+    session: Session, store: ObjectStore, run_id: str, name: FigureName, choice: FigureChoice
+) -> Figure:
+    """One figure of a run; empty where the run has nothing to show yet.
+
+    Raises
+    ------
+    NotFound
+        If the run, or the experiment that was asked for, is not there.
+    """
+    run = RunRepository(session).get(run_id)
+    job = JobRepository(session).get(run.job_id)
+    if name == "response":
+        experiments = experiments_of(session, store, job, run)
+        if not experiments:
+            return {"data": [], "layout": figures.layout(200)}
+        if choice.experiment >= len(experiments):
+            last = f"; the last is {len(experiments) - 1}"
+            raise NotFound("experiment", str(choice.experiment), last)
+        figure = figures_signals.response(experiments[choice.experiment], choice.start, choice.stop)
+        figure["layout"]["meta"]["experiments"] = [one.name for one in experiments]
+        return figure
+    evidence = evidence_of(session, job, run)
+    if name == "history":
+        return figures.history(evidence, choice.abscissa)
+    if name == "convergence":
+        return figures.convergence(evidence, choice.columns)
+    return figures.correlation(evidence) if name == "correlation" else figures.waterfall(evidence)
+
+
+def dataset_figure(
+    session: Session, store: ObjectStore, dataset_id: str, choice: FigureChoice
+) -> Figure:
+    """The signals of a dataset."""
+    dataset = DatasetRepository(session).get(dataset_id)
+    return figures_signals.signals(traces_of(store, dataset), choice.start, choice.stop)

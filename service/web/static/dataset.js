@@ -1,0 +1,5 @@
+// A dataset's page: its signals.
+
+import { begin } from './figures.js';
+
+begin();

@@ -1,0 +1,101 @@
+// Draws the figures that the server defines. Only what is on the screen is fetched and drawn.
+
+import { Problem, ask, element } from './live.js';
+
+const dark = matchMedia('(prefers-color-scheme: dark)');
+const CONFIG = {
+  displaylogo: false,
+  responsive: true,
+  modeBarButtonsToRemove: ['lasso2d', 'select2d', 'autoScale2d'],
+  toImageButtonOptions: { format: 'svg' },
+};
+const seen = new WeakSet();
+const latest = new WeakMap();
+
+export const plots = () => [...document.querySelectorAll('[data-figure]')];
+
+/** Address of a plot's figure, with what the user chose. */
+function address(plot, extra = {}) {
+  const url = new URL(plot.dataset.url, location.href);
+  const query = new URLSearchParams(plot.dataset.query ?? '');
+  query.set('theme', dark.matches ? 'dark' : 'light');
+  if (plot.dataset.figure === 'convergence') query.set('columns', columns(plot));
+  for (const [name, value] of Object.entries(extra)) query.set(name, value);
+  url.search = query;
+  return url;
+}
+
+const columns = (plot) => (plot.clientWidth < 520 ? 1 : plot.clientWidth < 860 ? 2 : 3);
+
+/** Fetch and draw one plot; a figure that is overtaken by a later one is dropped. */
+export async function draw(plot, extra = {}) {
+  const turn = (latest.get(plot) ?? 0) + 1;
+  latest.set(plot, turn);
+  try {
+    const figure = await ask(address(plot, extra));
+    if (latest.get(plot) !== turn) return;
+    if (!figure.data.length) return tell(plot, plot.dataset.empty ?? 'nothing to show yet');
+    plot.querySelector('.plot-empty')?.remove();
+    plot.style.height = `${figure.layout.height}px`;
+    const first = !plot.classList.contains('js-plotly-plot');
+    await window.Plotly.react(plot, figure.data, figure.layout, CONFIG);
+    plot.dataset.thinned = figure.layout.meta?.thinned ?? '';
+    plot.dispatchEvent(new CustomEvent('drawn', { bubbles: true, detail: figure.layout }));
+    if (first) plot.on('plotly_relayout', (change) => zoomed(plot, change));
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    if (latest.get(plot) === turn && !plot.classList.contains('js-plotly-plot')) tell(plot, error.message);
+  }
+}
+
+function tell(plot, text) {
+  const place = plot.querySelector('.plot-empty') ?? plot.appendChild(element('span', '', 'plot-empty'));
+  place.textContent = text;
+}
+
+/** A zoom into a thinned signal fetches the stretch anew, with more of its samples. */
+function zoomed(plot, change) {
+  if (!['response', 'signals'].includes(plot.dataset.figure)) return;
+  if (change['xaxis.autorange']) {
+    if (plot.dataset.zoomed) draw(plot);
+    delete plot.dataset.zoomed;
+  } else if (change['xaxis.range[0]'] !== undefined && (plot.dataset.thinned === 'true' || plot.dataset.zoomed)) {
+    plot.dataset.zoomed = '1';
+    draw(plot, { start: change['xaxis.range[0]'], stop: change['xaxis.range[1]'] });
+  }
+}
+
+/** Change a plot's query (its abscissa, its experiment) and draw it again. */
+export function choose(plot, name, value) {
+  const query = new URLSearchParams(plot.dataset.query ?? '');
+  query.set(name, value);
+  plot.dataset.query = query;
+  const csv = document.querySelector(`[data-csv="${plot.dataset.figure}"]`);
+  if (csv) {
+    const url = new URL(csv.href);
+    url.searchParams.set(name, value);
+    csv.href = url;
+  }
+  if (seen.has(plot)) draw(plot);
+}
+
+/** Draw again those that are or were on the screen. */
+export const redraw = (names) =>
+  Promise.all(plots().filter((p) => seen.has(p) && (!names || names.includes(p.dataset.figure))).map((p) => draw(p)));
+
+const watcher = new IntersectionObserver(
+  (entries) => {
+    for (const { target, isIntersecting } of entries) {
+      if (!isIntersecting || seen.has(target)) continue;
+      seen.add(target);
+      watcher.unobserve(target);
+      draw(target);
+    }
+  },
+  { rootMargin: '300px' },
+);
+
+export function begin() {
+  plots().forEach((plot) => watcher.observe(plot));
+  dark.addEventListener('change', () => redraw());
+}

@@ -1,0 +1,251 @@
+// New identification: choices from the REST interface, live checks, and one POST to /v1/jobs.
+
+import { Problem, ask, element, post } from './live.js';
+import { fillTable, overrides, showFaults, clearFaults } from './fields.js';
+
+const panel = document.getElementById('new');
+const form = document.getElementById('job-form');
+const field = (name) => form.elements.namedItem(name);
+const state = { dataset: null, model: null, extra: {}, started: false };
+const query = new URLSearchParams(location.search);
+
+async function start() {
+  if (state.started) return;
+  state.started = true;
+  const [datasets, models] = await Promise.all([ask('/v1/datasets?limit=200'), ask('/v1/models')]);
+  for (const one of datasets.items) field('dataset').append(new Option(one.name, one.id));
+  for (const one of models.items) field('model').append(new Option(one.title ? `${one.name} – ${one.title}` : one.name, one.name));
+  if (query.get('clone')) await fillFrom(query.get('clone'));
+  else {
+    if (query.get('dataset')) await choose(query.get('dataset'));
+    await listed();
+  }
+}
+
+/** Take over the request of an earlier job; what the form has no field for goes along. */
+async function fillFrom(job) {
+  const { request, name } = await ask(`/v1/jobs/${encodeURIComponent(job)}`);
+  const set = (key, value) => value !== undefined && value !== null && (field(key).value = value);
+  state.extra = request;
+  set('name', name);
+  const algorithm = request.algorithm ?? {};
+  for (const key of ['method', 'population', 'generations']) set(key, algorithm[key]);
+  if (Number.isInteger(algorithm.islands)) set('islands', algorithm.islands);
+  set('evaluations', algorithm.stop?.evaluations);
+  for (const key of ['seed', 'prediction']) set(key, request[key]);
+  set('loss', request.loss?.kind);
+  const fraction = request.validation?.fraction;
+  if (fraction) {
+    const known = [...field('validation').options].some((one) => one.value === String(fraction));
+    if (!known) field('validation').append(new Option(`the last ${100 * fraction} %`, String(fraction)));
+    set('validation', String(fraction));
+  } else if (request.validation) {
+    field('validation').append(new Option('as in the cloned job', 'clone'));
+    set('validation', 'clone');
+  }
+  await choose(request.datasets[0]);
+  if (typeof request.model === 'string') {
+    set('model', request.model);
+    await listed(request.parameters);
+  } else {
+    field('source').value = 'own';
+    await own(JSON.stringify(request.model, null, 2), request.parameters);
+  }
+  mapChannels(request.channels);
+}
+
+async function choose(id) {
+  if (![...field('dataset').options].some((one) => one.value === id)) {
+    const found = await ask(`/v1/datasets/${encodeURIComponent(id)}`);
+    field('dataset').append(new Option(found.name, found.id));
+  }
+  field('dataset').value = id;
+  await chosen();
+}
+
+async function chosen() {
+  const id = field('dataset').value;
+  state.dataset = id ? await ask(`/v1/datasets/${encodeURIComponent(id)}`) : null;
+  const facts = document.getElementById('dataset-facts');
+  const channels = state.dataset?.channels ?? [];
+  facts.textContent = channels.map((one) => (one.unit && one.unit !== '1' ? `${one.name} [${one.unit}]` : one.name)).join(' · ');
+  mapChannels();
+}
+
+async function upload() {
+  const [file] = field('upload').files;
+  if (!file) return;
+  clearFaults(form);
+  say(`storing ${file.name}…`);
+  const type = file.name.toLowerCase().endsWith('.mcap') ? 'application/x-mcap' : 'text/csv';
+  try {
+    const stored = await ask(`/v1/datasets?name=${encodeURIComponent(file.name)}`, {
+      method: 'POST', headers: { 'Content-Type': type }, body: file,
+    });
+    await choose(stored.id);
+    say(`${file.name} is stored`);
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    form.querySelector('[data-fault="/datasets"]').textContent = error.message;
+    say('');
+  }
+}
+
+/** Show a model of the list; its text is there to be read, and to be changed with "own equations". */
+async function listed(changes) {
+  const model = await ask(`/v1/models/${encodeURIComponent(field('model').value)}`);
+  const text = await ask(`/pages/models/${encodeURIComponent(field('model').value)}.yaml`);
+  field('equations').value = text;
+  field('equations').readOnly = true;
+  take(model.document, changes);
+  verdict({ valid: true });
+}
+
+async function own(text, changes) {
+  if (text !== undefined) field('equations').value = text;
+  field('equations').readOnly = false;
+  await check(changes);
+}
+
+let turn = 0;
+async function check(changes) {
+  const now = ++turn;
+  const found = await ask('/v1/models:check', {
+    method: 'POST', headers: { 'Content-Type': 'application/yaml' }, body: field('equations').value,
+  });
+  if (now !== turn) return; // a later text was checked meanwhile
+  verdict(found);
+  if (found.valid) take(found.normal_form, changes);
+}
+
+function verdict(found) {
+  const place = document.getElementById('check');
+  field('equations').ariaInvalid = String(!found.valid);
+  if (found.valid) return place.replaceChildren(element('span', '✓ the model can be used', 'status identified'));
+  const list = document.createElement('ul');
+  for (const one of found.errors) {
+    const where = [one.pointer, one.column && `column ${one.column}`].filter(Boolean).join(', ');
+    const item = element('li', '', 'fault');
+    item.append(element('b', where), ` ${one.detail}`);
+    list.append(item);
+  }
+  place.replaceChildren(element('span', '△ the model cannot be used yet', 'fault'), list);
+}
+
+function take(document, changes) {
+  const same = JSON.stringify(state.model) === JSON.stringify(document);
+  state.model = document;
+  if (same && !changes) return;
+  fillTable(document, changes ?? {});
+  mapChannels();
+}
+
+/** One choice per signal of the model; an equal name is taken, else the one at the same place. */
+function mapChannels(wanted = {}) {
+  if (!state.model || !state.dataset) return;
+  const recorded = state.dataset.channels.map((one) => one.name);
+  const inputs = Object.keys(state.model.inputs ?? {});
+  const outputs = Object.keys(state.model.outputs ?? (state.model.output ? { [state.model.output]: 0 } : {}));
+  const before = channels();
+  const choices = [...inputs, ...outputs].map((signal, place) => {
+    const label = element('label', inputs.includes(signal) ? `input ${signal}` : `output ${signal}`);
+    const select = document.createElement('select');
+    select.dataset.signal = signal;
+    select.dataset.pointer = `/channels/${signal}`;
+    recorded.forEach((name) => select.append(new Option(name, name)));
+    const guess = [wanted[signal], before[signal], signal].find((name) => recorded.includes(name));
+    select.value = guess ?? recorded[Math.min(place, recorded.length - 1)];
+    label.append(select);
+    return label;
+  });
+  document.getElementById('channels').replaceChildren(...choices);
+}
+
+const channels = () =>
+  Object.fromEntries([...form.querySelectorAll('[data-signal]')].map((one) => [one.dataset.signal, one.value]));
+
+/** A number as typed; text that is none goes to the server, which says what would be right. */
+const number = (name) => {
+  const text = field(name).value.trim();
+  return text === '' ? null : Number.isNaN(Number(text)) ? text : Number(text);
+};
+
+function body() {
+  const { sweep, ...kept } = state.extra;
+  const algorithm = { ...kept.algorithm, method: field('method').value };
+  for (const key of ['population', 'generations']) if (number(key) !== null) algorithm[key] = number(key);
+  if (!Array.isArray(kept.algorithm?.islands) || number('islands') !== null) algorithm.islands = number('islands');
+  algorithm.stop = { ...kept.algorithm?.stop, evaluations: number('evaluations') };
+  const validation = field('validation').value;
+  const datasets = kept.datasets?.[0] === field('dataset').value ? kept.datasets : [field('dataset').value];
+  return {
+    ...kept,
+    ...(sweep?.axes?.length ? { sweep } : {}),
+    name: field('name').value.trim() || null,
+    model: field('source').value === 'own' ? state.model : field('model').value,
+    datasets: datasets.filter(Boolean),
+    channels: channels(),
+    validation: validation === 'clone' ? kept.validation : validation ? { fraction: Number(validation) } : null,
+    parameters: overrides(),
+    prediction: field('prediction').value,
+    loss: { ...kept.loss, kind: field('loss').value },
+    algorithm,
+    seed: number('seed') ?? 1,
+  };
+}
+
+async function submit(event) {
+  event.preventDefault();
+  clearFaults(form);
+  const button = form.querySelector('[type="submit"]');
+  button.disabled = true;
+  say('submitting…');
+  try {
+    const job = await post('/v1/jobs', body());
+    location.assign(`/jobs/${encodeURIComponent(job.id)}`);
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    say('');
+    showFaults(form, error);
+    button.disabled = false;
+  }
+}
+
+const say = (text) => (document.getElementById('form-state').textContent = text);
+
+function delayed(work, ms) {
+  let timer = 0;
+  return () => {
+    clearTimeout(timer);
+    timer = setTimeout(work, ms);
+  };
+}
+
+/** What a choice sets going may be refused; the refusal is shown, never lost. */
+const shown = (work) => async (...given) => {
+  try {
+    await work(...given);
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    showFaults(form, error);
+  }
+};
+
+function open() {
+  if (location.hash === '#new') panel.open = true;
+}
+
+field('dataset').addEventListener('change', shown(chosen));
+field('upload').addEventListener('change', shown(upload));
+field('model').addEventListener('change', shown(() => {
+  field('source').value = 'listed';
+  return listed();
+}));
+for (const one of field('source'))
+  one.addEventListener('change', shown(() => (field('source').value === 'own' ? own() : listed())));
+field('equations').addEventListener('input', delayed(shown(() => check()), 300));
+form.addEventListener('submit', submit);
+panel.addEventListener('toggle', shown(() => panel.open && start()));
+addEventListener('hashchange', open);
+open();
+if (panel.open) shown(start)();

@@ -1,0 +1,88 @@
+// A job's page: plots, live regions while the job is open, and its actions.
+
+import { begin, choose, plots, redraw } from './figures.js';
+import { Problem, element, post, refresh, throttled } from './live.js';
+
+const job = document.getElementById('job').dataset.job;
+const isOpen = () => document.querySelector('[data-live="chip"]').dataset.open === '1';
+let stream = null;
+
+// An event only says that something is new; the page and the figures themselves say what.
+const renew = throttled(async () => {
+  const wasOpen = isOpen();
+  await refresh();
+  await redraw(isOpen() ? ['history', 'convergence'] : undefined);
+  if (wasOpen && !isOpen()) close();
+}, 1000);
+
+function listen() {
+  if (stream || !isOpen()) return; // a finished job opens no stream
+  stream = new EventSource(`/v1/jobs/${encodeURIComponent(job)}/events`);
+  for (const kind of ['message', 'state', 'progress', 'log']) stream.addEventListener(kind, renew);
+  stream.addEventListener('end', () => {
+    close();
+    renew();
+  });
+}
+
+function close() {
+  stream?.close();
+  stream = null;
+}
+
+document.addEventListener('click', async ({ target }) => {
+  const button = target.closest('button');
+  if (!button) return;
+  if (button.dataset.act) await act(button);
+  else if (button.dataset.dialog) document.getElementById(button.dataset.dialog).showModal();
+  else if ('close' in button.dataset) button.closest('dialog').close();
+  else if ('copy' in button.dataset) await copy(button);
+  else if (button.dataset.abscissa) abscissa(button);
+});
+
+async function act(button) {
+  const fault = document.getElementById('act-fault');
+  fault.textContent = '';
+  button.disabled = true;
+  try {
+    await post(`/v1/jobs/${encodeURIComponent(job)}:${button.dataset.act}`);
+    await refresh();
+    listen();
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    fault.textContent = error.message;
+    button.disabled = false;
+  }
+}
+
+async function copy(button) {
+  const text = button.closest('dialog').querySelector('pre');
+  try {
+    await navigator.clipboard.writeText(text.textContent);
+    button.textContent = 'Copied';
+  } catch {
+    getSelection().selectAllChildren(text); // without the permission the user copies by hand
+  }
+}
+
+function abscissa(button) {
+  for (const one of button.parentElement.children) one.ariaPressed = String(one === button);
+  choose(plots().find((p) => p.dataset.figure === 'history'), 'abscissa', button.dataset.abscissa);
+}
+
+// Which records there are, the response itself tells.
+document.addEventListener('drawn', ({ target, detail }) => {
+  const names = detail.meta?.experiments ?? [];
+  const choice = document.querySelector('[data-experiment]');
+  if (target.dataset.figure !== 'response' || names.length < 2 || choice.options.length) return;
+  names.forEach((name, place) => choice.append(new Option(`${place + 1} · ${name}`, place)));
+  choice.parentElement.hidden = false;
+});
+document.querySelector('[data-experiment]')?.addEventListener('change', ({ target }) => {
+  choose(plots().find((p) => p.dataset.figure === 'response'), 'experiment', target.value);
+});
+
+addEventListener('pagehide', close);
+addEventListener('pageshow', (event) => event.persisted && listen());
+begin();
+listen();

@@ -1,0 +1,93 @@
+// Regions marked data-live are taken anew from the page itself, so that one template draws them.
+
+const PROBLEM = 'application/problem+json';
+
+/** Replace every live region whose content has changed; nothing else of the page moves. */
+export async function refresh() {
+  const answer = await fetch(location.href, { headers: { Accept: 'text/html' } });
+  if (!answer.ok) return null;
+  const fresh = new DOMParser().parseFromString(await answer.text(), 'text/html');
+  for (const region of document.querySelectorAll('[data-live]')) {
+    const next = fresh.querySelector(`[data-live="${region.dataset.live}"]`);
+    if (!next) continue;
+    region.dataset.open = next.dataset.open ?? '';
+    if (next.innerHTML === region.innerHTML) continue;
+    const focused = region.contains(document.activeElement) ? place(region) : -1;
+    const scrolled = region.scrollTop;
+    region.replaceChildren(...document.adoptNode(next).childNodes);
+    region.scrollTop = scrolled;
+    if (focused >= 0) focusable(region)[focused]?.focus({ preventScroll: true });
+  }
+  return fresh;
+}
+
+const focusable = (region) => [...region.querySelectorAll('a[href], button, select, input')];
+const place = (region) => focusable(region).indexOf(document.activeElement);
+
+/** Call `work` at once, then at most once in `interval` ms; the last of many calls is not lost. */
+export function throttled(work, interval) {
+  let busy = false;
+  let again = false;
+  return async function call() {
+    if (busy) {
+      again = true;
+      return;
+    }
+    busy = true;
+    const started = performance.now();
+    try {
+      await work();
+    } finally {
+      const rest = Math.max(0, interval - (performance.now() - started));
+      setTimeout(() => {
+        busy = false;
+        if (again) {
+          again = false;
+          call();
+        }
+      }, rest);
+    }
+  };
+}
+
+/** A request whose refusal becomes a Problem with the document's title, detail and errors. */
+export async function ask(url, options = {}) {
+  let answer;
+  try {
+    answer = await fetch(url, options);
+  } catch {
+    throw new Problem({ title: 'No answer', detail: 'the server cannot be reached' });
+  }
+  const text = await answer.text();
+  const type = answer.headers.get('Content-Type') ?? '';
+  const isJson = type.includes('json');
+  const body = isJson && text ? JSON.parse(text) : text;
+  if (answer.ok) return body;
+  throw new Problem(
+    type.startsWith(PROBLEM) ? body : { title: answer.statusText, detail: `status ${answer.status}` },
+  );
+}
+
+export const post = (url, body) =>
+  ask(url, {
+    method: 'POST',
+    ...(body === undefined
+      ? {}
+      : { headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(body) }),
+  });
+
+export class Problem extends Error {
+  constructor(document) {
+    super(document.detail || document.title || 'refused');
+    this.document = document;
+    this.errors = document.errors ?? [];
+  }
+}
+
+/** An element with a class and a text; text never becomes markup. */
+export function element(tag, text = '', className = '') {
+  const made = document.createElement(tag);
+  made.textContent = text;
+  if (className) made.className = className;
+  return made;
+}

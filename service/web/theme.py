@@ -1,0 +1,63 @@
+"""Colours and templates of the figures. One set of line colours serves light and dark paper.
+
+The colours are those of Okabe and Ito, darkened where they vanish on white: each has a contrast of
+about 3 or more against both papers, and they stay apart for the colour-blind.
+"""
+
+from typing import Any, Literal
+
+Theme = Literal["light", "dark"]
+
+BLUE, VERMILLION, GREEN = "#2a83c4", "#d55e00", "#00916a"
+PURPLE, OCHRE, GREY = "#b9619b", "#b5830f", "#8a929b"
+SERIES = (BLUE, VERMILLION, GREEN, PURPLE, OCHRE, GREY)
+DASHES = ("solid", "dash", "dot", "dashdot")
+SHADE = "rgba(138,146,155,0.14)"
+HAIRLINE = "rgba(138,146,155,0.55)"
+DIVERGING = [[0.0, BLUE], [0.5, "rgba(138,146,155,0.10)"], [1.0, VERMILLION]]
+FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif"
+
+_INK: dict[Theme, dict[str, str]] = {
+    "light": {"text": "#303a44", "grid": "#e6e9ec", "line": "#b9c0c7", "card": "#ffffff"},
+    "dark": {"text": "#c6ced6", "grid": "#2a3138", "line": "#4c565f", "card": "#20262c"},
+}
+
+
+def series_style(number: int) -> dict[str, Any]:
+    """Colour and dash of the numbered series; no two of the first 24 are alike."""
+    return {
+        "color": SERIES[number % len(SERIES)],
+        "dash": DASHES[number // len(SERIES) % len(DASHES)],
+        "width": 1.6,
+    }
+
+
+def template(theme: Theme) -> dict[str, Any]:
+    """Plotly template: quiet axes on a transparent ground."""
+    ink = _INK[theme]
+    axis = {
+        "gridcolor": ink["grid"], "linecolor": ink["line"], "tickcolor": ink["line"],
+        "zerolinecolor": ink["line"], "zerolinewidth": 1, "showline": True, "ticks": "outside",
+        "ticklen": 4, "automargin": False, "title": {"standoff": 8},
+    }  # fmt: skip
+    return {
+        "layout": {
+            "paper_bgcolor": "rgba(0,0,0,0)",
+            "plot_bgcolor": "rgba(0,0,0,0)",
+            "font": {"family": FONT, "size": 12, "color": ink["text"]},
+            "colorway": list(SERIES),
+            "xaxis": axis,
+            "yaxis": axis,
+            "hoverlabel": {
+                "bgcolor": ink["card"],
+                "bordercolor": ink["line"],
+                "font": {"family": FONT, "size": 12, "color": ink["text"]},
+            },
+            "annotationdefaults": {"font": {"color": ink["text"], "size": 12}},
+            "modebar": {
+                "bgcolor": "rgba(0,0,0,0)",
+                "color": ink["line"],
+                "activecolor": ink["text"],
+            },
+        }
+    }
