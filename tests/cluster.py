@@ -1,0 +1,33 @@
+"""One local Ray for the whole session, started when first asked for."""
+
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:  # most tests need no Ray, and its import takes its time
+    from workers.cluster import RayCrew
+
+CPUS = 2
+FREE_SECONDS = 15.0
+
+
+@pytest.fixture(scope="session")
+def _ray() -> "Iterator[RayCrew]":
+    from workers.cluster import ClusterSettings, RayCrew
+
+    crew = RayCrew(ClusterSettings(cpus=CPUS))
+    crew.warm()
+    yield crew
+    crew.close()
+
+
+@pytest.fixture
+def ray_crew(_ray: "RayCrew") -> "Iterator[RayCrew]":
+    """Two workers of a local Ray; each test must leave both free."""
+    yield _ray
+    limit = time.monotonic() + FREE_SECONDS
+    while _ray.free_slots() < CPUS:
+        assert time.monotonic() < limit, "the test left work behind on the cluster"
+        time.sleep(0.05)
