@@ -7,9 +7,9 @@ from pydantic import ValidationError
 from sqlalchemy.orm import Session
 
 from service import models
-from service.pointers import pointer_into
 from service.conversion import algorithm_of, faults_of, loss_of
 from service.errors import FieldError
+from service.pointers import pointer_into
 from service.schemas_jobs import JobIn
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import NotFound

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from sqlalchemy.orm import Session
-from sysid.models.spec import parse_model
 
 from service.conversion import faults_of
 from service.errors import InvalidRequest, NotFound
@@ -16,6 +15,7 @@ from service.storage.tables import Model as StoredModel
 from sysid.errors import SysidError, UnknownModel, nearest
 from sysid.models import library
 from sysid.models.model import Model
+from sysid.models.spec import parse_model
 
 
 def page(session: Session, cursor: str | None, limit: int) -> Page[ModelOut]:

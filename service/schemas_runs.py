@@ -58,11 +58,9 @@ class HistoryOut(Answer):
 
 
 class ExperimentOut(Answer):
-    """Measured and simulated outputs and the inputs of one experiment."""
+    """Measured and simulated outputs of one experiment."""
 
-    dataset: str
-    role: Literal["estimation", "validation"]
-    inputs: list[Series]
+    name: str
     measured: list[Series]
     simulated: list[Series]
 

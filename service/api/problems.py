@@ -10,7 +10,6 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
-from service.pointers import known_fields, pointer_into
 from service.conversion import faults_of
 from service.errors import (
     Conflict,
@@ -20,6 +19,7 @@ from service.errors import (
     ServiceError,
     Unavailable,
 )
+from service.pointers import known_fields, pointer_into
 from service.storage.errors import StorageError
 from sysid.errors import SysidError, nearest
 

@@ -1,0 +1,129 @@
+"""Routes of datasets."""
+
+from collections.abc import Iterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import StreamingResponse
+
+from service import datasets, lineage, simulations
+from service.api.content import CROSS_ORIGIN, content_of, preflight
+from service.api.deps import Cursor, Limit, MaxPoints, PartsDep, ReadSession
+from service.api.uploads import received
+from service.csv_rows import csv_rows
+from service.recordings import recording_of
+from service.schemas import Page
+from service.schemas_datasets import DatasetOut, DeriveIn, LineageOut, SignalsOut, SimulateIn
+from service.storage.datasets import DatasetRepository, Stored
+
+router = APIRouter(prefix="/v1", tags=["datasets"])
+
+BODY: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "text/csv": {"schema": {"type": "string"}},
+            "application/x-mcap": {"schema": {"type": "string", "format": "binary"}},
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "properties": {"file": {"type": "string", "format": "binary"}},
+                    "required": ["file"],
+                }
+            },
+        },
+    }
+}
+Name = Annotated[str | None, Query(max_length=200)]
+Segments = Annotated[
+    str | None, Query(description="CSV columns of labels, separated by commas, that part the rows")
+]
+SampleTime = Annotated[float | None, Query(gt=0, description="s, for a CSV without a time column")]
+
+
+@router.post("/datasets", status_code=201, openapi_extra=BODY)
+async def add(
+    request: Request,
+    response: Response,
+    parts: PartsDep,
+    name: Name = None,
+    segments: Segments = None,
+    sample_time: SampleTime = None,
+) -> DatasetOut:
+    """Store a recording, CSV or MCAP. The same bytes again give the same dataset (200)."""
+    async with received(request, parts.settings) as upload:
+        stored = await run_in_threadpool(
+            datasets.add_upload, parts.database, parts.store, upload.path, upload.form,
+            sha256=upload.sha256, name=name or upload.name,
+            segments=[one.strip() for one in (segments or "").split(",") if one.strip()],
+            sample_time=sample_time,
+        )  # fmt: skip
+    return _told(stored, response)
+
+
+@router.post("/datasets:simulate", status_code=201)
+def simulate(body: SimulateIn, parts: PartsDep, response: Response) -> DatasetOut:
+    """Make a dataset from a model, its true parameters, inputs and noise."""
+    return _told(simulations.simulate(parts.database, parts.store, body), response)
+
+
+@router.post("/datasets/{dataset_id}:derive", status_code=201)
+def derive(dataset_id: str, body: DeriveIn, parts: PartsDep, response: Response) -> DatasetOut:
+    """Make a dataset from another: noise, resample, trim, detrend, select, pool and so on."""
+    return _told(datasets.derive(parts.database, parts.store, dataset_id, body), response)
+
+
+@router.get("/datasets")
+def page(session: ReadSession, cursor: Cursor = None, limit: Limit = 50) -> Page[DatasetOut]:
+    """Datasets, latest first."""
+    return datasets.page(session, cursor, limit)
+
+
+@router.get("/datasets/{dataset_id}")
+def read(dataset_id: str, session: ReadSession) -> DatasetOut:
+    """One dataset: channels, sampling, segments, warnings."""
+    return datasets.told(DatasetRepository(session).get(dataset_id))
+
+
+@router.get("/datasets/{dataset_id}/signals")
+def signals(
+    dataset_id: str, session: ReadSession, parts: PartsDep, max_points: MaxPoints = 1000
+) -> SignalsOut:
+    """The samples, reduced so that extremes stay visible."""
+    return datasets.signals(session, parts.store, dataset_id, max_points)
+
+
+@router.get("/datasets/{dataset_id}/lineage")
+def ancestry(dataset_id: str, session: ReadSession) -> LineageOut:
+    """What it was made from, and what was made from it."""
+    return lineage.of_dataset(session, dataset_id)
+
+
+@router.api_route("/datasets/{dataset_id}/content", methods=["GET", "HEAD"])
+def content(dataset_id: str, request: Request, session: ReadSession, parts: PartsDep) -> Response:
+    """The recording as MCAP; ranges and ETags are honoured."""
+    row = DatasetRepository(session).get(dataset_id)
+    return content_of(request, parts.store, row.sha256, f"{row.id}.mcap")
+
+
+@router.options("/datasets/{dataset_id}/content", include_in_schema=False)
+def may_read(dataset_id: str) -> Response:
+    """Pages of other origins may read content."""
+    return preflight()
+
+
+@router.get("/datasets/{dataset_id}/content.csv", response_class=StreamingResponse)
+def content_csv(dataset_id: str, session: ReadSession, parts: PartsDep) -> StreamingResponse:
+    """The recording as CSV."""
+    row = DatasetRepository(session).get(dataset_id)
+    rows: Iterator[str] = csv_rows(recording_of(parts.store, row.sha256))
+    headers = {**CROSS_ORIGIN, "Content-Disposition": f'attachment; filename="{row.id}.csv"'}
+    return StreamingResponse(rows, media_type="text/csv; charset=utf-8", headers=headers)
+
+
+def _told(stored: Stored, response: Response) -> DatasetOut:
+    response.headers["Location"] = f"/v1/datasets/{stored.dataset.id}"
+    if not stored.is_new:
+        response.status_code = 200
+    return datasets.told(stored.dataset)

@@ -1,0 +1,90 @@
+"""Whether the service is well: for people, supervisors and Prometheus."""
+
+from collections.abc import Callable, Iterator, Mapping
+from datetime import timedelta
+
+from fastapi import APIRouter
+from fastapi.responses import PlainTextResponse
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.api.deps import Parts, PartsDep, ReadSession
+from service.errors import FieldError, Unavailable
+from service.storage import migrate
+from service.storage.dispatchers import DispatcherRepository
+from service.storage.errors import StorageError
+from service.storage.jobs import JobRepository
+
+router = APIRouter(tags=["health"])
+
+PROBLEM_KINDS = {
+    "conflict": "The state of the job does not allow what was asked.",
+    "internal": "An unexpected error; the log of the server has it.",
+    "invalid": "The body or a query value cannot be used; `errors` lists every fault.",
+    "invalid-upload": "The file cannot be used; the message says where and why.",
+    "method-not-allowed": "The path exists, but not for this method.",
+    "not-found": "There is no such thing.",
+    "range": "The byte range lies outside the content.",
+    "stale": "The thing has changed since it was read.",
+    "too-large": "The body is larger than the stated limit.",
+    "unavailable": "A part of the service is down.",
+    "unsupported-media-type": "The body is of a kind that is not read.",
+}
+
+
+@router.get("/healthz")
+def alive() -> dict[str, str]:
+    """The web process answers."""
+    return {"status": "ok"}
+
+
+@router.get("/readyz")
+def ready(parts: PartsDep) -> dict[str, str]:
+    """Database at head, store writable, a dispatcher alive; 503 with what is not."""
+    checks = {"database": _database, "store": _store, "dispatcher": _dispatcher}
+    failures = list(_failures(parts, checks))
+    if failures:
+        detail = "; ".join(one.detail for one in failures)
+        raise Unavailable(detail, failures)
+    return dict.fromkeys(checks, "ok")
+
+
+@router.get("/metrics", response_class=PlainTextResponse)
+def metrics(session: ReadSession, parts: PartsDep) -> str:
+    """Gauges in Prometheus' text format."""
+    lease = timedelta(seconds=parts.settings.lease_seconds)
+    alive_now = len(DispatcherRepository(session).alive(lease))
+    lines = ["# HELP lagid_jobs Jobs by state.", "# TYPE lagid_jobs gauge"]
+    for state, n in JobRepository(session).counts().items():
+        lines.append(f'lagid_jobs{{state="{state.value}"}} {n}')
+    lines += ["# HELP lagid_dispatchers Dispatchers that are alive.",
+              "# TYPE lagid_dispatchers gauge", f"lagid_dispatchers {alive_now}"]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+@router.get("/problems/{kind}", response_class=PlainTextResponse, include_in_schema=False)
+def explain(kind: str) -> str:
+    """What a problem document's `type` means."""
+    return PROBLEM_KINDS.get(kind, "This server gives no problem of that type.")
+
+
+def _failures(parts: Parts, checks: Mapping[str, Callable[[Parts], None]]) -> Iterator[FieldError]:
+    for name, check in checks.items():
+        try:
+            check(parts)
+        except (StorageError, SQLAlchemyError, Unavailable) as error:
+            yield FieldError(f"/{name}", str(error).splitlines()[0])
+
+
+def _database(parts: Parts) -> None:
+    migrate.check(parts.database)
+
+
+def _store(parts: Parts) -> None:
+    parts.store.check_writable()
+
+
+def _dispatcher(parts: Parts) -> None:
+    with parts.database.read() as session:
+        lease = timedelta(seconds=parts.settings.lease_seconds)
+        if not DispatcherRepository(session).alive(lease):
+            raise Unavailable("no dispatcher is alive; jobs are accepted, and wait for one")

@@ -1,0 +1,47 @@
+"""Routes of runs."""
+
+from fastapi import APIRouter, Request, Response
+
+from service import responses, runs
+from service.api.content import content_of
+from service.api.deps import MaxPoints, PartsDep, ReadSession
+from service.errors import NotFound
+from service.schemas_runs import HistoryOut, MigrationsOut, ResponseOut, RunOut
+from service.storage.runs import RunRepository
+
+router = APIRouter(prefix="/v1/runs", tags=["runs"])
+
+
+@router.get("/{run_id}")
+def read(run_id: str, session: ReadSession) -> RunOut:
+    """One run: its state, and its result once there is one."""
+    return runs.one(session, run_id)
+
+
+@router.get("/{run_id}/history")
+def history(run_id: str, session: ReadSession) -> HistoryOut:
+    """Improvements of every island's champion; nothing is thinned out."""
+    return runs.history(session, run_id)
+
+
+@router.get("/{run_id}/migrations")
+def migrations(run_id: str, session: ReadSession) -> MigrationsOut:
+    """Who migrated when, from where, to where."""
+    return runs.migrations(session, run_id)
+
+
+@router.get("/{run_id}/response")
+def response(
+    run_id: str, session: ReadSession, parts: PartsDep, max_points: MaxPoints = 1000
+) -> ResponseOut:
+    """Measured and simulated outputs, reduced so that extremes stay visible."""
+    return responses.response(session, parts.store, run_id, max_points)
+
+
+@router.api_route("/{run_id}/signals.mcap", methods=["GET", "HEAD"])
+def signals(run_id: str, request: Request, session: ReadSession, parts: PartsDep) -> Response:
+    """Measured and simulated outputs and residuals as MCAP; ranges and ETags are honoured."""
+    run = RunRepository(session).get(run_id)
+    if run.signals_sha256 is None:
+        raise NotFound("signals file of run", run_id, f"; the run is {run.state.value}")
+    return content_of(request, parts.store, run.signals_sha256, f"{run_id}.mcap")

@@ -1,0 +1,73 @@
+"""The web application: parts opened and closed, routes joined, errors made problem documents."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from importlib import import_module
+from importlib.metadata import version
+from importlib.util import find_spec
+
+from fastapi import FastAPI
+from starlette.concurrency import run_in_threadpool
+
+from service.api import datasets, events, health, jobs, models, problems, runs
+from service.api.deps import Parts
+from service.settings import Settings
+from service.storage import migrate
+from service.storage.objects import open_store
+from service.storage.sessions import Database
+
+DESCRIPTION = (
+    "Identification of nonlinear time-lag systems. Send a recording, name a model or write its "
+    "equations, submit a job, read the estimates with their standard errors. Errors are RFC 9457 "
+    "problem documents."
+)
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The application with these settings; by default those of the environment.
+
+    Its lifespan opens database and store and brings the tables to this version. `app.state.parts`
+    holds them while it runs.
+    """
+    chosen = settings or Settings()
+    app = FastAPI(
+        title="lagid",
+        version=version("lagid"),
+        description=DESCRIPTION,
+        lifespan=_lifespan(chosen),
+        separate_input_output_schemas=False,
+    )
+    problems.install(app)
+    for module in (health, datasets, models, jobs, events, runs):
+        app.include_router(module.router)
+    # Exact REST paths come first: a page's path may have parameters.
+    if find_spec("service.api.pages") is not None:
+        app.include_router(import_module("service.api.pages").router)
+    return app
+
+
+def open_parts(settings: Settings) -> Parts:
+    """Open database and object store, making the data folder and the tables where needed.
+
+    Raises
+    ------
+    Misconfigured
+        If the data folder is not writable.
+    """
+    settings.prepare_folder()
+    database = Database(settings.database)
+    migrate.upgrade(database)
+    return Parts(settings, database, open_store(settings.store))
+
+
+def _lifespan(settings: Settings):  # type: ignore[no-untyped-def]
+    @asynccontextmanager
+    async def run(app: FastAPI) -> AsyncIterator[None]:
+        app.state.parts = parts = await run_in_threadpool(open_parts, settings)
+        try:
+            yield
+        finally:
+            parts.stopping.set()
+            parts.database.dispose()
+
+    return run

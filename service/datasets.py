@@ -1,0 +1,202 @@
+"""Use cases of datasets: store an upload, derive, tell, and read the samples back."""
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from sqlalchemy.orm import Session
+from sysid.derivations import derive as derived
+
+from service.errors import TooLarge
+from service.recordings import recording_of
+from service.schemas import Page
+from service.schemas_datasets import ChannelOut, DatasetOut, DeriveIn, Series, SignalsOut
+from service.settings import Settings
+from service.signals.decimation import decimate
+from service.signals.upload import read_untrusted
+from service.signals.writer import write_recording
+from service.storage.datasets import DatasetRepository, NewDataset, Stored
+from service.storage.lineage import Relation
+from service.storage.objects import ObjectStore, StoredObject
+from service.storage.sessions import Database
+from service.storage.tables import Dataset
+from sysid.records import Channel, Recording
+
+Kind = Literal["upload", "simulate", "derive"]
+Format = Literal["csv", "mcap"]
+
+
+def add_upload(
+    database: Database,
+    store: ObjectStore,
+    path: Path,
+    form: Format,
+    *,
+    sha256: str,
+    name: str | None = None,
+    segments: Sequence[str] = (),
+    sample_time: float | None = None,
+) -> Stored:
+    """Store an uploaded file, or give the dataset that the same bytes made before.
+
+    Raises
+    ------
+    InvalidUpload
+        If the file cannot be used, with the place.
+    """
+    read_as = {"sha256": sha256, "format": form, "segments": list(segments),
+               "sample_time": sample_time}  # fmt: skip
+    key = key_of(read_as)
+    with database.read() as session:
+        known = DatasetRepository(session).by_source(key)
+    if known is not None:
+        return Stored(known, is_new=False)
+    # Reading takes time: no transaction is open meanwhile, which on SQLite would hold up all.
+    read = read_untrusted(path, form, segments=segments, sample_time=sample_time)
+    details = {"source": read_as, "warnings": list(read.notes)}
+    return add_recording(
+        database, store, read.recording, name=name or "recording", kind="upload", key=key,
+        details=details,
+    )  # fmt: skip
+
+
+def derive(database: Database, store: ObjectStore, parent_id: str, body: DeriveIn) -> Stored:
+    """Make a dataset from another by steps; the same steps again give the same dataset.
+
+    Raises
+    ------
+    InvalidRecord, InvalidSettings
+        If a step cannot be done.
+    """
+    with database.read() as session:
+        parent = DatasetRepository(session).get(parent_id)
+        known = DatasetRepository(session).by_source(_derivation_key(parent, body))
+    if known is not None:
+        return Stored(known, is_new=False)
+    recording = derived(recording_of(store, parent.sha256), body.steps)
+    steps = ", ".join(next(iter(step), "?") for step in body.steps)
+    return add_recording(
+        database, store, recording, name=body.name or f"{parent.name} ({steps})", kind="derive",
+        key=_derivation_key(parent, body), details={"steps": body.steps, "warnings": []},
+        parents=[parent.id],
+    )  # fmt: skip
+
+
+def add_recording(
+    database: Database,
+    store: ObjectStore,
+    recording: Recording,
+    *,
+    name: str,
+    kind: Kind,
+    key: str,
+    details: Mapping[str, Any],
+    parents: Sequence[str] = (),
+    relation: Relation = "derived",
+) -> Stored:
+    """Store a recording: its object first, then the row that names it."""
+    metadata = {"source": key, "parents": " ".join(parents), "name": name}
+    content = _written(store, recording, metadata)
+    sampling = recording.sampling
+    new = NewDataset(
+        name=name, kind=kind, sha256=content.sha256, source_key=key, size_bytes=content.size,
+        n_samples=recording.samples, duration=recording.duration,
+        sample_time=_common_period(recording) if sampling.is_regular else None,
+        channels=[_summary(channel) for channel in recording.channels],
+        details={**details, "segments": [
+            {"start": s.start, "stop": s.stop, "origin": s.origin, "labels": dict(s.labels)}
+            for s in recording.segments
+        ]},
+    )  # fmt: skip
+    with database.write() as session:
+        return DatasetRepository(session).add(new, parents=parents, relation=relation)
+
+
+def told(row: Dataset) -> DatasetOut:
+    """A dataset as it is told."""
+    details = dict(row.details)
+    return DatasetOut(
+        id=row.id, name=row.name, kind=row.kind, sha256=row.sha256, size_bytes=row.size_bytes,
+        channels=[ChannelOut.model_validate(channel) for channel in row.channels],
+        samples=row.n_samples, duration=row.duration, sample_time=row.sample_time,
+        segments=details.pop("segments", []), warnings=details.pop("warnings", []),
+        details=details, created_at=row.created_at,
+    )  # fmt: skip
+
+
+def page(session: Session, cursor: str | None, limit: int) -> Page[DatasetOut]:
+    """Datasets, latest first."""
+    found = DatasetRepository(session).page(cursor=cursor, limit=limit)
+    return Page(items=[told(row) for row in found.items], next=found.next)
+
+
+def signals(session: Session, store: ObjectStore, dataset_id: str, max_points: int) -> SignalsOut:
+    """Channels of a dataset, reduced so that extremes stay visible."""
+    row = DatasetRepository(session).get(dataset_id)
+    channels = recording_of(store, row.sha256).channels
+    return SignalsOut(id=row.id, channels=[series(channel, max_points) for channel in channels])
+
+
+def series(channel: Channel, max_points: int) -> Series:
+    """A channel as one line of a plot."""
+    times, values = decimate(channel.times, channel.values, max_points)
+    return Series(
+        name=channel.name,
+        unit=channel.unit,
+        times=times.tolist(),
+        values=[value if np.isfinite(value) else None for value in values.tolist()],
+        samples=channel.times.size,
+    )
+
+
+def key_of(source: Mapping[str, Any]) -> str:
+    """Hash of what a dataset is made from."""
+    return hashlib.sha256(json.dumps(source, sort_keys=True).encode()).hexdigest()
+
+
+def check_size(size: int, settings: Settings) -> None:
+    """Refuse a body that is larger than the limit.
+
+    Raises
+    ------
+    TooLarge
+    """
+    if size > settings.max_upload_bytes:
+        raise TooLarge(
+            f"the upload has {size} bytes or more; at most {settings.max_upload_bytes} "
+            "(LAGID_MAX_UPLOAD_BYTES)"
+        )
+
+
+def _derivation_key(parent: Dataset, body: DeriveIn) -> str:
+    return key_of({"parent": parent.id, "steps": body.steps})
+
+
+def _written(store: ObjectStore, recording: Recording, metadata: Mapping[str, str]) -> StoredObject:
+    with tempfile.TemporaryDirectory(prefix="lagid-") as folder:
+        path = Path(folder) / "recording.mcap"
+        write_recording(recording, path, metadata=metadata)
+        return store.put_file(path)
+
+
+def _summary(channel: Channel) -> dict[str, Any]:
+    sampling = channel.sampling
+    return {
+        "name": channel.name, "unit": channel.unit, "hold": channel.hold,
+        "samples": channel.times.size, "start": float(channel.times[0]),
+        "stop": float(channel.times[-1]),
+        "sample_time": sampling.period if sampling.is_regular else None,
+        "missing": int(np.count_nonzero(~np.isfinite(channel.values))),
+    }  # fmt: skip
+
+
+def _common_period(recording: Recording) -> float | None:
+    periods = [channel.sampling for channel in recording.channels]
+    if not all(one.is_regular for one in periods):
+        return None
+    first = periods[0].period
+    return first if all(abs(p.period - first) <= 1e-6 * first for p in periods) else None

@@ -1,0 +1,146 @@
+"""Use cases of runs: their pages, results, history and migrations."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service.errors import InvalidRequest
+from service.models import resolve
+from service.schemas import Page
+from service.schemas_runs import (
+    HistoryOut,
+    ImprovementOut,
+    MigrantOut,
+    MigrationsOut,
+    RunOut,
+)
+from service.storage.jobs import JobRepository
+from service.storage.lookups import Reached, reached
+from service.storage.runs import RunOrder, RunRepository
+from service.storage.tables import Job, Run, State
+from service.sweeps import body_of
+from sysid.parameters import override
+
+ALMOST = 0.99  # what a run that is not over shows at most: refinement is still to come
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Which runs of a job are wanted, and in which order."""
+
+    states: Sequence[State] = ()
+    cell: Sequence[str] = ()
+    labels: Sequence[str] = ()
+    order: RunOrder = "number"
+    descending: bool = False
+
+
+def page(
+    session: Session, job_id: str, cursor: str | None, limit: int, choice: Choice
+) -> Page[RunOut]:
+    """Runs of a job."""
+    job = JobRepository(session).get(job_id)
+    found = RunRepository(session).page(
+        job.id, cursor=cursor, limit=limit, states=choice.states,
+        cell=_wanted("cell", choice.cell), labels=_wanted("label", choice.labels),
+        order=choice.order, descending=choice.descending,
+    )  # fmt: skip
+    known = reached(session, [run.id for run in found.items if run.state is State.RUNNING])
+    items = [told(run, job, known.get(run.id)) for run in found.items]
+    return Page(items=items, next=found.next)
+
+
+def one(session: Session, run_id: str) -> RunOut:
+    """One run with its result document."""
+    run = RunRepository(session).get(run_id)
+    job = JobRepository(session).get(run.job_id)
+    is_running = run.state is State.RUNNING
+    known = reached(session, [run.id]) if is_running else {}
+    return told(run, job, known.get(run.id))
+
+
+def told(run: Run, job: Job, known: Reached | None = None) -> RunOut:
+    """A run as it is told: its result document, or how far it is."""
+    so_far: dict[str, Any] = {
+        "rms": run.best_rms, "evaluations": run.evaluations, "generations": run.generations,
+    }  # fmt: skip
+    if known is not None:
+        so_far = {
+            "rms": known.rms, "evaluations": known.evaluations, "generations": known.generation,
+        }  # fmt: skip
+    return RunOut.model_validate(
+        {
+            **so_far, **(run.result or {}), "id": run.id, "job": run.job_id,
+            "number": run.number, "cell": run.cell, "labels": run.labels,
+            "state": run.state.value, "progress": _progress(run, job, known), "error": run.error,
+            "created_at": run.created_at, "started_at": run.started_at,
+            "finished_at": run.finished_at, "has_signals": run.signals_sha256 is not None,
+        }
+    )  # fmt: skip
+
+
+def body_of_run(run: Run, job: Job) -> dict[str, Any]:
+    """The exact request of one run: the job's with the cell's values in it."""
+    return body_of(job.spec, run.cell)
+
+
+def history(session: Session, run_id: str) -> HistoryOut:
+    """Improvements of every island's champion, in the order in which they were found."""
+    repository = RunRepository(session)
+    run = repository.get(run_id)
+    islands: list[list[ImprovementOut]] = []
+    for row in repository.history(run_id):
+        while len(islands) <= row.island:
+            islands.append([])
+        islands[row.island].append(
+            ImprovementOut(
+                generation=row.generation, evaluations=row.evaluations, rms=row.rms,
+                phase=row.phase, parameters=row.parameters,
+            )
+        )  # fmt: skip
+    return HistoryOut(id=run.id, names=_free_names(session, run), islands=islands)
+
+
+def migrations(session: Session, run_id: str) -> MigrationsOut:
+    """The migration log."""
+    migrants = [
+        MigrantOut(
+            epoch=row.epoch, source=row.source, destination=row.destination, fitness=row.fitness
+        )
+        for row in RunRepository(session).migrations(run_id)
+    ]
+    return MigrationsOut(id=run_id, migrants=migrants)
+
+
+def _free_names(session: Session, run: Run) -> list[str]:
+    if run.result is not None:
+        return [one["name"] for one in run.result["parameters"] if one["status"] != "fixed"]
+    body = body_of_run(run, JobRepository(session).get(run.job_id))
+    model, _ = resolve(session, body["model"])
+    return [p.name for p in override(model.parameters, body["parameters"]) if p.is_free]
+
+
+def _progress(run: Run, job: Job, known: Reached | None) -> float:
+    if run.state.is_terminal:
+        return 1.0
+    if known is None:
+        return 0.0
+    generations: int = body_of_run(run, job)["algorithm"]["generations"]
+    return min(known.generation / generations, ALMOST)
+
+
+def _wanted(name: str, filters: Sequence[str]) -> Mapping[str, Any]:
+    """Values asked for as ``key=value``; a value that is not JSON is a text."""
+    wanted: dict[str, Any] = {}
+    for text in filters:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise InvalidRequest.at(f"?{name}", f"found {text!r}; need path=value")
+        try:
+            wanted[key] = json.loads(value)
+        except ValueError:
+            wanted[key] = value
+    return wanted
