@@ -51,7 +51,7 @@ class Fault:
 
     def __str__(self) -> str:
         place = self.pointer if self.column is None else f"{self.pointer}, column {self.column}"
-        return f"{place}: {self.detail}"
+        return f"{place}: {self.detail}" if place else self.detail
 
 
 class InvalidModel(SysidError, ValueError):
