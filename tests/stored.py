@@ -42,7 +42,7 @@ def claimed(database: Database, n_runs: int = 1, **values) -> tuple[Claim, list[
     with database.write() as session:
         ledger = RunLedger(session, got.lease)
         ledger.create(Cell(number=i, cell={"/seed": i}, seed=i) for i in range(n_runs))
-        return got, [run.id for run in ledger.pending()]
+        return got, [run.id for run in ledger.pending(limit=10_000)]
 
 
 def job_of(database: Database, job_id: str) -> Job:

@@ -96,7 +96,7 @@ class JobRepository:
     def counts(self) -> dict[State, int]:
         """How many jobs are in each state."""
         query = select(Job.state, func.count()).where(*self._mine()).group_by(Job.state)
-        found = dict(self._session.execute(query).tuples().all())
+        found = dict(self._session.execute(query).all())
         return {state: found.get(state, 0) for state in State}
 
     def cancel(self, job_id: str) -> Job:

@@ -151,7 +151,7 @@ class RunLedger:
         query = select(Checkpoint.run_id, Checkpoint.state).where(
             Checkpoint.job_id == self._lease.job_id
         )
-        return dict(self._session.execute(query).tuples().all())
+        return dict(self._session.execute(query).all())
 
     def _is_mine(self, run_ids: Collection[str]) -> Any:
         return (Run.job_id == self._lease.job_id) & Run.id.in_(run_ids)

@@ -87,7 +87,7 @@ class RunRepository:
     def counts(self, job_id: str) -> dict[State, int]:
         """How many runs of a job are in each state."""
         query = select(Run.state, func.count()).where(*self._of(job_id)).group_by(Run.state)
-        found = dict(self._session.execute(query).tuples().all())
+        found = dict(self._session.execute(query).all())
         return {state: found.get(state, 0) for state in State}
 
     def table(self, job_id: str) -> list[RunRow]:

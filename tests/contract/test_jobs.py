@@ -1,0 +1,225 @@
+"""Jobs and their events as users see them, on SQLite and on PostgreSQL alike."""
+
+import threading
+from datetime import UTC
+
+import pytest
+
+from service.storage.errors import Conflict, KeyReused, NotFound, UnstorableValue
+from service.storage.events import EventRepository
+from service.storage.jobs import JobRepository, NewJob
+from service.storage.ledger import RunLedger, RunOutcome
+from service.storage.queue import Progress, Queue
+from service.storage.tables import Project, State
+from tests.stored import claim, claimed, job_of, submit
+
+NEW = NewJob(name="tube 40 m", spec={"model": "tube", "sweep": {"axes": []}}, n_runs=3)
+
+
+def events(database, job_id, after=0, limit=500):
+    with database.read() as session:
+        return EventRepository(session).after(job_id, after, limit)
+
+
+def kinds(database, job_id):
+    return [(event.kind, event.data.get("state")) for event in events(database, job_id)]
+
+
+def test_a_submitted_job_is_queued_and_kept_whole(database):
+    with database.write() as session:
+        submission = JobRepository(session).submit(NEW)
+    assert submission.is_new
+    job = job_of(database, submission.job.id)
+    assert (job.state, job.spec, job.n_runs, job.name) == (State.QUEUED, NEW.spec, 3, "tube 40 m")
+    assert job.created_at.tzinfo is UTC
+
+
+def test_the_same_request_under_the_same_key_is_one_job(database):
+    found = []
+    for _ in range(2):
+        with database.write() as session:
+            found.append(JobRepository(session).submit(NEW, key="k1", request_hash="h"))
+    assert [one.is_new for one in found] == [True, False]
+    assert found[0].job.id == found[1].job.id
+    assert found[1].job.spec == NEW.spec
+
+
+def test_another_request_under_the_same_key_is_refused(database):
+    with database.write() as session:
+        JobRepository(session).submit(NEW, key="k1", request_hash="h")
+    with pytest.raises(KeyReused, match="k1"), database.write() as session:
+        JobRepository(session).submit(NEW, key="k1", request_hash="other")
+
+
+def test_many_requests_under_one_key_at_once_make_one_job(database):
+    found, start = [], threading.Barrier(4)
+
+    def send():
+        start.wait()
+        with database.write() as session:
+            found.append(JobRepository(session).submit(NEW, key="k1", request_hash="h"))
+
+    threads = [threading.Thread(target=send) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len({one.job.id for one in found}) == 1
+    assert sum(one.is_new for one in found) == 1
+    with database.read() as session:
+        assert JobRepository(session).counts()[State.QUEUED] == 1
+
+
+def test_pages_of_jobs_stay_put_while_new_ones_arrive(database):
+    old = [submit(database) for _ in range(5)]
+    with database.read() as session:
+        first = JobRepository(session).page(limit=2)
+    submit(database)
+    with database.read() as session:
+        second = JobRepository(session).page(limit=2, cursor=first.next)
+        third = JobRepository(session).page(limit=2, cursor=second.next)
+    pages = [*first.items, *second.items, *third.items]
+    assert [job.id for job in pages] == old[::-1]
+    assert third.next is None
+
+
+def test_a_page_that_ends_exactly_at_the_end_has_no_next(database):
+    submit(database), submit(database)
+    with database.read() as session:
+        page = JobRepository(session).page(limit=2)
+    assert len(page.items) == 2
+    assert page.next is None
+
+
+def test_jobs_are_listed_and_counted_by_state(database):
+    first, second = submit(database), submit(database)
+    claim(database)
+    with database.read() as session:
+        jobs = JobRepository(session)
+        assert [job.id for job in jobs.page(states=[State.RUNNING]).items] == [first]
+        assert [job.id for job in jobs.page(states=[State.QUEUED, State.RUNNING]).items] == [
+            second, first,
+        ]  # fmt: skip
+        assert jobs.counts() == {
+            State.QUEUED: 1, State.RUNNING: 1, State.SUCCEEDED: 0, State.FAILED: 0,
+            State.CANCELLED: 0,
+        }  # fmt: skip
+
+
+def test_a_deleted_job_is_no_longer_there(database):
+    job_id = submit(database)
+    with pytest.raises(Conflict, match="cancel it"), database.write() as session:
+        JobRepository(session).delete(job_id)
+    with database.write() as session:
+        JobRepository(session).cancel(job_id)
+        JobRepository(session).delete(job_id)
+    with database.read() as session:
+        assert JobRepository(session).page().items == ()
+        assert sum(JobRepository(session).counts().values()) == 0
+        with pytest.raises(NotFound, match=job_id):
+            JobRepository(session).get(job_id)
+
+
+def test_another_projects_jobs_are_neither_seen_nor_touched(database):
+    with database.write() as session:
+        session.add(Project(id="proj_other", name="other"))
+    job_id = submit(database)
+    with database.write() as session:
+        foreign = JobRepository(session, "proj_other")
+        assert foreign.page().items == ()
+        for act in (foreign.get, foreign.cancel, foreign.resume, foreign.delete):
+            with pytest.raises(NotFound):
+                act(job_id)
+        assert foreign.submit(NEW, key="k", request_hash="h").is_new
+    with database.write() as session:
+        assert JobRepository(session).submit(NEW, key="k", request_hash="h").is_new
+
+
+@pytest.mark.parametrize("name", ["a\x00b", "\udcff"])
+def test_a_name_that_not_every_database_can_keep_is_refused(database, name):
+    with pytest.raises(UnstorableValue), database.write() as session:
+        JobRepository(session).submit(NewJob(name=name, spec={}))
+
+
+def test_a_job_tells_its_whole_story(database):
+    got, (run_id,) = claimed(database)
+    with database.write() as session:
+        queue = Queue(session)
+        queue.tell(got.lease, "log", {"line": "packing 1 run"})
+        queue.report(got.lease, Progress(50, best_rms=0.5))
+        RunLedger(session, got.lease).record([RunOutcome(run_id=run_id, state=State.SUCCEEDED)])
+        queue.finish(got.lease, State.SUCCEEDED)
+    assert kinds(database, got.job.id) == [
+        ("state", "queued"), ("state", "running"), ("log", None), ("progress", None),
+        ("state", "succeeded"), ("end", "succeeded"),
+    ]  # fmt: skip
+
+
+def test_a_resumed_job_tells_on_after_its_end(database):
+    job_id = submit(database)
+    with database.write() as session:
+        JobRepository(session).cancel(job_id)
+        JobRepository(session).resume(job_id)
+    assert kinds(database, job_id)[-2:] == [("end", "cancelled"), ("state", "queued")]
+
+
+def test_a_reader_goes_on_after_the_last_event_it_saw(database):
+    got, _ = claimed(database)
+    other, _ = claimed(database)
+    for i in range(5):
+        with database.write() as session:
+            Queue(session).tell(got.lease, "log", {"line": i})
+            Queue(session).tell(other.lease, "log", {"line": -i})
+    everything = events(database, got.job.id)
+    ids = [event.id for event in everything]
+    assert ids == sorted(set(ids))
+    first = events(database, got.job.id, limit=3)
+    rest = events(database, got.job.id, after=first[-1].id)
+    assert [event.id for event in first + rest] == ids
+    assert [event.data["line"] for event in rest] == [1, 2, 3, 4]
+    with database.read() as session:
+        assert EventRepository(session).last_id(got.job.id) == ids[-1]
+        assert EventRepository(session).last_id("job_none") == 0
+
+
+def test_a_reader_who_polls_while_two_writers_write_misses_no_event(database):
+    got, _ = claimed(database)
+    stop, seen = threading.Event(), []
+
+    def write(who):
+        for i in range(15):
+            with database.write() as session:
+                EventRepository(session).append(got.job.id, "log", {"line": f"{who}{i}"})
+
+    def read():
+        last, final = 0, False
+        while not final:
+            final = stop.is_set()
+            for event in events(database, got.job.id, last):
+                last = event.id
+                seen.append(event.id)
+
+    reader = threading.Thread(target=read)
+    writers = [threading.Thread(target=write, args=(who,)) for who in "ab"]
+    for thread in [reader, *writers]:
+        thread.start()
+    for thread in writers:
+        thread.join()
+    stop.set()
+    reader.join()
+    assert seen == [event.id for event in events(database, got.job.id)]
+    assert len(seen) == 32
+
+
+def test_pruning_keeps_the_last_progress_and_every_other_event(database):
+    got, _ = claimed(database)
+    for evaluations in (1, 2, 3):
+        with database.write() as session:
+            Queue(session).report(got.lease, Progress(evaluations))
+    with database.write() as session:
+        assert EventRepository(session).prune_progress(got.job.id) == 0
+        Queue(session).finish(got.lease, State.CANCELLED)
+        assert EventRepository(session).prune_progress(got.job.id) == 2
+    left = events(database, got.job.id)
+    assert [event.data["evaluations"] for event in left if event.kind == "progress"] == [3]
+    assert left[-1].kind == "end"

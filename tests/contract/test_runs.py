@@ -1,0 +1,283 @@
+"""Runs, their history, checkpoints and lists, on SQLite and on PostgreSQL alike."""
+
+import pytest
+
+from service.storage.errors import InvalidCursor, NotFound, UnstorableValue
+from service.storage.jobs import JobRepository
+from service.storage.ledger import (
+    Cell,
+    HistoryPoint,
+    MigrantPoint,
+    RunLedger,
+    RunOutcome,
+    add_runs,
+)
+from service.storage.queue import Queue
+from service.storage.runs import RunRepository
+from service.storage.tables import State
+from tests.stored import claimed, job_of, runs_of, submit
+
+RESULT = {
+    "parameters": [{"name": "L", "unit": "s", "value": 0.12, "stderr": 0.01},
+                   {"name": "m", "unit": "1", "value": 1.0, "stderr": None}],
+    "rms": 0.01,
+}  # fmt: skip
+
+
+def record(database, lease, *outcomes, **evidence):
+    with database.write() as session:
+        return RunLedger(session, lease).record(outcomes, **evidence)
+
+
+def good(run_id, rms=0.01):
+    return RunOutcome(
+        run_id=run_id, state=State.SUCCEEDED, result=RESULT, valid=True, best_rms=rms,
+        fit_estimation=98.0, evaluations=200, generations=4, seconds=0.5, signals_sha256="b" * 64,
+    )  # fmt: skip
+
+
+def sweep(database, cells):
+    """A claimed job with these cells; its identifier."""
+    submit(database, n_runs=len(cells))
+    with database.write() as session:
+        got = Queue(session).claim("d1")
+        RunLedger(session, got.lease).create(
+            Cell(number=i, cell=cell, labels={"length_m": i % 2}) for i, cell in enumerate(cells)
+        )
+    return got
+
+
+def numbers(database, job_id, **filters):
+    with database.read() as session:
+        return [run.number for run in RunRepository(session).page(job_id, **filters).items]
+
+
+def test_runs_are_made_in_bulk_and_a_second_time_changes_nothing(database):
+    got, before = claimed(database, n_runs=1500)
+    with database.write() as session:
+        ledger = RunLedger(session, got.lease)
+        ledger.create(Cell(number=i) for i in range(1500))
+        assert [run.id for run in ledger.pending(limit=2000)] == before
+    assert before == sorted(before)
+    assert len(set(before)) == 1500
+
+
+def test_runs_can_be_made_with_their_job(database):
+    job_id = submit(database)
+    with database.write() as session:
+        job = JobRepository(session).get(job_id)
+        add_runs(session, job, [Cell(number=0, cell={"/seed": 3}, seed=3, method="simple")])
+    (run,) = runs_of(database, job_id)
+    assert (run.job_id, run.project_id, run.seed, run.method) == (
+        job_id, "proj_default", 3, "simple",
+    )  # fmt: skip
+    assert run.state is State.QUEUED
+
+
+def test_pending_runs_come_in_order_and_in_parts(database):
+    got, ids = claimed(database, n_runs=5)
+    with database.write() as session:
+        ledger = RunLedger(session, got.lease)
+        first = ledger.pending(limit=2)
+        rest = ledger.pending(limit=9, after=first[-1].number)
+    assert [run.id for run in first + rest] == ids
+
+
+def test_started_runs_carry_the_attempt_that_started_them(database):
+    got, ids = claimed(database, n_runs=2)
+    with database.write() as session:
+        RunLedger(session, got.lease).start(ids[:1])
+    first, second = runs_of(database, got.job.id)
+    assert (first.state, first.attempt) == (State.RUNNING, 1)
+    assert first.started_at is not None
+    assert (second.state, second.attempt) == (State.QUEUED, 0)
+
+
+def test_a_result_is_stored_whole_with_the_columns_that_lists_use(database):
+    got, (run_id,) = claimed(database)
+    assert record(database, got.lease, good(run_id)) == (run_id,)
+    with database.read() as session:
+        run = RunRepository(session).get(run_id)
+        (row,) = RunRepository(session).table(got.job.id)
+    assert run.result == RESULT
+    assert run.estimates == {
+        "L": {"value": 0.12, "stderr": 0.01},
+        "m": {"value": 1.0, "stderr": None},
+    }
+    assert (run.state, run.best_rms, run.attempt) == (State.SUCCEEDED, 0.01, 1)
+    assert run.finished_at is not None
+    assert (row.id, row.estimates, row.cell, row.valid) == (run_id, run.estimates, run.cell, True)
+
+
+def test_a_result_is_written_exactly_once(database):
+    got, (run_id,) = claimed(database)
+    record(database, got.lease, good(run_id, 0.01))
+    assert record(database, got.lease, good(run_id, 0.005)) == ()
+    (run,) = runs_of(database, got.job.id)
+    assert run.best_rms == 0.01
+    job = job_of(database, got.job.id)
+    assert (job.n_done, job.best_rms) == (1, 0.01)
+
+
+def test_a_job_counts_its_finished_and_failed_runs_and_keeps_the_least_rms(database):
+    got, ids = claimed(database, n_runs=4)
+    record(database, got.lease, good(ids[0], 0.3), good(ids[1], 0.2))
+    record(database, got.lease, RunOutcome(run_id=ids[2], state=State.FAILED, error="diverged"))
+    job = job_of(database, got.job.id)
+    assert (job.n_done, job.n_failed, job.best_rms) == (3, 1, 0.2)
+    with database.read() as session:
+        counts = RunRepository(session).counts(got.job.id)
+    assert counts == {
+        State.QUEUED: 1, State.RUNNING: 0, State.SUCCEEDED: 2, State.FAILED: 1, State.CANCELLED: 0,
+    }  # fmt: skip
+
+
+def test_a_run_of_another_job_is_not_written(database):
+    _, (foreign,) = claimed(database)
+    got, _ = claimed(database)
+    assert record(database, got.lease, good(foreign)) == ()
+
+
+def test_results_and_history_stand_or_fall_together(database):
+    got, ids = claimed(database, n_runs=2)
+    bad = HistoryPoint("run_none", 0, 0, 0, 0, 1.0, "start", [])
+    with pytest.raises(Exception, match=r"(?i)foreign key"):
+        record(database, got.lease, good(ids[0]), history=[bad])
+    assert {run.state for run in runs_of(database, got.job.id)} == {State.QUEUED}
+    assert job_of(database, got.job.id).n_done == 0
+
+
+def test_history_written_again_after_a_resume_changes_nothing(database):
+    got, (run_id,) = claimed(database)
+    points = [
+        HistoryPoint(run_id, island, number, 10 * number, 50, 1.0 / (number + 1), "genetic", [1.5])
+        for island in range(2)
+        for number in range(3)
+    ]
+    migrants = [MigrantPoint(run_id, 0, 1, 0, 1, 0.5)]
+    with database.write() as session:
+        RunLedger(session, got.lease).append(points[:4], migrants)
+    record(database, got.lease, good(run_id), history=points, migrants=migrants)
+    with database.read() as session:
+        history = RunRepository(session).history(run_id)
+        log = RunRepository(session).migrations(run_id)
+    assert [(one.island, one.number) for one in history] == [
+        (i, n) for i in (0, 1) for n in range(3)
+    ]
+    assert history[2].rms == 1.0 / 3
+    assert history[2].parameters == [1.5]
+    assert [(one.epoch, one.source, one.destination) for one in log] == [(1, 0, 1)]
+
+
+def test_only_the_last_checkpoint_is_kept_and_a_finished_run_has_none(database):
+    got, (a, b) = claimed(database, n_runs=2)
+    with database.write() as session:
+        RunLedger(session, got.lease).save([(a, 10, b"\x00old"), (b, 10, b"b")])
+        RunLedger(session, got.lease).save([(a, 20, b"\x00new")])
+        assert RunLedger(session, got.lease).checkpoints() == {a: b"\x00new", b: b"b"}
+    record(database, got.lease, good(b))
+    with database.write() as session:
+        assert RunLedger(session, got.lease).checkpoints() == {a: b"\x00new"}
+
+
+def test_the_next_holder_goes_on_from_the_checkpoint(database):
+    got, (run_id,) = claimed(database)
+    with database.write() as session:
+        RunLedger(session, got.lease).save([(run_id, 10, b"half way")])
+        Queue(session).release(got.lease)
+    with database.write() as session:
+        again = Queue(session).claim("d2")
+        assert RunLedger(session, again.lease).checkpoints() == {run_id: b"half way"}
+
+
+def test_pages_of_runs_follow_each_other_without_gap_or_repeat(database):
+    got, _ = claimed(database, n_runs=7)
+    seen, cursor = [], None
+    while True:
+        with database.read() as session:
+            page = RunRepository(session).page(got.job.id, limit=3, cursor=cursor)
+        seen += [run.number for run in page.items]
+        if (cursor := page.next) is None:
+            break
+    assert seen == list(range(7))
+
+
+@pytest.mark.parametrize("descending", [False, True])
+def test_pages_sorted_by_a_column_have_every_run_once_and_those_without_a_value_last(
+    database, descending
+):
+    got, ids = claimed(database, n_runs=7)
+    values = [0.3, 0.1, 0.3, None, 0.2, None, 0.3]
+    record(database, got.lease, *(good(i, rms) for i, rms in zip(ids, values, strict=True)))
+    seen, cursor = [], None
+    while True:
+        with database.read() as session:
+            page = RunRepository(session).page(
+                got.job.id, limit=2, cursor=cursor, order="best_rms", descending=descending
+            )
+        seen += [run.number for run in page.items]
+        if (cursor := page.next) is None:
+            break
+    assert seen == ([0, 2, 6, 4, 1, 3, 5] if descending else [1, 4, 0, 2, 6, 3, 5])
+
+
+@pytest.mark.parametrize("cursor", ["", "x", "[1]", "[1,2,3]", '["a",1]', "null", '[1,"b"]', "{}"])
+def test_a_cursor_from_elsewhere_is_refused(database, cursor):
+    got, _ = claimed(database)
+    with pytest.raises(InvalidCursor, match="not a cursor"):
+        numbers(database, got.job.id, cursor=cursor)
+
+
+AXES = [0, 0.1, 1, True, False, None, "0.1", "improved", ["a"], ["a", "b"], {"k": 1}, "true"]
+
+
+@pytest.mark.parametrize("place", range(len(AXES)), ids=[repr(value) for value in AXES])
+def test_runs_are_found_by_the_exact_value_of_an_axis(database, place):
+    got = sweep(database, [{"/noise/sigma": value, "/seed": 3} for value in AXES])
+    assert numbers(database, got.job.id, cell={"/noise/sigma": AXES[place]}) == [place]
+
+
+def test_whole_and_broken_numbers_of_an_axis_are_the_same(database):
+    got = sweep(database, [{"/noise/sigma": 0}, {"/noise/sigma": 0.0}, {"/noise/sigma": 2.0}])
+    assert numbers(database, got.job.id, cell={"/noise/sigma": 0.0}) == [0, 1]
+    assert numbers(database, got.job.id, cell={"/noise/sigma": 2}) == [2]
+
+
+def test_filters_hold_together(database):
+    cells = [{"/seed": seed, "/x": x} for seed in range(2) for x in ("a", 'b"\\')]
+    got = sweep(database, cells)
+    assert numbers(database, got.job.id, cell={"/seed": 1, "/x": 'b"\\'}) == [3]
+    assert numbers(database, got.job.id, labels={"length_m": 0}) == [0, 2]
+    assert numbers(database, got.job.id, cell={"/none": 1}) == []
+    assert numbers(database, got.job.id, states=[State.SUCCEEDED]) == []
+
+
+def test_another_projects_runs_are_not_seen(database):
+    got, (run_id,) = claimed(database)
+    with database.read() as session:
+        foreign = RunRepository(session, "proj_other")
+        assert foreign.page(got.job.id).items == ()
+        assert foreign.table(got.job.id) == []
+        for read in (foreign.get, foreign.history, foreign.migrations):
+            with pytest.raises(NotFound, match="no run"):
+                read(run_id)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), "a\x00b", "\ud800"])
+def test_a_document_that_not_every_database_can_keep_is_refused(database, value):
+    got, (run_id,) = claimed(database)
+    bad = RunOutcome(run_id=run_id, state=State.SUCCEEDED, result={"note": [value]})
+    with pytest.raises(UnstorableValue):
+        record(database, got.lease, bad)
+
+
+def test_text_that_only_looks_like_an_escape_is_kept(database):
+    got, (run_id,) = claimed(database)
+    text = "\\u0000 and \\\\u0000 and \N{GREEK SMALL LETTER SIGMA}\N{PILE OF POO}"
+    record(
+        database, got.lease,
+        RunOutcome(run_id=run_id, state=State.FAILED, result={"note": text}, error=text),
+    )  # fmt: skip
+    (run,) = runs_of(database, got.job.id)
+    assert run.result == {"note": text}
+    assert run.error == text
