@@ -46,7 +46,7 @@ from sysid.types import FloatArray
 MAGIC: Final = b"\x89MCAP0\r\n"
 CHUNK_SAMPLES: Final = 16_384
 LIBRARY: Final = "lagid"
-ZSTD_LEVEL: Final = 1  # twice as fast as the usual 3, and no larger for measured doubles
+ZSTD_LEVEL: Final = -1  # half the time of the usual 3, and 4 % larger for measured doubles
 FOOTER_BODY: Final = 20
 _INDEX_HEAD = struct.Struct("<BQHI")
 _INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])

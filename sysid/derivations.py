@@ -1,0 +1,205 @@
+"""Recordings made from recordings: pure functions, named and parametrised by plain values.
+
+A step is a mapping with one key, such as ``{"trim": {"start": 2, "stop": 8}}``. The steps of a
+list are taken one after the other.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sysid.arguments import Arguments
+from sysid.errors import InvalidRecord, InvalidSettings, nearest
+from sysid.pooling import pool, select
+from sysid.records import HOLDS, Channel, Hold, Recording, Segment, time_of_cut
+from sysid.resampling import resample
+from sysid.types import FloatArray
+
+_HOLDS: Mapping[str, Hold] = {hold: hold for hold in HOLDS}
+Step = Callable[[Recording, Arguments], Recording]
+
+
+def derive(recording: Recording, steps: Sequence[Mapping[str, Any]]) -> Recording:
+    """Take all steps.
+
+    Raises
+    ------
+    InvalidSettings
+        With the JSON pointer of what cannot be used, such as ``/steps/2/pool/bin``.
+    """
+    if not isinstance(steps, list | tuple) or not steps:
+        raise InvalidSettings("/steps", f"found {steps!r}; need a list with one step or more")
+    for place, step in enumerate(steps):
+        if not isinstance(step, Mapping) or len(step) != 1:
+            raise InvalidSettings(
+                f"/steps/{place}", f"found {step!r}; need an object with one key, the step's name"
+            )
+        ((name, value),) = step.items()
+        pointer = f"/steps/{place}/{name}"
+        if name not in STEPS:
+            raise InvalidSettings(pointer, f"there is no such step{nearest(str(name), STEPS)}")
+        try:
+            recording = STEPS[name](recording, Arguments(pointer, value))
+        except InvalidRecord as error:
+            raise InvalidSettings(pointer, str(error)) from None
+    return recording
+
+
+def add_noise(recording: Recording, given: Arguments) -> Recording:
+    """Add white Gaussian noise of standard deviation `sigma` (in the channel's unit).
+
+    The draw depends on the seed and the channel's name only: the same samples whatever other
+    channels there are.
+    """
+    given.only("sigma", "seed", "channels")
+    sigma, seed = given.number("sigma"), given.whole("seed", 0)
+    if sigma < 0:
+        given.fail("sigma", f"found {sigma!r}; need 0 or more")
+
+    def noisy(channel: Channel) -> FloatArray:
+        key = [seed, *channel.name.encode()]
+        generator = np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
+        return channel.values + sigma * generator.standard_normal(channel.values.size)
+
+    return _changed(recording, given.texts("channels"), noisy)
+
+
+def trim(recording: Recording, given: Arguments) -> Recording:
+    """Keep a span of time (`start` to `stop`, s) or of samples (`rows`: [first, last + 1])."""
+    given.only("start", "stop", "rows")
+    if given.has("rows"):
+        if given.has("start") or given.has("stop"):
+            given.fail("rows", "is given together with a time; give rows, or start and stop")
+        return _rows(recording, given)
+    if not given.has("start") and not given.has("stop"):
+        given.fail("", "need start, stop (seconds), or rows")
+    start = given.number("start", recording.start)
+    stop = given.number("stop", recording.stop)
+    if stop <= start:
+        given.fail("stop", f"found {stop!r}; need more than the start, {start!r}")
+    return _span(recording, start, stop)
+
+
+def _rows(recording: Recording, given: Arguments) -> Recording:
+    first, last = given.pair("rows")
+    times = recording.channels[0].times
+    if any(not np.array_equal(one.times, times) for one in recording.channels):
+        given.fail("rows", "the channels have different times; give start and stop in seconds")
+    if last > times.size:
+        given.fail("rows", f"found [{first}, {last}]; the recording has {times.size} rows")
+    channels = tuple(
+        replace(one, times=one.times[first:last], values=one.values[first:last])
+        for one in recording.channels
+    )
+    return Recording(channels, _clipped(recording.segments, times[first], times[last - 1]))
+
+
+def _span(recording: Recording, start: float, stop: float) -> Recording:
+    channels = tuple(one.between(start, stop) for one in recording.channels)
+    return Recording(channels, _clipped(recording.segments, start, stop))
+
+
+def _clipped(segments: tuple[Segment, ...], start: float, stop: float) -> tuple[Segment, ...]:
+    return tuple(
+        replace(
+            one,
+            start=float(max(one.start, start)),
+            stop=float(min(one.stop, stop)),
+            origin=float(one.origin + max(start - one.start, 0.0)),
+        )
+        for one in segments
+        if one.start <= stop and one.stop >= start
+    )
+
+
+def split(recording: Recording, given: Arguments) -> Recording:
+    """Keep one part: the last `fraction` of the samples (``validation``) or what comes before."""
+    given.only("fraction", "part")
+    part = given.choice("part", ("estimation", "validation"))
+    longest = max((one.times for one in recording.channels), key=len)
+    cut = time_of_cut(longest, given.number("fraction"), f"{given.pointer}/fraction")
+    if part == "validation":
+        return _span(recording, cut, np.inf)
+    return _span(recording, -np.inf, float(np.nextafter(cut, -np.inf)))
+
+
+def detrend(recording: Recording, given: Arguments) -> Recording:
+    """Subtract the mean or the straight line of least squares; missing values do not count."""
+    given.only("kind", "channels")
+    degree = ("mean", "linear").index(given.choice("kind", ("mean", "linear"), "mean"))
+    names = given.texts("channels") if given.has("channels") else list(recording.names)
+
+    def flat(channel: Channel) -> FloatArray:
+        known = np.isfinite(channel.values)
+        if np.count_nonzero(known) <= degree:
+            given.fail("", f"channel {channel.name!r} has too few values")
+        trend = np.polynomial.Polynomial.fit(channel.times[known], channel.values[known], degree)
+        return np.asarray(channel.values - trend(channel.times), dtype=np.float64)
+
+    return _changed(recording, names, flat)
+
+
+def subtract_offset(recording: Recording, given: Arguments) -> Recording:
+    """Subtract a number from each named channel."""
+    offsets = {name: given.number(name) for name, _ in given.items()}
+    return _changed(recording, list(offsets), lambda one: one.values - offsets[one.name])
+
+
+def set_hold(recording: Recording, given: Arguments) -> Recording:
+    """Say what named channels do between their samples, when they are inputs."""
+    holds = {name: _HOLDS[given.choice(name, HOLDS)] for name, _ in given.items()}
+    for name in holds:
+        recording.channel(name)
+    return replace(
+        recording,
+        channels=tuple(
+            replace(one, hold=holds.get(one.name, one.hold)) for one in recording.channels
+        ),
+    )
+
+
+def rename(recording: Recording, given: Arguments) -> Recording:
+    """Give channels other names."""
+    names = {old: given.text(old) for old, _ in given.items()}
+    for old in names:
+        recording.channel(old)
+    renamed = [names.get(name, name) for name in recording.names]
+    for name in renamed:
+        if not name or renamed.count(name) > 1:
+            given.fail("", f"two channels would be called {name!r}, or one has no name")
+    return replace(
+        recording,
+        channels=tuple(
+            replace(one, name=name) for one, name in zip(recording.channels, renamed, strict=True)
+        ),
+    )
+
+
+def _changed(
+    recording: Recording, names: Sequence[str], change: Callable[[Channel], FloatArray]
+) -> Recording:
+    for name in names:
+        recording.channel(name)
+    return replace(
+        recording,
+        channels=tuple(
+            replace(one, values=change(one)) if one.name in names else one
+            for one in recording.channels
+        ),
+    )
+
+
+STEPS: Mapping[str, Step] = {
+    "noise": add_noise,
+    "resample": resample,
+    "trim": trim,
+    "detrend": detrend,
+    "offset": subtract_offset,
+    "split": split,
+    "select": select,
+    "pool": pool,
+    "hold": set_hold,
+    "rename": rename,
+}

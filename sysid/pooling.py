@@ -1,0 +1,135 @@
+"""Repeats of a measurement: choosing some of them, and pooling them into one record."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sysid.arguments import Arguments
+from sysid.errors import nearest
+from sysid.records import Channel, Recording, Segment
+from sysid.types import FloatArray, IntArray
+
+Label = float | str
+Condition = Callable[[Label], bool]
+
+
+def select(recording: Recording, given: Arguments) -> Recording:
+    """Segments whose labels satisfy every condition; they keep their place on the time axis.
+
+    A condition is a value, a list of values, ``{"modulus": m, "remainder": r}``, or
+    ``{"min": a, "max": b}``.
+    """
+    if not recording.segments:
+        given.fail("", "the recording has no segments; name its label columns on upload")
+    conditions = {name: _condition(name, value, given) for name, value in given.items()}
+    for name in conditions:
+        known = {label for segment in recording.segments for label in segment.labels}
+        if name not in known:
+            given.fail(name, f"no segment has such a label{nearest(name, known)}")
+    kept = tuple(
+        segment
+        for segment in recording.segments
+        if all(
+            name in segment.labels and holds(segment.labels[name])
+            for name, holds in conditions.items()
+        )
+    )
+    if not kept:
+        given.fail("", f"none of the {len(recording.segments)} segments satisfies this")
+    return Recording(tuple(_within(one, kept) for one in recording.channels), kept)
+
+
+def _within(channel: Channel, kept: tuple[Segment, ...]) -> Channel:
+    starts = np.searchsorted(channel.times, [one.start for one in kept])
+    stops = np.searchsorted(channel.times, [one.stop for one in kept], side="right")
+    rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, stops, strict=True)])
+    return replace(channel, times=channel.times[rows], values=channel.values[rows])
+
+
+def _condition(name: str, value: Any, given: Arguments) -> Condition:
+    if isinstance(value, Mapping):
+        inner = Arguments(f"{given.pointer}/{name}", value)
+        if inner.has("modulus"):
+            return _remainder(inner)
+        return _range(inner)
+    wanted = value if isinstance(value, list | tuple) else [value]
+    for one in wanted:
+        if isinstance(one, bool) or not isinstance(one, int | float | str):
+            given.fail(name, f"found {one!r}; need a number or a text")
+    return lambda label: label in wanted
+
+
+def _remainder(inner: Arguments) -> Condition:
+    inner.only("modulus", "remainder")
+    modulus, remainder = inner.positive("modulus"), inner.number("remainder")
+    return lambda label: isinstance(label, int | float) and label % modulus == remainder
+
+
+def _range(inner: Arguments) -> Condition:
+    inner.only("min", "max")
+    least, most = inner.number("min", -1e308), inner.number("max", 1e308)
+    return lambda label: isinstance(label, int | float) and least <= label <= most
+
+
+def pool(recording: Recording, given: Arguments) -> Recording:
+    """One record of all segments, on their own times.
+
+    The input becomes the median of its samples over bins of time, at the middle of each bin that
+    has any; each output keeps every sample at its own time. This resolves a lag that is shorter
+    than the sampling period when every repeat has another phase.
+    """
+    given.only("input", "outputs", "bin", "start", "stop")
+    start, width = given.number("start", 0.0), given.positive("bin")
+    source = recording.channel(given.text("input"))
+    outputs = [recording.channel(name) for name in given.texts("outputs")]
+    last = max(float(own_times_of(one, recording.segments).max()) for one in (source, *outputs))
+    stop = given.number("stop", float(np.nextafter(last, np.inf)))
+    if stop <= start:
+        given.fail("stop", f"found {stop!r}; need more than the start, {start!r}")
+    pooled = [_medians(source, recording.segments, start, stop, width)]
+    pooled += [_gathered(one, recording.segments, start, stop) for one in outputs]
+    for channel in pooled:
+        if channel is None:
+            given.fail("", f"a channel has no sample from {start:g} to {stop:g} s")
+    return Recording(tuple(channel for channel in pooled if channel is not None))
+
+
+def own_times_of(channel: Channel, segments: tuple[Segment, ...]) -> FloatArray:
+    """Times of all samples, each counted in its own segment, to the nanosecond."""
+    if not segments:
+        return channel.times
+    starts = np.array([one.start for one in segments])
+    origins = np.array([one.origin for one in segments])
+    here = np.searchsorted(starts, channel.times, side="right") - 1
+    return np.asarray(np.round(channel.times - starts[here] + origins[here], 9))
+
+
+def _gathered(
+    channel: Channel, segments: tuple[Segment, ...], start: float, stop: float
+) -> Channel | None:
+    times = own_times_of(channel, segments)
+    rows = np.flatnonzero((times >= start) & (times < stop) & np.isfinite(channel.values))
+    if rows.size == 0:
+        return None
+    ordered = rows[np.argsort(times[rows], kind="stable")]
+    return replace(channel, times=times[ordered], values=channel.values[ordered])
+
+
+def _medians(
+    channel: Channel, segments: tuple[Segment, ...], start: float, stop: float, width: float
+) -> Channel | None:
+    gathered = _gathered(channel, segments, start, stop)
+    if gathered is None:
+        return None
+    bins = _bins(gathered.times, start, width)
+    firsts = np.flatnonzero(np.diff(bins, prepend=-1))
+    medians = np.array([np.median(part) for part in np.split(gathered.values, firsts[1:])])
+    middles: FloatArray = start + (bins[firsts].astype(np.float64) + 0.5) * width
+    return replace(channel, times=middles, values=medians)
+
+
+def _bins(times: FloatArray, start: float, width: float) -> IntArray:
+    # Rounded first: a sample printed as 0.003 s belongs to the bin that begins there.
+    return np.floor(np.round((times - start) / width, 6)).astype(np.int64)
