@@ -1,0 +1,164 @@
+"""From a job's rows to specifications that workers can carry out."""
+
+import logging
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from service import models
+from service.conversion import algorithm_of, loss_of
+from service.dispatch.checkpoints import unpacked
+from service.dispatch.signals import Recordings, save_fit
+from service.errors import ServiceError
+from service.storage.datasets import DatasetRepository
+from service.storage.errors import LeaseLost, StorageError
+from service.storage.ledger import RunLedger
+from service.storage.objects import ObjectStore
+from service.storage.queue import Claim
+from service.storage.sessions import Database
+from service.storage.tables import Run
+from service.sweeps import body_of
+from sysid.errors import SysidError
+from sysid.models.model import Model
+from sysid.result import Identification
+from workers.errors import RecordsUnavailable
+from workers.ports import Failure, Noise, ProblemSpec, QueuedRun, Records, RefusedRun, RunSpec
+from workers.tasks import prepared
+
+_log = logging.getLogger(__name__)
+
+READ_AHEAD = 200
+
+
+class DataKey(NamedTuple):
+    """Which datasets, and which of their channels is which signal of which model."""
+
+    datasets: tuple[str, ...]
+    inputs: tuple[tuple[str, str], ...]
+    outputs: tuple[tuple[str, str], ...]
+
+
+class JobRuns:
+    """The runs and records of one claimed job; implements `workers.ports.JobSource`."""
+
+    def __init__(
+        self,
+        database: Database,
+        claim: Claim,
+        recordings: Recordings,
+        store: ObjectStore,
+    ) -> None:
+        self._database, self._lease, self._job = database, claim.lease, claim.job
+        self._recordings, self._store = recordings, store
+        self._problems: dict[str, ProblemSpec] = {}
+        self._models: dict[str, Model] = {}
+        self._data: dict[str, DataKey] = {}
+
+    def runs(self) -> Iterator[QueuedRun | RefusedRun]:
+        """The unfinished runs in order, each from its checkpoint if it has one."""
+        try:
+            states = self._checkpoints()
+            rows = self._pending(-1)
+            while rows:
+                for row in rows:
+                    yield self._queued(row, states.pop(row.id, None))
+                rows = self._pending(rows[-1].number)
+        except LeaseLost as error:  # the recorder will meet it too, and stop the job
+            _log.warning("no more runs: %s", error)
+
+    def specification(self, cell: Mapping[str, Any]) -> RunSpec:
+        """The run of one cell.
+
+        Raises
+        ------
+        SysidError, ServiceError, StorageError
+            If its settings cannot be used, or its model is not there.
+        """
+        body = body_of(self._job.spec, cell)
+        model = self._model(body["model"])
+        validation = body["validation"] or {}
+        kept = validation.get("datasets")
+        problem = ProblemSpec(
+            model=dict(model.document),
+            records=self._key(body["datasets"], body["channels"], model),
+            validation=None if kept is None else self._key(kept, body["channels"], model),
+            validation_fraction=validation.get("fraction"),
+            parameters=body["parameters"],
+            prediction=body["prediction"],
+            loss=loss_of(body["loss"]),
+            weights=body["weights"],
+            skip=body["skip"],
+            noise=Noise(float(body["noise"]["sigma"]), int(body["noise"]["seed"])),
+        )
+        return RunSpec(problem, algorithm_of(body["algorithm"]), int(body["seed"]))
+
+    def records(self, key: str) -> Records:
+        """The records of that key, read from the object store.
+
+        Raises
+        ------
+        RecordsUnavailable
+            If a dataset or a channel is not there, or cannot be used.
+        """
+        datasets, inputs, outputs = self._data[key]
+        try:
+            with self._database.read() as session:
+                project = self._job.project_id
+                rows = DatasetRepository(session, project).get_all(datasets)
+            return tuple(
+                record
+                for row in rows
+                for record in self._recordings.read(row.sha256).records(
+                    dict(inputs), dict(outputs), row.name
+                )
+            )
+        except (SysidError, ServiceError, StorageError) as error:
+            raise RecordsUnavailable(str(error)) from error
+
+    def save(self, run: str, found: Identification) -> str | None:
+        """Store the fitted signals of a run; gives the hash of the object.
+
+        Raises
+        ------
+        ObjectStoreFailed
+            If it cannot be written.
+        """
+        problem = self._problems.pop(run)
+        records = {key: self.records(key) for key in problem.needs}
+        estimation, validation = prepared(problem, records)
+        parts = [("estimation", estimation, found.simulated)]
+        if validation is not None:
+            parts.append(("validation", validation, found.simulated_validation))
+        return save_fit(self._store, run, parts)
+
+    def _checkpoints(self) -> dict[str, bytes]:
+        with self._database.write() as session:
+            return RunLedger(session, self._lease).checkpoints()
+
+    def _pending(self, after: int) -> list[Run]:
+        with self._database.write() as session:
+            return RunLedger(session, self._lease).pending(READ_AHEAD, after)
+
+    def _queued(self, row: Run, state: bytes | None) -> QueuedRun | RefusedRun:
+        try:
+            spec = self.specification(row.cell)
+        except (SysidError, ServiceError, StorageError) as error:
+            return RefusedRun(row.id, Failure(str(error), type(error).__name__))
+        self._problems[row.id] = spec.problem
+        return QueuedRun(row.id, spec, unpacked(state))
+
+    def _model(self, reference: Any) -> Model:
+        name = reference if isinstance(reference, str) else repr(reference)
+        if name not in self._models:
+            with self._database.read() as session:
+                self._models[name] = models.resolve(session, reference)[0]
+        return self._models[name]
+
+    def _key(self, datasets: list[str], channels: Mapping[str, str], model: Model) -> str:
+        data = DataKey(
+            tuple(datasets),
+            tuple((one.name, channels.get(one.name, one.name)) for one in model.inputs),
+            tuple((one.name, channels.get(one.name, one.name)) for one in model.outputs),
+        )
+        key = repr(data)
+        self._data[key] = data
+        return key

@@ -1,0 +1,222 @@
+"""What the dispatcher writes about the runs of one job: in bulk, fenced by the lease."""
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from sqlalchemy.orm import Session
+
+from service.dispatch.checkpoints import packed
+from service.dispatch.results import history_points, migrant_points, outcome_of
+from service.storage.errors import ObjectStoreFailed
+from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOutcome
+from service.storage.queue import Claim, Progress, Queue
+from service.storage.sessions import Database
+from service.storage.tables import State
+from sysid.result import Identification, Improvement, Migrant
+from sysid.run import RunState
+from workers.errors import RecordsUnavailable
+from workers.ports import Concluded, Failure
+
+_log = logging.getLogger(__name__)
+
+RESULTS_SECONDS = 0.2
+PROGRESS_SECONDS = 1.0
+CHECKPOINT_SECONDS = 4.0
+KEPT_REASONS = 3
+
+SaveSignals = Callable[[str, Identification], str | None]
+"""Stores the fitted signals of a run; gives the object's hash."""
+
+
+@dataclass(slots=True)
+class _Live:
+    """A run in progress: its latest state, and how much of it is written."""
+
+    state: RunState
+    seconds: float
+    written: dict[int, int] = field(default_factory=dict)
+    migrants: int = 0
+    changed: bool = True
+
+
+@dataclass(slots=True)
+class _Pending:
+    """What the next transaction will write."""
+
+    started: list[str] = field(default_factory=list)
+    outcomes: list[RunOutcome] = field(default_factory=list)
+    history: list[HistoryPoint] = field(default_factory=list)
+    migrants: list[MigrantPoint] = field(default_factory=list)
+
+
+class Recorder:
+    """Writes one job's runs; implements `workers.ports.RunObserver`.
+
+    Nothing is written when something happens, but by `flush`: results at most every
+    `RESULTS_SECONDS`, progress and history every second, checkpoints every `CHECKPOINT_SECONDS`.
+    """
+
+    def __init__(self, database: Database, claim: Claim, save_signals: SaveSignals) -> None:
+        self.lease = claim.lease
+        self.is_stopped = False
+        self._reasons: list[str] = []
+        self._database, self._save_signals = database, save_signals
+        self._live: dict[str, _Live] = {}
+        self._pending = _Pending()
+        self._n_runs, self._n_done = claim.job.n_runs, claim.job.n_done
+        self._evaluations, self._generation = 0, 0
+        self._best = math.inf if claim.job.best_rms is None else claim.job.best_rms
+        self._generations = max(1, int(claim.job.spec["algorithm"]["generations"]))
+        self._n_begun, self._begun = claim.job.n_done, time.monotonic()
+        self._told = self._wrote = self._kept = 0.0
+        self._news = False
+
+    def started(self, run: str) -> None:
+        """The run was given to a worker."""
+        self._pending.started.append(run)
+
+    def progress(self, run: str, state: RunState, seconds: float) -> None:
+        """The run can go on from `state`."""
+        live = self._live.setdefault(run, _Live(state, seconds))
+        live.state, live.seconds, live.changed = state, seconds, True
+        self._news = True
+
+    def result(self, run: str, concluded: Concluded, seconds: float) -> None:
+        """The run is complete."""
+        found, live = concluded.identification, self._live.pop(run, None)
+        self._collect_history(run, found.history, found.migrations, live)
+        try:
+            signals = self._save_signals(run, found)
+        except (
+            ObjectStoreFailed,
+            RecordsUnavailable,
+        ) as error:  # the numbers are worth more than the plot
+            _log.error("the signals of %s are not stored: %s", run, error)
+            signals = None
+        self._pending.outcomes.append(outcome_of(run, found, seconds, signals))
+        self._evaluations += found.evaluations
+        self._generation = max(self._generation, found.generations)
+        self._best = min(self._best, found.rms)
+        self._n_done += 1
+        self._news = True
+
+    def failure(self, run: str, failure: Failure) -> None:
+        """The run cannot be carried out."""
+        live = self._live.pop(run, None)
+        if live is not None:
+            self._collect_history(run, live.state.history, live.state.migrations, live)
+            self._evaluations += live.state.evaluations
+        outcome = RunOutcome(run_id=run, state=State.FAILED, error=failure.reason)
+        self._pending.outcomes.append(outcome)
+        if failure.reason not in self._reasons and len(self._reasons) < KEPT_REASONS:
+            self._reasons.append(failure.reason)
+        self._n_done += 1
+        self._news = True
+
+    def should_stop(self) -> bool:
+        """Whether the job was cancelled or its lease lost."""
+        return self.is_stopped
+
+    def flush(self) -> None:
+        """Write what is due.
+
+        Raises
+        ------
+        LeaseLost
+            If the job is no longer this dispatcher's; nothing was written.
+        """
+        now = time.monotonic()
+        tell = self._news and now - self._told > PROGRESS_SECONDS
+        keep = bool(self._live) and now - self._kept > CHECKPOINT_SECONDS
+        some = bool(self._pending.outcomes or self._pending.started)
+        if tell or keep or (some and now - self._wrote > RESULTS_SECONDS):
+            with self._database.write() as session:
+                self._write(session, tell=tell, keep=keep)
+            self._written(now, tell=tell, keep=keep)
+
+    def keep(self) -> None:
+        """Write everything, checkpoints too, because the dispatcher stops."""
+        with self._database.write() as session:
+            self._write(session, tell=True, keep=True)
+        self._written(time.monotonic(), tell=True, keep=True)
+
+    def finish(self) -> None:
+        """Write the last results and end the job, in one transaction."""
+        with self._database.write() as session:
+            self._write(session, tell=True, keep=False)
+            queue = Queue(session)
+            job = queue.hold(self.lease)
+            session.refresh(job)
+            state = State.FAILED if job.n_failed == job.n_runs else State.SUCCEEDED
+            queue.finish(self.lease, state, self._complaint(job.n_failed, job.n_runs))
+
+    def cancel(self) -> None:
+        """End the job as cancelled; what its runs gave before stays."""
+        with self._database.write() as session:
+            self._write(session, tell=True, keep=True)
+            Queue(session).finish(self.lease, State.CANCELLED)
+
+    def _progress(self) -> Progress:
+        """How far the job is; the generation is that of the run that is furthest."""
+        states = [live.state for live in self._live.values()]
+        best = min([self._best, *(state.rms for state in states)])
+        return Progress(
+            evaluations=self._evaluations + sum(state.evaluations for state in states),
+            generation=max([self._generation, *(state.generation for state in states)]),
+            best_rms=best if math.isfinite(best) else None,
+            seconds_left=self._seconds_left(),
+        )
+
+    def _seconds_left(self) -> float | None:
+        """What is left if the rest goes as fast as what was done since the claim."""
+        total = self._generations * self._n_runs
+        open_runs = sum(live.state.generation for live in self._live.values())
+        done = (self._n_done - self._n_begun) * self._generations + open_runs
+        left = total - self._n_done * self._generations - open_runs
+        elapsed = time.monotonic() - self._begun
+        return max(0.0, elapsed * left / done) if done else None
+
+    def _complaint(self, n_failed: int, n_runs: int) -> str | None:
+        if n_failed == 0:
+            return None
+        reasons = "; ".join(self._reasons)
+        return reasons if n_runs == 1 else f"{n_failed} of {n_runs} runs failed: {reasons}"
+
+    def _collect_history(
+        self,
+        run: str,
+        history: tuple[tuple[Improvement, ...], ...],
+        migrants: tuple[Migrant, ...],
+        live: _Live | None,
+    ) -> None:
+        written, logged = ({}, 0) if live is None else (live.written, live.migrants)
+        self._pending.history.extend(history_points(run, history, written))
+        self._pending.migrants.extend(migrant_points(run, migrants, logged))
+
+    def _write(self, session: Session, *, tell: bool, keep: bool) -> None:
+        ledger, pending = RunLedger(session, self.lease), self._pending
+        ledger.start(pending.started)
+        ledger.record(pending.outcomes, pending.history, pending.migrants)
+        if tell:
+            for run, live in self._live.items():
+                points = history_points(run, live.state.history, live.written)
+                ledger.append(points, migrant_points(run, live.state.migrations, live.migrants))
+            Queue(session).report(self.lease, self._progress())
+        if keep:
+            changed = [(run, live) for run, live in self._live.items() if live.changed]
+            ledger.save((run, live.state.evaluations, packed(live.state)) for run, live in changed)
+
+    def _written(self, now: float, *, tell: bool, keep: bool) -> None:
+        self._pending, self._wrote = _Pending(), now
+        if tell:
+            self._told, self._news = now, False
+            for live in self._live.values():
+                live.written = dict(enumerate(map(len, live.state.history)))
+                live.migrants = len(live.state.migrations)
+        if keep:
+            self._kept = now
+            for live in self._live.values():
+                live.changed = False

@@ -1,0 +1,206 @@
+"""The dispatcher: claims jobs by lease, drives the workers, writes what they find.
+
+A process of its own, ``python -m service.dispatcher``; any number of them share one queue.
+"""
+
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from types import FrameType
+
+from workers.warming import warm
+
+from service.dispatch.claiming import Leases
+from service.dispatch.preparing import JobRuns
+from service.dispatch.recording import Recorder
+from service.dispatch.signals import Recordings
+from service.errors import Misconfigured
+from service.settings import Settings
+from service.storage.errors import LeaseLost, StorageError
+from service.storage.objects import ObjectStore, open_store
+from service.storage.queue import Claim
+from service.storage.sessions import Database
+from service.storage.wakeup import new_waker
+from service.supervision import SUPERVISED
+from workers.cluster import ClusterSettings, RayCrew
+from workers.errors import WorkersError
+from workers.feeding import Feeder
+from workers.ports import Crew
+
+_log = logging.getLogger("lagid.dispatcher")
+
+IDLE_SECONDS = 1.0
+"""Longest wait for work; a submission wakes the dispatcher at once."""
+BUSY_SECONDS = 0.1
+"""How often a busy dispatcher looks for cancelled and waiting jobs."""
+STEP_SECONDS = 0.05
+MAX_JOBS = 8
+"""Jobs in hand at a time; the others are left to other dispatchers."""
+
+
+class Dispatcher:
+    """Joins the queue, the workers and the records of several jobs at a time."""
+
+    def __init__(self, database: Database, store: ObjectStore, crew: Crew, lease: float) -> None:
+        self.stopping = threading.Event()
+        self._database, self._store, self._crew = database, store, crew
+        self._recordings = Recordings(store)
+        self._woken = threading.Event()
+        self._leases = Leases(database, lease)
+        self._feeder = Feeder(crew)
+        self._recorders: dict[str, Recorder] = {}
+        self._lost: set[str] = set()
+        self._looked = 0.0
+        self._waking = threading.Thread(target=self._listen, name="waker", daemon=True)
+
+    def run(self) -> None:
+        """Work until `stopping` is set; then give every job back with its checkpoints.
+
+        Raises
+        ------
+        ClusterLost
+            If the workers do not answer; the leases are left to expire.
+        """
+        self._leases.start({"cpus": self._crew.slots, "pid": os.getpid()})
+        _log.info("ready: %s with %d cores", self._leases.owner, self._crew.slots)
+        self._waking.start()
+        while not self.stopping.is_set():
+            self.turn()
+        self._give_back()
+
+    def turn(self) -> None:
+        """One round: look at the queue, feed and collect, write."""
+        if not self._recorders:
+            self._woken.wait(IDLE_SECONDS)
+        pause = time.monotonic() - self._looked
+        if self._woken.is_set() or pause > (BUSY_SECONDS if self._recorders else 0.0):
+            self._woken.clear()
+            self._looked = time.monotonic()
+            self._attend()
+        for job in self._feeder.step(STEP_SECONDS if self._recorders else 0.0):
+            self._end(job)
+        for job, recorder in self._recorders.items():
+            try:
+                recorder.flush()
+            except LeaseLost as error:
+                self._lose(job, error)
+
+    def _attend(self) -> None:
+        signals = self._leases.look()
+        for job in signals.to_cancel & self._recorders.keys():
+            self._recorders[job].is_stopped = True
+        for job, recorder in self._recorders.items():
+            if job not in self._lost and self._leases.is_lost(recorder.lease):
+                self._lose(job, LeaseLost(job, recorder.lease.attempt))
+        if signals.is_waiting and len(self._recorders) < MAX_JOBS:
+            claim = self._leases.claim()
+            if claim is not None:
+                self._take(claim)
+
+    def _listen(self) -> None:
+        with new_waker(self._database, self.stopping) as waker:
+            while not self.stopping.is_set():
+                if waker.wait():
+                    self._woken.set()
+        self._woken.set()
+
+    def _take(self, claim: Claim) -> None:
+        job = claim.job.id
+        source = JobRuns(self._database, claim, self._recordings, self._store)
+        recorder = Recorder(self._database, claim, source.save)
+        self._recorders[job] = recorder
+        self._feeder.add(job, source, recorder)
+        _log.info("%s: %d runs, attempt %d", job, claim.job.n_runs, claim.lease.attempt)
+
+    def _lose(self, job: str, error: LeaseLost) -> None:
+        _log.warning("stop at once: %s", error)
+        self._lost.add(job)
+        self._recorders[job].is_stopped = True
+
+    def _end(self, job: str) -> None:
+        recorder = self._recorders.pop(job)
+        self._leases.forget(recorder.lease)
+        if job in self._lost:
+            self._lost.discard(job)
+            return
+        try:
+            if recorder.is_stopped:
+                recorder.cancel()
+            else:
+                recorder.finish()
+        except LeaseLost as error:
+            _log.warning("its end was not written: %s", error)
+
+    def _give_back(self) -> None:
+        self._feeder.stop()
+        for job, recorder in self._recorders.items():
+            try:
+                recorder.keep()
+            except LeaseLost as error:
+                self._lose(job, error)
+        self._leases.release_all()
+        self._leases.stop()
+        _log.info("stopped")
+
+
+def main() -> int:
+    """Run a dispatcher with the settings of the environment; gives the exit code."""
+    logging.basicConfig(
+        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
+    )
+    try:
+        return serve(Settings())
+    except (Misconfigured, StorageError, WorkersError) as error:
+        _log.error("%s", error)
+        return 1
+
+
+def serve(settings: Settings) -> int:
+    """Run a dispatcher until it is told to stop.
+
+    Raises
+    ------
+    Misconfigured, StorageError, WorkersError
+        If the data folder, the database, the object store or Ray cannot be used.
+    """
+    settings.prepare_folder()
+    database = Database(settings.database)
+    store = open_store(settings.store)
+    compiling = threading.Thread(target=warm, name="warm", daemon=True)
+    compiling.start()  # the compiler and Ray's start wait on different things
+    crew = RayCrew(ClusterSettings(settings.ray_address, settings.cpus))
+    try:
+        compiling.join()
+        crew.warm()
+        dispatcher = Dispatcher(database, store, crew, settings.lease_seconds)
+        _stop_on_signals(dispatcher.stopping)
+        dispatcher.run()
+    finally:
+        crew.close()
+        database.dispose()
+    return 0
+
+
+def _stop_on_signals(stopping: threading.Event) -> None:
+    """SIGTERM, SIGINT, and the end of standard input where a supervisor holds it."""
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        stopping.set()  # the waker's thread sees it and wakes the main loop
+
+    # After ray.init, which sets handlers of its own.
+    signal.signal(signal.SIGTERM, handle)
+    signal.signal(signal.SIGINT, handle)
+    if os.environ.get(SUPERVISED):
+        threading.Thread(target=_outlive_no_parent, args=(stopping,), daemon=True).start()
+
+
+def _outlive_no_parent(stopping: threading.Event) -> None:
+    sys.stdin.buffer.read()
+    stopping.set()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,24 @@
+"""Questions a dispatcher asks many times a second: cheap reads that lock nothing."""
+
+from typing import NamedTuple
+
+from sqlalchemy import exists, select
+from sqlalchemy.orm import Session
+
+from service.storage.tables import Job, State
+
+
+class Signals(NamedTuple):
+    """Whether a job waits, and which of a dispatcher's jobs are to be cancelled."""
+
+    is_waiting: bool
+    to_cancel: frozenset[str]
+
+
+def look(session: Session, owner: str) -> Signals:
+    """What a dispatcher should attend to."""
+    waiting = session.scalar(select(exists().where(Job.state == State.QUEUED)))
+    asked = select(Job.id).where(
+        Job.lease_owner == owner, Job.state == State.RUNNING, Job.cancel_requested
+    )
+    return Signals(bool(waiting), frozenset(session.scalars(asked)))

@@ -1,0 +1,145 @@
+"""Keep a dispatcher running beside the web process, and leave no process behind."""
+
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from service.settings import Settings
+
+_log = logging.getLogger(__name__)
+
+FIRST_PAUSE_SECONDS = 0.2
+LONGEST_PAUSE_SECONDS = 30.0
+STEADY_SECONDS = 60.0
+"""A child that lived so long is restarted after the first pause again."""
+STOP_SECONDS = 2.5
+
+SUPERVISED = "LAGID_SUPERVISED"
+"""Set for the child: it ends when its standard input does, that is, when this process dies."""
+
+
+class Supervisor:
+    """Runs a command as a child in a session of its own, again and again until `stop`.
+
+    The session is what finds every process that the child has started, also after the child
+    itself was killed: Ray's helpers put themselves into process groups of their own.
+    """
+
+    def __init__(
+        self, command: Sequence[str], environment: Mapping[str, str], log: Path | None = None
+    ) -> None:
+        self._command, self._environment, self._log_path = tuple(command), dict(environment), log
+        self._stopping = threading.Event()
+        self._lock = threading.Lock()
+        self._child: subprocess.Popen[bytes] | None = None
+        self._thread = threading.Thread(target=self._keep_running, name="supervisor", daemon=True)
+
+    def start(self) -> None:
+        """Start the child and watch it."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the child: asked first, killed after `STOP_SECONDS`; then whatever it left."""
+        with self._lock:
+            self._stopping.set()
+            child = self._child
+        if child is None:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            child.send_signal(signal.SIGTERM)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.wait(STOP_SECONDS)
+        kill_session(child.pid)
+        child.wait()
+        self._thread.join()
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child that runs now."""
+        child = self._child
+        return None if child is None or child.poll() is not None else child.pid
+
+    def _keep_running(self) -> None:
+        pause = FIRST_PAUSE_SECONDS
+        while not self._stopping.is_set():
+            begun = time.monotonic()
+            child = self._spawn()
+            if child is None:
+                return
+            code = child.wait()
+            kill_session(child.pid)
+            assert child.stdin is not None
+            child.stdin.close()
+            if self._stopping.is_set():
+                return
+            steady = time.monotonic() - begun > STEADY_SECONDS
+            pause = FIRST_PAUSE_SECONDS if steady else min(2 * pause, LONGEST_PAUSE_SECONDS)
+            _log.warning("the dispatcher ended with %d; a new one in %.1f s", code, pause)
+            self._stopping.wait(pause)
+
+    def _spawn(self) -> "subprocess.Popen[bytes] | None":
+        with self._lock, contextlib.ExitStack() as stack:
+            if self._stopping.is_set():
+                return None
+            sink = None
+            if self._log_path is not None:
+                self._log_path.parent.mkdir(parents=True, exist_ok=True)
+                sink = stack.enter_context(self._log_path.open("ab"))
+            self._child = subprocess.Popen(
+                self._command,
+                env={**os.environ, **self._environment, SUPERVISED: "1"},
+                stdin=subprocess.PIPE,  # never written to: its end tells the child of our death
+                stdout=sink,
+                stderr=sink,
+                start_new_session=True,
+            )
+            return self._child
+
+
+@contextmanager
+def supervised_dispatcher(settings: Settings) -> Iterator[Supervisor]:
+    """Keep a dispatcher with these settings running for the length of the block."""
+    supervisor = Supervisor(
+        [sys.executable, "-m", "service.dispatcher"],
+        environment_of(settings),
+        settings.data_dir.absolute() / "logs" / "dispatcher.log",
+    )
+    supervisor.start()
+    try:
+        yield supervisor
+    finally:
+        supervisor.stop()
+
+
+def environment_of(settings: Settings) -> dict[str, str]:
+    """The settings as environment variables, so that a child has the same."""
+    values = settings.model_dump(mode="json", exclude_none=True)
+    values["data_dir"] = str(settings.data_dir.absolute())
+    return {f"LAGID_{name.upper()}": str(value) for name, value in values.items()}
+
+
+def kill_session(session: int) -> None:
+    """Kill every process of a session except this one."""
+    for pid in processes_of_session(session):
+        if pid != os.getpid():
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def processes_of_session(session: int) -> tuple[int, ...]:
+    """Return the processes of a session; where there is no ``/proc``, at most its leader."""
+    found = []
+    listed = [int(entry.name) for entry in Path("/proc").glob("[0-9]*")] or [session]
+    for pid in listed:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            if os.getsid(pid) == session:
+                found.append(pid)
+    return tuple(found)

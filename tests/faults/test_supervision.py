@@ -1,0 +1,101 @@
+"""The supervisor: restarts what ends, and leaves no process behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from service.settings import Settings
+from service.supervision import Supervisor, environment_of, processes_of_session
+
+LIMIT_SECONDS = 15.0
+
+# A child with a child of its own in another process group, as Ray's helpers are.
+CHILD = """
+import os, subprocess, sys, time
+subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], process_group=0)
+open(sys.argv[1], "a").write(f"{os.getpid()}\\n")
+time.sleep(60)
+"""
+
+OWNER = """
+import sys, time
+from service.supervision import Supervisor
+supervisor = Supervisor([sys.executable, "-c", sys.argv[2], sys.argv[1]], {})
+supervisor.start()
+time.sleep(60)
+"""
+
+# Ends when its standard input does.
+ORPHAN = """
+import os, sys
+open(sys.argv[1], "a").write(f"{os.getpid()}\\n")
+sys.stdin.buffer.read()
+"""
+
+
+def until(holds: Callable[[], bool], what: str) -> None:
+    limit = time.monotonic() + LIMIT_SECONDS
+    while not holds():
+        assert time.monotonic() < limit, f"{what} did not come true"
+        time.sleep(0.02)
+
+
+def pids(file: Path) -> list[int]:
+    return [int(line) for line in file.read_text().split()] if file.exists() else []
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def test_stopping_ends_the_child_and_every_process_it_started(tmp_path: Path) -> None:
+    file = tmp_path / "pids"
+    supervisor = Supervisor([sys.executable, "-c", CHILD, str(file)], {})
+    supervisor.start()
+    until(lambda: len(pids(file)) == 1, "the start")
+    family = processes_of_session(pids(file)[0])
+    supervisor.stop()
+    assert len(family) == 2
+    until(lambda: not any(map(is_alive, family)), "the end of all")
+    assert supervisor.pid is None
+
+
+def test_a_killed_child_is_started_anew_and_its_orphans_are_killed(tmp_path: Path) -> None:
+    file = tmp_path / "pids"
+    supervisor = Supervisor([sys.executable, "-c", CHILD, str(file)], {})
+    supervisor.start()
+    until(lambda: len(pids(file)) == 1, "the start")
+    family = processes_of_session(pids(file)[0])
+    os.kill(pids(file)[0], signal.SIGKILL)
+    until(lambda: len(pids(file)) == 2, "the second start")
+    assert not any(map(is_alive, family))
+    supervisor.stop()
+    until(lambda: not any(map(is_alive, pids(file))), "the end of all")
+
+
+def test_a_child_learns_that_its_supervisor_was_killed(tmp_path: Path) -> None:
+    file = tmp_path / "pids"
+    owner = subprocess.Popen([sys.executable, "-c", OWNER, str(file), ORPHAN])
+    until(lambda: len(pids(file)) == 1, "the start")
+    owner.kill()
+    owner.wait()
+    until(lambda: not is_alive(pids(file)[0]), "the end of the orphan")
+
+
+def test_the_settings_of_the_child_are_those_of_the_parent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Settings(data_dir=tmp_path / "data", cpus=3, lease_seconds=7.0)
+    for name, value in environment_of(settings).items():
+        monkeypatch.setenv(name, value)
+    assert Settings() == settings

@@ -1,0 +1,235 @@
+"""Start or join Ray, and give it packs of work; nothing else of the program imports Ray.
+
+What Ray 2.60 does unasked, and what is done about it, stands in ``docs/decisions``: it joins any
+cluster it finds, retries killed tasks, hangs when its raylet is gone, and listens on every
+interface (therefore the token).
+"""
+
+import contextlib
+import logging
+import os
+import secrets
+import shutil
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from workers.errors import ClusterLost, ClusterUnavailable, PackCancelled, PackFailed, WorkerDied
+from workers.ports import Done, Handle, Item, Records
+from workers.tasks import advance
+from workers.warming import warm
+
+_log = logging.getLogger(__name__)
+
+START_SECONDS = 90.0
+FETCH_SECONDS = 20.0
+SILENCE_SECONDS = 10.0
+"""After so long without a finished task a no-op task asks whether Ray is alive."""
+ANSWER_SECONDS = 20.0
+OBJECT_STORE_BYTES = 200 * 2**20
+"""Records are small; the default of Ray, 30 % of the memory, is not."""
+
+ONE_THREAD = {
+    "NUMBA_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+_RAY_ENVIRONMENT = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_task_events_report_interval_ms": "0",  # else the GCS keeps 3-4 kB for each task
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # tomorrow's default; silences a warning
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ClusterSettings:
+    """Which Ray: `address` None starts one here with `cpus` cores (None: all of them)."""
+
+    address: str | None = None
+    cpus: int | None = None
+
+
+class RayCrew:
+    """The workers of a Ray cluster; implements `workers.ports.Crew`.
+
+    Raises
+    ------
+    ClusterUnavailable
+        If Ray cannot be started or joined.
+    """
+
+    def __init__(self, settings: ClusterSettings) -> None:
+        os.environ.update(_RAY_ENVIRONMENT)
+        self._folder = None if settings.address else _fresh_folder()
+        if settings.address is None:  # the token is read when Ray is imported
+            os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
+            os.environ.update(ONE_THREAD)  # inherited by the local workers
+        import ray
+
+        self._ray = ray
+        try:
+            _initialise(ray, settings, self._folder)
+        except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
+            self._forget_folder()
+            raise ClusterUnavailable(f"Ray could not be started or joined: {error}") from error
+        self._advance = ray.remote(num_cpus=1, max_retries=0)(advance)
+        self._noop = ray.remote(num_cpus=0, max_retries=0)(_answer)
+        self._flying: set[Any] = set()
+        self._probe: Any = None
+        self._heard = time.monotonic()
+        self.slots = self._count_slots()
+
+    def warm(self) -> None:
+        """Load the compiled loops in every worker, so that the first run need not.
+
+        Raises
+        ------
+        ClusterUnavailable
+            If the workers do not come up.
+        """
+        task = self._ray.remote(num_cpus=1, max_retries=0)(warm)
+        try:
+            self._ray.get([task.remote() for _ in range(self.slots)], timeout=START_SECONDS)
+        except self._ray.exceptions.RayError as error:
+            raise ClusterUnavailable(f"Ray's workers do not come up: {error}") from error
+        self._heard = time.monotonic()
+
+    def share(self, records: Records) -> Any:
+        """Put records into the object store; the reference travels instead of them."""
+        return self._ray.put(records)
+
+    def submit(self, pack: Sequence[Item], keys: Sequence[str], shared: Sequence[Any]) -> Handle:
+        """Send a pack; `keys` name the shared records in order."""
+        handle = self._advance.remote(tuple(pack), tuple(keys), *shared)
+        self._flying.add(handle)
+        return handle
+
+    def finished(self, timeout: float) -> tuple[Handle, ...]:
+        """Handles of packs that ended, waiting at most `timeout` seconds for the first."""
+        if not self._flying:
+            time.sleep(timeout)
+            return ()
+        flying = list(self._flying)
+        ready, _ = self._ray.wait(flying, num_returns=1, timeout=timeout, fetch_local=False)
+        if ready:  # whatever else has ended by now comes along
+            ready, _ = self._ray.wait(flying, num_returns=len(flying), timeout=0, fetch_local=False)
+            self._heard = time.monotonic()
+        return tuple(ready)
+
+    def fetch(self, handle: Handle) -> tuple[Done, ...]:
+        """What a finished pack gave.
+
+        Raises
+        ------
+        PackLost
+            If it was cancelled, its worker died, or it met a programming error.
+        ClusterLost
+            If Ray does not hand it out.
+        """
+        errors = self._ray.exceptions
+        self._flying.discard(handle)
+        try:
+            done: tuple[Done, ...] = self._ray.get(handle, timeout=FETCH_SECONDS)
+        except errors.TaskCancelledError as error:
+            raise PackCancelled("cancelled") from error
+        except errors.GetTimeoutError as error:
+            raise ClusterLost("Ray does not hand out a finished result") from error
+        except errors.RayTaskError as error:
+            raise PackFailed(str(error)) from error
+        except errors.RayError as error:  # crashed, out of memory, node or object lost
+            raise WorkerDied(str(error).splitlines()[0]) from error
+        return done
+
+    def cancel(self, handle: Handle, *, force: bool) -> None:
+        """Interrupt a pack between two kernel calls, or kill its worker."""
+        self._ray.cancel(handle, force=force, recursive=False)
+
+    def check(self) -> None:
+        """Ask Ray for a sign of life when none was seen for a while; never waits.
+
+        Raises
+        ------
+        ClusterLost
+            If a no-op task has not been answered in time.
+        """
+        silence = time.monotonic() - self._heard
+        if self._probe is None:
+            if silence > SILENCE_SECONDS:
+                self._probe = self._noop.remote()
+            return
+        answered, _ = self._ray.wait([self._probe], timeout=0)
+        if answered:
+            self._probe, self._heard = None, time.monotonic()
+        elif silence > SILENCE_SECONDS + ANSWER_SECONDS:
+            raise ClusterLost(f"Ray has not answered for {silence:.0f} s")
+
+    def free_slots(self) -> int:
+        """Cores without a task at this moment."""
+        return int(self._ray.available_resources().get("CPU", 0))
+
+    def close(self) -> None:
+        """Leave the cluster; a local one ends with it."""
+        self._ray.shutdown()
+        self._forget_folder()
+
+    def _count_slots(self) -> int:
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def _forget_folder(self) -> None:
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _initialise(ray: Any, settings: ClusterSettings, folder: Path | None) -> None:
+    common = {"log_to_driver": False, "logging_level": logging.ERROR}
+    if settings.address is not None:
+        ray.init(address=settings.address, runtime_env={"env_vars": ONE_THREAD}, **common)
+        return
+    ray.init(
+        address="local",  # never a cluster that happens to run on this host
+        num_cpus=settings.cpus,
+        include_dashboard=False,
+        object_store_memory=OBJECT_STORE_BYTES,
+        _temp_dir=str(folder),
+        **common,
+    )
+
+
+def _answer() -> bool:
+    return True
+
+
+_PREFIX = "lagid-ray-"
+
+
+def _fresh_folder() -> Path:
+    """Make Ray's folder for this process; those of processes that are gone are removed.
+
+    Its path must be short: Ray puts sockets below it, and a socket's path has 107 bytes at most.
+    """
+    base = Path(tempfile.gettempdir())
+    if len(str(base)) > 30:
+        base = Path("/tmp")
+    for old in base.glob(f"{_PREFIX}*"):
+        owner = old.name.removeprefix(_PREFIX)
+        if owner.isdigit() and not _is_alive(int(owner)):
+            shutil.rmtree(old, ignore_errors=True)
+    folder = base / f"{_PREFIX}{os.getpid()}"
+    shutil.rmtree(folder, ignore_errors=True)
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    return folder
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True

@@ -1,0 +1,184 @@
+"""The runs of one job on the driver's side: which items come next, what became of them."""
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+from workers.errors import RecordsUnavailable
+from workers.packing import Cost, deal, pack_size
+from workers.ports import (
+    Advance,
+    Advanced,
+    Concluded,
+    Crew,
+    Done,
+    Evolved,
+    Failure,
+    Handle,
+    Item,
+    JobSource,
+    QueuedRun,
+    RefusedRun,
+    RunObserver,
+)  # fmt: skip
+from workers.progress import MAX_STRIKES, ActiveRun
+
+PREFETCH = 64
+"""Runs read ahead of the workers, for each core."""
+
+KEPT_RECORDS = 16
+"""Sets of records that a job keeps with the crew."""
+
+
+class JobWork:
+    """One job's runs: waiting, with the workers, or done.
+
+    Attributes
+    ----------
+    flying : dict
+        Items of each pack in flight.
+    """
+
+    def __init__(self, source: JobSource, observer: RunObserver, crew: Crew) -> None:
+        self.observer = observer
+        self.flying: dict[Handle, tuple[Item, ...]] = {}
+        self._source, self._crew = source, crew
+        self._coming: Iterator[QueuedRun | RefusedRun] = iter(source.runs())
+        self._ready: deque[ActiveRun] = deque()
+        self._active: dict[str, ActiveRun] = {}
+        self._shared: dict[str, Any] = {}
+        self._cost = Cost()
+        self._exhausted = False
+
+    @property
+    def has_ready(self) -> bool:
+        """Whether a run waits for a worker."""
+        self._read_ahead()
+        return bool(self._ready)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether nothing waits and nothing is with the workers."""
+        return not self.flying and not self.has_ready
+
+    def feed(self, idle: int) -> None:
+        """Send the next pack, or one run's islands as several packs if `idle` cores allow."""
+        run = self._ready[0]
+        if run.should_spread(idle if len(self._ready) == 1 else 0):
+            self._ready.popleft()
+            self._spread(run)
+        elif run.strikes or run.slices:
+            self._send([self._ready.popleft().whole()])  # long, or suspected: alone
+        else:
+            size = pack_size(self._cost, len(self._ready), self._crew.slots)
+            self._send([run.whole() for run in self._take_fresh(size)])
+
+    def absorb(self, handle: Handle, done: tuple[Done, ...]) -> None:
+        """Take in what a pack gave."""
+        del self.flying[handle]
+        for one in done:
+            run = self._active.get(one.run)
+            if run is None:
+                continue  # it failed while another of its islands was still out
+            run.seconds += one.seconds
+            if one.outcome is None:
+                self._ready.appendleft(run)
+            else:
+                self._take(run, one)
+
+    def lose(self, handle: Handle, reason: str) -> None:
+        """A worker died: its runs go on from where they were, a few times."""
+        for name in {item.run for item in self.flying.pop(handle)}:
+            run = self._active.get(name)
+            if run is None:
+                continue
+            run.strikes += 1
+            run.gather_again()
+            if run.strikes >= MAX_STRIKES:
+                text = f"its worker process died {run.strikes} times; the last time: {reason}"
+                self._fail(name, Failure(text, "WorkerDied"))
+            elif run not in self._ready:
+                self._ready.append(run)
+
+    def fail(self, handle: Handle, reason: str) -> None:
+        """A programming error: the runs of the pack fail with it."""
+        for name in {item.run for item in self.flying.pop(handle)}:
+            self._fail(name, Failure(reason, "InternalError"))
+
+    def stop(self) -> None:
+        """Begin nothing more."""
+        self._ready.clear()
+        self._exhausted = True
+
+    def _read_ahead(self) -> None:
+        wanted = PREFETCH * self._crew.slots
+        while not self._exhausted and len(self._ready) < wanted:
+            queued = next(self._coming, None)
+            if queued is None:
+                self._exhausted = True
+            elif isinstance(queued, RefusedRun):
+                self.observer.failure(queued.run, queued.failure)
+            else:
+                run = ActiveRun.of(queued)
+                self._active[run.run] = run
+                self._ready.append(run)
+
+    def _take_fresh(self, size: int) -> list[ActiveRun]:
+        """The next `size` runs that have not been begun and see the same records."""
+        chosen = [self._ready.popleft()]
+        while self._ready and len(chosen) < size:
+            following = self._ready[0]
+            if following.slices or following.spec.problem.needs != chosen[0].spec.problem.needs:
+                break
+            chosen.append(self._ready.popleft())
+        return chosen
+
+    def _spread(self, run: ActiveRun) -> None:
+        items = run.split()
+        costs = [float(item.island.words.size) for item in items]
+        for bundle in deal(costs, self._crew.slots):
+            self._send([items[index] for index in bundle])
+
+    def _send(self, items: list[Item]) -> None:
+        keys = items[0].spec.problem.needs
+        try:
+            shared = [self._share(key) for key in keys]
+        except RecordsUnavailable as error:
+            for name in {item.run for item in items}:
+                self._fail(name, Failure(str(error), type(error).__name__))
+            return
+        for item in items:
+            if isinstance(item, Advance) and item.state is None:
+                self.observer.started(item.run)
+        self.flying[self._crew.submit(items, keys, shared)] = tuple(items)
+
+    def _share(self, key: str) -> Any:
+        if key not in self._shared:
+            while len(self._shared) >= KEPT_RECORDS:
+                self._shared.pop(next(iter(self._shared)))
+            self._shared[key] = self._crew.share(self._source.records(key))
+        return self._shared[key]
+
+    def _take(self, run: ActiveRun, one: Done) -> None:
+        match one.outcome:
+            case Failure() as failure:
+                self._fail(run.run, failure)
+            case Concluded() as concluded:
+                self._cost = self._cost.observe(one.seconds)
+                del self._active[run.run]
+                self.observer.result(run.run, concluded, run.seconds)
+            case Advanced(state):
+                run.advance(state, one.seconds)
+                self._go_on(run)
+            case Evolved() as evolved:
+                if run.gather(evolved, one.seconds):
+                    self._go_on(run)
+
+    def _go_on(self, run: ActiveRun) -> None:
+        assert run.state is not None
+        self.observer.progress(run.run, run.state, run.seconds)
+        self._ready.append(run)
+
+    def _fail(self, name: str, failure: Failure) -> None:
+        if self._active.pop(name, None) is not None:
+            self.observer.failure(name, failure)

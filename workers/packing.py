@@ -1,0 +1,88 @@
+"""How work is cut and grouped: pure functions of measured cost.
+
+A task should last 0.2 to 1 s: shorter, and Ray's millisecond a task shows; longer, and progress,
+cancellation and fairness suffer. Results never depend on any of this.
+"""
+
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil
+from typing import TypeVar
+
+PACK_SECONDS = 0.5
+"""Compute time a task aims at."""
+
+FIRST_SLICE_SECONDS = 0.15
+"""First slice of a run, shorter so that its progress is seen at once."""
+
+PACKS_PER_CPU = 2
+"""Packs in flight for each core: one computes, one waits beside it."""
+
+WORTH_SPREADING_SECONDS = 0.02
+"""An island's epoch that takes less is not worth a task of its own."""
+
+KEPT = 0.7
+"""Weight of what was known when a new cost is measured."""
+
+Key = TypeVar("Key", bound=Hashable)
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Running mean of what one item of a job costs; `seconds` is None before the first."""
+
+    seconds: float | None = None
+
+    def observe(self, seconds: float) -> "Cost":
+        """The mean after one more item."""
+        if self.seconds is None:
+            return Cost(seconds)
+        return Cost(KEPT * self.seconds + (1 - KEPT) * seconds)
+
+
+def pack_size(cost: Cost, waiting: int, slots: int) -> int:
+    """How many of `waiting` equal items go into the next task.
+
+    One while the cost is unknown; never more than an even share of what waits, so that the end of
+    a sweep keeps every core busy.
+    """
+    if cost.seconds is None:
+        return min(1, waiting)
+    by_cost = int(PACK_SECONDS / max(cost.seconds, 1e-4))
+    share = ceil(waiting / max(slots, 1))
+    return min(max(1, min(by_cost, share)), waiting)
+
+
+def fairest(in_flight: Mapping[Key, int]) -> Key | None:
+    """The job that has fewest packs in flight; among equals the first in order."""
+    return min(in_flight, key=lambda job: in_flight[job], default=None)
+
+
+def slice_seconds(slices: int) -> float:
+    """Length of a run's next time slice after `slices` of them."""
+    return min(PACK_SECONDS, FIRST_SLICE_SECONDS * 2**slices)
+
+
+def is_worth_spreading(epoch_seconds: float, islands: int, idle: int) -> bool:
+    """Whether the islands of one run should go to several tasks instead of one.
+
+    Parameters
+    ----------
+    epoch_seconds : float
+        What one epoch of all islands costs on one core.
+    islands, idle : int
+        Islands of the run; cores without work.
+    """
+    return idle > 0 and islands > 1 and epoch_seconds / islands >= WORTH_SPREADING_SECONDS
+
+
+def deal(costs: Sequence[float], bins: int) -> tuple[tuple[int, ...], ...]:
+    """Indices dealt over at most `bins` packs of about equal cost (longest first)."""
+    count = min(bins, len(costs))
+    packs: list[list[int]] = [[] for _ in range(count)]
+    loads = [0.0] * count
+    for index in sorted(range(len(costs)), key=lambda i: (-costs[i], i)):
+        lightest = loads.index(min(loads))
+        packs[lightest].append(index)
+        loads[lightest] += costs[index]
+    return tuple(tuple(sorted(pack)) for pack in packs)

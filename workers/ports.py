@@ -1,0 +1,219 @@
+"""What goes into the workers and what comes out: values, and two small protocols."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from hashlib import blake2b
+from typing import Any, Protocol, TypeAlias
+
+from sysid.ga.island import Island
+from sysid.records import Record
+from sysid.result import Identification
+from sysid.run import RunState
+from sysid.settings import GeneticAlgorithm, Loss, Prediction
+
+Records: TypeAlias = tuple[Record, ...]
+Handle: TypeAlias = Any
+"""Names a pack in flight; only the crew that gave it knows more."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Noise added to the measured outputs before fitting (Eq. 19, 20)."""
+
+    sigma: float = 0.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class ProblemSpec:
+    """What is fitted to what.
+
+    Attributes
+    ----------
+    model : Mapping
+        Model document.
+    records : str
+        Key under which the crew shares the records; equal keys mean equal records.
+    validation : str or None
+        Key of the records kept for validation.
+    validation_fraction : float or None
+        Else the last fraction of each record that is kept for it.
+    skip : int
+        First samples of each output that are not scored.
+    """
+
+    model: Mapping[str, Any]
+    records: str
+    validation: str | None = None
+    validation_fraction: float | None = None
+    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    prediction: Prediction = "simulation"
+    loss: Loss = field(default_factory=Loss)
+    weights: Mapping[str, float] | None = None
+    skip: int = 0
+    noise: Noise = field(default_factory=Noise)
+
+    @cached_property
+    def key(self) -> str:
+        """Equal for equal specifications; names a built problem in a worker's cache."""
+        text = json.dumps(asdict(self), sort_keys=True)
+        return blake2b(text.encode(), digest_size=16).hexdigest()
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Keys of the shared records."""
+        return (self.records,) if self.validation is None else (self.records, self.validation)
+
+
+@dataclass(frozen=True, slots=True)
+class RunSpec:
+    """One identification, complete: the same specification gives the same bits anywhere.
+
+    `warm` are parameter vectors from earlier results, to seed part of the population with.
+    """
+
+    problem: ProblemSpec
+    algorithm: GeneticAlgorithm
+    seed: int = 1
+    warm: tuple[Mapping[str, float], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Advance:
+    """Work on a whole run for about `seconds`; from the start if `state` is None."""
+
+    run: str
+    spec: RunSpec
+    state: RunState | None
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Evolve:
+    """Work on one island of a run, up to the generation `target` of its next border."""
+
+    run: str
+    spec: RunSpec
+    island: Island
+    target: int
+
+
+Item: TypeAlias = Advance | Evolve
+
+
+@dataclass(frozen=True, slots=True)
+class Advanced:
+    """The run goes on from here."""
+
+    state: RunState
+
+
+@dataclass(frozen=True, slots=True)
+class Evolved:
+    """The island has got to the border `target`, or rests before it."""
+
+    island: Island
+    target: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Concluded:
+    """The run is complete."""
+
+    state: RunState
+    identification: Identification
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """The run cannot be carried out; `reason` is a sentence for its user."""
+
+    reason: str
+    kind: str = ""
+
+
+Outcome: TypeAlias = Advanced | Evolved | Concluded | Failure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Done:
+    """What became of one item, and the compute time it took; None: its turn did not come."""
+
+    run: str
+    outcome: Outcome | None
+    seconds: float
+
+
+class Crew(Protocol):
+    """Those who compute packs: a Ray cluster, or this process."""
+
+    slots: int
+
+    def share(self, records: Records) -> Any:
+        """Make records known once; the reference travels instead of them."""
+
+    def submit(self, pack: Sequence[Item], keys: Sequence[str], shared: Sequence[Any]) -> Handle:
+        """Send a pack; `keys` name the shared records in order."""
+
+    def finished(self, timeout: float) -> tuple[Handle, ...]:
+        """Handles of packs that ended, waiting at most `timeout` seconds for the first."""
+
+    def fetch(self, handle: Handle) -> tuple[Done, ...]:
+        """What a finished pack gave; raises `PackLost`."""
+
+    def cancel(self, handle: Handle, *, force: bool) -> None:
+        """Interrupt a pack, or kill its worker."""
+
+    def check(self) -> None:
+        """Raise `ClusterLost` if the crew shows no sign of life; never waits."""
+
+    def close(self) -> None:
+        """Let the crew go."""
+
+
+class RunObserver(Protocol):
+    """Who is told about the runs of one job."""
+
+    def started(self, run: str) -> None:
+        """The run was given to a worker for the first time."""
+
+    def progress(self, run: str, state: RunState, seconds: float) -> None:
+        """The run can go on from `state` after `seconds` of compute time."""
+
+    def result(self, run: str, concluded: Concluded, seconds: float) -> None:
+        """The run is complete."""
+
+    def failure(self, run: str, failure: Failure) -> None:
+        """The run cannot be carried out."""
+
+    def should_stop(self) -> bool:
+        """Whether the job was cancelled or lost: asked between packs."""
+
+
+@dataclass(frozen=True, slots=True)
+class QueuedRun:
+    """A run that waits for its turn; `state` is its checkpoint, if there is one."""
+
+    run: str
+    spec: RunSpec
+    state: RunState | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RefusedRun:
+    """A run whose specification cannot be used."""
+
+    run: str
+    failure: Failure
+
+
+class JobSource(Protocol):
+    """Where a job's runs and records come from, asked for as they are needed."""
+
+    def runs(self) -> Iterable[QueuedRun | RefusedRun]:
+        """The runs, in order; the iterable is read lazily."""
+
+    def records(self, key: str) -> Records:
+        """Return the records of that key, or raise `RecordsUnavailable`."""

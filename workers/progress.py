@@ -1,0 +1,102 @@
+"""Where one run stands on the driver's side, and which items of work come next."""
+
+from dataclasses import dataclass, field, replace
+
+from sysid.ga.island import Island
+from sysid.run import RunState, border, exchange, is_finished
+from workers.packing import is_worth_spreading, slice_seconds
+from workers.ports import Advance, Evolve, Evolved, Item, QueuedRun, RunSpec
+
+MAX_STRIKES = 3
+"""A run whose workers died this often is given up."""
+
+
+@dataclass(slots=True, eq=False)
+class ActiveRun:
+    """One run between its first item of work and its result.
+
+    Attributes
+    ----------
+    slices : int
+        Time slices done; 0 before the first.
+    strikes : int
+        How often a worker died over it.
+    seconds : float
+        Compute time so far, over all workers.
+    generation_seconds : float
+        Measured cost of one generation of one island; 0 while unknown.
+    islands : dict
+        While the run is spread: its islands, by number, as they stand.
+    awaited : set
+        Numbers of the islands that are with the workers.
+    """
+
+    run: str
+    spec: RunSpec
+    state: RunState | None
+    slices: int = 0
+    strikes: int = 0
+    seconds: float = 0.0
+    generation_seconds: float = 0.0
+    islands: dict[int, Island] = field(default_factory=dict)
+    awaited: set[int] = field(default_factory=set)
+
+    @classmethod
+    def of(cls, queued: QueuedRun) -> "ActiveRun":
+        """The run as it waits in the queue."""
+        return cls(queued.run, queued.spec, queued.state)
+
+    def should_spread(self, idle: int) -> bool:
+        """Whether its islands should go to several workers, given `idle` cores."""
+        algorithm = self.spec.algorithm
+        if self.state is None or is_finished(algorithm, self.state):
+            return False
+        epoch = self.generation_seconds * algorithm.n_islands * algorithm.migration.every
+        return is_worth_spreading(epoch, algorithm.n_islands, idle)
+
+    def whole(self) -> Item:
+        """The next time slice of the whole run."""
+        return Advance(self.run, self.spec, self.state, slice_seconds(self.slices))
+
+    def split(self) -> list[Evolve]:
+        """The islands that have not got to the next border, one item each; at least one."""
+        assert self.state is not None
+        target = border(self.spec.algorithm, self.state)
+        self.islands = dict(enumerate(self.state.islands))
+        behind = [i for i, island in self.islands.items() if island.generation < target]
+        self.awaited = set(behind)
+        return [Evolve(self.run, self.spec, self.islands[i], target) for i in behind]
+
+    def advance(self, state: RunState, seconds: float) -> None:
+        """Take in a time slice of the whole run."""
+        before = 0 if self.state is None else _generations(self.state)
+        done = _generations(state) - before
+        if done > 0:
+            self.generation_seconds = seconds / done
+        self.state = state
+        self.slices += 1
+
+    def gather(self, evolved: Evolved, seconds: float) -> bool:
+        """Take in an island; whether it was the last, so that the run stands at its border."""
+        assert self.state is not None
+        index = evolved.island.index
+        if index not in self.awaited or evolved.target != border(self.spec.algorithm, self.state):
+            return False  # it was sent again after a worker died, and is here already
+        spent = self.state.seconds + seconds / len(self.islands)  # as if all were beside another
+        self.state = replace(self.state, seconds=spent)
+        self.islands[index] = evolved.island
+        self.awaited.discard(index)
+        if self.awaited:
+            return False
+        islands = [self.islands[i] for i in range(len(self.islands))]
+        self.state = exchange(self.spec.algorithm, self.state, islands)
+        self.islands = {}
+        return True
+
+    def gather_again(self) -> None:
+        """Forget the islands that are with the workers: the epoch begins anew."""
+        self.islands, self.awaited = {}, set()
+
+
+def _generations(state: RunState) -> int:
+    return sum(island.generation for island in state.islands)

@@ -1,0 +1,139 @@
+"""The one kind of task: advance a pack of work. Stateless but for a cache of built problems."""
+
+import time
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+
+from sysid.noise import add_noise
+from sysid.problem import Problem
+
+from sysid.errors import SysidError
+from sysid.ga.island import Island
+from sysid.models.spec import parse_model
+from sysid.records import split_record
+from sysid.run import CALL_SECONDS, advance_island, begin, conclude, is_finished
+from sysid.run import advance as advance_run
+from workers.ports import (
+    Advance,
+    Advanced,
+    Concluded,
+    Done,
+    Evolve,
+    Evolved,
+    Failure,
+    Item,
+    Outcome,
+    ProblemSpec,
+    Records,
+)  # fmt: skip
+
+PACK_LIMIT_SECONDS = 1.0
+"""No further item is begun after that; what is left goes back unchanged."""
+
+CACHED_PROBLEMS = 8
+
+_problems: OrderedDict[str, tuple[Problem, Problem | None]] = OrderedDict()
+
+
+def advance(pack: Sequence[Item], keys: Sequence[str], *shared: Records) -> tuple[Done, ...]:
+    """Work on every item of the pack in turn.
+
+    What is wrong with a run comes back as its `Failure`; only programming errors raise.
+
+    Parameters
+    ----------
+    pack : sequence of Item
+    keys : sequence of str
+        Names of the shared records, in order.
+    shared : Records
+        They travel as arguments of their own, so that Ray hands out one copy per machine.
+    """
+    records = dict(zip(keys, shared, strict=True))
+    begun = time.perf_counter()
+    done = []
+    for item in pack:
+        started = time.perf_counter()
+        if done and started - begun > PACK_LIMIT_SECONDS:
+            done.append(Done(item.run, None, 0.0))
+            continue
+        outcome = _outcome(item, records)
+        done.append(Done(item.run, outcome, time.perf_counter() - started))
+    return tuple(done)
+
+
+def _outcome(item: Item, records: Mapping[str, Records]) -> Outcome:
+    try:
+        problem, validation = _problem(item.spec.problem, records)
+        if isinstance(item, Evolve):
+            return Evolved(_evolved(item, problem), item.target)
+        return _advanced(item, problem, validation)
+    except SysidError as error:
+        return Failure(str(error), type(error).__name__)
+
+
+def _advanced(item: Advance, problem: Problem, validation: Problem | None) -> Outcome:
+    algorithm = item.spec.algorithm
+    state = item.state
+    if state is None:
+        state = begin(problem, algorithm, item.spec.seed, item.spec.warm)
+    state = advance_run(problem, algorithm, state, item.seconds)
+    if not is_finished(algorithm, state):
+        return Advanced(state)
+    return Concluded(state, conclude(problem, algorithm, state, validation))
+
+
+def _evolved(item: Evolve, problem: Problem) -> Island:
+    """The island at its border, in calls of about `CALL_SECONDS`: a cancel is heard between."""
+    island, cost = item.island, CALL_SECONDS
+    while island.generation < item.target:
+        count = max(1, min(item.target - island.generation, int(CALL_SECONDS / cost)))
+        started = time.perf_counter()
+        before = island.generation
+        island = advance_island(problem, item.spec.algorithm, island, count, item.spec.seed)
+        cost = max((time.perf_counter() - started) / count, 1e-9)
+        if island.generation < before + count:
+            return island  # it rests
+    return island
+
+
+def _problem(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Problem, Problem | None]:
+    """The problem and its validation; the last few are kept, since slices of a run follow."""
+    if spec.key in _problems:
+        _problems.move_to_end(spec.key)
+        return _problems[spec.key]
+    _problems[spec.key] = built = build(spec, records)
+    while len(_problems) > CACHED_PROBLEMS:
+        _problems.popitem(last=False)
+    return built
+
+
+def build(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Problem, Problem | None]:
+    """The problem and that of its validation data, if there are any.
+
+    Raises
+    ------
+    SysidError
+        If model, records or settings cannot be used.
+    """
+    model = parse_model(spec.model)
+    estimation, validation = prepared(spec, records)
+
+    def problem(chosen: Records) -> Problem:
+        return Problem.build(
+            model, chosen, parameters=spec.parameters, prediction=spec.prediction,
+            loss=spec.loss, weights=spec.weights, skip=spec.skip,
+        )  # fmt: skip
+
+    return problem(estimation), None if validation is None else problem(validation)
+
+
+def prepared(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Records, Records | None]:
+    """Records as a run sees them: noise added to those for the estimate, validation split off."""
+    estimation = records[spec.records]
+    validation = None if spec.validation is None else records[spec.validation]
+    if spec.validation_fraction is not None:
+        parts = [split_record(record, spec.validation_fraction) for record in estimation]
+        estimation, validation = tuple(p[0] for p in parts), tuple(p[1] for p in parts)
+    if spec.noise.sigma > 0:
+        estimation = add_noise(estimation, spec.noise.sigma, spec.noise.seed)
+    return estimation, validation
