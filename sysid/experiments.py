@@ -1,0 +1,216 @@
+"""Laying out experiments: which recorded channel is which signal, where it lies on the grid."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.errors import InvalidRecord, InvalidSettings, RecordTooShort, nearest
+from sysid.kernels.comparison import measured_state
+from sysid.kernels.demand import is_difference
+from sysid.kernels.grid import Grid, grid_of, sample_places
+from sysid.kernels.inputs import FineInput
+from sysid.kernels.plan import Samples, Start, fine_inputs, largest_lags
+from sysid.language.tree import Past
+from sysid.models.model import EstimatedInitial, FixedInitial, Model
+from sysid.parameters import Parameter
+from sysid.records import Channel, Record
+from sysid.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Experiment:
+    """One record laid out for a model.
+
+    Attributes
+    ----------
+    grid : Grid
+    inputs, outputs, starts : tuple
+        In the model's order of inputs, outputs and states.
+    lag : float
+        Largest lag of a state, in integration steps.
+    """
+
+    grid: Grid
+    inputs: tuple[FineInput, ...]
+    outputs: tuple[Samples, ...]
+    starts: tuple[Start, ...]
+    lag: float
+
+
+def initial_name(state: str, experiment: int) -> str:
+    """Name of an estimated initial state: ``x(0)``, in the second experiment ``x(0)[2]``."""
+    return f"{state}(0)" if experiment == 0 else f"{state}(0)[{experiment + 1}]"
+
+
+def initial_parameters(model: Model, experiments: int) -> tuple[Parameter, ...]:
+    """The initial states to be estimated, for each experiment on its own."""
+    return tuple(
+        Parameter(initial_name(state.name, e), start.lower, start.upper, state.unit)
+        for e in range(experiments)
+        for state, start in zip(model.states, model.initial, strict=True)
+        if isinstance(start, EstimatedInitial)
+    )
+
+
+def output_weights(
+    model: Model, records: Sequence[Record], weights: Mapping[str, float] | None, skip: int
+) -> dict[str, float]:
+    """Weight of each output: 1 for one output, else as given or 1 / its standard deviation.
+
+    Raises
+    ------
+    InvalidSettings
+        If a weight names no output or is not a positive number.
+    InvalidRecord
+        If an output without a given weight is constant.
+    """
+    names = [output.name for output in model.outputs]
+    for name, weight in (weights or {}).items():
+        if name not in names:
+            raise InvalidSettings(
+                f"/weights/{name}", f"the model has no output {name!r}{nearest(name, names)}"
+            )
+        if not 0 < weight < np.inf:
+            raise InvalidSettings(f"/weights/{name}", f"{weight!r} is not a positive number")
+    if weights is None and len(names) == 1:
+        return {names[0]: 1.0}
+    given = weights or {}
+    return {
+        name: given[name] if name in given else _reciprocal_deviation(name, records, skip)
+        for name in names
+    }
+
+
+def _reciprocal_deviation(name: str, records: Sequence[Record], skip: int) -> float:
+    values = np.concatenate([_channel(r.outputs, name, "output").values[skip:] for r in records])
+    deviation = float(np.std(values[np.isfinite(values)])) if np.any(np.isfinite(values)) else 0.0
+    if deviation == 0.0:
+        raise InvalidRecord(
+            f"output {name!r} is constant, so its standard deviation gives no weight; "
+            "give weights for the outputs"
+        )
+    return 1.0 / deviation
+
+
+def lay_out(
+    model: Model, record: Record, experiment: int, parameters: Sequence[Parameter],
+    weights: Mapping[str, float], skip: int, simulates_only: bool = False,
+) -> Experiment:  # fmt: skip
+    """Lay one record out for a model.
+
+    Raises
+    ------
+    InvalidRecord, RecordTooShort, InvalidSettings
+        If the record does not have what the model needs.
+    """
+    inputs = [_input(record, quantity.name) for quantity in model.inputs]
+    outputs = [_channel(record.outputs, output.name, "output") for output in model.outputs]
+    if not simulates_only:
+        for channel in outputs:
+            _check_scored(channel, skip)
+    grid = grid_of(model, inputs, outputs)
+    if is_difference(model) and grid.points <= model.memory:
+        raise RecordTooShort(grid.duration, model.memory * grid.step, "the model's memory")
+    spans = {
+        p.name: (p.lower, p.upper) if p.fixed is None else (p.fixed, p.fixed) for p in parameters
+    }
+    rows = {p.name: i for i, p in enumerate(parameters)}
+    return Experiment(
+        grid,
+        tuple(fine_inputs(model, inputs, spans, grid)),
+        tuple(_samples(model, grid, c, weights[c.name], skip) for c in outputs),
+        tuple(_starts(model, grid, outputs, experiment, rows)),
+        max([0.0, *largest_lags(model, "state", spans, grid).values()]),
+    )
+
+
+def _channel(channels: Sequence[Channel], name: str, role: str) -> Channel:
+    for channel in channels:
+        if channel.name == name:
+            return channel
+    known = [channel.name for channel in channels]
+    raise InvalidRecord(f"the record has no {role} {name!r}{nearest(name, known)}")
+
+
+def _input(record: Record, name: str) -> Channel:
+    channel = _channel(record.inputs, name, "input")
+    bad = np.flatnonzero(~np.isfinite(channel.values))
+    if bad.size:
+        raise InvalidRecord(
+            f"input {name!r} has no finite value at {channel.times[bad[0]]:g} s "
+            f"(sample {bad[0]}, and {bad.size - 1} more); fill the gap or trim the record"
+        )
+    return channel
+
+
+def _check_scored(channel: Channel, skip: int) -> None:
+    if not np.any(np.isfinite(channel.values[skip:])):
+        raise InvalidRecord(
+            f"output {channel.name!r} has {channel.values.size} samples and none with a value "
+            f"after the first {skip}; nothing is left to compare with"
+        )
+
+
+def _samples(model: Model, grid: Grid, channel: Channel, weight: float, skip: int) -> Samples:
+    known = np.isfinite(channel.values)
+    weights = np.where(known & (np.arange(known.size) >= skip), weight, 0.0)
+    values = np.where(known, channel.values, 0.0)
+    return Samples(sample_places(grid, model, channel), values, weights,
+                   _on_grid(grid, channel))  # fmt: skip
+
+
+def _on_grid(grid: Grid, channel: Channel) -> FloatArray:
+    """The measurement at the grid points, on a line between its samples."""
+    known = np.isfinite(channel.values)
+    if not np.any(known):
+        return np.zeros(grid.points)
+    return np.interp(grid.times, channel.times[known], channel.values[known])
+
+
+def _starts(
+    model: Model, grid: Grid, outputs: Sequence[Channel], experiment: int,
+    rows: Mapping[str, int],
+) -> list[Start]:  # fmt: skip
+    starts = []
+    for i, initial in enumerate(model.initial):
+        if isinstance(initial, FixedInitial):
+            starts.append(Start(np.array([initial.value])))
+        elif isinstance(initial, EstimatedInitial):
+            row = rows[initial_name(model.states[i].name, experiment)]
+            starts.append(Start(np.zeros(1), row))
+        else:
+            starts.append(Start(_measured_start(model, i, grid, outputs)))
+    return starts
+
+
+def _measured_start(model: Model, state: int, grid: Grid, outputs: Sequence[Channel]) -> FloatArray:
+    """First values of a measured state; of its rate, the first difference.
+
+    Raises
+    ------
+    InvalidRecord
+        If no output measures the state or what it is the rate of.
+    """
+    measured = {measured_state(o): c for o, c in zip(model.outputs, outputs, strict=True)}
+    name = model.states[state].name
+    count = max(model.memory, 1) if is_difference(model) else 1
+    if name in measured:
+        return _on_grid(grid, measured[name])[:count]
+    for other, equation in zip(model.states, model.equations, strict=True):
+        if equation == Past(name, "state") and other.name in measured:
+            return _first_slope(measured[other.name])
+    raise InvalidRecord(
+        f"state {name!r} is to start at its measured value, but no output measures it or what it "
+        "is the rate of; give its initial value or bounds to estimate it in"
+    )
+
+
+def _first_slope(channel: Channel) -> FloatArray:
+    known = np.isfinite(channel.values)
+    times, values = channel.times[known], channel.values[known]
+    later = np.flatnonzero(np.diff(times) > 0)
+    if later.size == 0:
+        return np.zeros(1)
+    i = int(later[0])
+    return np.array([(values[i + 1] - values[i]) / (times[i + 1] - times[i])])

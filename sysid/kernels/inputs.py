@@ -1,0 +1,150 @@
+"""Inputs between their samples: each is laid once onto a fine uniform grid that kernels read."""
+
+from dataclasses import dataclass
+from math import ceil, floor
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import upfirdn
+
+from sysid.errors import InvalidRecord
+from sysid.records import Channel
+from sysid.types import FloatArray
+
+DENSE = 8
+"""Fine points in a sampling period where the signal between samples is not a straight line."""
+
+MOST_POINTS = 64
+"""Fine points in an integration step at most."""
+
+_HALF_WIDTH = 48  # of the band-limited interpolation, in samples
+_KAISER = 8.0  # 80 dB
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FineInput:
+    """An input on the fine grid.
+
+    Attributes
+    ----------
+    values : FloatArray
+    zero : int
+        Index of the value at the start of the simulation.
+    points : int
+        Fine points in an integration step.
+    begin, end : int
+        Where a step begins and ends, in fine points from its start. At a jump the grid holds the
+        mean of both sides, so that a lagged jump is not displaced; an input without lag is read
+        one point behind the jump and one before it.
+    cap : int
+        Fine points before the start.
+    """
+
+    values: FloatArray
+    zero: int
+    points: int
+    begin: int
+    end: int
+    cap: int
+
+
+def fine_input(channel: Channel, start: float, step: float, steps: int, lag: float) -> FineInput:
+    """Lay an input onto the fine grid.
+
+    Parameters
+    ----------
+    start, step, steps : float, float, int
+        First time of the simulation, its integration step, both in s, and how many steps follow.
+    lag : float
+        Largest lag with which the input is read, in steps.
+    """
+    points = _points(channel, start, step)
+    cap = ceil(lag * points) + 2
+    count = cap + (steps + 2) * points + 2
+    times: FloatArray = start + (np.arange(count, dtype=np.float64) - cap) * (step / points)
+    jump = 1 if channel.hold == "zero" else 0
+    return FineInput(
+        between_samples(channel, times), cap, points, jump, points - jump, max(cap - 2, 0)
+    )
+
+
+def _points(channel: Channel, start: float, step: float) -> int:
+    """Fine points in a step: an even number, so that half steps are fine points too."""
+    period = sampling_period(channel)
+    if period is None:
+        return 2
+    if channel.hold == "first":
+        for points in range(2, MOST_POINTS + 1, 2):
+            if _is_aligned(channel.times, start, step / points):
+                return points
+    return int(np.clip(2 * ceil(DENSE * step / period / 2 - 1e-9), 4, MOST_POINTS))
+
+
+def _is_aligned(times: FloatArray, start: float, spacing: float) -> bool:
+    places = (times - start) / spacing
+    return bool(np.max(np.abs(places - np.round(places))) < 1e-3)
+
+
+def sampling_period(channel: Channel) -> float | None:
+    """Median distance of neighbouring samples in s; None if no two have different times."""
+    steps = np.diff(channel.times)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if steps.size else None
+
+
+def between_samples(channel: Channel, times: FloatArray) -> FloatArray:
+    """Values of a channel at any times, by its hold; its end values outside the record."""
+    if channel.hold == "first" or channel.times.size < 2:
+        return np.interp(times, channel.times, channel.values)
+    if channel.hold == "zero":
+        return _held(channel, times)
+    return _band_limited(channel, times)
+
+
+def _held(channel: Channel, times: FloatArray) -> FloatArray:
+    """The last sample's value; the mean of both sides where the time is a sample's own."""
+    tolerance = 1e-6 * (sampling_period(channel) or 1.0)
+    last = channel.times.size - 1
+    after = np.searchsorted(channel.times, times + tolerance, side="right") - 1
+    before = np.searchsorted(channel.times, times - tolerance, side="right") - 1
+    values = channel.values
+    found: FloatArray = 0.5 * (values[np.clip(after, 0, last)] + values[np.clip(before, 0, last)])
+    return found
+
+
+def _band_limited(channel: Channel, times: FloatArray) -> FloatArray:
+    """Kaiser-windowed sinc to `DENSE` points a sample, then a cubic spline through those.
+
+    The record is continued at both ends by its point reflection, which keeps value and slope.
+    """
+    period = (channel.times[-1] - channel.times[0]) / (channel.times.size - 1)
+    if not _is_regular(channel.times, period):
+        raise InvalidRecord(
+            f"input {channel.name!r} is to be band-limited between its samples, but they are not "
+            "regular; use hold 'first' or resample it"
+        )
+    reach = np.arange(-_HALF_WIDTH * DENSE, _HALF_WIDTH * DENSE + 1)
+    kernel = np.sinc(reach / DENSE) * np.kaiser(reach.size, _KAISER)
+    values, margin = channel.values, 2 * _HALF_WIDTH
+    extended = np.pad(values, margin, mode="reflect", reflect_type="odd")
+    dense = upfirdn(kernel, extended, up=DENSE)[_HALF_WIDTH * DENSE :]
+    first = (margin - 1) * DENSE
+    dense = dense[first : first + (values.size + 1) * DENSE + 1]
+    places = (np.arange(dense.size) / DENSE - 1.0) * period + channel.times[0]
+    inside = np.clip(times, channel.times[0], channel.times[-1])
+    if dense.size == 0:
+        return np.interp(times, channel.times, values)
+    found: FloatArray = CubicSpline(places, dense)(inside)
+    return found
+
+
+def _is_regular(times: FloatArray, period: float) -> bool:
+    return bool(
+        period > 0
+        and np.max(np.abs(times - times[0] - period * np.arange(times.size))) < 0.05 * period
+    )
+
+
+def whole_steps(duration: float, step: float) -> int:
+    """Steps that fit into a duration, forgiving a millionth of a step."""
+    return floor(duration / step + 1e-6)

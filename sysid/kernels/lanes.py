@@ -1,0 +1,237 @@
+"""Writes vector instructions of LLVM: arithmetic on `LANES` individuals at once, and memory.
+
+A value is either the same for all individuals (a scalar: time, inputs, numbers) or one per
+individual (a vector). Scalars stay scalars until they meet a vector.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+from llvmlite import ir
+
+from sysid.kernels.calls import LANES
+
+DOUBLE, INT, BOOL = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
+VECTOR, INTS, BOOLS = (ir.VectorType(kind, LANES) for kind in (DOUBLE, INT, BOOL))
+_INT32 = ir.IntType(32)
+_POINTERS = ir.VectorType(ir.PointerType(), LANES)
+
+FLAGS = ("contract", "nsz", "arcp")
+"""Fast-math flags in use: fused multiply-add, any sign of zero, reciprocal for a division.
+
+Never ``nnan`` or ``ninf``: with them the compiler may drop the very ``nan`` or ``inf`` by which a
+diverged simulation is known. Nor ``reassoc``: sums stay in the order written, so that a lane's
+bits do not depend on how the compiler arranges its neighbours.
+"""
+
+# llvmlite is untyped
+Value: TypeAlias = Any
+Function: TypeAlias = Any
+
+
+class Lanes:
+    """An instruction builder that knows vectors of individuals."""
+
+    def __init__(self, function: Function) -> None:
+        self.function = function
+        self.builder = ir.IRBuilder(function.append_basic_block("entry"))
+
+    # ---- constants and shapes -------------------------------------------------------------
+    @staticmethod
+    def number(value: float) -> Value:
+        """A scalar constant."""
+        return ir.Constant(DOUBLE, float(value))
+
+    @staticmethod
+    def integer(value: int) -> Value:
+        """A whole number."""
+        return ir.Constant(INT, value)
+
+    @staticmethod
+    def lane_numbers() -> Value:
+        """0, 1, …, LANES - 1."""
+        return ir.Constant(INTS, list(range(LANES)))
+
+    def splat(self, value: Value) -> Value:
+        """The scalar in every lane; a vector as it is."""
+        if isinstance(value.type, ir.VectorType):
+            return value
+        kind = ir.VectorType(value.type, LANES)
+        if isinstance(value, ir.Constant):
+            return ir.Constant(kind, [value.constant] * LANES)
+        one = self.builder.insert_element(
+            ir.Constant(kind, ir.Undefined), value, ir.Constant(_INT32, 0)
+        )
+        zeros = ir.Constant(ir.VectorType(_INT32, LANES), [0] * LANES)
+        return self.builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), zeros)
+
+    def same_shape(self, *values: Value) -> list[Value]:
+        """All as vectors if one of them is."""
+        if any(isinstance(v.type, ir.VectorType) for v in values):
+            return [self.splat(v) for v in values]
+        return list(values)
+
+    # ---- arithmetic -----------------------------------------------------------------------
+    def _float(self, operation: str, a: Value, b: Value) -> Value:
+        left, right = self.same_shape(a, b)
+        return getattr(self.builder, operation)(left, right, flags=FLAGS)
+
+    def add(self, a: Value, b: Value) -> Value:
+        """Sum of a and b."""
+        return self._float("fadd", a, b)
+
+    def sub(self, a: Value, b: Value) -> Value:
+        """Difference of a and b."""
+        return self._float("fsub", a, b)
+
+    def mul(self, a: Value, b: Value) -> Value:
+        """Product of a and b."""
+        return self._float("fmul", a, b)
+
+    def div(self, a: Value, b: Value) -> Value:
+        """Quotient of a and b."""
+        return self._float("fdiv", a, b)
+
+    def compare(self, operator: str, a: Value, b: Value) -> Value:
+        """A comparison; false where either is ``nan``, except ``!=``."""
+        left, right = self.same_shape(a, b)
+        if operator == "!=":
+            return self.builder.fcmp_unordered(operator, left, right)
+        return self.builder.fcmp_ordered(operator, left, right)
+
+    def select(self, condition: Value, a: Value, b: Value) -> Value:
+        """A where the condition holds, b elsewhere."""
+        if isinstance(condition.type, ir.VectorType):
+            return self.builder.select(condition, self.splat(a), self.splat(b))
+        left, right = self.same_shape(a, b)
+        return self.builder.select(condition, left, right)
+
+    def between(self, start: Value, fraction: Value, stop: Value) -> Value:
+        """Start + fraction · (stop - start)."""
+        return self.add(start, self.mul(fraction, self.sub(stop, start)))
+
+    def intrinsic(self, name: str, *arguments: Value) -> Value:
+        """A function LLVM knows, lane by lane; those without instructions become libm calls."""
+        values = self.same_shape(*arguments)
+        kind = values[0].type
+        suffix = f"v{LANES}f64" if isinstance(kind, ir.VectorType) else "f64"
+        signature = ir.FunctionType(kind, [v.type for v in values])
+        return self.builder.call(self._declared(f"llvm.{name}.{suffix}", signature), values)
+
+    def whole_and_fraction(self, value: Value) -> tuple[Value, Value]:
+        """Floor as whole numbers, and what remains."""
+        floor = self.intrinsic("floor", value)
+        return self.builder.fptosi(floor, INTS), self.sub(value, floor)
+
+    def clamped(self, value: Value, upper: Value) -> Value:
+        """Inside [0, upper]; 0 where the value is ``nan``, so that it may address memory."""
+        zero = self.number(0.0)
+        positive = self.select(self.compare(">", value, zero), value, zero)
+        return self.select(self.compare("<", positive, upper), positive, upper)
+
+    # ---- memory ---------------------------------------------------------------------------
+    def _address(self, base: Value, index: Value) -> Value:
+        return self.builder.gep(base, [index], inbounds=True, source_etype=DOUBLE)
+
+    def load(self, base: Value, index: Value) -> Value:
+        """The double at ``base[index]``."""
+        return self.builder.load(self._address(base, index), typ=DOUBLE)
+
+    def load_int(self, base: Value, index: Value) -> Value:
+        """The whole number at ``base[index]``."""
+        return self.builder.load(self._address(base, index), typ=INT)
+
+    def load_row(self, base: Value, index: Value) -> Value:
+        """The vector of doubles that begins at ``base[index]``."""
+        return self.builder.load(self._address(base, index), typ=VECTOR, align=8)
+
+    def store_row(self, value: Value, base: Value, index: Value) -> None:
+        """Store a vector of doubles from ``base[index]`` on."""
+        self.builder.store(self.splat(value), self._address(base, index), align=8)
+
+    def addresses(self, base: Value, index: Value) -> Value:
+        """Addresses of ``base[index]`` for a vector of indices, to add a common shift to."""
+        start = self.splat(self.builder.ptrtoint(base, INT))
+        return self.builder.add(start, self.builder.shl(index, self.splat(self.integer(3))))
+
+    def gather(self, addresses: Value, shift: Value) -> Value:
+        """The doubles at `addresses`, each `shift` doubles further."""
+        step = self.splat(self.builder.shl(shift, self.integer(3)))
+        pointers = self.builder.inttoptr(self.builder.add(addresses, step), _POINTERS)
+        name = f"llvm.masked.gather.v{LANES}f64.v{LANES}p0"
+        signature = ir.FunctionType(VECTOR, [_POINTERS, _INT32, BOOLS, VECTOR])
+        mask = ir.Constant(BOOLS, [1] * LANES)
+        arguments = [pointers, ir.Constant(_INT32, 8), mask, ir.Constant(VECTOR, ir.Undefined)]
+        return self.builder.call(self._declared(name, signature), arguments)
+
+    def copy_rows(self, base: Value, target: Value, source: Value, doubles: Value) -> None:
+        """Copy doubles inside one array; the two parts do not overlap."""
+        pointer = ir.PointerType()
+        signature = ir.FunctionType(ir.VoidType(), [pointer, pointer, INT, BOOL])
+        copy = self._declared("llvm.memcpy.p0.p0.i64", signature)
+        size = self.builder.shl(doubles, self.integer(3))
+        places = [self._address(base, target), self._address(base, source)]
+        self.builder.call(copy, [*places, size, ir.Constant(BOOL, 0)])
+
+    # ---- control --------------------------------------------------------------------------
+    def branch(
+        self, condition: Value, body: Callable[[], Sequence[Value]], otherwise: Sequence[Value]
+    ) -> list[Value]:
+        """Values of `body` where the scalar condition holds, else `otherwise`."""
+        before = self.builder.block
+        inside = self.function.append_basic_block("then")
+        after = self.function.append_basic_block("join")
+        self.builder.cbranch(condition, inside, after)
+        self.builder.position_at_end(inside)
+        made = body()
+        last = self.builder.block
+        self.builder.branch(after)
+        self.builder.position_at_end(after)
+        merged = []
+        for new, old in zip(made, otherwise, strict=True):
+            phi = self.builder.phi(new.type)
+            phi.add_incoming(new, last)
+            phi.add_incoming(old, before)
+            merged.append(phi)
+        return merged
+
+    def _declared(self, name: str, signature: ir.FunctionType) -> Function:
+        module = self.function.module
+        known = module.globals.get(name)
+        return known if known is not None else ir.Function(module, signature, name)
+
+
+class Loop:
+    """A loop whose carried values are vectors or scalars in registers."""
+
+    def __init__(self, lanes: Lanes) -> None:
+        self.lanes = lanes
+        self._before = lanes.builder.block
+        self._head = lanes.function.append_basic_block("head")
+        self._after = lanes.function.append_basic_block("after")
+        self._carried: list[tuple[Value, Value]] = []
+        lanes.builder.branch(self._head)
+        lanes.builder.position_at_end(self._head)
+
+    def carry(self, initial: Value) -> Value:
+        """A value that each turn hands to the next; call before any other instruction."""
+        phi = self.lanes.builder.phi(initial.type)
+        phi.add_incoming(initial, self._before)
+        return phi
+
+    def update(self, carried: Value, value: Value) -> None:
+        """Say what the next turn gets."""
+        self._carried.append((carried, value))
+
+    def leave_if(self, condition: Value) -> None:
+        """Leave the loop here, in the middle of a turn."""
+        stay = self.lanes.function.append_basic_block("stay")
+        self.lanes.builder.cbranch(condition, self._after, stay)
+        self.lanes.builder.position_at_end(stay)
+
+    def repeat(self) -> None:
+        """End of a turn; what follows is written behind the loop."""
+        for carried, value in self._carried:
+            carried.add_incoming(value, self.lanes.builder.block)
+        self.lanes.builder.branch(self._head)
+        self.lanes.builder.position_at_end(self._after)

@@ -1,0 +1,251 @@
+"""A problem: a model, the records it is to explain, and the fitness of a population on them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import Any
+
+import numpy as np
+
+from sysid.errors import InvalidRecord, InvalidSettings
+from sysid.experiments import Experiment, initial_parameters, lay_out, output_weights
+from sysid.kernels.compiler import kernel_address
+from sysid.kernels.evaluation import population_fitness, population_predictions
+from sysid.kernels.evaluator import Evaluator
+from sysid.kernels.layout import Variant
+from sysid.kernels.plan import Numbers, fits_grid, has_weights, numbers
+from sysid.metrics import ChannelMetrics, Metrics, fit_percent, rms
+from sysid.models.model import Model
+from sysid.parameters import Parameter, override
+from sysid.records import Record
+from sysid.settings import Loss, Prediction
+from sysid.types import FloatArray
+
+_Rebuild = tuple[Callable[..., "Problem"], tuple[Any, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Fitness and predictions of candidates, J = √(Σ w²(y - ŷ)² / n) (Eq. 10).
+
+    Make one with `Problem.build`. Pickling sends what it was built from, since the address of
+    compiled code means nothing in another process.
+
+    Attributes
+    ----------
+    model : Model
+    records : tuple of Record
+    all_parameters : tuple of Parameter
+        K: the model's, then the estimated initial states, named ``x(0)`` in the first experiment
+        and ``x(0)[2]`` in the second.
+    space : tuple of Parameter
+        D: those of them that are free.
+    evaluator : Evaluator
+        The problem as compiled code sees it.
+    experiments : tuple of Experiment
+    """
+
+    model: Model
+    records: tuple[Record, ...]
+    all_parameters: tuple[Parameter, ...]
+    space: tuple[Parameter, ...]
+    evaluator: Evaluator
+    experiments: tuple[Experiment, ...]
+    arguments: tuple[Any, ...]
+
+    @classmethod
+    def build(
+        cls,
+        model: Model,
+        records: Sequence[Record],
+        *,
+        parameters: Mapping[str, Mapping[str, Any]] | None = None,
+        prediction: Prediction = "simulation",
+        loss: Loss | None = None,
+        weights: Mapping[str, float] | None = None,
+        skip: int = 0,
+    ) -> "Problem":
+        """Lay the records out for the model and compile it.
+
+        Parameters
+        ----------
+        parameters : mapping of str to mapping
+            Changed bounds, scales or fixed values.
+        prediction : {"simulation", "one-step"}
+        loss : Loss
+            Squares if not given.
+        weights : mapping of str to float
+            Weight of each output; by default 1 for one output, else 1 / its standard deviation.
+        skip : int
+            First samples of each output that are not scored.
+
+        Raises
+        ------
+        InvalidRecord, RecordTooShort
+            If a record does not have what the model needs.
+        InvalidSettings, InvalidBounds
+            If an option cannot be used.
+        """
+        arguments = (model, tuple(records), dict(parameters or {}), prediction, loss or Loss(),
+                     None if weights is None else dict(weights), skip)  # fmt: skip
+        return _built(*arguments)
+
+    def __reduce__(self) -> _Rebuild:
+        return _built, self.arguments
+
+    def fitness(self, theta: FloatArray) -> FloatArray:
+        """J of individuals (P, D) → (P,), smaller is better; ``inf`` where one diverges."""
+        return population_fitness(self.evaluator, _population(theta, len(self.space)))
+
+    def predictions(self, theta: FloatArray) -> FloatArray:
+        """Simulated values at the measured times, (P, D) → (P, M)."""
+        return population_predictions(self.evaluator, _population(theta, len(self.space)))
+
+    def split(self, values: FloatArray) -> list[dict[str, FloatArray]]:
+        """Values (M,) as one array for each output of each experiment."""
+        parts: list[dict[str, FloatArray]] = []
+        first = 0
+        for experiment in self.experiments:
+            part = {}
+            for output, samples in zip(self.model.outputs, experiment.outputs, strict=True):
+                part[output.name] = values[first : first + samples.places.size]
+                first += samples.places.size
+            parts.append(part)
+        return parts
+
+    @property
+    def unit(self) -> str:
+        """Unit of J: that of the output, or 1 if several are weighted together."""
+        return self.model.outputs[0].unit if len(self.model.outputs) == 1 else "1"
+
+    @property
+    def n_scored(self) -> int:
+        """Number of samples that enter J."""
+        return int(np.count_nonzero(self.evaluator.weight))
+
+    @property
+    def output_scale(self) -> float:
+        """J of a simulation that gives each output's mean: what a model should stay well below."""
+        total = 0.0
+        for measured, weight in self._channels(self.evaluator.measured):
+            scored = weight > 0
+            if np.any(scored):
+                centred = measured[scored] - np.mean(measured[scored])
+                total += float(np.sum(np.square(weight[scored] * centred)))
+        return sqrt(total / max(self.n_scored, 1))
+
+    def metrics(self, theta: FloatArray) -> Metrics:
+        """Agreement of one individual (D,) with the records; what `skip` leaves out is not in."""
+        simulated = self.predictions(np.atleast_2d(theta))[0]
+        return metrics_of(self, simulated)
+
+    def _channels(self, values: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+        pairs = zip(self.split(values), self.split(self.evaluator.weight), strict=True)
+        return [(value[name], weight[name]) for value, weight in pairs for name in value]
+
+
+def metrics_of(problem: Problem, simulated: FloatArray) -> Metrics:
+    """Agreement of simulated values (M,) with the records of a problem."""
+    weight = problem.evaluator.weight
+    error = weight * (problem.evaluator.measured - simulated)
+    one = len(problem.model.outputs) == 1
+    with np.errstate(all="ignore"):  # a diverged simulation has an infinite residual
+        channels = tuple(_channel_metrics(problem, simulated))
+        scored = weight > 0
+        total = rms((error / np.where(scored, weight, 1.0) if one else error)[scored])
+        scale = problem.output_scale
+        fit = 100.0 * (1.0 - rms(error[scored]) / scale) if scale > 0 else float("nan")
+    return Metrics(total, problem.unit, fit, channels)
+
+
+def _channel_metrics(problem: Problem, simulated: FloatArray) -> list[ChannelMetrics]:
+    found = []
+    parts = zip(
+        problem.split(problem.evaluator.measured), problem.split(simulated),
+        problem.split(problem.evaluator.weight), strict=True,
+    )  # fmt: skip
+    for experiment, (measured, model, weight) in enumerate(parts):
+        for output in problem.model.outputs:
+            scored = weight[output.name] > 0
+            if np.any(scored):
+                y, computed = measured[output.name][scored], model[output.name][scored]
+                found.append(
+                    ChannelMetrics(experiment, output.name, output.unit, int(y.size),
+                                   rms(y - computed), fit_percent(y, computed))
+                )  # fmt: skip
+    return found
+
+
+def _built(
+    model: Model, records: tuple[Record, ...], parameters: Mapping[str, Mapping[str, Any]],
+    prediction: Prediction, loss: Loss, weights: Mapping[str, float] | None, skip: int,
+) -> Problem:  # fmt: skip
+    if not records:
+        raise InvalidRecord("there is no record to compare the model with; need one or more")
+    if prediction not in ("simulation", "one-step"):
+        raise InvalidSettings("/prediction", f"{prediction!r} is not 'simulation' or 'one-step'")
+    if skip < 0:
+        raise InvalidSettings("/skip", f"{skip!r} is not a number of samples, 0 or more")
+    arguments = (model, records, parameters, prediction, loss, weights, skip)
+    everything = override((*model.parameters, *initial_parameters(model, len(records))), parameters)
+    per_output = output_weights(model, records, weights, skip)
+    experiments = tuple(
+        lay_out(model, record, e, everything, per_output, skip) for e, record in enumerate(records)
+    )
+    free = tuple(parameter for parameter in everything if parameter.is_free)
+    evaluator = _evaluator(model, experiments, everything, prediction == "one-step", loss)
+    return Problem(model, records, everything, free, evaluator, experiments, arguments)
+
+
+def _evaluator(
+    model: Model, experiments: Sequence[Experiment], parameters: Sequence[Parameter],
+    one_step: bool, loss: Loss,
+) -> Evaluator:  # fmt: skip
+    on_grid = all(fits_grid(experiment.outputs) for experiment in experiments)
+    weighted = any(has_weights(e.outputs, e.grid, on_grid) for e in experiments)
+    variant = Variant(one_step, loss.kind == "soft-l1", on_grid, weighted)
+    laid = [
+        numbers(model, variant, e.grid, e.inputs, e.outputs, e.starts, e.lag, loss.scale)
+        for e in experiments
+    ]
+    rows = [i for i, parameter in enumerate(parameters) if parameter.is_free]
+    free = [parameters[i] for i in rows]
+    samples = [samples for e in experiments for samples in e.outputs]
+    weight = np.concatenate([s.weights for s in samples])
+    return Evaluator(
+        kernel=kernel_address(model, variant),
+        template=np.array([p.lower if p.fixed is None else p.fixed for p in parameters]),
+        rows=np.array(rows, dtype=np.int64),
+        lower=np.array([p.lower for p in free], dtype=np.float64),
+        upper=np.array([p.upper for p in free], dtype=np.float64),
+        log=np.array([p.scale == "log" for p in free], dtype=np.int64),
+        plans=_plans(laid, experiments),
+        ints=np.concatenate([one.ints for one in laid]),
+        floats=np.concatenate([one.floats for one in laid]),
+        n_work=max(one.n_work for one in laid),
+        n_measured=weight.size,
+        weight=weight,
+        measured=np.concatenate([s.values for s in samples]),
+        n_weight=max(float(np.count_nonzero(weight)), 1.0),
+    )
+
+
+def _plans(laid: Sequence[Numbers], experiments: Sequence[Experiment]) -> Any:
+    """Where each experiment's numbers and its measured values begin."""
+    lengths = [
+        (one.ints.size, one.floats.size, sum(s.places.size for s in e.outputs))
+        for one, e in zip(laid, experiments, strict=True)
+    ]
+    ends = np.cumsum(np.array(lengths, dtype=np.int64), axis=0)
+    return np.ascontiguousarray(np.vstack([np.zeros((1, 3), dtype=np.int64), ends[:-1]]))
+
+
+def _population(theta: FloatArray, free: int) -> FloatArray:
+    values = np.ascontiguousarray(theta, dtype=np.float64)
+    if values.ndim != 2 or values.shape[1] != free:
+        raise InvalidSettings(
+            "/parameters",
+            f"candidates have shape {values.shape}; need (P, {free}), one column for each free "
+            "parameter",
+        )
+    return values
