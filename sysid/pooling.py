@@ -76,8 +76,8 @@ def _range(inner: Arguments) -> Condition:
 def pool(recording: Recording, given: Arguments) -> Recording:
     """One record of all segments, on their own times.
 
-    The input becomes the median of its samples over bins of time, at the middle of each bin that
-    has any; each output keeps every sample at its own time. This resolves a lag that is shorter
+    The input becomes the median of its samples over bins of time, at the mean time of each bin's
+    samples; each output keeps every sample at its own time. This resolves a lag that is shorter
     than the sampling period when every repeat has another phase.
     """
     given.only("input", "outputs", "bin", "start", "stop")
@@ -126,8 +126,10 @@ def _medians(
     bins = _bins(gathered.times, start, width)
     firsts = np.flatnonzero(np.diff(bins, prepend=-1))
     medians = np.array([np.median(part) for part in np.split(gathered.values, firsts[1:])])
-    middles: FloatArray = start + (bins[firsts].astype(np.float64) + 0.5) * width
-    return replace(channel, times=middles, values=medians)
+    counts = np.diff(firsts, append=bins.size)
+    # Not the bin's middle: where its samples are few or uneven, that would shift the curve in time.
+    means = np.asarray(np.round(np.add.reduceat(gathered.times, firsts) / counts, 9))
+    return replace(channel, times=means, values=medians)
 
 
 def _bins(times: FloatArray, start: float, width: float) -> IntArray:
