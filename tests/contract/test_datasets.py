@@ -1,0 +1,183 @@
+"""Datasets, lineage, models and dispatchers, on SQLite and on PostgreSQL alike."""
+
+import threading
+from dataclasses import replace
+from datetime import timedelta
+
+import pytest
+
+from service.storage.datasets import DatasetRepository
+from service.storage.dispatchers import DispatcherRepository
+from service.storage.errors import NotFound
+from service.storage.lineage import Edge, LineageRepository
+from service.storage.models import ModelRepository
+from tests.stored import Clock, new_dataset
+
+
+def add(database, parents=(), **values):
+    with database.write() as session:
+        return DatasetRepository(session).add(new_dataset(**values), parents=parents).dataset.id
+
+
+def at_once(n, work):
+    """Run `work` in several threads at once; what they gave."""
+    found, start = [], threading.Barrier(n)
+
+    def begin():
+        start.wait()
+        found.append(work())
+
+    threads = [threading.Thread(target=begin) for _ in range(n)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == n
+    return found
+
+
+def test_a_dataset_is_kept_whole(database):
+    new = new_dataset(details={"segments": [0, 5]}, size_bytes=3 << 32)
+    with database.write() as session:
+        stored = DatasetRepository(session).add(new)
+    with database.read() as session:
+        kept = DatasetRepository(session).get(stored.dataset.id)
+    assert stored.is_new
+    assert all(getattr(kept, name) == getattr(new, name) for name in type(new).__slots__)
+    assert kept.n_channels == 1
+
+
+def test_the_same_source_gives_the_same_dataset_even_at_once(database):
+    def store():
+        with database.write() as session:
+            return DatasetRepository(session).add(new_dataset())
+
+    found = at_once(4, store)
+    assert len({one.dataset.id for one in found}) == 1
+    assert sum(one.is_new for one in found) == 1
+
+
+def test_a_deleted_dataset_is_gone_and_its_source_may_come_again(database):
+    first = add(database)
+    with database.write() as session:
+        DatasetRepository(session).delete(first)
+    second = add(database)
+    assert second != first
+    with database.read() as session, pytest.raises(NotFound, match=first):
+        DatasetRepository(session).get(first)
+    with database.read() as session, pytest.raises(NotFound, match=second):
+        DatasetRepository(session, "proj_other").get(second)
+
+
+def test_datasets_come_in_the_order_asked_for_and_the_missing_one_is_named(database):
+    a, b = add(database, source_key="a"), add(database, source_key="b")
+    with database.read() as session:
+        repository = DatasetRepository(session)
+        assert [one.id for one in repository.get_all([b, a, b])] == [b, a, b]
+        with pytest.raises(NotFound, match="ds_none"):
+            repository.get_all([a, "ds_none"])
+
+
+def test_pages_of_datasets_are_latest_first_without_gap_or_repeat(database):
+    ids = [add(database, source_key=str(i)) for i in range(5)]
+    with database.read() as session:
+        first = DatasetRepository(session).page(limit=3)
+        second = DatasetRepository(session).page(limit=3, cursor=first.next)
+    assert [one.id for one in first.items + second.items] == ids[::-1]
+    assert second.next is None
+
+
+def test_lineage_leads_from_a_dataset_to_all_it_was_made_from_and_all_made_of_it(database):
+    raw = add(database, source_key="raw")
+    other = add(database, source_key="other")
+    cut = add(database, [raw], source_key="cut")
+    both = add(database, [cut, other], source_key="both")
+    with database.write() as session:
+        lineage = LineageRepository(session)
+        lineage.link("job_1", [both], "estimation")
+        lineage.link("job_1", [both], "estimation")  # once more is as once
+        up, down = lineage.ancestors("job_1"), lineage.descendants(raw)
+    assert set(up) == {
+        Edge("job_1", both, "estimation"), Edge(both, cut, "derived"),
+        Edge(both, other, "derived"), Edge(cut, raw, "derived"),
+    }  # fmt: skip
+    assert set(down) == {one for one in up if one.parent != other}
+    with database.read() as session:
+        assert LineageRepository(session, "proj_other").ancestors("job_1") == []
+
+
+def test_a_circle_of_lineage_ends(database):
+    with database.write() as session:
+        lineage = LineageRepository(session)
+        lineage.link("ds_a", ["ds_b"], "derived")
+        lineage.link("ds_b", ["ds_a"], "derived")
+        assert len(lineage.ancestors("ds_a")) == 2
+
+
+def test_a_model_has_numbered_versions_and_its_name_means_the_latest(database):
+    with database.write() as session:
+        models = ModelRepository(session)
+        one = models.add("pump", {"order": 1})
+        two = models.add("pump", {"order": 2})
+        same = models.add("pump", {"order": 2})
+    assert (one.model.version, two.model.version) == (1, 2)
+    assert (same.is_new, same.model.id) == (False, two.model.id)
+    with database.read() as session:
+        models = ModelRepository(session)
+        assert models.get("pump").document == {"order": 2}
+        assert models.get("pump@1").document == {"order": 1}
+        assert models.get(one.model.id).version == 1
+
+
+@pytest.mark.parametrize(
+    "reference",
+    ["", "none", "pump@", "pump@2", "pump@x", "pump@-1", "pump@1@1", "pump@" + "9" * 40],
+)
+def test_an_unknown_model_or_version_is_not_found(database, reference):
+    with database.write() as session:
+        ModelRepository(session).add("pump", {"order": 1})
+        with pytest.raises(NotFound, match="no model"):
+            ModelRepository(session).get(reference)
+
+
+def test_a_deleted_version_keeps_its_number(database):
+    with database.write() as session:
+        models = ModelRepository(session)
+        models.add("pump", {"order": 1})
+        models.delete("pump")
+        assert models.page().items == ()
+        assert models.add("pump", {"order": 1}).model.version == 2
+
+
+def test_models_stored_at_once_get_different_versions(database):
+    orders = iter(range(4))
+
+    def store():
+        with database.write() as session:
+            return ModelRepository(session).add("pump", {"order": next(orders)}).model.version
+
+    assert sorted(at_once(4, store)) == [1, 2, 3, 4]
+
+
+def test_a_dispatcher_is_alive_while_it_beats(database):
+    clock = Clock()
+    with database.write() as session:
+        dispatchers = DispatcherRepository(session, clock)
+        dispatchers.announce("d1", {"cpus": 2})
+        clock.advance(20)
+        dispatchers.announce("d2", {"cpus": 4})
+        assert [one.owner for one in dispatchers.alive()] == ["d1", "d2"]
+        clock.advance(20)
+        assert [one.owner for one in dispatchers.alive()] == ["d2"]
+        dispatchers.beat("d1")
+        assert [one.owner for one in dispatchers.alive(timedelta(seconds=5))] == ["d1"]
+        dispatchers.leave("d1")
+        dispatchers.announce("d2", {"cpus": 8})
+        (left,) = dispatchers.alive()
+    with database.read() as session:
+        assert DispatcherRepository(session, clock).alive()[0].details == {"cpus": 8}
+    assert left.owner == "d2"
+
+
+def test_a_new_dataset_is_a_value():
+    assert replace(new_dataset(), name="a") == new_dataset(name="a")

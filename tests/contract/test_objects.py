@@ -1,0 +1,221 @@
+"""The object store: a folder and a bucket keep the same contract."""
+
+import hashlib
+import os
+import threading
+import uuid
+
+import boto3
+import pytest
+from moto.server import ThreadedMotoServer
+
+from service.storage import objects
+from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
+from service.storage.objects import open_store
+
+ABSENT = "0" * 64
+CREDENTIALS = {"aws_access_key_id": "test", "aws_secret_access_key": "test"}
+
+
+@pytest.fixture(scope="session")
+def s3_endpoint():
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture
+def bucket(s3_endpoint):
+    """Options of a store in a fresh bucket, and its address."""
+    name = f"lagid-{uuid.uuid4().hex}"
+    client = boto3.client("s3", endpoint_url=s3_endpoint, region_name="us-east-1", **CREDENTIALS)
+    client.create_bucket(Bucket=name)
+    client.close()
+    options = {
+        "endpoint": s3_endpoint, "region": "us-east-1", **CREDENTIALS,
+        "client_options": {"allow_http": True},
+    }  # fmt: skip
+    return f"s3://{name}/lagid", options
+
+
+@pytest.fixture(params=["folder", "bucket"])
+def store(request, tmp_path):
+    if request.param == "folder":
+        return open_store(f"file://{tmp_path}/objects")
+    url, options = request.getfixturevalue("bucket")
+    return open_store(url, **options)
+
+
+def sha256(data):
+    return hashlib.sha256(data).hexdigest()
+
+
+@pytest.mark.parametrize("data", [b"", b"x", bytes(range(256)) * 5000])
+def test_bytes_come_back_under_their_hash(store, data):
+    stored = store.put_bytes(data)
+    assert (stored.sha256, stored.size) == (sha256(data), len(data))
+    assert store.get(stored.sha256) == data
+    assert store.size(stored.sha256) == len(data)
+    assert store.exists(stored.sha256)
+
+
+def test_a_stream_and_a_file_give_what_their_bytes_give(store, tmp_path):
+    blocks = [bytes([i]) * 3000 for i in range(5)]
+    whole = b"".join(blocks)
+    (tmp_path / "file").write_bytes(whole)
+    assert store.put_stream(iter(blocks)).sha256 == sha256(whole)
+    assert store.put_file(tmp_path / "file").sha256 == sha256(whole)
+    assert store.get(sha256(whole)) == whole
+    assert (tmp_path / "file").exists()
+
+
+def test_storing_again_changes_nothing(store):
+    store.put_bytes(b"same")
+    (before,) = store.objects()
+    store.put_bytes(b"same")
+    (after,) = store.objects()
+    assert after == before
+
+
+def test_many_writers_of_the_same_bytes_at_once_all_succeed(store):
+    results = []
+    threads = [
+        threading.Thread(target=lambda: results.append(store.put_bytes(b"y" * 100_000)))
+        for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(results) == 4
+    assert store.get(results[0].sha256) == b"y" * 100_000
+
+
+@pytest.mark.parametrize(
+    ("start", "length"), [(0, 10), (5, 0), (5, 1), (0, 1000), (990, 100), (1000, 5), (5000, 5)]
+)
+def test_a_range_is_that_part_of_the_bytes(store, start, length):
+    data = os.urandom(1000)
+    name = store.put_bytes(data).sha256
+    assert store.get_range(name, start, length) == data[start : start + length]
+
+
+def test_a_stream_gives_the_bytes_in_blocks(store, monkeypatch):
+    monkeypatch.setattr(objects, "_BLOCK", 300)
+    data = os.urandom(1000)
+    name = store.put_bytes(data).sha256
+    blocks = list(store.stream(name))
+    assert b"".join(blocks) == data
+    assert max(map(len, blocks)) == 300
+    assert b"".join(store.stream(name, 10, 500)) == data[10:510]
+    assert b"".join(store.stream(name, 900, 500)) == data[900:]
+
+
+@pytest.mark.parametrize("name", [ABSENT, "", "../../etc/passwd", "A" * 64, "0" * 63])
+def test_what_is_not_there_is_missing(store, name):
+    assert not store.exists(name)
+    store.delete(name)
+    reads = (store.get, store.size, lambda one: store.get_range(one, 0, 1))
+    for read in reads:
+        with pytest.raises(ObjectMissing):
+            read(name)
+    with pytest.raises(ObjectMissing):
+        next(store.stream(name))
+
+
+def test_a_deleted_object_is_gone_and_others_stay(store):
+    one, two = store.put_bytes(b"1").sha256, store.put_bytes(b"2").sha256
+    store.delete(one)
+    assert not store.exists(one)
+    assert [left.sha256 for left in store.objects()] == [two]
+
+
+def test_all_objects_are_listed_and_nothing_else(store):
+    store.check_writable()
+    wanted = {store.put_bytes(str(i).encode()).sha256: len(str(i)) for i in range(60)}
+    assert {one.sha256: one.size for one in store.objects()} == wanted
+
+
+def test_a_writer_that_fails_half_way_leaves_nothing(store):
+    def blocks():
+        yield b"half"
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        store.put_stream(blocks())
+    assert list(store.objects()) == []
+
+
+def test_a_large_object_goes_to_a_bucket_in_parts(bucket, monkeypatch):
+    monkeypatch.setattr(objects, "_SINGLE_PUT", 1000)
+    url, options = bucket
+    store = open_store(url, **options)
+    data = os.urandom(6 << 20)
+    for _ in range(2):
+        assert store.get(store.put_bytes(data).sha256) == data
+
+
+def test_a_bucket_never_replaces_an_object(bucket, s3_endpoint):
+    url, options = bucket
+    store = open_store(url, **options)
+    name = store.put_bytes(b"first").sha256
+    client = boto3.client("s3", endpoint_url=s3_endpoint, region_name="us-east-1", **CREDENTIALS)
+    key = f"lagid/sha256/{name[:2]}/{name}.mcap"
+    client.put_object(Bucket=url.split("/")[2], Key=key, Body=b"marked")
+    client.close()
+    store.put_bytes(b"first")
+    assert store.get(name) == b"marked"
+
+
+def test_a_folder_never_replaces_an_object_and_has_the_agreed_layout(tmp_path):
+    store = open_store(f"file://{tmp_path}")
+    name = store.put_bytes(b"first").sha256
+    path = tmp_path / "sha256" / name[:2] / f"{name}.mcap"
+    path.write_bytes(b"marked")
+    store.put_bytes(b"first")
+    assert path.read_bytes() == b"marked"
+    assert list((tmp_path / "tmp").iterdir()) == []
+
+
+def test_a_folder_forgets_what_a_crash_left_half_written_long_ago(tmp_path):
+    (tmp_path / "tmp").mkdir()
+    old, new = tmp_path / "tmp" / "old", tmp_path / "tmp" / "new"
+    old.write_bytes(b"half")
+    new.write_bytes(b"half")
+    os.utime(old, (1, 1))
+    open_store(f"file://{tmp_path}")
+    assert not old.exists()
+    assert new.exists()
+
+
+def test_a_folder_that_cannot_be_made_or_written_is_told_in_one_line(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(ObjectStoreFailed, match="cannot create its folder"):
+        open_store(f"file://{tmp_path}/file/objects")
+    store = open_store(f"file://{tmp_path}/objects")
+    (tmp_path / "objects" / "tmp").rmdir()
+    for act in (store.check_writable, lambda: store.put_bytes(b"x")):
+        with pytest.raises(ObjectStoreFailed, match="cannot write") as caught:
+            act()
+        assert "\n" not in str(caught.value)
+
+
+def test_a_bucket_that_is_not_there_is_told_in_one_line(bucket):
+    _, options = bucket
+    store = open_store("s3://no-such-bucket-here/x", **options)
+    with pytest.raises(ObjectStoreFailed, match="the object store cannot write") as caught:
+        store.check_writable()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("url", ["", "objects", "ftp://x/y", "file://host/x", "file:relative"])
+def test_an_address_of_an_unknown_kind_is_refused(url):
+    with pytest.raises(InvalidStoreUrl, match="no object store"):
+        open_store(url)
+
+
+def test_spaces_in_a_folders_address_may_be_escaped(tmp_path):
+    open_store(f"file://{tmp_path}/my%20objects").put_bytes(b"x")
+    assert (tmp_path / "my objects" / "sha256").is_dir()
