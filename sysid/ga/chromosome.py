@@ -6,7 +6,7 @@ rule holds for ln θ. The *place* of a parameter is int/(2^bits − 1), a number
 
 import numpy as np
 
-from sysid.kernels.calls import compiled
+from sysid.kernels.caching import compiled
 from sysid.kernels.evaluator import Evaluator
 from sysid.types import FloatArray, WordArray
 

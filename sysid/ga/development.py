@@ -16,10 +16,22 @@ from sysid.ga.gauss_newton import damped_step, normal_equations, partial_fitness
 from sysid.ga.operators import rank
 from sysid.ga.random import DEVELOPMENT, below, draws, unit
 from sysid.ga.state import (
-    DAMPING, DIFFERENCE, DEVELOPMENTS, EVALUATIONS, FAILED, GENERATION, HORIZON, OLD, POINT, PROBES, SEQUENCE,
-    SETTLED, STEP, Plan,
+    DAMPING,
+    DEVELOPMENTS,
+    DIFFERENCE,
+    EVALUATIONS,
+    FAILED,
+    GENERATION,
+    HORIZON,
+    OLD,
+    POINT,
+    PROBES,
+    SEQUENCE,
+    SETTLED,
+    STEP,
+    Plan,
 )  # fmt: skip
-from sysid.kernels.calls import compiled
+from sysid.kernels.caching import compiled
 from sysid.kernels.evaluation import population_fitness, population_predictions
 from sysid.kernels.evaluator import Evaluator
 from sysid.types import FloatArray, IntArray, WordArray
@@ -75,10 +87,12 @@ def start_development(
         counters[PROBES] = words.shape[0]
     if chosen < words.shape[0]:
         memory[OLD] = fitness[chosen]
-        memory[POINT:] = decoded(words[chosen : chosen + 1], plan.bits)[0]
+        begin = decoded(words[chosen : chosen + 1], plan.bits)[0]
     else:
         memory[OLD] = np.inf
-        memory[POINT:] = _fresh(evaluator, plan, words.shape, counters, memory[HORIZON])
+        begin = _fresh(evaluator, plan, words.shape, counters, memory[HORIZON])
+    for d in range(begin.size):
+        memory[POINT + d] = begin[d]
 
 
 @compiled
@@ -90,7 +104,9 @@ def _keep(words: WordArray, fitness: FloatArray, memory: FloatArray, word: WordA
         if fitness[p] == memory[OLD]:
             place = p
     if reached < fitness[place]:
-        words[place], fitness[place] = word, reached
+        for d in range(word.size):
+            words[place, d] = word[d]
+        fitness[place] = reached
         rank(words, fitness)
         memory[OLD] = reached
 
@@ -115,17 +131,18 @@ def _trials(plan: Plan, counters: IntArray, memory: FloatArray, matrix: FloatArr
     point = memory[POINT:]
     places = np.empty((TRIALS + counters[PROBES], point.size))
     for t in range(TRIALS):
-        places[t] = damped_step(matrix, gradient, point, memory[DAMPING] * FACTOR ** (t - 1))
+        damping = memory[DAMPING] * FACTOR ** (t - 1)
+        damped_step(matrix, gradient, point, damping, places[t])
     deviation = np.empty(point.size)
     for t in range(TRIALS, places.shape[0]):
         for d in range(point.size):
             draw = 1 + t * point.size + d
             word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
             size = base * 10.0 ** (-2.0 * unit(word[2]))
-            deviation[d] = size * np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(
-                2.0 * np.pi * unit(word[1])
+            deviation[d] = (
+                size * np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(2.0 * np.pi * unit(word[1]))
             )
-        places[t] = spread(matrix, gradient, point, deviation)
+        spread(matrix, gradient, point, deviation, places[t])
     return places
 
 
@@ -138,9 +155,7 @@ def adaptive_sequence(
     point, horizon = memory[POINT:], memory[HORIZON]
     counters[STEP] += 1
     counters[EVALUATIONS] += point.size + 1 + TRIALS + counters[PROBES]
-    matrix, gradient, base = normal_equations(
-        evaluator, plan, point, horizon, memory[DIFFERENCE]
-    )
+    matrix, gradient, base = normal_equations(evaluator, plan, point, horizon, memory[DIFFERENCE])
     proposals = coded(_trials(plan, counters, memory, matrix, gradient, base), plan.bits)
     places = decoded(proposals, plan.bits)
     if horizon < 1.0:
@@ -153,7 +168,8 @@ def adaptive_sequence(
     best = np.argmin(reached)
     enough = ENOUGH if horizon == 1.0 else ENOUGH_PART
     if reached[best] < base:
-        memory[POINT:] = places[best]
+        for d in range(point.size):
+            point[d] = places[best, d]
         memory[DAMPING] *= FACTOR ** (min(best, TRIALS) - 2)
         if horizon == 1.0:
             _keep(words, fitness, memory, proposals[best], reached[best])

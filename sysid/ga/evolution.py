@@ -2,16 +2,33 @@
 
 import numpy as np
 
-from sysid.ga.chromosome import coded, decoded, located
+from sysid.ga.chromosome import decoded, located
 from sysid.ga.development import adaptive_sequence, start_development
-from sysid.ga.operators import cross, flip, rank, scheduled, stepped, two_of
+from sysid.ga.operators import cross, flip, rank, reflected, scheduled, stepped, two_of
 from sysid.ga.random import CHILDREN, INITIAL, RESTART, STRATA, below, draws, unit
 from sysid.ga.sequence import fixed_sequence
 from sysid.ga.state import (
-    AT_EVALUATIONS, AT_GENERATION, DEVELOPMENTS, EVALUATIONS, GENERATION, IMPROVED, PHASE, RMS,
-    SEQUENCE, SETTLED, SIMPLE, STAGNATION, STEP, VALUES, Plan,
+    AT_EVALUATIONS,
+    AT_GENERATION,
+    DEVELOPMENTS,
+    EVALUATIONS,
+    GENERATION,
+    GENETIC,
+    IMPROVED,
+    LOCAL,
+    MIGRATION,
+    PHASE,
+    RMS,
+    SEQUENCE,
+    SETTLED,
+    SIMPLE,
+    STAGNATION,
+    START,
+    STEP,
+    VALUES,
+    Plan,
 )  # fmt: skip
-from sysid.kernels.calls import compiled
+from sysid.kernels.caching import compiled
 from sysid.kernels.evaluation import population_fitness
 from sysid.kernels.evaluator import Evaluator
 from sysid.types import FloatArray, IntArray, WordArray
@@ -28,7 +45,6 @@ def initial_places(plan: Plan, individuals: int, n: int) -> FloatArray:
     order = np.arange(plan.total)
     for d in range(n):
         if plan.method >= IMPROVED:
-            order[:] = np.arange(plan.total)
             for i in range(plan.total - 1, 0, -1):
                 j = below(draws(plan.seed, STRATA, 0, d, i)[0], i + 1)
                 order[i], order[j] = order[j], order[i]
@@ -40,14 +56,8 @@ def initial_places(plan: Plan, individuals: int, n: int) -> FloatArray:
 
 
 @compiled
-def _evaluate(evaluator: Evaluator, plan: Plan, words: WordArray, counters: IntArray) -> FloatArray:
-    counters[EVALUATIONS] += words.shape[0]
-    return population_fitness(evaluator, located(evaluator, decoded(words, plan.bits)))
-
-
-@compiled
 def simple_generation(
-    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray, counters: IntArray
+    plan: Plan, words: WordArray, fitness: FloatArray, counters: IntArray
 ) -> None:
     """Figure 4: the survivors stay unchanged, their children take the places of the others."""
     generation, length = counters[GENERATION], words.shape[1] * plan.bits
@@ -59,69 +69,86 @@ def simple_generation(
         cross(words[p], words[first], words[second], 1 + below(word[2], length - 1), plan.bits)
         if unit(word[3]) < rate:
             flip(words[p], below(more[0], length), plan.bits)
-    fitness[plan.survivors :] = _evaluate(evaluator, plan, words[plan.survivors :], counters)
-    rank(words, fitness)
+        fitness[p] = np.nan
 
 
 @compiled
-def _bred(plan: Plan, words: WordArray, generation: int) -> WordArray:
-    """As many children as there are individuals, by crossover or by a difference of parents."""
-    individuals, n = words.shape
+def _breed(plan: Plan, places: FloatArray, parents: WordArray, generation: int, p: int,
+           word: WordArray) -> None:  # fmt: skip
+    """Write child `p`: by crossover, or by a difference of parents (differential evolution)."""
+    bits, n = plan.bits, word.size
+    drawn = draws(plan.seed, CHILDREN, plan.island, generation, 3 * p)
+    more = draws(plan.seed, CHILDREN, plan.island, generation, 3 * p + 1)
+    last = draws(plan.seed, CHILDREN, plan.island, generation, 3 * p + 2)
+    first, second = two_of(drawn[0], drawn[1], plan.survivors)
+    crossed, third = more[0] & 1, below(more[1], places.shape[0])
+    cross(word, parents[first], parents[second], 1 + below(drawn[2], n * bits - 1), bits)
     rate = scheduled(plan.starts, plan.rates, generation)
-    places = decoded(words, plan.bits)
-    children = np.empty_like(words)
-    for p in range(individuals):
-        word = draws(plan.seed, CHILDREN, plan.island, generation, 3 * p)
-        more = draws(plan.seed, CHILDREN, plan.island, generation, 3 * p + 1)
-        last = draws(plan.seed, CHILDREN, plan.island, generation, 3 * p + 2)
-        first, second = two_of(word[0], word[1], plan.survivors)
-        if more[0] & 1:
-            length = n * plan.bits
-            cross(
-                children[p], words[first], words[second], 1 + below(word[2], length - 1), plan.bits
-            )
-            child = decoded(children[p : p + 1], plan.bits)
-        else:
-            third = below(more[1], individuals)
-            child = places[p : p + 1] + (0.4 + 0.6 * unit(word[2])) * (
-                places[first : first + 1] - places[third : third + 1]
-            )
-            child = np.abs(child)
-            child = np.where(child > 1.0, np.maximum(2.0 - child, 0.0), child)
-        if unit(word[3]) < rate:
-            d = below(last[0], n)
-            child[0, d] = stepped(child[0, d], last[1], last[2], plan.bits)
-        children[p] = coded(child, plan.bits)[0]
+    mutated = below(last[0], n) if unit(drawn[3]) < rate else -1
+    for d in range(n):
+        place = word[d] / float((1 << bits) - 1)
+        if not crossed:
+            length = 0.4 + 0.6 * unit(drawn[2])
+            place = reflected(places[p, d] + length * (places[first, d] - places[third, d]))
+        if d == mutated:
+            place = stepped(place, last[1], last[2], bits)
+        word[d] = np.uint32(round(place * float((1 << bits) - 1)))
+
+
+@compiled
+def improved_generation(plan: Plan, words: WordArray, counters: IntArray) -> WordArray:
+    """As many children as there are individuals, to compete with their parents."""
+    children, places = np.empty_like(words), decoded(words, plan.bits)
+    for p in range(words.shape[0]):
+        _breed(plan, places, words, counters[GENERATION], p, children[p])
     return children
 
 
 @compiled
-def improved_generation(
-    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray, counters: IntArray
-) -> None:
-    """One population of children competes with the survivors."""
-    children = _bred(plan, words, counters[GENERATION])
-    reached = _evaluate(evaluator, plan, children, counters)
-    all_words = np.concatenate((words, children))
-    all_fitness = np.concatenate((fitness, reached))
-    rank(all_words, all_fitness)
-    words[:], fitness[:] = all_words[: fitness.size], all_fitness[: fitness.size]
+def restart(plan: Plan, words: WordArray, fitness: FloatArray, counters: IntArray) -> None:
+    """All but the champion are drawn anew."""
+    largest, n = float((1 << plan.bits) - 1), words.shape[1]
+    for p in range(1, fitness.size):
+        fitness[p] = np.nan
+        for d in range(n):
+            word = draws(plan.seed, RESTART, plan.island, counters[GENERATION], p * n + d)
+            words[p, d] = np.uint32(round(unit(word[0]) * largest))
 
 
 @compiled
-def restart(
+def compete(
+    words: WordArray, fitness: FloatArray, children: WordArray, reached: FloatArray
+) -> None:
+    """Of parents and children the fittest stay; on equal fitness the parent does."""
+    size, n = words.shape
+    everyone, values = np.empty((2 * size, n), np.uint32), np.empty(2 * size)
+    for p in range(size):
+        values[p], values[size + p] = fitness[p], reached[p]
+        for d in range(n):
+            everyone[p, d], everyone[size + p, d] = words[p, d], children[p, d]
+    rank(everyone, values)
+    for p in range(size):
+        fitness[p] = values[p]
+        for d in range(n):
+            words[p, d] = everyone[p, d]
+
+
+@compiled
+def evaluate(
     evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray, counters: IntArray
 ) -> None:
-    """All but the champion are drawn anew."""
-    places = np.empty((fitness.size - 1, words.shape[1]))
-    for p in range(places.shape[0]):
-        for d in range(places.shape[1]):
-            word = draws(
-                plan.seed, RESTART, plan.island, counters[GENERATION], p * words.shape[1] + d
-            )
-            places[p, d] = unit(word[0])
-    words[1:] = coded(places, plan.bits)
-    fitness[1:] = _evaluate(evaluator, plan, words[1:], counters)
+    """Simulate the individuals that are not evaluated yet (``nan``), and rank all."""
+    waiting = np.flatnonzero(np.isnan(fitness))
+    if waiting.size == 0:
+        return
+    chosen = np.empty((waiting.size, words.shape[1]), np.uint32)
+    for i in range(waiting.size):
+        for d in range(words.shape[1]):
+            chosen[i, d] = words[waiting[i], d]
+    reached = population_fitness(evaluator, located(evaluator, decoded(chosen, plan.bits)))
+    counters[EVALUATIONS] += waiting.size
+    for i in range(waiting.size):
+        fitness[waiting[i]] = reached[i]
     rank(words, fitness)
 
 
@@ -135,13 +162,17 @@ def _generation(
     elif counters[SEQUENCE]:
         fixed_sequence(evaluator, plan, words, fitness, counters)
     elif plan.method < IMPROVED:
-        simple_generation(evaluator, plan, words, fitness, counters)
+        simple_generation(plan, words, fitness, counters)
     elif counters[STAGNATION] >= plan.stagnation:
         counters[STAGNATION] = 0
-        restart(evaluator, plan, words, fitness, counters)
+        restart(plan, words, fitness, counters)
     else:
         counters[STEP] += 1
-        improved_generation(evaluator, plan, words, fitness, counters)
+        children = improved_generation(plan, words, counters)
+        reached = np.full(fitness.size, np.nan)
+        evaluate(evaluator, plan, children, reached, counters)
+        compete(words, fitness, children, reached)
+    evaluate(evaluator, plan, words, fitness, counters)
 
 
 @compiled
@@ -164,7 +195,9 @@ def _note(evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArra
           counters: IntArray, phase: int, row: FloatArray) -> None:  # fmt: skip
     row[AT_GENERATION], row[AT_EVALUATIONS] = counters[GENERATION], counters[EVALUATIONS]
     row[RMS], row[PHASE] = fitness[0], phase
-    row[VALUES:] = located(evaluator, decoded(words[:1], plan.bits))[0]
+    values = located(evaluator, decoded(words[:1], plan.bits))
+    for d in range(words.shape[1]):
+        row[VALUES + d] = values[0, d]
 
 
 @compiled
@@ -178,22 +211,24 @@ def generations(
     generation the initial population is evaluated.
     """
     written = 0
-    if counters[EVALUATIONS] == 0:
-        fitness[:] = _evaluate(evaluator, plan, words, counters)
-        rank(words, fitness)
-        _note(evaluator, plan, words, fitness, counters, 0, improvements[0])
-        written = 1
+    if np.any(np.isnan(fitness)):  # the beginning, or migrants from an island of other bits
+        best = np.inf if counters[EVALUATIONS] == 0 else np.nanmin(fitness)
+        phase = START if counters[EVALUATIONS] == 0 else MIGRATION
+        evaluate(evaluator, plan, words, fitness, counters)
+        if fitness[0] < best:
+            _note(evaluator, plan, words, fitness, counters, phase, improvements[0])
+            written = 1
     for _ in range(count):
         if counters[EVALUATIONS] >= plan.evaluations or fitness[0] <= plan.rms:
             break
         _turn(evaluator, plan, words, fitness, counters, memory)
-        best, phase = fitness[0], 2 if counters[SEQUENCE] else 1
+        best, phase = fitness[0], LOCAL if counters[SEQUENCE] else GENETIC
         _generation(evaluator, plan, words, fitness, counters, memory)
         counters[GENERATION] += 1
         counters[STAGNATION] += 1
         if fitness[0] < best:
             counters[STAGNATION] = 0
-            if phase == 1:
+            if phase == GENETIC:
                 counters[SETTLED] = 0
             _note(evaluator, plan, words, fitness, counters, phase, improvements[written])
             written += 1

@@ -8,10 +8,11 @@ import numpy as np
 
 from sysid.ga.chromosome import located
 from sysid.ga.state import Plan
-from sysid.kernels.calls import compiled
+from sysid.kernels.caching import compiled
 from sysid.kernels.evaluation import population_predictions
 from sysid.kernels.evaluator import Evaluator
 from sysid.types import FloatArray
+
 
 @compiled
 def partial_fitness(
@@ -34,35 +35,40 @@ def partial_fitness(
 
 
 @compiled
+def _sensed(
+    evaluator: Evaluator, point: FloatArray, difference: float
+) -> tuple[FloatArray, FloatArray]:
+    """Predictions at a point and at its D neighbours, (D + 1, M), and the distances of these."""
+    n = point.size
+    places, steps = np.empty((n + 1, n)), np.empty(n)
+    for d in range(n):
+        for p in range(n + 1):
+            places[p, d] = point[d]
+        steps[d] = difference if point[d] < 0.5 else -difference
+        places[d + 1, d] += steps[d]
+    return population_predictions(evaluator, located(evaluator, places)), steps
+
+
+@compiled
 def normal_equations(
     evaluator: Evaluator, plan: Plan, point: FloatArray, horizon: float, difference: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """JᵀJ, Jᵀe and the fitness at a point, over the samples up to `horizon`: D + 1 simulations."""
     n = point.size
-    places = np.empty((n + 1, n))
-    steps = np.empty(n)
-    for d in range(n):
-        places[:, d] = point[d]
-        steps[d] = difference if point[d] < 0.5 else -difference
-        places[d + 1, d] += steps[d]
-    predicted = population_predictions(evaluator, located(evaluator, places))
+    predicted, steps = _sensed(evaluator, point, difference)
     matrix, gradient, row = np.zeros((n, n)), np.zeros(n), np.empty(n)
     for m in range(predicted.shape[1]):
-        weight = evaluator.weight[m]
-        if weight > 0.0 and plan.progress[m] <= horizon:
-            error = weight * (predicted[0, m] - evaluator.measured[m])
-            share = 1.0
-            if plan.loss_scale > 0.0:
-                share = 1.0 / np.sqrt(1.0 + (error / plan.loss_scale) ** 2)
-            for d in range(n):
-                row[d] = weight * (predicted[d + 1, m] - predicted[0, m]) / steps[d]
-            for d in range(n):
-                gradient[d] += share * row[d] * error
-                for e in range(d + 1):
-                    matrix[d, e] += share * row[d] * row[e]
-    for d in range(n):
-        for e in range(d):
-            matrix[e, d] = matrix[d, e]
+        weight = evaluator.weight[m] if plan.progress[m] <= horizon else 0.0
+        if weight == 0.0:
+            continue
+        error, share = weight * (predicted[0, m] - evaluator.measured[m]), 1.0
+        if plan.loss_scale > 0.0:
+            share = 1.0 / np.sqrt(1.0 + (error / plan.loss_scale) ** 2)
+        for d in range(n):
+            row[d] = weight * (predicted[d + 1, m] - predicted[0, m]) / steps[d]
+            gradient[d] += share * row[d] * error
+            for e in range(d + 1):
+                matrix[d, e] += share * row[d] * row[e]
     return matrix, gradient, partial_fitness(evaluator, plan, predicted[0], horizon)
 
 
@@ -102,10 +108,15 @@ def _back(factor: FloatArray, vector: FloatArray) -> None:
 
 
 @compiled
-def damped_step(
-    matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float
-) -> FloatArray:
-    """The point after the step p of (A + λ diag A) p = −g, kept inside [0, 1]."""
+def _shift(point: FloatArray, step: FloatArray, place: FloatArray) -> None:
+    for d in range(point.size):
+        place[d] = min(max(point[d] + step[d], 0.0), 1.0)
+
+
+@compiled
+def damped_step(matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float,
+                place: FloatArray) -> None:  # fmt: skip
+    """Write the place after the step p of (A + λ diag A) p = −g, kept inside [0, 1]."""
     factor = factored(matrix, gradient, point, damping)
     step = np.zeros(point.size)
     for d in range(point.size):
@@ -115,16 +126,15 @@ def damped_step(
                 value -= factor[d, k] * step[k]
             step[d] = value / factor[d, d]
     _back(factor, step)
-    return np.minimum(np.maximum(point + step, 0.0), 1.0)
+    _shift(point, step, place)
 
 
 @compiled
-def spread(
-    matrix: FloatArray, gradient: FloatArray, point: FloatArray, deviation: FloatArray
-) -> FloatArray:
-    """A point whose distance from `point` has the covariance A⁻¹, for normal `deviation`.
+def spread(matrix: FloatArray, gradient: FloatArray, point: FloatArray, deviation: FloatArray,
+           place: FloatArray) -> None:  # fmt: skip
+    """Write a place whose distance from `point` has covariance A⁻¹, for normal `deviation`.
 
     Long where the output is insensitive, short across the valley.
     """
     _back(factored(matrix, gradient, point, 0.0), deviation)
-    return np.minimum(np.maximum(point + deviation, 0.0), 1.0)
+    _shift(point, deviation, place)

@@ -3,16 +3,32 @@
 import numpy as np
 
 from sysid.ga.random import below, unit
-from sysid.kernels.calls import compiled
+from sysid.kernels.caching import compiled
 from sysid.types import FloatArray, IntArray, WordArray
 
 
 @compiled
 def rank(words: WordArray, fitness: FloatArray) -> None:
-    """Sort a population in place, fittest first; equals keep their order."""
-    order = np.argsort(fitness, kind="mergesort")
-    words[:] = words[order]
-    fitness[:] = fitness[order]
+    """Sort a population in place, fittest first; equals keep their order.
+
+    By insertion: populations are small, and after a generation half of them is in order.
+    """
+    n = words.shape[1]
+    held = np.empty(n, np.uint32)
+    for p in range(1, fitness.size):
+        value, place = fitness[p], p
+        if fitness[p - 1] <= value:
+            continue
+        for d in range(n):
+            held[d] = words[p, d]
+        while place > 0 and fitness[place - 1] > value:
+            fitness[place] = fitness[place - 1]
+            for d in range(n):
+                words[place, d] = words[place - 1, d]
+            place -= 1
+        fitness[place] = value
+        for d in range(n):
+            words[place, d] = held[d]
 
 
 @compiled
@@ -44,6 +60,13 @@ def scheduled(starts: IntArray, rates: FloatArray, generation: int) -> float:
 
 
 @compiled
+def reflected(place: float) -> float:
+    """A place of at most one range outside, mirrored at the bound it has passed."""
+    inside = abs(place)
+    return inside if inside <= 1.0 else max(2.0 - inside, 0.0)
+
+
+@compiled
 def stepped(place: float, size: int, sign: int, bits: int) -> float:
     """Scale-free mutation: a step whose size is uniform in its logarithm, reflected at a bound.
 
@@ -51,8 +74,7 @@ def stepped(place: float, size: int, sign: int, bits: int) -> float:
     neighbours are far apart (Hamming cliffs); a step on the axis has none.
     """
     step = 2.0 ** (-unit(size) * bits)
-    moved = abs(place + (step if sign & 1 else -step))
-    return moved if moved <= 1.0 else 2.0 - moved
+    return reflected(place + (step if sign & 1 else -step))
 
 
 @compiled

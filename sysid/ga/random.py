@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sysid.kernels.calls import compiled
+from sysid.kernels.caching import compiled
 
 Draws: TypeAlias = tuple[int, int, int, int]
 """Four independent words of 32 bits."""

@@ -10,7 +10,7 @@ from sysid.ga.chromosome import coded, decoded, located, placed
 from sysid.ga.operators import rank
 from sysid.ga.random import DEVELOPMENT, below, draws
 from sysid.ga.state import EVALUATIONS, FAILED, GENERATION, SEQUENCE, Plan
-from sysid.kernels.calls import compiled
+from sysid.kernels.caching import compiled
 from sysid.kernels.evaluation import population_fitness
 from sysid.kernels.evaluator import Evaluator
 from sysid.types import FloatArray, IntArray, WordArray
@@ -57,7 +57,9 @@ def fixed_sequence(
     counters[EVALUATIONS] += fitness.size
     best = np.argmin(reached)
     if reached[best] < fitness[0]:
-        words[-1], fitness[-1] = proposals[best], reached[best]
+        fitness[-1] = reached[best]
+        for d in range(champion.size):
+            words[-1, d] = proposals[best, d]
         rank(words, fitness)
         counters[FAILED] = 0
         return

@@ -2,13 +2,16 @@
 
 from typing import NamedTuple
 
+from sysid.result import Phase
 from sysid.types import FloatArray, IntArray
 
 SIMPLE, PAPER, IMPROVED, IMPROVED_PAPER_STEPS = 0, 1, 2, 3
 """Methods: simple GA; with the fixed sequence; improved with adaptive, with fixed sequence."""
 
 # Places in an island's counters.
-GENERATION, EVALUATIONS, STAGNATION, SEQUENCE, STEP, FAILED, DEVELOPMENTS, SETTLED, PROBES = range(9)
+GENERATION, EVALUATIONS, STAGNATION, SEQUENCE, STEP, FAILED, DEVELOPMENTS, SETTLED, PROBES = range(
+    9
+)
 N_COUNTERS = 9
 
 # Places in an island's memory of the sequence search; the point's D places follow.
@@ -16,7 +19,8 @@ DAMPING, HORIZON, DIFFERENCE, OLD, POINT = range(5)
 
 # Columns of an improvement; the D physical values follow.
 AT_GENERATION, AT_EVALUATIONS, RMS, PHASE, VALUES = range(5)
-PHASES = ("start", "genetic", "sequence")
+START, GENETIC, LOCAL, MIGRATION = range(4)
+PHASES: tuple[Phase, ...] = ("start", "genetic", "sequence", "migration")
 
 
 class Plan(NamedTuple):

@@ -1,0 +1,155 @@
+"""The islands of one run: how many individuals each has, how each searches, how all begin."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.errors import InvalidSettings
+from sysid.ga.chromosome import coded, placed
+from sysid.ga.evolution import initial_places
+from sysid.ga.island import Island
+from sysid.ga.random import WARM, draws, unit
+from sysid.ga.state import IMPROVED, IMPROVED_PAPER_STEPS, N_COUNTERS, PAPER, POINT, SIMPLE, Plan
+from sysid.problem import Problem
+from sysid.settings import GeneticAlgorithm
+from sysid.types import FloatArray
+
+_UNLIMITED = 2**62
+_NEVER = -1.0
+_WARM_SHARE = 4  # one individual in four of a warm start comes from the given values
+_WARM_SPREAD = 0.1  # of the range
+
+
+def sizes(algorithm: GeneticAlgorithm) -> tuple[int, ...]:
+    """Individuals of each island: the population dealt as evenly as possible."""
+    each, more = divmod(algorithm.population, algorithm.n_islands)
+    return tuple(each + (i < more) for i in range(algorithm.n_islands))
+
+
+def of_island(algorithm: GeneticAlgorithm, index: int) -> GeneticAlgorithm:
+    """The settings of one island, where islands differ."""
+    if not isinstance(algorithm.islands, tuple):
+        return algorithm
+    change = algorithm.islands[index]
+    return replace(
+        algorithm,
+        method=change.method or algorithm.method,
+        bits=change.bits or algorithm.bits,
+        mutation=change.mutation or algorithm.mutation,
+    )
+
+
+def search_budget(algorithm: GeneticAlgorithm, n: int) -> int:
+    """Simulations that the islands may run: all but a tenth kept for the refinement.
+
+    At least a few steps of the refinement (of n + 1 simulations) and at most half are kept.
+    """
+    limit = algorithm.stop.evaluations
+    if limit is None:
+        return _UNLIMITED
+    kept = min(max(limit // 10, 4 * (n + 2)), limit // 2) if algorithm.refine else 0
+    return limit - kept
+
+
+def plans(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> tuple[Plan, ...]:
+    """How each island searches."""
+    progress = record_progress(problem)
+    dealt = sizes(algorithm)
+    budget = search_budget(algorithm, len(problem.space))
+    made = []
+    for index, size in enumerate(dealt):
+        own = of_island(algorithm, index)
+        share = budget if budget == _UNLIMITED else max(1, budget * size // algorithm.population)
+        made.append(
+            Plan(
+                seed=seed,
+                island=index,
+                first=sum(dealt[:index]),
+                total=algorithm.population,
+                method=_method(own),
+                bits=own.bits,
+                survivors=min(max(2, round(own.selection_rate * size)), size - 1),
+                stagnation=own.stagnation,
+                relative=int(own.sequence.relative),
+                evaluations=share,
+                beta=float(own.sequence.beta),
+                rms=_NEVER if own.stop.rms is None else float(own.stop.rms),
+                loss_scale=float(problem.loss.scale) if problem.loss.kind == "soft-l1" else 0.0,
+                starts=np.array([start for start, _ in own.mutation], dtype=np.int64),
+                rates=np.array([rate for _, rate in own.mutation], dtype=np.float64),
+                progress=progress,
+            )
+        )
+    return tuple(made)
+
+
+def _method(algorithm: GeneticAlgorithm) -> int:
+    match algorithm.method:
+        case "simple":
+            return SIMPLE
+        case "improved-paper":
+            return PAPER
+        case "improved":
+            return IMPROVED if algorithm.sequence.kind == "adaptive" else IMPROVED_PAPER_STEPS
+
+
+def record_progress(problem: Problem) -> FloatArray:
+    """How far in its record (0 … 1) each of the M measured values lies."""
+    numbers = np.arange(problem.evaluator.n_measured, dtype=np.float64)
+    progress = np.empty(numbers.size)
+    for experiment in problem.split(numbers):
+        for places in experiment:
+            progress[places.astype(np.int64)] = np.arange(1, places.size + 1) / places.size
+    return progress
+
+
+def found(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    seed: int,
+    warm: Sequence[Mapping[str, float]] = (),
+) -> tuple[Island, ...]:
+    """The islands before their first generation; no individual is evaluated yet.
+
+    A quarter of every island comes from the `warm` parameter values (in turn: the values
+    themselves, then neighbours), the rest is drawn.
+    """
+    if not 0 <= seed < 2**63:
+        raise InvalidSettings("/seed", f"found {seed!r}; need a whole number 0 to 2^63 - 1")
+    n = len(problem.space)
+    if n == 0:
+        raise InvalidSettings("/parameters", "every parameter is fixed; leave at least one free")
+    islands = []
+    for plan, size in zip(plans(problem, algorithm, seed), sizes(algorithm), strict=True):
+        places = initial_places(plan, size, n)
+        for p in range(max(1, size // _WARM_SHARE) if warm else 0):
+            _warm(problem, plan, warm[p % len(warm)], p, places, p >= len(warm))
+        islands.append(
+            Island(
+                plan.island,
+                coded(places, plan.bits),
+                np.full(size, np.nan),
+                np.zeros(N_COUNTERS, dtype=np.int64),
+                np.zeros(POINT + n),
+            )
+        )
+    return tuple(islands)
+
+
+def _warm(
+    problem: Problem,
+    plan: Plan,
+    values: Mapping[str, float],
+    p: int,
+    places: FloatArray,
+    shifted: bool,
+) -> None:
+    """Put given values, or a neighbour of them, in the place of individual `p`."""
+    theta = np.array([[values.get(q.name, 0.5 * (q.lower + q.upper)) for q in problem.space]])
+    given = placed(problem.evaluator, theta)[0]
+    for d, parameter in enumerate(problem.space):
+        if parameter.name in values:
+            word = draws(plan.seed, WARM, plan.island, p, d)
+            shift = _WARM_SPREAD * (2.0 * unit(word[0]) - 1.0) if shifted else 0.0
+            places[p, d] = min(max(given[d] + shift, 0.0), 1.0)

@@ -1,0 +1,190 @@
+"""One run as a value that goes on from wherever it was cut: begin, advance, conclude.
+
+The result does not depend on where a run is cut, nor on which process evolves which island:
+islands evolve alone up to the next *border*, and only there do they exchange migrants and is it
+decided whether the run has ended. The clock decides when to stop, never what is computed; it is
+read here and nowhere else in this package.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+from sysid.ga.island import Island, evolve
+from sysid.ga.state import Plan
+from sysid.islands.archipelago import found, of_island, plans
+from sysid.islands.migration import migrate
+from sysid.problem import Problem
+from sysid.result import Improvement, Migrant
+from sysid.settings import GeneticAlgorithm
+
+CALL_SECONDS = 0.1
+"""Aimed at for one compiled call, by measured cost, so that a cancel is heard in time."""
+
+_TARGET_ROUND = 5  # generations between two looks at the target RMS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunState:
+    """A run between two compiled calls.
+
+    Attributes
+    ----------
+    seed : int
+    islands : tuple of Island
+        Some may be ahead of `generation`, up to the next border.
+    generation : int
+        The last border that all islands have passed.
+    epoch : int
+        Exchanges of migrants done.
+    migrations : tuple of Migrant
+    seconds : float
+        Time computed so far.
+    ended : bool
+        Whether an end condition held at the last border.
+    """
+
+    seed: int
+    islands: tuple[Island, ...]
+    generation: int = 0
+    epoch: int = 0
+    migrations: tuple[Migrant, ...] = ()
+    seconds: float = 0.0
+    ended: bool = False
+
+    @property
+    def evaluations(self) -> int:
+        """Simulations run by all islands."""
+        return sum(island.evaluations for island in self.islands)
+
+    @property
+    def rms(self) -> float:
+        """Fitness of the best champion."""
+        return min(island.champion_rms for island in self.islands)
+
+    @property
+    def history(self) -> tuple[tuple[Improvement, ...], ...]:
+        """Improvements of each island."""
+        return tuple(island.history for island in self.islands)
+
+
+def begin(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    seed: int,
+    warm: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+) -> RunState:
+    """A run before its first generation; `warm`: parameter values that seed a quarter of it."""
+    given = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
+    return RunState(seed, found(problem, algorithm, seed, given))
+
+
+def border(algorithm: GeneticAlgorithm, state: RunState) -> int:
+    """The generation up to which every island evolves alone."""
+    every = algorithm.migration.every
+    step = every if algorithm.stop.rms is None else min(every, _TARGET_ROUND)
+    at, done = state.generation, state.generation % every
+    return min(at + min(step, every - done), algorithm.generations)
+
+
+def is_resting(plan: Plan, island: Island) -> bool:
+    """Whether an island has used up its evaluations or reached the target RMS."""
+    return island.evaluations >= plan.evaluations or island.champion_rms <= plan.rms
+
+
+def advance_island(
+    problem: Problem, algorithm: GeneticAlgorithm, island: Island, generations: int, seed: int
+) -> Island:
+    """The island after some generations, fewer where it comes to rest."""
+    plan = plans(problem, algorithm, seed)[island.index]
+    return evolve(problem.evaluator, plan, island, generations)
+
+
+def exchange(algorithm: GeneticAlgorithm, state: RunState, islands: Sequence[Island]) -> RunState:
+    """The run at the next border, when all its islands have got there: migrate, look at the end."""
+    generation = border(algorithm, state)
+    state = replace(state, islands=tuple(islands), generation=generation)
+    if generation % algorithm.migration.every == 0 and len(islands) > 1:
+        bits = tuple(of_island(algorithm, i).bits for i in range(len(islands)))
+        moved, log = migrate(state.islands, bits, algorithm.migration, state.epoch)
+        state = replace(
+            state, islands=moved, migrations=state.migrations + log, epoch=state.epoch + 1
+        )
+    return replace(state, ended=_has_ended(algorithm, state))
+
+
+def _has_ended(algorithm: GeneticAlgorithm, state: RunState) -> bool:
+    if state.generation >= algorithm.generations:
+        return True
+    if algorithm.stop.rms is not None and state.rms <= algorithm.stop.rms:
+        return True
+    # Below the border only those islands stay that have used up their evaluations.
+    return all(island.generation < state.generation for island in state.islands)
+
+
+def is_finished(algorithm: GeneticAlgorithm, state: RunState) -> bool:
+    """Whether an end condition holds: generations, evaluations, target RMS, seconds."""
+    limit = algorithm.stop.seconds
+    return state.ended or (limit is not None and state.seconds >= limit)
+
+
+def advance(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    seconds: float | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> RunState:
+    """Go on until an end condition holds, `seconds` are used up, or `should_stop` says so.
+
+    `should_stop` is asked between compiled calls, about every 0.1 s.
+    """
+    pace = _Pace(seconds, algorithm.stop.seconds, state.seconds, should_stop)
+    planned = plans(problem, algorithm, state.seed)
+    while not is_finished(algorithm, state):
+        target = border(algorithm, state)
+        islands = list(state.islands)
+        for i, plan in enumerate(planned):
+            while islands[i].generation < target and not is_resting(plan, islands[i]):
+                if pace.is_over():
+                    return replace(state, islands=tuple(islands), seconds=pace.used())
+                count = pace.affordable(target - islands[i].generation)
+                islands[i] = evolve(problem.evaluator, plan, islands[i], count)
+                pace.measure(count)
+        state = replace(exchange(algorithm, state, islands), seconds=pace.used())
+    return state
+
+
+class _Pace:
+    """How many generations one compiled call may run, and when to stop, by the clock."""
+
+    def __init__(
+        self,
+        seconds: float | None,
+        limit: float | None,
+        before: float,
+        should_stop: Callable[[], bool] | None,
+    ) -> None:
+        self._start = self._last = perf_counter()
+        self._before, self._should_stop, self._calls = before, should_stop, 0
+        ends = [
+            end for end in (seconds, None if limit is None else limit - before) if end is not None
+        ]
+        self._end = min(ends, default=float("inf"))
+        self._cost = CALL_SECONDS  # of one generation, until it is measured
+
+    def used(self) -> float:
+        return self._before + perf_counter() - self._start
+
+    def is_over(self) -> bool:
+        """Whether to stop; at least one call is made, so that every advance advances."""
+        stopped = self._should_stop is not None and self._should_stop()
+        return stopped or (self._calls > 0 and self._last - self._start >= self._end)
+
+    def affordable(self, wanted: int) -> int:
+        return max(1, min(wanted, int(CALL_SECONDS / self._cost)))
+
+    def measure(self, count: int) -> None:
+        now = perf_counter()
+        self._cost = max((now - self._last) / count, 1e-9)
+        self._last, self._calls = now, self._calls + 1
