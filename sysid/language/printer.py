@@ -1,5 +1,6 @@
 """Checked trees back to text, with no more parentheses than needed."""
 
+from sysid.language.laurent import CONSTANT, add, collect, rebuild
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
 
 _LEVEL = {
@@ -11,7 +12,7 @@ _ATOM = 9
 
 
 def text(expression: Expression, clock: str = "k") -> str:
-    """Text of the expression, which parses to the same tree.
+    """Text of the expression, which parses to the same tree if that came from a text.
 
     Parameters
     ----------
@@ -56,9 +57,14 @@ def _infix(operator: str, left: Expression, right: Expression, clock: str) -> st
 
 
 def _past(value: Past, clock: str) -> str:
-    whole = f"-{value.offset}" if value.offset else ""
-    lag = "" if value.lag is None else f" - {_text(value.lag, clock, _LEVEL['*'])}"
-    return f"{value.name}({clock}{whole}{lag})" if whole or lag else value.name
+    back = collect(Number(float(value.offset)))
+    if value.lag is not None:
+        back = add(back, collect(value.lag))
+    constant = back.pop(CONSTANT, 0.0)
+    whole = f"-{number(constant)}" if constant else ""
+    lag = _text(rebuild(back), clock, _LEVEL["*"])
+    index = f"{clock}{whole} - {lag}" if back else f"{clock}{whole}"
+    return value.name if index == clock else f"{value.name}({index})"
 
 
 def number(value: float) -> str:

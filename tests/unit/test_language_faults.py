@@ -1,0 +1,120 @@
+"""What is not in the language is refused, with the column and what would be right."""
+
+import pytest
+
+from sysid.language.checker import check
+from sysid.language.scope import Scope
+
+SCOPE = Scope(
+    "difference",
+    states=("x", "speed"),
+    inputs=("q",),
+    parameters={"L": (0.0, 1.0), "c": (0.0, 1.0)},
+)
+
+
+@pytest.mark.parametrize(
+    ("written", "column", "part"),
+    [
+        ("2*sped(k-1)", 3, "did you mean 'speed'?"),
+        ("x(k-1) + sped", 10, "did you mean 'speed'?"),
+        ("sinn(x)", 1, "did you mean 'sin'?"),
+        ("sin*2", 1, "write sin(…)"),
+        ("sin(x, x)", 1, "takes 1 argument, not 2"),
+        ("min(x)", 1, "takes 2 or more arguments, not 1"),
+        ("where(x > 0, 1)", 1, "takes 3 arguments, not 2"),
+        ("c(x)", 1, "'c' is not a signal"),
+        ("x()", 1, "takes one index"),
+        ("x(k, 1)", 1, "takes one index"),
+        ("x > 1", 3, "only for the condition of where"),
+        ("not x", 1, "only for the condition of where"),
+        ("where(x, 1, 2)", 7, "a condition compares two values"),
+        ("where(0 < x < 1, 1, 2)", 13, "comparisons do not chain"),
+        ("(x + 1", 1, "is not closed"),
+        ("sin(x + (1)", 4, "is not closed"),
+        ("x + 1)", 6, "never opened"),
+        ("2 x", 3, "an operator such as * is missing"),
+        ("x +", 4, "the expression ends"),
+        ("*x", 1, "unexpected '*'"),
+        ("+x", 1, "leave it out"),
+        ("x, c", 2, "only for the arguments of a function"),
+        ("", 1, "empty"),
+        ("x^2", 2, "write ** for a power"),
+        ("x = 2", 3, "write == to compare"),
+        ("x[k", 2, "write a past value with parentheses"),
+        ("x.real", 2, "attributes are not part"),
+        ("'x'", 1, "strings are not part"),
+        ("1e999", 1, "too large"),
+        ("lambda: 1", 7, "':' is not part"),
+        ("x\x00", 2, "is not part of the language"),
+        ("x(3)", 1, "does not count from k"),
+        ("x(2*k)", 1, "changes with time"),
+        ("x(k - k**2)", 1, "changes with time"),
+        ("x(t - L)", 1, "write x(k - n - L/h)"),
+        ("x(k - L*t)", 1, "counts seconds"),
+        ("x(k + 1)", 1, "value of the future"),
+        ("x(k - 1 - x)", 11, "the lag depends on 'x'"),
+        ("q(k - speed(k-1))", 7, "the lag depends on 'speed'"),
+        ("q(k + 1 - c)", 1, "the lag c - 1 may be negative"),
+        ("x(k - 1.5 + 2*c)", 1, "its smallest value is -0.5 samples"),
+        ("q(k + c)", 1, "its smallest value is -1 samples"),
+        ("q(k + L/h)", 1, "its smallest value is -1 s"),
+    ],
+)
+def test_a_fault_names_its_column_and_what_would_be_right(
+    written: str, column: int, part: str
+) -> None:
+    found = check(written, SCOPE)
+    assert found.tree is None
+    assert [fault.column for fault in found.faults] == [column]
+    assert part in found.faults[0].detail
+
+
+def test_python_is_not_the_language() -> None:
+    found = check("__import__('os').system('ls')", SCOPE)
+    assert found.tree is None
+    assert [fault.column for fault in found.faults] == [12, 17, 25]
+
+
+def test_an_unknown_call_and_its_argument_are_both_told() -> None:
+    found = check("__import__('os')", SCOPE)
+    assert [fault.column for fault in found.faults] == [1, 12]
+    assert "no function or signal '__import__'" in found.faults[0].detail
+
+
+def test_every_unknown_name_of_a_text_is_told_in_the_order_of_the_text() -> None:
+    found = check("foo + 2*bar(baz) + x", SCOPE)
+    assert [fault.column for fault in found.faults] == [1, 9, 13]
+
+
+@pytest.mark.parametrize("written", ["(" * 65 + "x" + ")" * 65, "-" * 70 + "x", "x**" * 70 + "x"])
+def test_nesting_deeper_than_64_levels_is_refused(written: str) -> None:
+    [fault] = check(written, SCOPE).faults
+    assert "deeper than 64" in fault.detail
+
+
+def test_nesting_of_sums_in_sums_is_measured_on_the_tree() -> None:
+    written = "x"
+    for _ in range(40):
+        written = f"({written} + x + x + x)"
+    [fault] = check(written, SCOPE).faults
+    assert "deeper than 64" in fault.detail
+
+
+def test_a_text_of_more_than_4000_characters_is_refused_unread() -> None:
+    [fault] = check("x" * 4001, SCOPE).faults
+    assert "4001 characters" in fault.detail
+
+
+def test_the_sampling_period_is_not_known_in_the_differential_form() -> None:
+    [fault] = check("h*x", Scope("differential", states=("x",))).faults
+    assert "difference form only" in fault.detail
+
+
+@pytest.mark.parametrize(
+    ("written", "part"),
+    [("x(t - L)", "smallest value is -0.5 s"), ("x(1)", "write x(t - L)"), ("x(2*t)", "with time")],
+)
+def test_lags_of_the_differential_form_are_checked_in_seconds(written: str, part: str) -> None:
+    [fault] = check(written, Scope("differential", ("x",), (), {"L": (-0.5, 1.0)})).faults
+    assert part in fault.detail
