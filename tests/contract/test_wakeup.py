@@ -1,0 +1,90 @@
+"""Waiting for work: a waker tells of it soon, and never needs to."""
+
+import threading
+import time
+
+from sqlalchemy import text
+
+from service.storage.jobs import JobRepository
+from service.storage.queue import Queue
+from service.storage.wakeup import new_waker
+from tests.stored import claimed, submit
+
+LONG = 60.0  # far beyond what a wake-up takes; a test that waits that long has failed
+
+
+def settle(waker):
+    while waker.wait(0.1):
+        pass
+
+
+def later(act):
+    thread = threading.Timer(0.1, act)
+    thread.start()
+    return thread
+
+
+def elapsed(waker, seconds):
+    start = time.monotonic()
+    return waker.wait(seconds), time.monotonic() - start
+
+
+def test_a_new_job_wakes_the_waiting(database):
+    with new_waker(database) as waker:
+        settle(waker)
+        thread = later(lambda: submit(database))
+        assert waker.wait(LONG)
+        thread.join()
+
+
+def test_a_job_that_came_just_before_the_wait_is_not_missed(database):
+    with new_waker(database) as waker:
+        settle(waker)
+        submit(database)
+        assert waker.wait(LONG)
+
+
+def test_jobs_that_come_back_wake_too(database):
+    got, _ = claimed(database)
+    with new_waker(database) as waker:
+        settle(waker)
+        with database.write() as session:
+            Queue(session).release(got.lease)
+        assert waker.wait(LONG)
+        settle(waker)
+        with database.write() as session:
+            JobRepository(session).cancel(got.job.id)
+            JobRepository(session).resume(got.job.id)
+        assert waker.wait(LONG)
+
+
+def test_without_news_the_wait_ends_by_the_clock(database):
+    with new_waker(database) as waker:
+        settle(waker)
+        woken, seconds = elapsed(waker, 0.2)
+    assert not woken
+    assert seconds >= 0.2
+
+
+def test_a_stop_ends_the_wait(database):
+    stop = threading.Event()
+    with new_waker(database, stop) as waker:
+        settle(waker)
+        thread = later(stop.set)
+        assert waker.wait(LONG)
+        thread.join()
+
+
+def test_a_broken_connection_is_replaced(postgres_database):
+    with new_waker(postgres_database) as waker:
+        settle(waker)
+        with postgres_database.write() as session:
+            session.execute(
+                text("SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+                     "WHERE query LIKE 'LISTEN%' AND datname = current_database()")
+            )  # fmt: skip
+        assert not waker.wait(0.1)  # it notices
+        settle(waker)  # it listens again
+        thread = later(lambda: submit(postgres_database))
+        assert waker.wait(LONG)
+        thread.join()

@@ -1,0 +1,104 @@
+"""Several dispatcher processes, some of which die or fall silent: each run has one result."""
+
+import multiprocessing
+import os
+import time
+from datetime import timedelta
+
+import pytest
+
+from service.storage.errors import LeaseLost
+from service.storage.ledger import Cell, RunLedger, RunOutcome
+from service.storage.queue import Queue
+from service.storage.sessions import Database
+from service.storage.tables import State
+from tests.stored import job_of, runs_of, submit
+
+LEASE = timedelta(seconds=0.4)
+N_JOBS, N_RUNS = 24, 2
+
+
+def _work_on(database, claim, trouble):
+    with database.write() as session:
+        ledger = RunLedger(session, claim.lease)
+        ledger.create(Cell(number=i) for i in range(N_RUNS))
+        pending = ledger.pending()
+        ledger.start([run.id for run in pending])
+    for run in pending:
+        if trouble == "dies":
+            os._exit(9)
+        if trouble == "stalls":
+            _fall_silent(database, claim.lease)
+        outcome = RunOutcome(
+            run_id=run.id, state=State.SUCCEEDED, best_rms=float(run.number + 1),
+            result={"by": claim.lease.owner, "attempt": claim.lease.attempt},
+        )  # fmt: skip
+        with database.write() as session:
+            RunLedger(session, claim.lease).record([outcome])
+    with database.write() as session:
+        Queue(session).finish(claim.lease, State.SUCCEEDED)
+
+
+def _fall_silent(database, lease):
+    """Do nothing until the lease is lost."""
+    job = job_of(database, lease.job_id)
+    while (job.state, job.attempt) == (State.RUNNING, lease.attempt):
+        time.sleep(0.05)
+        job = job_of(database, lease.job_id)
+
+
+def _dispatch(url, owner, trouble, before, claimed, refused):
+    """Claim and work for ever; the first claim comes after `before` and meets the trouble."""
+    database = Database(url)
+    before.wait(60)
+    while True:
+        with database.write() as session:
+            queue = Queue(session)
+            queue.reap()
+            claim = queue.claim(owner, LEASE)
+        if claim is None:
+            time.sleep(0.02)
+            continue
+        claimed.set()
+        try:
+            _work_on(database, claim, trouble)
+        except LeaseLost:
+            refused.put((owner, claim.job.id))
+        trouble = ""
+
+
+def _finished(database, jobs):
+    return all(job_of(database, job_id).state.is_terminal for job_id in jobs)
+
+
+@pytest.mark.slow
+def test_each_run_has_one_result_though_dispatchers_die_and_stall(database):
+    context = multiprocessing.get_context("spawn")
+    url = database.engine.url.render_as_string(hide_password=False)
+    jobs = [submit(database, n_runs=N_RUNS, max_attempts=10) for _ in range(N_JOBS)]
+    refused = context.Queue()
+    events = [context.Event() for _ in range(4)]
+    events[0].set()
+    processes = [
+        context.Process(target=_dispatch, args=(url, *who, *events[i : i + 2], refused))
+        for i, who in enumerate([("stalling", "stalls"), ("dying", "dies"), ("sound", "")])
+    ]
+    for process in processes:
+        process.start()
+    limit = time.monotonic() + 60
+    try:
+        while not _finished(database, jobs) and time.monotonic() < limit:
+            time.sleep(0.1)
+        owner, late = refused.get(timeout=20)
+        while owner != "stalling":  # on a busy machine others may be late as well
+            owner, late = refused.get(timeout=20)
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+    for job_id in jobs:
+        job, runs = job_of(database, job_id), runs_of(database, job_id)
+        assert (job.state, job.n_done, job.n_failed) == (State.SUCCEEDED, N_RUNS, 0)
+        assert [run.number for run in runs] == list(range(N_RUNS))
+        assert all(run.result["attempt"] == run.attempt for run in runs)
+    assert job_of(database, late).attempt > 1
