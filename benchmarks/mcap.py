@@ -13,13 +13,13 @@ from service.signals.writer import write_recording
 from sysid.records import Channel, Recording
 
 SAMPLES = 1_000_000
-WRITE_BAR_S, READ_BAR_S = 0.4, 0.2
+WRITE_BAR_S, READ_BAR_S = 0.30, 0.15
 
 
 def made_up(samples: int) -> Recording:
     """Two channels of noise, the hardest to compress, at 1 kHz."""
     rng = np.random.default_rng(1)
-    times = np.arange(samples) * 1e-3
+    times = np.arange(samples, dtype=np.float64) * 1e-3
     return Recording(
         tuple(Channel(name, times, rng.standard_normal(samples), "V") for name in ("u", "y"))
     )

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sysid.types import FloatArray
+from sysid.types import FloatArray, IntArray
 
 
 def decimate(
@@ -35,9 +35,9 @@ def decimate(
     return times[kept], values[kept]
 
 
-def _first_extreme(values: FloatArray, edges: np.ndarray, extreme: np.ufunc) -> np.ndarray:  # type: ignore[type-arg]
+def _first_extreme(values: FloatArray, edges: IntArray, extreme: np.ufunc) -> IntArray:
     """Index of the first sample of each bucket that is the bucket's extreme."""
     lengths = np.diff(edges, append=values.size)
     found = values == np.repeat(extreme.reduceat(values, edges), lengths)
     hits = np.flatnonzero(found)
-    return hits[np.searchsorted(hits, edges)]
+    return hits[np.searchsorted(hits, edges)].astype(np.int64)

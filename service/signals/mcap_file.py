@@ -39,7 +39,7 @@ from service.signals.protobuf import (
     identifiers,
     record_layout,
     schema_of,
-    tag_bytes,
+    tag_value,
 )
 from sysid.types import FloatArray
 
@@ -116,7 +116,7 @@ class McapFile:
         messages["length"] = layout.itemsize - MESSAGE_HEADER
         messages["channel"] = channel
         for i, field in enumerate(fields):
-            messages[f"tag{i}"] = tag_bytes(field)
+            messages[f"tag{i}"] = tag_value(field)
         index = np.zeros(messages.size, _INDEX)
         index["offset"] = layout.itemsize * np.arange(messages.size)
         for first in range(0, log_times.size, CHUNK_SAMPLES):

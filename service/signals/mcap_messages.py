@@ -19,7 +19,7 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from service.signals.protobuf import MESSAGE_HEADER, Field, flat_fields, record_layout, tag_bytes
+from service.signals.protobuf import MESSAGE_HEADER, Field, flat_fields, record_layout, tag_value
 
 DEEPEST: Final = 4
 """Messages inside messages are looked into down to this depth."""
@@ -51,7 +51,7 @@ class FlatLayout:
             ("opcode", Opcode.MESSAGE),
             ("length", self.dtype.itemsize - MESSAGE_HEADER),
             ("channel", channel),
-            *((f"tag{i}", tag_bytes(field)) for i, field in enumerate(fields)),
+            *((f"tag{i}", tag_value(field)) for i, field in enumerate(fields)),
         ]
 
     def read(self, content: bytes) -> NDArray[np.void] | None:

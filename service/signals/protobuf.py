@@ -99,8 +99,15 @@ def record_layout(fields: Sequence[Field]) -> np.dtype[np.void]:
         ("log_time", "<u8"), ("publish_time", "<u8"),
     ]  # fmt: skip
     for i, field in enumerate(fields):
-        parts += [(f"tag{i}", f"S{len(tag_bytes(field))}"), (f"value{i}", field.wire)]
+        length = len(tag_bytes(field))
+        parts += [(f"tag{i}", "u1" if length == 1 else f"S{length}"), (f"value{i}", field.wire)]
     return np.dtype(parts)
+
+
+def tag_value(field: Field) -> int | bytes:
+    """The field's tag as it stands in a `record_layout`: numbers compare faster than texts."""
+    tag = tag_bytes(field)
+    return tag[0] if len(tag) == 1 else tag
 
 
 def tag_bytes(field: Field) -> bytes:
