@@ -52,7 +52,7 @@ def read_columns(lines: Iterable[str], layout: Layout) -> Table:
 def _blocks(
     lines: Iterable[str], layout: Layout
 ) -> Iterator[tuple[list[Values], NDArray[np.int64]]]:
-    reader = csv.reader(lines, delimiter=layout.separator)
+    reader = csv.reader(lines, delimiter=layout.separator, strict=True)
     next(reader)
     before = 1
     try:

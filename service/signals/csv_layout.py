@@ -51,7 +51,10 @@ def find_layout(lines: Sequence[str], segments: Sequence[str], sample_time: floa
         If there is no usable header, or the time is missing or told twice.
     """
     separator = _separator(lines[0])
-    rows = list(csv.reader(lines, delimiter=separator))
+    try:
+        rows = list(csv.reader(lines, delimiter=separator))
+    except csv.Error as error:
+        raise InvalidUpload(f"the first rows cannot be read ({error})") from None
     names = [_name_and_unit(field) for field in rows[0]]
     if len(names) == 1 and (sample_time is None or _is_number(rows[0][0])):
         raise InvalidUpload(

@@ -1,0 +1,181 @@
+"""CSV files: what is understood, and that every fault is told with its place in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.signals.csv_reader import read_csv
+from service.signals.errors import InvalidUpload
+
+
+def refused(content: str | bytes, **options: object) -> InvalidUpload:
+    data = content if isinstance(content, bytes) else content.encode()
+    with pytest.raises(InvalidUpload) as caught:
+        read_csv(data, **options)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+def test_names_units_times_and_values_are_read() -> None:
+    recording, notes = read_csv(b"t,u [V],y [m/s]\n0,1,-2.5\n0.1,2,3e-3\n0.2,3,4\n")
+    assert recording.names == ("u", "y")
+    assert [channel.unit for channel in recording.channels] == ["V", "m/s"]
+    np.testing.assert_array_equal(recording.channels[0].times, [0, 0.1, 0.2])
+    np.testing.assert_array_equal(recording.channels[1].values, [-2.5, 3e-3, 4])
+    assert notes == ()
+
+
+@pytest.mark.parametrize("name", ["t", "t_s", "t [s]", "time", "Time [s]", "T_S"])
+def test_the_time_column_goes_by_several_names(name: str) -> None:
+    recording, _ = read_csv(f"{name},u\n0,1\n1,2\n".encode())
+    assert recording.names == ("u",)
+
+
+def test_a_unit_that_is_part_of_a_name_stays_in_the_name() -> None:
+    recording, _ = read_csv(b"t_s,P1_true_Pa\n0,1\n1,2\n")
+    assert recording.names == ("P1_true_Pa",)
+
+
+@pytest.mark.parametrize("sign", [",", ";", "\t"])
+def test_comma_semicolon_and_tab_separate(sign: str) -> None:
+    recording, _ = read_csv(sign.join("tuy").encode() + f"\n0{sign}1{sign}2\n".encode())
+    assert [channel.values[0] for channel in recording.channels] == [1, 2]
+
+
+def test_decimal_commas_are_detected_and_said() -> None:
+    recording, notes = read_csv(b"t;u\n0,0;1,5\n0,1;-2\n")
+    np.testing.assert_array_equal(recording.channel("u").values, [1.5, -2])
+    assert any("decimal commas" in note for note in notes)
+
+
+def test_a_byte_order_mark_windows_line_ends_blank_rows_and_quotes_do_no_harm() -> None:
+    recording, _ = read_csv(b'\xef\xbb\xbf"t","u"\r\n0,"1"\r\n\r\n1,2\r\n\r\n')
+    np.testing.assert_array_equal(recording.channel("u").values, [1, 2])
+
+
+def test_a_given_sampling_period_stands_for_the_time_column() -> None:
+    recording, _ = read_csv(b"u,y\n1,2\n3,4\n5,6\n", sample_time=0.5)
+    np.testing.assert_array_equal(recording.channel("y").times, [0, 0.5, 1])
+    single, _ = read_csv(b"u\n1\n2\n", sample_time=0.5)
+    assert single.names == ("u",)
+
+
+def test_a_path_is_read_like_its_content(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(b"t,u\n0,1\n1,2\n")
+    recording, _ = read_csv(tmp_path / "a.csv")
+    assert recording.samples == 2
+
+
+def test_irregular_times_are_kept_and_said() -> None:
+    recording, notes = read_csv(b"t,u\n0,1\n1,2\n5,3\n")
+    np.testing.assert_array_equal(recording.channel("u").times, [0, 1, 5])
+    assert any("irregular" in note for note in notes)
+
+
+def test_missing_values_become_nan_and_are_said_with_their_row() -> None:
+    recording, notes = read_csv(b"t,u,y\n0,1,\n1,2,NaN\n2,3,7\n")
+    np.testing.assert_array_equal(recording.channel("y").values, [np.nan, np.nan, 7])
+    assert any("2 of 3 values are missing" in note and "row 2" in note for note in notes)
+
+
+def test_the_times_of_a_clock_are_counted_from_the_first() -> None:
+    recording, notes = read_csv(b"t,u\n1700000000.5,1\n1700000001.5,2\n")
+    np.testing.assert_array_equal(recording.channel("u").times, [0, 1])
+    assert any("1700000000.5" in note for note in notes)
+
+
+def test_segments_are_laid_end_to_end_with_their_labels() -> None:
+    content = (
+        b"length,phase,t,u\n1,fill,0,1\n1,fill,0.5,2\n1,vent,0.1,3\n1,vent,0.3,4\n2,vent,0,5\n"
+    )
+    recording, _ = read_csv(content, segments=("length", "phase"))
+    assert recording.names == ("u",)
+    np.testing.assert_array_equal(recording.channel("u").times, [0, 0.5, 1, 1.2, 2])
+    assert [dict(one.labels) for one in recording.segments] == [
+        {"length": 1.0, "phase": "fill"},
+        {"length": 1.0, "phase": "vent"},
+        {"length": 2.0, "phase": "vent"},
+    ]
+    pieces = recording.pieces()
+    np.testing.assert_array_equal(pieces[1].channel("u").times, [0.1, 0.3])
+
+
+def test_equal_times_are_allowed_inside_repeats_only() -> None:
+    recording, notes = read_csv(b"n,t,u\n1,0,1\n1,0,2\n2,0,3\n", segments=("n",))
+    assert recording.samples == 3
+    assert any("same time" in note for note in notes)
+
+
+def test_a_text_in_a_column_of_numbers_is_told_with_row_and_column() -> None:
+    error = refused("t,u,y\n0,1,2\n1,2,oops\n")
+    assert (error.row, error.column) == (3, "y")
+    assert "'oops'" in error.detail
+    assert error.errors[0].pointer == "/rows/3/y"
+
+
+def test_the_row_of_a_fault_far_down_is_right() -> None:
+    rows = "".join(f"{k},{k}\n" for k in range(120_000))
+    assert refused(f"t,u\n{rows}120000,x\n").row == 120_002
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [("0,1\n0.5,1\n0.5,2\n", "repeats"), ("0,1\n0.5,1\n0.25,2\n", "decreases")],
+)
+def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, words: str) -> None:
+    error = refused("t,u\n" + rows)
+    assert (error.row, error.column) == (4, "t")
+    assert words in error.detail
+    assert "0.5 s is followed by" in error.detail
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("", "the file is empty"),
+        ("\n\n", "first row is empty"),
+        ("t\n1\n2\n", "only one column"),
+        ("1\n2\n", "only one column"),
+        ("t,u\n", "no rows"),
+        ("t,u\n\n\n", "no rows"),
+        ("1,2\n3,4\n", "header"),
+        ("a,u\n0,1\n", "no time column"),
+        ("t,\n0,1\n", "has no name"),
+        ("t [ms],u\n0,1\n", "need seconds"),
+        ("t,u,u\n0,1,2\n", "names must differ"),
+        ("t,u\n0,1\n1\n", "has 1 fields, but the header has 2"),
+        ("t,u\n0,1\n1,2,3\n", "has 3 fields, but the header has 2"),
+        ("t,u\n0,nan\n1,\n", "every value is missing"),
+        ("t,u\n0,1\nnan,2\n", "the time is missing"),
+        ("t,u\n0,1\n,2\n", "the time is missing"),
+        ("t,u\n0,1\n1,inf\n", "must be finite"),
+        ("t,u\n0,1\n1,1e999\n", "must be finite"),
+        ("t,u\n0,1_000\n", "not a number"),
+        ("t;u\n0;1,5\n1;1.5\n", "not a number"),
+        ("t;u\n0;1,5\n1;1.234,5\n", "mixed"),
+        ('t,u\n0,"1\n', "cannot be read"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(content: str, words: str) -> None:
+    assert words in refused(content).detail
+
+
+def test_bytes_that_are_not_utf_8_are_told_with_their_row() -> None:
+    assert refused(b"t,u\n0,1\n1,\xb5\n").row == 3
+    assert "UTF-16" in refused("t,u\n0,1\n".encode("utf-16")).detail
+    assert refused(b"\x7fELF\0\0").byte == 4
+
+
+def test_a_row_without_end_is_refused_before_it_fills_the_memory() -> None:
+    assert "longer than" in refused(b"t,u\n" + b"1" * 1_000_100).detail
+
+
+def test_time_told_twice_or_wrongly_is_refused() -> None:
+    assert "leave one out" in refused("t,u\n0,1\n", sample_time=0.1).detail
+    assert "positive" in refused("u,y\n0,1\n", sample_time=0.0).detail
+
+
+def test_an_unknown_label_column_is_refused_with_the_nearest() -> None:
+    assert "did you mean 'length'" in refused("t,length\n0,1\n", segments=("lenght",)).detail
+    assert "no signal" in refused("t,length\n0,1\n", segments=("length",)).detail

@@ -1,0 +1,217 @@
+"""Derivations: what each step keeps and changes, and that each bad setting is told."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.derivations import derive
+from sysid.errors import InvalidSettings
+from sysid.records import Channel, Recording, Segment
+
+
+def recording(samples: int = 100) -> Recording:
+    times = np.arange(samples) * 0.1
+    rng = np.random.default_rng(1)
+    return Recording(
+        (
+            Channel("u", times, rng.normal(size=samples), "V"),
+            Channel("y", times, 3 + 0.5 * times, "m"),
+        )
+    )
+
+
+def repeats() -> Recording:
+    """Three repeats of a ramp u = y = t, sampled each at another phase, labelled n = 1, 2, 3."""
+    own = [np.array([0.0, 0.4, 0.8]), np.array([0.1, 0.5, 0.9]), np.array([0.2, 0.6])]
+    times = np.concatenate([i + one - one[0] for i, one in enumerate(own)])
+    values = np.concatenate(own)
+    segments = tuple(
+        Segment(
+            float(i),
+            float(i + one[-1] - one[0]),
+            float(one[0]),
+            {"n": i + 1.0, "side": "ab"[i % 2]},
+        )
+        for i, one in enumerate(own)
+    )
+    return Recording((Channel("u", times, values), Channel("y", times, values)), segments)
+
+
+def values(made: Recording, name: str) -> Any:
+    return made.channel(name).values
+
+
+def test_steps_are_taken_one_after_the_other() -> None:
+    made = derive(recording(), [{"trim": {"rows": [10, 20]}}, {"offset": {"y": 3}}])
+    np.testing.assert_allclose(values(made, "y"), 0.5 * made.channel("y").times)
+
+
+def test_trimming_by_rows_and_by_time_agree() -> None:
+    by_rows = derive(recording(), [{"trim": {"rows": [10, 21]}}])
+    by_time = derive(recording(), [{"trim": {"start": 0.95, "stop": 2.05}}])
+    for name in ("u", "y"):
+        np.testing.assert_array_equal(values(by_rows, name), values(by_time, name))
+        np.testing.assert_array_equal(
+            by_rows.channel(name).times, recording().channel("u").times[10:21]
+        )
+
+
+def test_noise_has_its_deviation_is_drawn_by_the_seed_and_leaves_others_alone() -> None:
+    start = recording(20_000)
+    step = {"noise": {"sigma": 0.2, "seed": 7, "channels": ["y"]}}
+    first, again = derive(start, [step]), derive(start, [step])
+    added = values(first, "y") - values(start, "y")
+    np.testing.assert_array_equal(values(first, "y"), values(again, "y"))
+    np.testing.assert_array_equal(values(first, "u"), values(start, "u"))
+    assert np.std(added) == pytest.approx(0.2, rel=0.05)
+    assert abs(np.mean(added)) < 0.01
+    other = derive(start, [{"noise": {"sigma": 0.2, "seed": 8, "channels": ["y"]}}])
+    assert not np.array_equal(values(first, "y"), values(other, "y"))
+
+
+def test_noise_of_two_channels_is_independent() -> None:
+    start = recording(5000)
+    made = derive(start, [{"noise": {"sigma": 1, "seed": 1, "channels": ["u", "y"]}}])
+    a, b = (values(made, name) - values(start, name) for name in ("u", "y"))
+    assert abs(np.corrcoef(a, b)[0, 1]) < 0.1
+
+
+def test_detrending_takes_away_what_it_says() -> None:
+    line = derive(recording(), [{"detrend": {"kind": "linear", "channels": ["y"]}}])
+    np.testing.assert_allclose(values(line, "y"), 0, atol=1e-12)
+    mean = derive(recording(), [{"detrend": {}}])
+    assert np.mean(values(mean, "u")) == pytest.approx(0, abs=1e-14)
+
+
+def test_a_line_survives_resampling() -> None:
+    made = derive(recording(), [{"resample": {"sample_time": 0.03}}])
+    y = made.channel("y")
+    assert y.sampling.is_regular
+    assert y.sampling.period == pytest.approx(0.03)
+    np.testing.assert_allclose(y.values, 3 + 0.5 * y.times)
+    np.testing.assert_array_equal(made.channel("u").times, y.times)
+
+
+def test_resampling_a_held_input_never_invents_a_value() -> None:
+    made = derive(recording(), [{"hold": {"u": "zero"}}, {"resample": {"sample_time": 0.03}}])
+    assert set(values(made, "u")) <= set(values(recording(), "u"))
+
+
+def test_the_mean_of_each_period_is_taken() -> None:
+    start = recording(101)
+    made = derive(start, [{"resample": {"sample_time": 0.5, "method": "mean"}}])
+    assert values(made, "u")[2] == pytest.approx(np.mean(values(start, "u")[8:13]))
+
+
+def test_the_two_parts_of_a_split_are_the_whole() -> None:
+    parts = [
+        derive(recording(), [{"split": {"fraction": 0.3, "part": part}}])
+        for part in ("estimation", "validation")
+    ]
+    assert [part.samples for part in parts] == [70, 30]
+    joined = np.concatenate([values(part, "u") for part in parts])
+    np.testing.assert_array_equal(joined, values(recording(), "u"))
+
+
+def test_hold_and_names_are_set() -> None:
+    made = derive(recording(), [{"hold": {"u": "band-limited"}}, {"rename": {"u": "q"}}])
+    assert made.names == ("q", "y")
+    assert made.channel("q").hold == "band-limited"
+
+
+@pytest.mark.parametrize(
+    ("condition", "kept"),
+    [
+        ({"n": 2}, [2]),
+        ({"n": [1, 3]}, [1, 3]),
+        ({"n": {"modulus": 2, "remainder": 1}}, [1, 3]),
+        ({"n": {"min": 2}}, [2, 3]),
+        ({"side": "a", "n": {"max": 2}}, [1]),
+    ],
+)
+def test_segments_are_selected_by_their_labels(condition: dict[str, Any], kept: list[int]) -> None:
+    made = derive(repeats(), [{"select": condition}])
+    assert [one.labels["n"] for one in made.segments] == kept
+    for piece, number in zip(made.pieces(), kept, strict=True):
+        whole = repeats().pieces()[number - 1]
+        np.testing.assert_array_equal(piece.channel("u").times, whole.channel("u").times)
+        np.testing.assert_array_equal(values(piece, "u"), values(whole, "u"))
+
+
+def test_pooling_puts_every_output_sample_at_its_own_time() -> None:
+    made = derive(repeats(), [{"pool": {"input": "u", "outputs": ["y"], "bin": 0.1}}])
+    assert made.segments == ()
+    y = made.channel("y")
+    np.testing.assert_array_equal(y.times, y.values)  # y = t in every repeat
+    np.testing.assert_array_equal(y.times, [0, 0.1, 0.2, 0.4, 0.5, 0.6, 0.8, 0.9])
+
+
+def test_a_pooled_input_is_the_median_of_each_bin() -> None:
+    made = derive(
+        repeats(), [{"pool": {"input": "u", "outputs": ["y"], "bin": 0.3, "start": 0, "stop": 0.7}}]
+    )
+    u = made.channel("u")
+    np.testing.assert_allclose(u.values, [0.1, 0.45, 0.6])  # bins 0-0.3, 0.3-0.6, from 0.6
+    np.testing.assert_allclose(u.times, u.values)
+    assert made.channel("y").times[-1] == 0.6
+
+
+@pytest.mark.parametrize(
+    ("steps", "pointer"),
+    [
+        ([], "/steps"),
+        ({"trim": {}}, "/steps"),
+        ([{}], "/steps/0"),
+        ([{"trim": {"start": 0}, "detrend": {}}], "/steps/0"),
+        ([{"detrend": {}}, {"trimm": {}}], "/steps/1/trimm"),
+        ([{"trim": 3}], "/steps/0/trim"),
+        ([{"trim": {}}], "/steps/0/trim"),
+        ([{"trim": {"begin": 0}}], "/steps/0/trim/begin"),
+        ([{"trim": {"start": "0"}}], "/steps/0/trim/start"),
+        ([{"trim": {"start": 4, "stop": 2}}], "/steps/0/trim/stop"),
+        ([{"trim": {"start": 1.01, "stop": 1.02}}], "/steps/0/trim"),
+        ([{"trim": {"rows": [3]}}], "/steps/0/trim/rows"),
+        ([{"trim": {"rows": [0, 5], "start": 0}}], "/steps/0/trim/rows"),
+        ([{"trim": {"rows": [0, 101]}}], "/steps/0/trim/rows"),
+        ([{"noise": {"sigma": 1}}], "/steps/0/noise/channels"),
+        ([{"noise": {"sigma": -1, "channels": ["y"]}}], "/steps/0/noise/sigma"),
+        ([{"noise": {"sigma": 1, "seed": 0.5, "channels": ["y"]}}], "/steps/0/noise/seed"),
+        ([{"noise": {"sigma": 1, "channels": ["z"]}}], "/steps/0/noise"),
+        ([{"resample": {"sample_time": 0}}], "/steps/0/resample/sample_time"),
+        ([{"resample": {"sample_time": 1e-9}}], "/steps/0/resample/sample_time"),
+        ([{"resample": {"sample_time": 1, "method": "cubic"}}], "/steps/0/resample/method"),
+        ([{"detrend": {"channels": []}}], "/steps/0/detrend/channels"),
+        ([{"offset": {}}], "/steps/0/offset"),
+        ([{"offset": {"y": True}}], "/steps/0/offset/y"),
+        ([{"split": {"fraction": 1.5, "part": "validation"}}], "/steps/0/split/fraction"),
+        ([{"split": {"fraction": 0.5, "part": "test"}}], "/steps/0/split/part"),
+        ([{"hold": {"u": "second"}}], "/steps/0/hold/u"),
+        ([{"rename": {"u": "y"}}], "/steps/0/rename"),
+        ([{"select": {"n": 1}}], "/steps/0/select"),
+        ([{"pool": {"outputs": ["y"], "bin": 1}}], "/steps/0/pool/input"),
+        ([{"pool": {"input": "u", "outputs": ["y"], "bin": -1}}], "/steps/0/pool/bin"),
+        ([{"pool": {"input": "u", "outputs": ["y"], "bin": 1, "stop": 0}}], "/steps/0/pool/stop"),
+        ([{"pool": {"input": "u", "outputs": ["y"], "bin": 1, "start": 50}}], "/steps/0/pool/stop"),
+    ],
+)  # fmt: skip
+def test_a_bad_step_is_told_with_its_pointer(steps: Any, pointer: str) -> None:
+    with pytest.raises(InvalidSettings) as caught:
+        derive(recording(), steps)
+    assert caught.value.pointer == pointer
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("condition", "pointer"),
+    [
+        ({"m": 1}, "/steps/0/select/m"),
+        ({"n": 9}, "/steps/0/select"),
+        ({"n": None}, "/steps/0/select/n"),
+        ({"n": {"modulus": 0, "remainder": 1}}, "/steps/0/select/n/modulus"),
+    ],
+)
+def test_a_bad_condition_is_told_with_its_pointer(condition: dict[str, Any], pointer: str) -> None:
+    with pytest.raises(InvalidSettings) as caught:
+        derive(repeats(), [{"select": condition}])
+    assert caught.value.pointer == pointer

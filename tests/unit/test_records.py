@@ -1,0 +1,77 @@
+"""Recordings: experiments made from channels, samplings, splitting."""
+
+import numpy as np
+import pytest
+
+from sysid.errors import InvalidRecord, InvalidSettings
+from sysid.records import Channel, Record, Recording, Segment, sampling_of, split_record
+
+
+def ramp(name: str, samples: int = 10, period: float = 0.1) -> Channel:
+    return Channel(name, np.arange(samples) * period, np.arange(samples, dtype=float))
+
+
+def test_a_record_carries_the_models_names() -> None:
+    recording = Recording((ramp("P1"), ramp("P2")))
+    record = recording.record({"u": "P1"}, {"y": "P2"}, "tube")
+    assert [one.name for one in (*record.inputs, *record.outputs)] == ["u", "y"]
+    assert record.duration == pytest.approx(0.9)
+
+
+def test_an_unknown_channel_is_told_with_the_nearest() -> None:
+    with pytest.raises(InvalidRecord, match="did you mean 'P1'"):
+        Recording((ramp("P1"),)).record({"u": "P11"}, {"y": "P1"})
+
+
+def test_missing_values_are_an_error_in_an_input_and_none_in_an_output() -> None:
+    holes = Channel("x", np.arange(3.0), np.array([1.0, np.nan, 2.0]))
+    recording = Recording((holes,))
+    assert recording.record({}, {"y": "x"}).outputs[0].values.size == 3
+    with pytest.raises(InvalidRecord, match=r"input 'u'.*1 missing.*t = 1 s"):
+        recording.record({"u": "x"}, {})
+    with pytest.raises(InvalidRecord, match="has no value"):
+        Recording((Channel("x", np.arange(2.0), np.full(2, np.nan)),)).record({}, {"y": "x"})
+
+
+def test_several_segments_are_several_experiments_on_their_own_times() -> None:
+    channel = Channel("y", np.array([0.0, 0.5, 1.0, 1.25]), np.arange(4.0))
+    segments = (Segment(0, 0.5, 0.0, {"n": 1}), Segment(1, 1.25, 3.0, {"n": 2}))
+    recording = Recording((channel,), segments)
+    with pytest.raises(InvalidRecord, match="2 segments"):
+        recording.record({}, {"y": "y"})
+    first, second = recording.records({}, {"y": "y"})
+    np.testing.assert_array_equal(first.outputs[0].times, [0, 0.5])
+    np.testing.assert_array_equal(second.outputs[0].times, [3, 3.25])
+
+
+def test_regular_and_irregular_times_are_told_apart() -> None:
+    assert sampling_of(np.arange(5) * 0.1).is_regular
+    assert sampling_of(np.round(np.arange(100) / 610.35, 5)).is_regular  # printed with few digits
+    irregular = sampling_of(np.array([0.0, 1.0, 2.0, 5.0]))
+    assert not irregular.is_regular
+    assert irregular.period == 1.0
+    assert "irregular" in str(irregular)
+    assert "every 0.1 s" in str(sampling_of(np.arange(5) * 0.1))
+    assert str(sampling_of(np.zeros(1))) == "one sample"
+
+
+def test_splitting_gives_every_sample_to_one_part() -> None:
+    record = Record((ramp("u", 20, 0.05),), (ramp("y"),))
+    estimation, validation = split_record(record, 0.3)
+    assert [part.outputs[0].values.size for part in (estimation, validation)] == [7, 3]
+    for before, kinds in ((record.inputs, "inputs"), (record.outputs, "outputs")):
+        parts = [getattr(part, kinds)[0].values for part in (estimation, validation)]
+        np.testing.assert_array_equal(np.concatenate(parts), before[0].values)
+    assert estimation.stop < validation.start
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0, -1.0, 0.01, float("nan")])
+def test_a_fraction_that_leaves_a_part_empty_is_refused(fraction: float) -> None:
+    with pytest.raises(InvalidSettings, match="/validation/fraction"):
+        split_record(Record((), (ramp("y"),)), fraction)
+
+
+def test_a_channel_without_samples_in_a_part_is_told() -> None:
+    early = Channel("u", np.array([0.0]), np.array([1.0]))
+    with pytest.raises(InvalidSettings, match="channel 'u' has no sample"):
+        split_record(Record((early,), (ramp("y"),)), 0.5)
