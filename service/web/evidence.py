@@ -36,12 +36,13 @@ class SoughtParameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """One signal of the response on its own times (s)."""
+    """One signal on its own times (s); `is_held` if it keeps its value until the next sample."""
 
     name: str
     unit: str
     times: Floats
     values: Floats
+    is_held: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from service.web import theme
+from service.web import formats, theme
 from service.web.decimation import strided
 from service.web.evidence import Floats, Improvement, RunEvidence, SoughtParameter
 
@@ -19,11 +19,12 @@ Figure = dict[str, Any]
 Abscissa = Literal["generations", "evaluations"]
 
 MARGIN = {"l": 64, "r": 16, "t": 28, "b": 44}
+WATERFALL_HEIGHT = 280
 _EPOCHS_MARKED = 80
 _PHASES = {
-    "sequence": ("sequence search", "diamond-open"),
+    "sequence": ("sequence", "diamond-open"),
     "migration": ("migration", "triangle-up-open"),
-    "refinement": ("least-squares refinement", "star"),
+    "refinement": ("refinement", "star"),
 }
 
 
@@ -34,15 +35,15 @@ def finite(values: Iterable[float]) -> list[float | None]:
 
 def layout(height: int, **more: Any) -> dict[str, Any]:
     """The layout that all figures share; `uirevision` keeps a zoom through live updates."""
-    return {
+    shared: dict[str, Any] = {
         "height": height,
         "margin": MARGIN,
         "uirevision": "keep",
         "hovermode": "closest",
         "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0, "xanchor": "left"},
         "template": theme.template("light"),
-        **more,
     }
+    return {**shared, **more}
 
 
 def in_theme(figure: Figure, paper: theme.Theme) -> Figure:
@@ -66,7 +67,7 @@ def history(run: RunEvidence, abscissa: Abscissa = "generations") -> Figure:
             xaxis={"title": {"text": abscissa}, "rangemode": "tozero"},
             yaxis={"title": {"text": f"RMS [{run.unit}]"}, "type": "log", "exponentformat": "e"},
             shapes=[_upright(epoch * run.epoch) for epoch in _some(epochs)],
-            meta={"abscissa": abscissa},
+            uirevision=abscissa,
         ),
     }
 
@@ -117,7 +118,7 @@ def correlation(run: RunEvidence) -> Figure:
     if few:
         matrix["texttemplate"] = "%{z:.2f}"
     return {
-        "data": [matrix],
+        "data": [matrix] if names else [],
         "layout": layout(
             correlation_height(len(names)),
             xaxis={"showgrid": False, "type": "category", "showline": False, "ticks": ""},
@@ -148,9 +149,9 @@ def waterfall(run: RunEvidence) -> Figure:
         for name, colour, symbol, part in series
     ]  # fmt: skip
     return {
-        "data": data,
+        "data": data if order else [],
         "layout": layout(
-            280,
+            WATERFALL_HEIGHT,
             xaxis={"title": {"text": "islands, best first"}, "dtick": max(1, len(order) // 12),
                    "range": [0.5, len(order) + 0.5]},
             yaxis={"title": {"text": f"RMS [{run.unit}]"}, "type": "log", "exponentformat": "e"},
@@ -317,5 +318,5 @@ def _caption(parameter: SoughtParameter) -> str:
     unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     if parameter.value is None:
         return f"<b>{parameter.name}</b>{f' [{parameter.unit}]' if unit else ''}"
-    spread = "" if parameter.stderr is None else f" ± {parameter.stderr:.2g}"
-    return f"<b>{parameter.name}</b> = {parameter.value:.5g}{spread}{unit}"
+    value, error = formats.estimate(parameter.value, parameter.stderr)
+    return f"<b>{parameter.name}</b> = {value}{f' ± {error}' if error else ''}{unit}"

@@ -31,12 +31,12 @@ def response(
         figure["data"].append(_residual(output, span, f"y{2 * number + 2}", number == 0))
         unit = _bracketed(output.measured.unit)
         _name_axis(figure, 2 * number + 1, f"{output.measured.name}{unit}")
-        _name_axis(figure, 2 * number + 2, "residual")
+        _name_axis(figure, 2 * number + 2, f"residual<br>{unit}")
     for number, signal in enumerate(experiment.inputs, 2 * len(experiment.outputs) + 1):
         span = window(signal.times, start, stop)
         figure["data"].append(_line(signal, span, f"y{number}", theme.GREEN, legend=True))
         _name_axis(figure, number, f"{signal.name}{_bracketed(signal.unit)}")
-    figure["layout"].update(_shading(experiment))
+    figure["layout"].update(_shading(experiment), uirevision=experiment.name)
     traces = [output.measured for output in experiment.outputs] + list(experiment.inputs)
     figure["layout"]["meta"] = {"thinned": _is_thinned(traces)}
     return figure
@@ -160,7 +160,7 @@ def _line(signal: Trace, span: slice, axis: str, colour: str, *, legend: bool) -
     return {
         "type": "scatter", "mode": "lines", "name": signal.name, "yaxis": _axis(axis),
         "showlegend": legend, "x": finite(times[kept]), "y": finite(values[kept]),
-        "line": {"color": colour, "width": 1.2},
+        "line": {"color": colour, "width": 1.2, "shape": "hv" if signal.is_held else "linear"},
         "hovertemplate": f"%{{y:.6g}}<extra>{signal.name}</extra>",
     }  # fmt: skip
 

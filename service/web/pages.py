@@ -21,7 +21,7 @@ from service.storage.lineage import LineageRepository
 from service.storage.runs import RunRepository
 from service.storage.tables import Dataset, Job, Run, State
 from service.web import assets, figures_signals, formats
-from service.web.figures import convergence_height, correlation_height
+from service.web.figures import WATERFALL_HEIGHT, convergence_height, correlation_height
 from service.web.reading import model_of, run_body, sought_parameters, unit_of
 from service.web.views import JobView, RunView, event_view, job_view, run_view
 
@@ -122,10 +122,13 @@ def run_in_full(job: Job, run: Run) -> RunView:
     """A run with what its plots need to be laid out before they are drawn."""
     body = run_body(job, run)
     sought = sought_parameters(run, body)
+    result = run.result or {}
+    # What comes with the end of the run lies below the live plots and takes its room then.
     heights = {
-        "response": figures_signals.response_height(*_counts(body)),
+        "response": figures_signals.response_height(*_counts(body)) if run.signals_sha256 else 0,
         "convergence": convergence_height(len(sought), columns=3),
-        "correlation": correlation_height(len(sought)),
+        "correlation": correlation_height(len(sought)) if result.get("correlation") else 0,
+        "waterfall": WATERFALL_HEIGHT if result.get("islands") else 0,
     }
     return run_view(run, unit_of(body), heights)
 

@@ -16,7 +16,7 @@ from service.web.evidence import Improvement, RunEvidence, SoughtParameter
 from sysid.errors import SysidError
 from sysid.models.library import load_model
 from sysid.models.model import EstimatedInitial, Model
-from sysid.parameters import Parameter, override
+from sysid.parameters import Parameter, Scale, override
 
 Body = Mapping[str, Any]
 
@@ -28,7 +28,7 @@ def run_body(job: Job, run: Run) -> dict[str, Any]:
 
 def model_of(body: Body) -> Model | None:
     """The model of a body; None if this version of the program cannot read it any more."""
-    return _model(json.dumps(body["model"], sort_keys=True))
+    return _model(json.dumps(body["model"]))
 
 
 @lru_cache(maxsize=256)
@@ -52,14 +52,16 @@ def sought_parameters(run: Run, body: Body) -> list[SoughtParameter]:
 
     The result names them once the run has ended; until then the model and the request do.
     """
+    model = model_of(body)
+    known = override(model.parameters, body.get("parameters", {})) if model else ()
     result = (run.result or {}).get("parameters")
     if result:
-        return [_estimated(one) for one in result if one.get("status") != "fixed"]
-    model = model_of(body)
+        scales = {one.name: one.scale for one in known}
+        return [_estimated(one, scales) for one in result if one.get("status") != "fixed"]
     if model is None:
         return []
-    free = [p for p in override(model.parameters, body.get("parameters", {})) if p.is_free]
-    return [*map(_sought, free), *_initial_states(model, len(body["datasets"]))]
+    free = [_sought(one) for one in known if one.is_free]
+    return [*free, *_initial_states(model, len(body["datasets"]))]
 
 
 def evidence_of(session: Session, job: Job, run: Run) -> RunEvidence:
@@ -124,10 +126,10 @@ def _by_its_values(points: Sequence[Improvement], column: int) -> SoughtParamete
                            else lower + 1.0)  # fmt: skip
 
 
-def _estimated(one: Mapping[str, Any]) -> SoughtParameter:
+def _estimated(one: Mapping[str, Any], scales: Mapping[str, Scale]) -> SoughtParameter:
     return SoughtParameter(
         one["name"], one.get("unit", "1"), one["lower"], one["upper"],
-        value=one["value"], stderr=one.get("stderr"),
+        scales.get(one["name"], "linear"), value=one["value"], stderr=one.get("stderr"),
     )  # fmt: skip
 
 

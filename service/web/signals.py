@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.signals.reader import read_fit, read_recording
+from service.recordings import recording_of
+from service.signals.reader import read_fit
 from service.signals.writer import FittedOutput
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import StorageError
@@ -26,7 +27,7 @@ _KEPT = 4
 
 def traces_of(store: ObjectStore, dataset: Dataset) -> list[Trace]:
     """The channels of a dataset."""
-    return [_trace(channel) for channel in _recording(store, dataset.sha256).channels]
+    return [_trace(channel) for channel in recording_of(store, dataset.sha256).channels]
 
 
 def experiments_of(session: Session, store: ObjectStore, job: Job, run: Run) -> list[Experiment]:
@@ -49,11 +50,6 @@ def experiments_of(session: Session, store: ObjectStore, job: Job, run: Run) -> 
         Experiment(f"validation {number}", _outputs(parts), _at(other, number), -inf)
         for number, parts in validation
     ]
-
-
-@lru_cache(maxsize=_KEPT)
-def _recording(store: ObjectStore, sha256: str) -> Recording:
-    return read_recording(store.get(sha256))
 
 
 @lru_cache(maxsize=_KEPT)
@@ -122,7 +118,7 @@ def _inputs(
     for name in datasets:
         try:
             dataset = DatasetRepository(session).get(name)
-            yield from _records(_recording(store, dataset.sha256), model, body["channels"])
+            yield from _records(recording_of(store, dataset.sha256), model, body["channels"])
         except (StorageError, SysidError):
             yield ()
 
@@ -137,4 +133,4 @@ def _records(
 
 
 def _trace(channel: Channel) -> Trace:
-    return Trace(channel.name, channel.unit, channel.times, channel.values)
+    return Trace(channel.name, channel.unit, channel.times, channel.values, channel.hold == "zero")

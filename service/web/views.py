@@ -165,12 +165,11 @@ def progress(job: Job) -> float:
     """How much of a job is done, from 0 to 1: runs, and the generations of a single one."""
     if job.state is State.SUCCEEDED:
         return 1.0
-    done = job.n_done / max(job.n_runs, 1)
     if job.n_runs > 1 or job.state is State.QUEUED:
-        return min(done, 1.0)
+        return min(job.n_done / max(job.n_runs, 1), 1.0)
     algorithm = job.spec.get("algorithm", {})
     budget = (algorithm.get("stop") or {}).get("evaluations")
-    parts: list[float] = [done, job.generation / max(algorithm.get("generations", 1), 1)]
+    parts: list[float] = [job.generation / max(algorithm.get("generations", 1), 1)]
     if budget:
         parts.append(job.evaluations / budget)
     return min(max(parts), 1.0)
@@ -189,9 +188,11 @@ def _run_title(run: Run) -> str:
 def _progress_text(job: Job, share: float) -> str:
     if job.n_runs > 1:
         return f"{formats.count(job.n_done)} of {formats.count(job.n_runs)} runs"
-    if job.state is State.RUNNING and job.generation:
-        return f"generation {formats.count(job.generation)}"
-    return f"{100 * share:.0f} %" if job.state is not State.QUEUED else "waiting"
+    if job.state is State.QUEUED:
+        return "waiting"
+    if job.state is not State.SUCCEEDED:
+        return f"generation {formats.count(job.generation)}" if job.generation else ""
+    return f"{100 * share:.0f}\u202f%"
 
 
 def _plain(value: object) -> str:

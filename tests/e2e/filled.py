@@ -1,0 +1,226 @@
+"""A data folder as it looks after some use: jobs that ended well, run, failed, wait, and a sweep.
+
+The rows are written by the repositories, as the dispatcher would write them. The numbers are made
+up by a closed formula, so that every test run sees the same pages.
+"""
+
+import io
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+import numpy as np
+
+from service import jobs
+from service.datasets import add_recording
+from service.schemas_jobs import JobIn
+from service.settings import Settings
+from service.signals.writer import FittedOutput, write_fit
+from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOutcome
+from service.storage.objects import ObjectStore
+from service.storage.queue import Claim, Progress, Queue
+from service.storage.runs import RunRepository
+from service.storage.sessions import Database
+from service.storage.tables import State
+from sysid.records import Channel, Recording
+
+MODEL = {
+    "name": "lagged-tube", "title": "First-order lag behind a dead time", "form": "differential",
+    "inputs": {"u": "kPa"}, "states": {"y": "kPa"},
+    "parameters": {
+        "K": {"lower": 0, "upper": 2, "unit": "1"},
+        "T": {"lower": 0.01, "upper": 2, "unit": "s", "scale": "log"},
+        "L": {"lower": 0, "upper": 0.5, "unit": "s"},
+    },
+    "equations": {"y": "(K*u(t - L) - y)/T"}, "outputs": {"p": "y"}, "initial": {"y": 0},
+}  # fmt: skip
+TRUE = {"K": 1.0153, "T": 0.3489, "L": 0.1127}
+SIGMA = 0.42
+STEP = 0.01
+
+
+@dataclass(frozen=True)
+class Filled:
+    """Identifiers of what was written."""
+
+    dataset: str
+    finished: str
+    finished_run: str
+    running: str
+    running_run: str
+    failed: str
+    queued: str
+    sweep: str
+    lease: Claim
+
+
+def fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
+    """Write everything; the job that runs can be driven on with `progress`."""
+    recording = _recording()
+    dataset = add_recording(
+        database, store, recording, name="tube 40 m", kind="upload", key="tube", details={}
+    ).dataset.id
+    finished = _claimed(database, settings, _body(dataset, "tube 40 m, pattern 1"))
+    run = _end(database, store, finished, recording)
+    sweep = _claimed(database, settings, _body(dataset, "three methods, four seeds", sweep=True))
+    _end_sweep(database, sweep)
+    failed = _claimed(database, settings, _body(dataset, "a model that diverges"))
+    with database.write() as session:
+        reason = "the model diverges everywhere: no individual of 50 gave a finite output"
+        ledger = RunLedger(session, failed.lease)
+        ledger.record([RunOutcome(run_id=_first(session, failed), state=State.FAILED,
+                                  error=reason)])  # fmt: skip
+        Queue(session).finish(failed.lease, State.FAILED, reason)
+    running = _claimed(database, settings, _body(dataset, "tube 80 m <b>live</b>"))
+    with database.write() as session:
+        running_run = _first(session, running)
+        RunLedger(session, running.lease).start([running_run])
+    progress(database, running, running_run, 60)
+    with database.write() as session:
+        queued = jobs.submit(session, _body(dataset, "tube 5 m, waits"), settings).job.id
+    return Filled(
+        dataset, finished.job.id, run, running.job.id, running_run, failed.job.id, queued,
+        sweep.job.id, running,
+    )  # fmt: skip
+
+
+def progress(database: Database, claim: Claim, run: str, generation: int) -> None:
+    """Bring the running job to a generation."""
+    with database.write() as session:
+        points = [p for p in _history(run) if p.generation <= generation]
+        RunLedger(session, claim.lease).append(points)
+        now = Progress(50 * generation, generation, min(p.rms for p in points), 12.5)
+        Queue(session).report(claim.lease, now)
+
+
+def end_running(database: Database, store: ObjectStore, claim: Claim) -> None:
+    """Let the running job succeed."""
+    _end(database, store, claim, _recording())
+
+
+def _body(dataset: str, name: str, *, sweep: bool = False) -> JobIn:
+    axes: list[dict[str, Any]] = [
+        {"path": "/algorithm/method", "values": ["simple", "improved-paper", "improved"]},
+        {"path": "/seed", "range": [1, 5]},
+    ]
+    return JobIn.model_validate({
+        "name": name, "model": MODEL, "datasets": [dataset],
+        "channels": {"u": "P1", "p": "P2"}, "validation": {"fraction": 0.3},
+        "sweep": {"axes": axes if sweep else []},
+    })  # fmt: skip
+
+
+def _recording() -> Recording:
+    times = np.arange(3000) * STEP
+    levels = np.array([100, 300, 480, 200, 400, 50, 350, 250, 450, 150.0])
+    u = np.repeat(levels, 300)
+    noise = SIGMA * np.random.default_rng(7).standard_normal(times.size)
+    return Recording((
+        Channel("P1", times, u, "kPa", "zero"),
+        Channel("P2", times, _simulated(u) + noise, "kPa"),
+    ))  # fmt: skip
+
+
+def _simulated(u: np.ndarray) -> np.ndarray:
+    delay, pole = round(TRUE["L"] / STEP), np.exp(-STEP / TRUE["T"])
+    y = np.zeros_like(u)
+    for k in range(1, u.size):
+        past = u[max(k - 1 - delay, 0)] if k > delay else u[0]
+        y[k] = pole * y[k - 1] + (1 - pole) * TRUE["K"] * past
+    return y
+
+
+def _claimed(database: Database, settings: Settings, body: JobIn) -> Claim:
+    with database.write() as session:
+        jobs.submit(session, body, settings)
+        claim = Queue(session).claim("test", timedelta(hours=1))
+    assert claim is not None
+    return claim
+
+
+def _first(session: Any, claim: Claim) -> str:
+    return RunRepository(session).page(claim.job.id, limit=1).items[0].id
+
+
+def _history(run: str, islands: int = 4, floor: float = SIGMA) -> list[HistoryPoint]:
+    """Improvements that shrink towards `floor`, with sequence searches and a refinement."""
+    found = []
+    for island in range(islands):
+        draws = np.random.default_rng(island)
+        generation, rms = 0, 60.0 * (1 + 0.4 * island)
+        for number in range(40):
+            generation += int(draws.integers(1, 18)) if number else 0
+            rms = floor + (rms - floor) * float(draws.uniform(0.55, 0.95)) if number else rms
+            off = (rms - floor) / 80
+            phase = ("genetic", "sequence", "migration")[0 if number < 12 else number % 3]
+            if number == 39:
+                phase = "refinement"
+            values = [TRUE["K"] * (1 + 0.4 * off), TRUE["T"] * (1 + 1.5 * off * (-1) ** island),
+                      TRUE["L"] * (1 + 2 * off)]  # fmt: skip
+            found.append(HistoryPoint(
+                run, island, number, min(generation, 400), 13 * min(generation, 400), rms, phase,
+                values,
+            ))  # fmt: skip
+    return found
+
+
+def _result(rms: float = SIGMA) -> dict[str, Any]:
+    stderr = {"K": 0.00007, "T": 0.00041, "L": 0.00023}
+    bounds = MODEL["parameters"]
+    assert isinstance(bounds, dict)
+    return {
+        "valid": True, "rms": rms,
+        "parameters": [
+            {"name": name, "unit": bounds[name]["unit"], "value": value, "stderr": stderr[name],
+             "lower": float(bounds[name]["lower"]), "upper": float(bounds[name]["upper"]),
+             "interval95": [value - 1.96 * stderr[name], value + 1.96 * stderr[name]],
+             "status": "identified", "reason": ""}
+            for name, value in TRUE.items()
+        ],
+        "islands": [{"champion_rms": rms * (1 + 0.2 * i), "refined_rms": rms * (1 + 0.02 * i**3)}
+                    for i in range(4)],
+        "correlation": {"names": ["K", "T", "L"],
+                        "matrix": [[1, 0.31, -0.05], [0.31, 1, -0.78], [-0.05, -0.78, 1]]},
+        "warnings": ["T and L are strongly correlated (−0.78): T + L is better known than either"],
+    }  # fmt: skip
+
+
+def _end(database: Database, store: ObjectStore, claim: Claim, recording: Recording) -> str:
+    u, y = recording.channel("P1"), recording.channel("P2")
+    fits = [
+        FittedOutput(name, "p", "kPa", y.times[part], y.values[part], _simulated(u.values)[part])
+        for name, part in (("estimation 1", slice(0, 2100)), ("validation 1", slice(2100, None)))
+    ]
+    with database.write() as session:
+        run = _first(session, claim)
+        target = io.BytesIO()
+        write_fit(run, fits, target)
+        migrants = [MigrantPoint(run, n, 1 + n // 4, n % 4, (n + 1) % 4, 5.0) for n in range(60)]
+        outcome = RunOutcome(
+            run_id=run, state=State.SUCCEEDED, result=_result(), valid=True, best_rms=SIGMA,
+            fit_estimation=99.71, fit_validation=99.68, evaluations=20_000, generations=400,
+            seconds=0.184, signals_sha256=store.put_bytes(target.getvalue()).sha256,
+        )  # fmt: skip
+        ledger = RunLedger(session, claim.lease)
+        ledger.record([outcome], _history(run), migrants)
+        queue = Queue(session)
+        queue.tell(claim.lease, "log", {"message": "compiled lagged-tube in 26 ms"})
+        queue.report(claim.lease, Progress(20_000, 400, SIGMA))
+        queue.finish(claim.lease, State.SUCCEEDED)
+    return run
+
+
+def _end_sweep(database: Database, claim: Claim) -> None:
+    with database.write() as session:
+        runs = RunRepository(session).page(claim.job.id, limit=100).items
+        outcomes = [
+            RunOutcome(
+                run_id=run.id, state=State.SUCCEEDED, result=_result(SIGMA * (1 + (7 * n) % 12)),
+                valid=True, best_rms=SIGMA * (1 + (7 * n) % 12), fit_estimation=99.0 - n,
+                fit_validation=98.0 - n, evaluations=20_000, generations=400, seconds=0.2,
+            )
+            for n, run in enumerate(runs)
+        ]  # fmt: skip
+        RunLedger(session, claim.lease).record(outcomes, [p for r in runs for p in _history(r.id)])
+        Queue(session).report(claim.lease, Progress(240_000, 400, SIGMA))
+        Queue(session).finish(claim.lease, State.SUCCEEDED)
