@@ -7,65 +7,27 @@ read here and nowhere else in this package.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 
+from sysid.conclusion import conclude
 from sysid.ga.island import Island, evolve
 from sysid.ga.state import Plan
 from sysid.islands.archipelago import found, of_island, plans
 from sysid.islands.migration import migrate
+from sysid.islands.run_state import RunState
 from sysid.problem import Problem
-from sysid.result import Improvement, Migrant
 from sysid.settings import GeneticAlgorithm
+
+__all__ = [
+    "RunState", "advance", "advance_island", "begin", "border", "conclude", "exchange",
+    "is_finished", "is_resting",
+]  # fmt: skip
 
 CALL_SECONDS = 0.1
 """Aimed at for one compiled call, by measured cost, so that a cancel is heard in time."""
 
 _TARGET_ROUND = 5  # generations between two looks at the target RMS
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RunState:
-    """A run between two compiled calls.
-
-    Attributes
-    ----------
-    seed : int
-    islands : tuple of Island
-        Some may be ahead of `generation`, up to the next border.
-    generation : int
-        The last border that all islands have passed.
-    epoch : int
-        Exchanges of migrants done.
-    migrations : tuple of Migrant
-    seconds : float
-        Time computed so far.
-    ended : bool
-        Whether an end condition held at the last border.
-    """
-
-    seed: int
-    islands: tuple[Island, ...]
-    generation: int = 0
-    epoch: int = 0
-    migrations: tuple[Migrant, ...] = ()
-    seconds: float = 0.0
-    ended: bool = False
-
-    @property
-    def evaluations(self) -> int:
-        """Simulations run by all islands."""
-        return sum(island.evaluations for island in self.islands)
-
-    @property
-    def rms(self) -> float:
-        """Fitness of the best champion."""
-        return min(island.champion_rms for island in self.islands)
-
-    @property
-    def history(self) -> tuple[tuple[Improvement, ...], ...]:
-        """Improvements of each island."""
-        return tuple(island.history for island in self.islands)
 
 
 def begin(
@@ -93,10 +55,10 @@ def is_resting(plan: Plan, island: Island) -> bool:
 
 
 def advance_island(
-    problem: Problem, algorithm: GeneticAlgorithm, island: Island, generations: int, seed: int
+    problem: Problem, algorithm: GeneticAlgorithm, island: Island, generations: int
 ) -> Island:
     """The island after some generations, fewer where it comes to rest."""
-    plan = plans(problem, algorithm, seed)[island.index]
+    plan = plans(problem, algorithm, island.seed)[island.index]
     return evolve(problem.evaluator, plan, island, generations)
 
 

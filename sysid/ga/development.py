@@ -64,7 +64,7 @@ def _fresh(
         value = partial_fitness(evaluator, plan, predicted[p], horizon)
         if value < least:
             best, least = p, value
-    return places[best]
+    return np.asarray(places[best])
 
 
 @compiled
@@ -170,7 +170,7 @@ def adaptive_sequence(
     if reached[best] < base:
         for d in range(point.size):
             point[d] = places[best, d]
-        memory[DAMPING] *= FACTOR ** (min(best, TRIALS) - 2)
+        memory[DAMPING] *= FACTOR ** float(min(int(best), TRIALS) - 2)
         if horizon == 1.0:
             _keep(words, fitness, memory, proposals[best], reached[best])
         if reached[best] > base * (1.0 - enough) or counters[STEP] >= MOST_STEPS:

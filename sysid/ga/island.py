@@ -29,6 +29,8 @@ class Island:
     ----------
     index : int
         Its number in the archipelago.
+    seed : int
+        The run's seed: with the index, what its random numbers derive from.
     words : WordArray, shape (P, D)
         Chromosomes, fittest first.
     fitness : FloatArray, shape (P,)
@@ -42,6 +44,7 @@ class Island:
     """
 
     index: int
+    seed: int
     words: WordArray
     fitness: FloatArray
     counters: IntArray
@@ -74,7 +77,8 @@ def evolve(evaluator: Evaluator, plan: Plan, island: Island, count: int) -> Isla
     rows = np.empty((count + 1, VALUES + words.shape[1]))
     written = generations(evaluator, plan, count, words, fitness, counters, memory, rows)
     better = tuple(_improvement(row) for row in rows[:written].tolist())
-    return Island(island.index, words, fitness, counters, memory, island.history + better)
+    history = island.history + better
+    return Island(island.index, island.seed, words, fitness, counters, memory, history)
 
 
 def _improvement(row: list[float]) -> Improvement:

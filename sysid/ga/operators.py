@@ -73,7 +73,7 @@ def stepped(place: float, size: int, sign: int, bits: int) -> float:
     A flipped bit also changes a parameter by a power of two, but of the code, so that some
     neighbours are far apart (Hamming cliffs); a step on the axis has none.
     """
-    step = 2.0 ** (-unit(size) * bits)
+    step = float(2.0 ** (-unit(size) * bits))
     return reflected(place + (step if sign & 1 else -step))
 
 

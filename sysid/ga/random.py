@@ -5,14 +5,14 @@ SC 2011). Its key is the run's seed, its counter (use, island, generation, draw)
 is cut anywhere, or runs on another machine, draws the same numbers, and no two uses share any.
 """
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from sysid.kernels.caching import compiled
 
-Draws: TypeAlias = tuple[int, int, int, int]
-"""Four independent words of 32 bits."""
+Draws: TypeAlias = tuple[Any, Any, Any, Any]
+"""Four independent words of 32 bits, as whole numbers."""
 
 # Uses of random numbers: the first word of the counter.
 INITIAL, STRATA, CHILDREN, DEVELOPMENT, RESTART, WARM = 1, 2, 3, 4, 5, 6

@@ -12,7 +12,7 @@ from sysid.ga.island import Island
 from sysid.ga.random import WARM, draws, unit
 from sysid.ga.state import IMPROVED, IMPROVED_PAPER_STEPS, N_COUNTERS, PAPER, POINT, SIMPLE, Plan
 from sysid.problem import Problem
-from sysid.settings import GeneticAlgorithm
+from sysid.settings import GeneticAlgorithm, Loss
 from sysid.types import FloatArray
 
 _UNLIMITED = 2**62
@@ -75,13 +75,19 @@ def plans(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> tuple[Pla
                 evaluations=share,
                 beta=float(own.sequence.beta),
                 rms=_NEVER if own.stop.rms is None else float(own.stop.rms),
-                loss_scale=float(problem.loss.scale) if problem.loss.kind == "soft-l1" else 0.0,
+                loss_scale=loss_scale(problem),
                 starts=np.array([start for start, _ in own.mutation], dtype=np.int64),
                 rates=np.array([rate for _, rate in own.mutation], dtype=np.float64),
                 progress=progress,
             )
         )
     return tuple(made)
+
+
+def loss_scale(problem: Problem) -> float:
+    """Scale of the soft-l1 loss, 0 for squares: what compiled code is told."""
+    loss = next(a for a in problem.arguments if isinstance(a, Loss))
+    return float(loss.scale) if loss.kind == "soft-l1" else 0.0
 
 
 def _method(algorithm: GeneticAlgorithm) -> int:
@@ -99,7 +105,7 @@ def record_progress(problem: Problem) -> FloatArray:
     numbers = np.arange(problem.evaluator.n_measured, dtype=np.float64)
     progress = np.empty(numbers.size)
     for experiment in problem.split(numbers):
-        for places in experiment:
+        for places in experiment.values():
             progress[places.astype(np.int64)] = np.arange(1, places.size + 1) / places.size
     return progress
 
@@ -128,6 +134,7 @@ def found(
         islands.append(
             Island(
                 plan.island,
+                seed,
                 coded(places, plan.bits),
                 np.full(size, np.nan),
                 np.zeros(N_COUNTERS, dtype=np.int64),

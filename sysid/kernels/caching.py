@@ -33,11 +33,12 @@ def fingerprint() -> str:
     return digest.hexdigest()
 
 
-class _SourcesCache(FunctionCache):  # type: ignore[misc]
+class _SourcesCache(FunctionCache):
     """Numba's cache of one function, its key widened by the digest of the sources."""
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
-        return (*super()._index_key(sig, codegen), fingerprint())
+        key: tuple[Any, ...] = super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
+        return (*key, fingerprint())
 
 
 def compiled(function: _Function) -> _Function:
@@ -46,5 +47,5 @@ def compiled(function: _Function) -> _Function:
     No `fastmath`: ``isfinite`` must work, and a run must give the same bits on every worker.
     """
     made: Any = numba.njit(nogil=True, error_model="numpy")(function)
-    made._cache = _SourcesCache(function)
+    made._cache = _SourcesCache(function)  # type: ignore[no-untyped-call]
     return cast(_Function, made)

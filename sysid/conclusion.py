@@ -1,0 +1,151 @@
+"""From the end of a search to its result: refinement, uncertainty, validation, warnings."""
+
+import numpy as np
+
+from sysid.errors import DivergedEverywhere
+from sysid.islands.archipelago import of_island
+from sysid.islands.run_state import RunState
+from sysid.problem import Problem, metrics_of
+from sysid.refinement import Refined, refine
+from sysid.result import Estimate, Identification, Improvement, IslandSummary
+from sysid.settings import GeneticAlgorithm
+from sysid.types import FloatArray
+from sysid.uncertainty import Analysis, analyse
+from sysid.warnings import warnings_of
+
+_NONE: tuple[float | None, float | None, tuple[tuple[FloatArray, ...], ...]] = (None, None, ())
+
+
+def conclude(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    validation: Problem | None = None,
+) -> Identification:
+    """The identification that a run has led to.
+
+    With ``refine`` the champions of an ``improved`` search are polished by least squares. Those
+    of the paper's two methods are reported as found, so that a comparison is one of the methods.
+
+    Raises
+    ------
+    DivergedEverywhere
+        If no candidate of the search gave a finite simulation.
+    """
+    if not np.isfinite(state.rms):
+        raise DivergedEverywhere(state.evaluations)
+    champions = [_champion(problem, island.history) for island in state.islands]
+    refined = _polished(problem, algorithm, state, champions)
+    ends = [
+        (champion, island.champion_rms) if end is None else (end.theta, end.rms)
+        for champion, island, end in zip(champions, state.islands, refined, strict=True)
+    ]
+    best = min(range(len(ends)), key=lambda i: ends[i][1])
+    theta = ends[best][0]
+    analysis = analyse(problem, theta)
+    simulated = problem.predictions(theta[None])[0]
+    metrics = metrics_of(problem, simulated)
+    rms_validation, fit_validation, simulated_validation = (
+        _NONE if validation is None else _validated(validation, analysis.estimates)
+    )
+    limit = algorithm.safe_limit
+    return Identification(
+        estimates=analysis.estimates,
+        rms=metrics.rms,
+        fit_percent=metrics.fit_percent,
+        rms_validation=rms_validation,
+        fit_percent_validation=fit_validation,
+        valid=limit is None or metrics.rms <= limit,
+        evaluations=_evaluations(state, refined, analysis),
+        generations=max(island.generation for island in state.islands),
+        islands=_summaries(state, refined, ends),
+        history=_histories(state, refined),
+        migrations=state.migrations,
+        uncertainty=analysis.uncertainty,
+        simulated=_split(problem, simulated),
+        simulated_validation=simulated_validation,
+        warnings=warnings_of(problem, algorithm, analysis, simulated, metrics.rms),
+    )
+
+
+def _champion(problem: Problem, history: tuple[Improvement, ...]) -> FloatArray:
+    if history:
+        return np.array(history[-1].parameters)
+    return 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
+
+
+def _polished(
+    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, champions: list[FloatArray]
+) -> tuple[Refined | None, ...]:
+    methods = {of_island(algorithm, i).method for i in range(len(champions))}
+    if not algorithm.refine or "improved" not in methods:
+        return (None,) * len(champions)
+    limit = algorithm.stop.evaluations
+    left = None if limit is None else max(0, limit - state.evaluations - 2 * len(champions[0]) - 1)
+    return refine(problem, champions, left)
+
+
+def _evaluations(state: RunState, refined: tuple[Refined | None, ...], analysis: Analysis) -> int:
+    polishing = sum(end.evaluations for end in refined if end is not None)
+    return state.evaluations + polishing + analysis.evaluations
+
+
+def _summaries(
+    state: RunState, refined: tuple[Refined | None, ...], ends: list[tuple[FloatArray, float]]
+) -> tuple[IslandSummary, ...]:
+    return tuple(
+        IslandSummary(
+            champion_rms=island.champion_rms,
+            refined_rms=None if end is None else end.rms,
+            parameters=tuple(theta.tolist()),
+            evaluations=island.evaluations + (0 if end is None else end.evaluations),
+        )
+        for island, end, (theta, _) in zip(state.islands, refined, ends, strict=True)
+    )
+
+
+def _histories(
+    state: RunState, refined: tuple[Refined | None, ...]
+) -> tuple[tuple[Improvement, ...], ...]:
+    """The islands' histories, with what the refinement gained."""
+    histories = []
+    for island, end in zip(state.islands, refined, strict=True):
+        history = island.history
+        if end is not None and end.rms < island.champion_rms:
+            spent = island.evaluations + end.evaluations
+            values = tuple(end.theta.tolist())
+            gain = Improvement(island.generation, spent, end.rms, "refinement", values)
+            history = (*history, gain)
+        histories.append(history)
+    return tuple(histories)
+
+
+def _split(problem: Problem, values: FloatArray) -> tuple[tuple[FloatArray, ...], ...]:
+    names = [output.name for output in problem.model.outputs]
+    return tuple(tuple(part[name] for name in names) for part in problem.split(values))
+
+
+def _validated(
+    validation: Problem, estimates: tuple[Estimate, ...]
+) -> tuple[float, float, tuple[tuple[FloatArray, ...], ...]]:
+    """RMS, fit and simulation on data that were not used.
+
+    The model's parameters are those of the estimate. An initial state belongs to its record, so
+    those of the validation records are found on them, alone.
+    """
+    model, records, changes, prediction, loss, weights, skip = validation.arguments
+    own = {p.name for p in model.parameters}
+    fixed = {e.name: {"fixed": e.value} for e in estimates if e.name in own}
+    kept = {name: fields for name, fields in changes.items() if name not in own}
+    known = Problem.build(
+        model, records, parameters={**kept, **fixed}, prediction=prediction, loss=loss,
+        weights=weights, skip=skip,
+    )  # fmt: skip
+    theta = np.zeros(0)
+    if known.space:
+        middle = 0.5 * (known.evaluator.lower + known.evaluator.upper)
+        start = refine(known, [middle])[0]
+        theta = middle if start is None else start.theta
+    simulated = known.predictions(theta[None])[0]
+    metrics = metrics_of(known, simulated)
+    return metrics.rms, metrics.fit_percent, _split(known, simulated)

@@ -1,0 +1,83 @@
+"""The library call: from a model and records to an identification, in this process."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from sysid.models.model import Model
+from sysid.noise import Noise, with_noise
+from sysid.problem import Problem
+from sysid.records import Record
+from sysid.result import Identification
+from sysid.run import RunState, advance, begin, conclude, is_finished
+from sysid.settings import GeneticAlgorithm, Loss, Prediction
+
+_PROGRESS_SECONDS = 0.25
+
+
+def identify(
+    model: Model,
+    records: Record | Sequence[Record],
+    settings: GeneticAlgorithm | None = None,
+    *,
+    seed: int = 1,
+    parameters: Mapping[str, Mapping[str, Any]] | None = None,
+    prediction: Prediction = "simulation",
+    loss: Loss | None = None,
+    weights: Mapping[str, float] | None = None,
+    skip: int = 0,
+    validation: Record | Sequence[Record] | None = None,
+    noise: Noise | None = None,
+    warm: Mapping[str, float] | None = None,
+    progress: Callable[[RunState], None] | None = None,
+) -> Identification:
+    """Find the free parameters of a model, its unknown lags among them.
+
+    Parameters
+    ----------
+    records : Record or sequence of Record
+        Experiments that are fitted jointly.
+    settings : GeneticAlgorithm
+        The improved algorithm with its defaults if not given.
+    seed : int
+        The same seed gives the same result, bit for bit.
+    parameters, prediction, loss, weights, skip
+        See `Problem.build`.
+    validation : Record or sequence of Record
+        Data that are not used for the estimate.
+    noise : Noise
+        Added to the outputs of `records` before fitting.
+    warm : mapping of str to float
+        Values that a part of the population begins with.
+    progress : callable
+        Told the run's state several times a second.
+
+    Raises
+    ------
+    DivergedEverywhere
+        If no candidate gave a finite simulation.
+    InvalidRecord, RecordTooShort, InvalidSettings, InvalidBounds
+        If an argument cannot be used.
+    """
+    algorithm = settings or GeneticAlgorithm()
+
+    def problem(given: Sequence[Record]) -> Problem:
+        return Problem.build(
+            model, given, parameters=parameters, prediction=prediction, loss=loss,
+            weights=weights, skip=skip,
+        )  # fmt: skip
+
+    estimation = _several(records)
+    if noise is not None:
+        estimation = tuple(with_noise(record, noise, e) for e, record in enumerate(estimation))
+    posed = problem(estimation)
+    kept = None if validation is None else problem(_several(validation))
+    state = begin(posed, algorithm, seed, warm)
+    while not is_finished(algorithm, state):
+        state = advance(posed, algorithm, state, _PROGRESS_SECONDS)
+        if progress is not None:
+            progress(state)
+    return conclude(posed, algorithm, state, kept)
+
+
+def _several(records: Record | Sequence[Record]) -> tuple[Record, ...]:
+    return (records,) if isinstance(records, Record) else tuple(records)

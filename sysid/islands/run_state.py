@@ -1,0 +1,50 @@
+"""The state of a run: a value that can be pickled between any two compiled calls."""
+
+from dataclasses import dataclass
+
+from sysid.ga.island import Island
+from sysid.result import Improvement, Migrant
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunState:
+    """A run between two compiled calls.
+
+    Attributes
+    ----------
+    seed : int
+    islands : tuple of Island
+        Some may be ahead of `generation`, up to the next border.
+    generation : int
+        The last border that all islands have passed.
+    epoch : int
+        Exchanges of migrants done.
+    migrations : tuple of Migrant
+    seconds : float
+        Time computed so far.
+    ended : bool
+        Whether an end condition held at the last border.
+    """
+
+    seed: int
+    islands: tuple[Island, ...]
+    generation: int = 0
+    epoch: int = 0
+    migrations: tuple[Migrant, ...] = ()
+    seconds: float = 0.0
+    ended: bool = False
+
+    @property
+    def evaluations(self) -> int:
+        """Simulations run by all islands."""
+        return sum(island.evaluations for island in self.islands)
+
+    @property
+    def rms(self) -> float:
+        """Fitness of the best champion."""
+        return min(island.champion_rms for island in self.islands)
+
+    @property
+    def history(self) -> tuple[tuple[Improvement, ...], ...]:
+        """Improvements of each island."""
+        return tuple(island.history for island in self.islands)
