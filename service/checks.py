@@ -17,8 +17,9 @@ from service.storage.lookups import dataset_names, datasets_named
 from service.storage.tables import Dataset
 from sysid.errors import RecordTooShort, SysidError, nearest
 from sysid.language.intervals import bounds
-from sysid.language.tree import Binary, Call, Expression, Past, Unary
-from sysid.models.model import Model
+from sysid.language.lags import past_values
+from sysid.models.lags import check_lags
+from sysid.models.model import EstimatedInitial, Model
 from sysid.parameters import Parameter, override
 
 Body = dict[str, Any]
@@ -43,8 +44,12 @@ class JobChecker:
         model = self.model(body["model"])
         if isinstance(model, list):
             return found + model + list(self._missing_datasets(body))
-        parameters = _tried(override, found, model[0].parameters, body["parameters"])
-        found += self._data(body, model[0], parameters or model[0].parameters)
+        parameters = _tried(
+            override, found, self._all_parameters(body, model[0]), body["parameters"]
+        )
+        own = (parameters or model[0].parameters)[: len(model[0].parameters)]
+        _tried(check_lags, found, model[0], own)
+        found += self._data(body, model[0], own)
         return found + list(_signal_faults(body, model[0]))
 
     def resolved(self, body: Body) -> Body:
@@ -97,6 +102,20 @@ class JobChecker:
             hint = "; a path of a file is not read here, add the file first: `lagid dataset add`"
         return f"there is no dataset {reference!r}{hint}"
 
+    def _all_parameters(self, body: Body, model: Model) -> tuple[Parameter, ...]:
+        """The model's parameters, and the initial states to be estimated in each experiment."""
+        if not any(isinstance(start, EstimatedInitial) for start in model.initial):
+            return model.parameters
+        # Only such models pay for this import, which brings all of SciPy's signal processing.
+        from sysid.experiments import initial_parameters
+
+        found = [self.dataset(reference) for reference in body["datasets"]]
+        pieces = sum(
+            max(1, len(one.details.get("segments") or ())) for one in found
+            if isinstance(one, Dataset)
+        )  # fmt: skip
+        return (*model.parameters, *initial_parameters(model, pieces))
+
     def _conversions(self, body: Body) -> Iterator[FieldError]:
         found: list[FieldError] = []
         _tried(algorithm_of, found, body["algorithm"])
@@ -147,7 +166,7 @@ def longest_delay(
                for p in parameters}  # fmt: skip
     longest = (0.0, "")
     trees = (*model.equations, *(output.expression for output in model.outputs))
-    for past in (one for tree in trees for one in _pasts(tree)):
+    for past in (one for tree in trees for one in past_values(tree)):
         back = float(past.offset)
         if past.lag is not None:
             back += bounds(past.lag, between, period)[1]
@@ -155,20 +174,6 @@ def longest_delay(
             back *= period or 0.0
         longest = max(longest, (back, past.name))
     return longest
-
-
-def _pasts(tree: Expression) -> Iterator[Past]:
-    match tree:
-        case Past():
-            yield tree
-        case Unary(_, operand):
-            yield from _pasts(operand)
-        case Binary(_, left, right):
-            yield from _pasts(left)
-            yield from _pasts(right)
-        case Call(_, arguments):
-            for one in arguments:
-                yield from _pasts(one)
 
 
 def _references(body: Body) -> Iterator[tuple[str, str]]:

@@ -90,15 +90,16 @@ class Client:
         document: Document = self.send(call).json()
         return document
 
-    def _all(self, *parts: str, **filters: Any) -> list[Document]:
+    def _all(self, *parts: str, at_most: int | None = None, **filters: Any) -> list[Document]:
         items: list[Document] = []
         cursor: str | None = None
+        limit = min(at_most or PAGE, PAGE)
         while True:
-            page = self._json(calls.read(*parts, cursor=cursor, limit=PAGE, **filters))
+            page = self._json(calls.read(*parts, cursor=cursor, limit=limit, **filters))
             items += page["items"]
             cursor = page["next"]
-            if cursor is None:
-                return items
+            if cursor is None or (at_most is not None and len(items) >= at_most):
+                return items[:at_most]
 
     # ---- datasets
     def add_dataset(
@@ -163,9 +164,9 @@ class Client:
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
         return self._json(calls.create("jobs", job, headers))
 
-    def jobs(self) -> list[Document]:
-        """All jobs, newest first."""
-        return self._all("jobs")
+    def jobs(self, limit: int | None = None) -> list[Document]:
+        """Jobs, newest first: all, or at most `limit`."""
+        return self._all("jobs", at_most=limit)
 
     def job(self, name: str) -> Document:
         """One job with its state and progress."""

@@ -9,14 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 from sqlalchemy.orm import Session
-from sysid.derivations import derive as derived
 
 from service.errors import TooLarge
 from service.recordings import recording_of
 from service.schemas import Page
 from service.schemas_datasets import ChannelOut, DatasetOut, DeriveIn, Series, SignalsOut
 from service.settings import Settings
-from service.signals.decimation import decimate
+from service.signals.decimate import decimate
 from service.signals.upload import read_untrusted
 from service.signals.writer import write_recording
 from service.storage.datasets import DatasetRepository, NewDataset, Stored
@@ -77,6 +76,8 @@ def derive(database: Database, store: ObjectStore, parent_id: str, body: DeriveI
         known = DatasetRepository(session).by_source(_derivation_key(parent, body))
     if known is not None:
         return Stored(known, is_new=False)
+    from sysid.derivations import derive as derived  # brings SciPy's signal processing
+
     recording = derived(recording_of(store, parent.sha256), body.steps)
     steps = ", ".join(next(iter(step), "?") for step in body.steps)
     return add_recording(

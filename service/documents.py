@@ -1,61 +1,16 @@
-"""Reading JSON and YAML that users write: data only, without aliases that grow without bound."""
+"""Reading JSON and YAML that users write: data only, with the place of what cannot be read."""
 
 import json
-import re
 from typing import Any
 
-import yaml
-
-from service.errors import InvalidRequest, TooLarge
+from service.errors import FieldError, InvalidRequest, TooLarge
+from sysid.errors import InvalidModel
+from sysid.models import documents
 
 MAX_DOCUMENT_BYTES = 4 * 1024**2
 
-# YAML 1.1 takes `1e-3` for a text; whoever writes a bound means a number.
-_FLOAT = re.compile(
-    r"^[-+]?(?:[0-9][0-9_]*\.?[0-9_]*(?:[eE][-+]?[0-9]+)?|\.[0-9_]+(?:[eE][-+]?[0-9]+)?"
-    r"|\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-)
 
-
-class _Loader(yaml.SafeLoader):
-    """Plain YAML without aliases, without repeated keys, and with ``y`` and ``no`` as texts."""
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
-            raise yaml.MarkedYAMLError(problem="aliases are not read", problem_mark=mark)
-        node: yaml.Node | None = super().compose_node(parent, index)
-        if isinstance(node, yaml.MappingNode):
-            _refuse_repeated_keys(node)
-        return node
-
-
-def _refuse_repeated_keys(node: yaml.MappingNode) -> None:
-    seen: set[str] = set()
-    for key, _ in node.value:
-        if key.value in seen:
-            problem = f"the key {key.value!r} is there twice"
-            raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
-        seen.add(key.value)
-
-
-def _resolvers() -> dict[str, list[tuple[str, re.Pattern[str]]]]:
-    kept = {
-        first: [(tag, rule) for tag, rule in rules if not tag.endswith((":bool", ":float"))]
-        for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
-    for first in "-+0123456789.":
-        kept.setdefault(first, []).append(("tag:yaml.org,2002:float", _FLOAT))
-    for first in "tTfF":  # `y`, `n`, `on`: names of signals, not truth values
-        rule = re.compile("^(?:true|True|TRUE|false|False|FALSE)$")
-        kept.setdefault(first, []).append(("tag:yaml.org,2002:bool", rule))
-    return kept
-
-
-_Loader.yaml_implicit_resolvers = _resolvers()
-
-
-def read_yaml(text: str | bytes) -> Any:
+def read_yaml(text: bytes) -> Any:
     """What a YAML text says; JSON is YAML too.
 
     Raises
@@ -65,16 +20,13 @@ def read_yaml(text: str | bytes) -> Any:
     TooLarge
         If it is longer than 4 MiB.
     """
-    if len(text) > MAX_DOCUMENT_BYTES:
-        raise TooLarge(f"the document has {len(text)} bytes; at most {MAX_DOCUMENT_BYTES}")
+    _check_size(text)
     try:
-        return yaml.load(text, _Loader)  # a SafeLoader
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark
-        place = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        raise InvalidRequest.at("", f"not YAML: {place}{error.problem or error}") from None
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise InvalidRequest.at("", f"not YAML: {str(error).splitlines()[0]}") from None
+        return documents.read_yaml(text.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise InvalidRequest.at("", f"not UTF-8 text: byte {error.start} does not fit") from None
+    except InvalidModel as error:
+        raise InvalidRequest(FieldError(one.pointer, one.detail) for one in error.faults) from None
 
 
 def read_json(text: bytes) -> Any:
@@ -87,15 +39,19 @@ def read_json(text: bytes) -> Any:
     TooLarge
         If it is longer than 4 MiB.
     """
-    if len(text) > MAX_DOCUMENT_BYTES:
-        raise TooLarge(f"the document has {len(text)} bytes; at most {MAX_DOCUMENT_BYTES}")
+    _check_size(text)
     try:
         return json.loads(text, parse_constant=_refuse_constant)
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
-        raise InvalidRequest.at("", f"not JSON: {place}: {error.msg}") from None
+        raise InvalidRequest.at("", f"the body is not JSON: {place}: {error.msg}") from None
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise InvalidRequest.at("", f"not JSON: {error}") from None
+        raise InvalidRequest.at("", f"the body is not JSON: {error}") from None
+
+
+def _check_size(text: bytes) -> None:
+    if len(text) > MAX_DOCUMENT_BYTES:
+        raise TooLarge(f"the document has {len(text)} bytes; at most {MAX_DOCUMENT_BYTES}")
 
 
 def _refuse_constant(name: str) -> None:

@@ -21,8 +21,13 @@ from sysid.models.spec import parse_model
 def page(session: Session, cursor: str | None, limit: int) -> Page[ModelOut]:
     """Built-in models on the first page, then every version of own ones, latest first."""
     own = ModelRepository(session).page(cursor=cursor, limit=limit)
-    built_in = [] if cursor else [_built_in(name) for name in library.catalogue()]
+    built_in = [] if cursor else catalogue()
     return Page(items=built_in + [_stored(row) for row in own.items], next=own.next)
+
+
+def catalogue() -> list[ModelOut]:
+    """The built-in models."""
+    return [_built_in(name) for name in library.catalogue()]
 
 
 def one(session: Session, reference: str) -> ModelOut:

@@ -1,12 +1,45 @@
-"""Where in a body a validation error lies, and which fields are known there."""
+"""What a validation error says to a user: where in the body, what was found, what is known."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from inspect import get_annotations
 from typing import Any, get_args
 
 from pydantic import BaseModel
 
+from service.errors import FieldError
+from sysid.errors import nearest
+
 Location = Sequence[str | int]
+SHOWN = 80
+
+
+def explained(entries: Iterable[Mapping[str, Any]], body: Any, kind: Any) -> Iterator[FieldError]:
+    """Pydantic's errors of a body as faults with JSON pointers.
+
+    Parameters
+    ----------
+    entries : iterable of mapping
+        As `pydantic.ValidationError.errors` gives them.
+    kind : type
+        The body's wire type, for the names of known fields.
+    """
+    seen: set[str] = set()
+    for entry in entries:
+        pointer = pointer_into(body, entry["loc"])
+        # A union gives one entry per member; the first is about the member most often meant.
+        if pointer not in seen:
+            seen.add(pointer)
+            yield FieldError(pointer, detail_of(entry, known_fields(kind, entry["loc"][:-1])))
+
+
+def detail_of(entry: Mapping[str, Any], known: Sequence[str]) -> str:
+    """What was wrong, what was found."""
+    if entry["type"] == "extra_forbidden":
+        return f"unknown field {entry['loc'][-1]!r}{nearest(str(entry['loc'][-1]), known)}"
+    if entry["type"] == "missing":
+        return "this field is required"
+    found = repr(entry.get("input"))
+    return f"{entry['msg']}; found {found if len(found) <= SHOWN else found[:SHOWN] + '…'}"
 
 
 def pointer_into(body: Any, loc: Location) -> str:
@@ -22,10 +55,14 @@ def pointer_into(body: Any, loc: Location) -> str:
     return "".join(f"/{part}" for part in parts)
 
 
-def known_fields(endpoint: Callable[..., Any] | None, loc: Location) -> list[str]:
-    """Fields that the body of an endpoint may have at a location."""
-    annotation = get_annotations(endpoint, eval_str=True).get("body") if endpoint else None
-    types = list(_models(annotation))
+def body_type(endpoint: Callable[..., Any] | None) -> Any:
+    """Wire type of an endpoint's body."""
+    return get_annotations(endpoint, eval_str=True).get("body") if endpoint else None
+
+
+def known_fields(kind: Any, loc: Location) -> list[str]:
+    """Fields that a wire type knows at a location."""
+    types = list(_models(kind))
     for part in loc:
         fields = [t.model_fields[part] for t in types if part in t.model_fields]
         # A list index, a key of a mapping or a union's own name leaves the types as they are.

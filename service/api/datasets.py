@@ -100,7 +100,8 @@ def ancestry(dataset_id: str, session: ReadSession) -> LineageOut:
     return lineage.of_dataset(session, dataset_id)
 
 
-@router.api_route("/datasets/{dataset_id}/content", methods=["GET", "HEAD"])
+@router.head("/datasets/{dataset_id}/content", include_in_schema=False)
+@router.get("/datasets/{dataset_id}/content")
 def content(dataset_id: str, request: Request, session: ReadSession, parts: PartsDep) -> Response:
     """The recording as MCAP; ranges and ETags are honoured."""
     row = DatasetRepository(session).get(dataset_id)

@@ -19,9 +19,9 @@ from service.errors import (
     ServiceError,
     Unavailable,
 )
-from service.pointers import known_fields, pointer_into
+from service.pointers import body_type, detail_of, explained
 from service.storage.errors import StorageError
-from sysid.errors import SysidError, nearest
+from sysid.errors import SysidError
 
 log = logging.getLogger(__name__)
 
@@ -114,27 +114,13 @@ def _unexpected(request: Request, error: Exception) -> Response:
 
 
 def _field_errors(request: Request, error: RequestValidationError) -> Iterator[FieldError]:
-    seen: set[str] = set()
+    entries = []
     for entry in error.errors():
         place, loc = entry["loc"][0], entry["loc"][1:]
         if entry["type"] == "json_invalid":
             yield FieldError("", f"the body is not JSON: {entry['ctx']['error']} at {loc[0]}")
-            continue
-        if place == "body":
-            pointer = pointer_into(error.body, loc)
-            known = known_fields(request.scope.get("endpoint"), loc[:-1])
+        elif place == "body":
+            entries.append({**entry, "loc": loc})
         else:
-            pointer, known = f"?{loc[-1] if loc else ''}", []
-        # A union gives one entry per member; the first is about the member most often meant.
-        if pointer not in seen:
-            seen.add(pointer)
-            yield FieldError(pointer, _detail(entry, known))
-
-
-def _detail(entry: Mapping[str, Any], known: Sequence[str]) -> str:
-    if entry["type"] == "extra_forbidden":
-        return f"unknown field {entry['loc'][-1]!r}{nearest(str(entry['loc'][-1]), known)}"
-    if entry["type"] == "missing":
-        return "this field is required"
-    found = repr(entry.get("input"))
-    return f"{entry['msg']}; found {found if len(found) <= 80 else found[:77] + '…'}"
+            yield FieldError(f"?{loc[-1] if loc else ''}", detail_of(entry, ()))
+    yield from explained(entries, error.body, body_type(request.scope.get("endpoint")))

@@ -38,7 +38,8 @@ def response(
     return responses.response(session, parts.store, run_id, max_points)
 
 
-@router.api_route("/{run_id}/signals.mcap", methods=["GET", "HEAD"])
+@router.head("/{run_id}/signals.mcap", include_in_schema=False)
+@router.get("/{run_id}/signals.mcap")
 def signals(run_id: str, request: Request, session: ReadSession, parts: PartsDep) -> Response:
     """Measured and simulated outputs and residuals as MCAP; ranges and ETags are honoured."""
     run = RunRepository(session).get(run_id)

@@ -1,0 +1,97 @@
+"""What the commands share: options, consoles, tables, and errors as one line."""
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from service.client import DEFAULT_URL, Client
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+Url = Annotated[str, typer.Option("--url", envvar="LAGID_URL", help="Address of the server.")]
+Key = Annotated[
+    str | None, typer.Option("--key", envvar="LAGID_KEY", help="API key.", show_default=False)
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for machines.")]
+
+__all__ = ["DEFAULT_URL", "AsJson", "Key", "Url", "connected", "fail", "out", "print_json"]
+
+
+@contextmanager
+def connected(url: str, key: str | None = None) -> Iterator[Client]:
+    """A client for the length of a command."""
+    with Client(url, key) as client:
+        yield client
+
+
+def fail(message: str, code: int = 1) -> NoReturn:
+    """End the command with one readable line on stderr."""
+    err.print(f"lagid: {' '.join(message.split())}", markup=False)
+    raise typer.Exit(code)
+
+
+def usage(message: str) -> NoReturn:
+    """End the command because it was called wrongly."""
+    fail(message, 2)
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON, unstyled and unwrapped."""
+    out.print(json.dumps(value, indent=2, ensure_ascii=False), markup=False, soft_wrap=True)
+
+
+def print_table(
+    headings: Sequence[str], rows: Iterable[Sequence[object]], *, empty: str, title: str = ""
+) -> None:
+    """Print rows under headings; a heading that begins with ``>`` is set to the right."""
+    table = Table(title=title or None, box=None, pad_edge=False, title_justify="left")
+    for heading in headings:
+        table.add_column(
+            heading.removeprefix(">"), justify="right" if heading.startswith(">") else "left",
+            overflow="fold",
+        )  # fmt: skip
+    for row in rows:
+        table.add_row(*(shown(value) for value in row))
+    if table.row_count:
+        out.print(table)
+    else:
+        out.print(empty)
+
+
+def shown(value: object) -> str:
+    """A value in a cell: a dash for None, six digits for a number."""
+    if value is None:
+        return "–"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return str(value).replace("[", "\\[")
+
+
+def estimate(one: dict[str, Any]) -> str:
+    """``0.1193 ± 0.0004``, cut at the standard error's second digit."""
+    value, stderr = one["value"], one["stderr"]
+    if stderr is None or not stderr > 0:
+        return f"{value:.6g}"
+    digits = max(0, 1 - _exponent(stderr))
+    if _exponent(stderr) > 5 or digits > 9:
+        return f"{value:.6g} ± {stderr:.2g}"
+    return f"{value:.{digits}f} ± {stderr:.{digits}f}"
+
+
+def _exponent(number: float) -> int:
+    return int(f"{number:e}".partition("e")[2])
+
+
+def read_file(path: Path) -> bytes:
+    """Content of a file that the user names; ends the command if it cannot be read."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        fail(f"{path} cannot be read: {error.strerror}")

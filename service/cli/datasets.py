@@ -1,0 +1,118 @@
+"""`lagid datasets` and `lagid dataset …`."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.cli.common import (
+    DEFAULT_URL,
+    AsJson,
+    Key,
+    Url,
+    connected,
+    fail,
+    out,
+    print_json,
+    print_table,
+    read_file,
+)
+from service.documents import read_yaml
+
+app = typer.Typer(help="Add, simulate and derive recordings.", no_args_is_help=True)
+
+DOCUMENT = "YAML or JSON file with the body of the request."
+
+
+def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
+    """List the recordings of the server."""
+    with connected(url, key) as client:
+        found = client.datasets()
+    if as_json:
+        print_json(found)
+        return
+    print_table(
+        ("id", "name", "kind", ">samples", ">duration [s]", "channels"),
+        ((one["id"], one["name"], one["kind"], one["samples"], one["duration"], _channels(one))
+         for one in found),
+        empty="no datasets; add one: lagid dataset add recording.csv",
+    )  # fmt: skip
+
+
+@app.command()
+def add(
+    file: Annotated[Path, typer.Argument(help="CSV or MCAP file.")],
+    name: Annotated[str | None, typer.Option(help="Name; by default that of the file.")] = None,
+    segments: Annotated[
+        str | None, typer.Option(help="CSV columns of labels that part the rows: col,col.")
+    ] = None,
+    sample_time: Annotated[
+        float | None, typer.Option(help="Sampling period in s, for a CSV without times.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Store a recording."""
+    if not file.is_file():
+        fail(f"there is no file {file}")
+    with connected(url, key) as client:
+        stored = client.add_dataset(file, name, segments=segments, sample_time=sample_time)
+    _tell(stored, as_json)
+
+
+@app.command()
+def simulate(
+    file: Annotated[Path, typer.Argument(help=DOCUMENT)],
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a recording from a model, its true parameters, inputs and noise."""
+    body = _object(read_yaml(read_file(file)), file)
+    with connected(url, key) as client:
+        _tell(client.simulate_dataset(body), as_json)
+
+
+@app.command()
+def derive(
+    dataset: Annotated[str, typer.Argument(help="Id of the parent.")],
+    file: Annotated[Path, typer.Argument(help="YAML or JSON file with the list of steps.")],
+    name: Annotated[str | None, typer.Option(help="Name of the new dataset.")] = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a recording from another: noise, resample, trim, select, pool and so on."""
+    steps = read_yaml(read_file(file))
+    if isinstance(steps, dict):
+        steps = steps.get("steps")
+    if not isinstance(steps, list):
+        fail(f"{file} has no list of steps, such as - detrend: {{}}")
+    with connected(url, key) as client:
+        _tell(client.derive(dataset, steps, name), as_json)
+
+
+def _tell(stored: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        print_json(stored)
+        return
+    period = stored["sample_time"]
+    sampling = "irregular sampling" if period is None else f"sampling period {period:.6g} s"
+    out.print(f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, "
+              f"channels {_channels(stored)}", markup=False, soft_wrap=True)  # fmt: skip
+    for warning in stored["warnings"]:
+        out.print(f"note: {warning}", markup=False, soft_wrap=True)
+
+
+def _channels(dataset: dict[str, Any]) -> str:
+    return ", ".join(
+        one["name"] if one["unit"] == "1" else f"{one['name']} [{one['unit']}]"
+        for one in dataset["channels"]
+    )
+
+
+def _object(body: Any, file: Path) -> dict[str, Any]:
+    if not isinstance(body, dict):
+        fail(f"{file} does not hold an object (name: value)")
+    return body

@@ -1,0 +1,210 @@
+"""`lagid identify`: one identification in this process, without a server."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.common import err, estimate, fail, out, print_json, print_table, usage
+from service.documents import read_yaml
+
+if TYPE_CHECKING:
+    from service.schemas_jobs import JobIn
+    from sysid.models.model import Model
+    from sysid.records import Record, Recording
+    from sysid.result import Identification
+
+MODEL_SUFFIXES = (".yaml", ".yml", ".json")
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """How CSV files are read."""
+
+    sample_time: float | None
+    segments: tuple[str, ...]
+
+
+def identify(
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="Recording, CSV or MCAP.")],
+    model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="path=value of the job body, as algorithm.population=100."),
+    ] = None,
+    channels: Annotated[
+        str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")
+    ] = None,
+    validation: Annotated[
+        Path | None, typer.Option(help="Recording that is kept for validation.")
+    ] = None,
+    segments: Annotated[
+        str | None, typer.Option(help="CSV columns of labels that part the rows: col,col.")
+    ] = None,
+    sample_time: Annotated[
+        float | None, typer.Option(help="Sampling period in s, for a CSV without times.")
+    ] = None,
+    json_file: Annotated[
+        str | None, typer.Option("--json", metavar="FILE", help="Write the result; - for stdout.")
+    ] = None,
+) -> None:
+    """Identify a model's parameters and lags from a recording, in this process."""
+    body = job_body(data, model, changes or [], _pairs(channels))
+    loaded = _model(model)
+    reading = Reading(sample_time, _names(segments))
+    records = _records(data, reading, loaded, body)
+    kept = [] if validation is None else _records(validation, reading, loaded, body)
+    if body.validation is not None and body.validation.fraction is not None:
+        records, kept = _split(records, body.validation.fraction)
+    begun = time.perf_counter()
+    found = _identified(loaded, records, kept, body, quiet=json_file == "-")
+    tell(loaded, found, time.perf_counter() - begun, json_file)
+
+
+def job_body(data: Path, model: str, changes: list[str], channels: dict[str, str]) -> "JobIn":
+    """The job body that the options stand for; its checks are those of the service."""
+    from pydantic import ValidationError
+
+    from service.pointers import explained
+    from service.schemas_jobs import JobIn
+
+    body: dict[str, Any] = {"model": model, "datasets": [str(data)], "channels": channels}
+    for change in changes:
+        path, equals, value = change.partition("=")
+        if not equals:
+            usage(f"--set {change}: need path=value, as algorithm.population=100")
+        parts = [part for part in path.replace("/", ".").split(".") if part]
+        here = body
+        for part in parts[:-1]:
+            here = here.setdefault(part, {})
+            if not isinstance(here, dict):
+                usage(f"--set {change}: {part} has no fields")
+        here[parts[-1] if parts else ""] = read_yaml(value.encode())
+    try:
+        return JobIn.model_validate(body)
+    except ValidationError as error:
+        faults = explained(error.errors(), body, JobIn)
+        usage("; ".join(f"{one.pointer}: {one.detail}" for one in faults))
+
+
+def read(path: Path, reading: Reading) -> "Recording":
+    """A recording from a file; notes about it go to stderr."""
+    from service.signals.csv_reader import read_csv
+    from service.signals.limits import DEFAULT_LIMITS
+    from service.signals.reader import read_mcap
+
+    if not path.is_file():
+        fail(f"there is no file {path}")
+    if path.suffix.lower() == ".mcap":
+        recording, notes = read_mcap(path, DEFAULT_LIMITS)
+    else:
+        recording, notes = read_csv(
+            path, sample_time=reading.sample_time, segments=reading.segments
+        )
+    for note in notes:
+        err.print(f"note: {note}", markup=False)
+    return recording
+
+
+def tell(model: "Model", found: "Identification", seconds: float, json_file: str | None) -> None:
+    """Print the estimates, or write the result as JSON, or both."""
+    from service.dispatch.results import result_document
+
+    document = result_document(found, seconds)
+    if json_file == "-":
+        print_json(document)
+        return
+    if json_file is not None:
+        import json
+
+        try:
+            Path(json_file).write_text(json.dumps(document, indent=2), encoding="utf-8")
+        except OSError as error:
+            fail(f"{json_file} cannot be written: {error.strerror}")
+    print_table(
+        ("parameter", ">estimate ± standard error", "unit", "status"),
+        ((one["name"], estimate(one), one["unit"], _status(one)) for one in document["parameters"]),
+        empty="no parameters",
+    )
+    unit = model.outputs[0].unit if len(model.outputs) == 1 else "standard deviations"
+    fit = f"RMS {found.rms:.6g} {'' if unit == '1' else unit}".rstrip()
+    out.print(f"{fit}, fit {found.fit_percent:.2f} %", markup=False, end="")
+    if found.fit_percent_validation is not None:
+        out.print(f", validation {found.fit_percent_validation:.2f} %", markup=False, end="")
+    out.print(f"; {found.evaluations} simulations in {seconds:.2f} s", markup=False)
+    for warning in found.warnings:
+        err.print(f"note: {warning}", markup=False)
+
+
+def _status(one: dict[str, Any]) -> str:
+    return f"{one['status']} ({one['reason']})" if one["reason"] else str(one["status"])
+
+
+def _identified(
+    model: "Model", records: "list[Record]", kept: "list[Record]", body: "JobIn", *, quiet: bool
+) -> "Identification":
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from service.conversion import algorithm_of, loss_of
+    from sysid.identify import identify as identified
+    from sysid.noise import Noise
+
+    document = body.normal_form()
+    algorithm = algorithm_of(document["algorithm"])
+    columns = (BarColumn(bar_width=40), TextColumn("{task.percentage:>3.0f} %"),
+               TextColumn("RMS {task.fields[rms]}"), TimeElapsedColumn())  # fmt: skip
+    console = Console(stderr=True, highlight=False)
+    with Progress(*columns, console=console, disable=quiet, transient=True) as progress:
+        bar = progress.add_task("", total=algorithm.generations, rms="–")
+
+        def show(state: Any) -> None:
+            progress.update(bar, completed=state.generation, rms=f"{state.rms:.6g}")
+
+        return identified(
+            model, records, algorithm, seed=body.seed, parameters=document["parameters"],
+            prediction=body.prediction, loss=loss_of(document["loss"]), weights=body.weights,
+            skip=body.skip, validation=kept or None,
+            noise=Noise(body.noise.sigma, body.noise.seed) if body.noise.sigma else None,
+            progress=show,
+        )  # fmt: skip
+
+
+def _model(name: str) -> "Model":
+    from sysid.models.library import load_model
+
+    return load_model(Path(name) if name.endswith(MODEL_SUFFIXES) else name)
+
+
+def _records(path: Path, reading: Reading, model: "Model", body: "JobIn") -> "list[Record]":
+    inputs, outputs = [one.name for one in model.inputs], [one.name for one in model.outputs]
+    for signal in body.channels:
+        if signal not in (*inputs, *outputs):
+            known = ", ".join((*inputs, *outputs))
+            fail(f"model {model.name!r} has no signal {signal!r}; it has {known}")
+    chosen = {signal: body.channels.get(signal, signal) for signal in (*inputs, *outputs)}
+    roles = ({one: chosen[one] for one in inputs}, {one: chosen[one] for one in outputs})
+    return list(read(path, reading).records(*roles, path.stem))
+
+
+def _split(records: "list[Record]", fraction: float) -> "tuple[list[Record], list[Record]]":
+    from sysid.records import split_record
+
+    parts = [split_record(record, fraction) for record in records]
+    return [first for first, _ in parts], [second for _, second in parts]
+
+
+def _pairs(text: str | None) -> dict[str, str]:
+    pairs = {}
+    for one in _names(text):
+        signal, equals, channel = one.partition("=")
+        if not equals or not signal or not channel:
+            usage(f"--channels {text}: need signal=channel,…, as u=P1,y=P2")
+        pairs[signal.strip()] = channel.strip()
+    return pairs
+
+
+def _names(text: str | None) -> tuple[str, ...]:
+    return tuple(one.strip() for one in (text or "").split(",") if one.strip())

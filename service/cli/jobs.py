@@ -1,0 +1,187 @@
+"""`lagid submit`, `watch`, `jobs`, `runs`, `cancel`, `resume`, `report`."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.cli.common import (
+    DEFAULT_URL,
+    AsJson,
+    Key,
+    Url,
+    connected,
+    err,
+    estimate,
+    fail,
+    out,
+    print_json,
+    print_table,
+    read_file,
+)
+from service.cli.watching import follow
+from service.client import Client
+from service.documents import read_yaml
+
+JobName = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.")]
+FILE_SUFFIXES = (".yaml", ".yml", ".json")
+DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
+
+
+def submit(
+    file: Annotated[Path, typer.Argument(metavar="JOB.yaml", help="The job, YAML or JSON.")],
+    wait: Annotated[bool, typer.Option("--wait", help="Show its progress until its end.")] = False,
+    idempotency_key: Annotated[
+        str | None, typer.Option(help="The same key again gives the same job.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Submit a job."""
+    body = job_of(file)
+    with connected(url, key) as client:
+        job = client.submit(body, idempotency_key=idempotency_key)
+        if not wait:
+            if as_json:
+                print_json(job)
+            else:
+                out.print(f"{job['id']}  {job['name']}: {job['state']}", markup=False)
+            return
+        _finish(client, follow(client, job["id"], quiet=as_json), as_json)
+
+
+def watch(job: JobName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
+    """Show a job's progress and RMS until it ends, then its estimates."""
+    with connected(url, key) as client:
+        _finish(client, follow(client, job, quiet=as_json), as_json)
+
+
+def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
+    """List the jobs of the server, latest first."""
+    with connected(url, key) as client:
+        found = client.jobs()
+    if as_json:
+        print_json(found)
+        return
+    print_table(
+        ("id", "name", "state", "model", ">runs", ">best RMS", "submitted"),
+        ((one["id"], one["name"], one["state"], one["model"],
+          f"{one['progress']['finished']}/{one['progress']['runs']}",
+          one["progress"]["best_rms"], one["created_at"][:19].replace("T", " "))
+         for one in found),
+        empty="no jobs; submit one: lagid submit job.yaml",
+    )  # fmt: skip
+
+
+def runs(
+    job: Annotated[
+        str | None, typer.Argument(metavar="[JOB]", help="Id of a job; by default the latest.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the runs of a job with their estimates."""
+    with connected(url, key) as client:
+        found = client.runs(job or _latest(client))
+    if as_json:
+        print_json(found)
+    else:
+        print_runs(found)
+
+
+def cancel(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
+    """Cancel a job; what it has found so far stays."""
+    with connected(url, key) as client:
+        found = client.cancel(job)
+    asked = "will be cancelled" if found["state"] == "running" else f"is {found['state']}"
+    out.print(f"{found['id']} {asked}", markup=False)
+
+
+def resume(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
+    """Queue a failed or cancelled job again; it goes on from where it stopped."""
+    with connected(url, key) as client:
+        found = client.resume(job)
+    out.print(f"{found['id']} is {found['state']}", markup=False)
+
+
+def report(
+    job: JobName,
+    file: Annotated[Path, typer.Option("--out", help="File to write.")] = Path("report.html"),
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Write the report of a job as one HTML file."""
+    with connected(url, key) as client:
+        text = client.report(job)
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        fail(f"{file} cannot be written: {error.strerror}")
+    out.print(str(file), markup=False)
+
+
+def job_of(file: Path) -> dict[str, Any]:
+    """The body of a job file; a model named as a file is read, beside the job file."""
+    body = read_yaml(read_file(file))
+    if not isinstance(body, dict):
+        fail(f"{file} does not hold a job (model: …, datasets: […])")
+    model = body.get("model")
+    if isinstance(model, str) and model.endswith(FILE_SUFFIXES):
+        body["model"] = read_yaml(read_file(file.parent / model))
+    for one in body.get("datasets") or []:
+        if isinstance(one, str) and one.endswith(DATA_SUFFIXES):
+            fail(f"{file}: datasets are ids or names on the server, and {one!r} is a file; "
+                 f"add it first: lagid dataset add {one}")  # fmt: skip
+    return body
+
+
+def print_runs(runs: list[dict[str, Any]]) -> None:
+    """Print runs with their cells, fits and estimates."""
+    paths = list(dict.fromkeys(path for run in runs for path in run["cell"]))
+    names = list(dict.fromkeys(one["name"] for run in runs for one in run["parameters"]))
+    rows = []
+    for run in runs:
+        found = {one["name"]: estimate(one) for one in run["parameters"]}
+        fit = run.get("fit_percent") or {}
+        rows.append([
+            run["id"], run["state"], *(_brief(run["cell"].get(path)) for path in paths),
+            run["rms"], _percent(fit.get("estimation")), _percent(fit.get("validation")),
+            *(found.get(name) for name in names),
+        ])  # fmt: skip
+    axes = [path.removeprefix("/").replace("/", ".") for path in paths]
+    headings = ("run", "state", *axes, ">RMS", ">fit %", ">validation %",
+                *(f">{name}" for name in names))  # fmt: skip
+    print_table(headings, rows, empty="no runs")
+
+
+def _finish(client: Client, job: dict[str, Any], as_json: bool) -> None:
+    found = client.runs(job["id"])
+    if as_json:
+        print_json({**job, "runs": found})
+    else:
+        print_runs(found[:50])
+        if len(found) > 50:
+            out.print(f"… and {len(found) - 50} more: lagid runs {job['id']}", markup=False)
+        for warning in dict.fromkeys(w for run in found for w in run.get("warnings", [])):
+            out.print(f"note: {warning}", markup=False, soft_wrap=True)
+    if job["state"] != "succeeded":
+        reason = f": {job['error']}" if job["error"] else ""
+        err.print(f"lagid: {job['id']} {job['state']}{reason}", markup=False)
+        raise typer.Exit(1)
+
+
+def _latest(client: Client) -> str:
+    found = client.jobs(limit=1)
+    if not found:
+        fail("there are no jobs; submit one: lagid submit job.yaml")
+    return str(found[0]["id"])
+
+
+def _brief(value: object) -> object:
+    return value.get("name", "…") if isinstance(value, dict) else value
+
+
+def _percent(value: float | None) -> str | None:
+    return None if value is None else f"{value:.2f}"

@@ -1,0 +1,83 @@
+"""`lagid`: the command line. Commands import what they need when they run, so `--help` is quick."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.calls import ClientError
+from service.cli import datasets, jobs, models, serving, upkeep
+from service.cli.common import err, out
+from service.cli.identify import identify
+from service.errors import ServiceError
+
+app = typer.Typer(
+    name="lagid",
+    help="Identification of nonlinear systems with unknown time lags.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+app.command()(serving.serve)
+app.command()(serving.dispatcher)
+app.command()(identify)
+app.command()(jobs.submit)
+app.command()(jobs.watch)
+app.command("jobs")(jobs.listing)
+app.command("runs")(jobs.runs)
+app.command()(jobs.cancel)
+app.command()(jobs.resume)
+app.command()(jobs.report)
+app.command("datasets")(datasets.listing)
+app.add_typer(datasets.app, name="dataset")
+app.add_typer(models.app, name="models")
+app.add_typer(upkeep.database, name="db")
+app.command()(upkeep.doctor)
+
+
+@app.command()
+def demo(
+    data_dir: Annotated[Path, typer.Option(help="Where to keep its data.")] = Path("lagid-demo"),
+) -> None:
+    """Run the paper's Example 1 through the whole service and print its Table 1."""
+    from service.cli import demo as program
+
+    program.run(data_dir, out)
+
+
+def main() -> None:
+    """Run the command line; a user's mistake gives one line, never a traceback."""
+    # Errors of the core are imported late: the package may load compiled code.
+    try:
+        app()
+    except (ServiceError, ClientError) as error:
+        _end(str(error))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.stderr.close()
+        sys.exit(1)
+    except Exception as error:
+        if not _is_expected(error):
+            raise
+        _end(str(error))
+
+
+def _end(message: str) -> None:
+    err.print(f"lagid: {' '.join(message.split())}", markup=False)
+    sys.exit(1)
+
+
+def _is_expected(error: Exception) -> bool:
+    """Whether an error was raised on purpose by the core or the storage."""
+    from service.storage.errors import StorageError
+    from sysid.errors import SysidError
+
+    return isinstance(error, SysidError | StorageError)
+
+
+if __name__ == "__main__":
+    main()

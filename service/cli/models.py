@@ -1,0 +1,129 @@
+"""`lagid models`: list them, show one, check one's own."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from service.cli.common import (
+    DEFAULT_URL,
+    AsJson,
+    Key,
+    Url,
+    connected,
+    err,
+    fail,
+    out,
+    print_json,
+    print_table,
+    read_file,
+)
+from service.documents import read_yaml
+from service.errors import InvalidRequest
+
+app = typer.Typer(help="Built-in and own models.", invoke_without_command=True)
+
+
+@app.callback()
+def models(context: typer.Context) -> None:
+    """Built-in and own models; without a command, a list of the built-in ones."""
+    if context.invoked_subcommand is None:
+        listing()
+
+
+@app.command("list")
+def listing(
+    url: Annotated[
+        str | None, typer.Option("--url", envvar="LAGID_URL", help="Also those of a server.")
+    ] = None,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the models: built-in ones, and own ones of a server if one is named."""
+    found = _built_in()
+    if url is not None:
+        with connected(url, key) as client:
+            found = client.models()
+    if as_json:
+        print_json(found)
+        return
+    print_table(
+        ("name", ">version", "form", "inputs", "outputs", "parameters", "title"),
+        ((one["name"], one["version"] or "built in", one["form"], ", ".join(one["inputs"]),
+          ", ".join(one["outputs"]), ", ".join(one["parameters"]), one["title"])
+         for one in found),
+        empty="no models",
+    )  # fmt: skip
+
+
+@app.command()
+def show(
+    name: Annotated[str, typer.Argument(help="Name, or name@version of an own model.")],
+    url: Annotated[
+        str | None, typer.Option("--url", envvar="LAGID_URL", help="Server of own models.")
+    ] = None,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print a model's document as YAML, to be copied and changed."""
+    import yaml
+
+    from sysid.models import library
+
+    document: dict[str, Any]
+    if url is None or name in library.catalogue():
+        document = dict(library.document(name))
+    else:
+        with connected(url, key) as client:
+            document = client.model(name)["document"]
+    if as_json:
+        print_json(document)
+        return
+    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
+    out.print(text, markup=False, soft_wrap=True, end="")
+
+
+@app.command()
+def check(
+    file: Annotated[Path, typer.Argument(help="Model document, YAML or JSON.")],
+    as_json: AsJson = False,
+) -> None:
+    """Check a model document; each error with its place and, in equations, its column."""
+    from service.models import check as checked
+
+    try:
+        answer = checked(read_yaml(read_file(file))).model_dump(mode="json")
+    except InvalidRequest as error:
+        answer = {"valid": False, "errors": [one.as_dict() for one in error.errors]}
+    if as_json:
+        print_json(answer)
+    elif answer["valid"]:
+        out.print(f"{file}: the model can be used", markup=False)
+    else:
+        for one in answer["errors"]:
+            column = f", column {one['column']}" if one.get("column") else ""
+            where = f"{one['pointer'] or 'document'}{column}"
+            err.print(f"{file}: {where}: {one['detail']}", markup=False)
+    if not answer["valid"]:
+        raise typer.Exit(1)
+
+
+@app.command()
+def add(
+    file: Annotated[Path, typer.Argument(help="Model document, YAML or JSON.")],
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Store an own model on a server."""
+    document = read_yaml(read_file(file))
+    if not isinstance(document, dict):
+        fail(f"{file} does not hold a model (name, equations, …)")
+    with connected(url, key) as client:
+        stored = client.add_model(document)
+    out.print(f"{stored['name']}@{stored['version']}", markup=False)
+
+
+def _built_in() -> list[dict[str, Any]]:
+    from service.models import catalogue
+
+    return [one.model_dump(mode="json") for one in catalogue()]

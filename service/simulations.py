@@ -1,0 +1,185 @@
+"""Use case: a dataset simulated from a model, its true parameters, inputs, and noise."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from service import models
+from service.datasets import add_recording, key_of
+from service.errors import FieldError, InvalidRequest
+from service.recordings import recording_of
+from service.schemas_datasets import (
+    BinaryInput,
+    DatasetInput,
+    ExpressionInput,
+    InputIn,
+    SimulateIn,
+    StepInput,
+    Wave,
+)
+from service.storage.datasets import DatasetRepository, Stored
+from service.storage.objects import ObjectStore
+from service.storage.sessions import Database
+from sysid.errors import InvalidRecord, SysidError, nearest
+from sysid.models.model import Model
+from sysid.records import Channel, Recording
+from sysid.types import FloatArray
+
+
+def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored:
+    """Make a dataset of a model's inputs and outputs; the same body gives the same dataset.
+
+    Raises
+    ------
+    InvalidRequest
+        With every fault: unknown model, parameter or signal, a missing value, a bad expression.
+    """
+    with database.read() as session:
+        model, document = _model(session, body.model)
+        key = key_of({**body.model_dump(mode="json", exclude={"name"}), "model": document})
+        known = DatasetRepository(session).by_source(key)
+        if known is not None:
+            return Stored(known, is_new=False)
+        faults = [*_parameter_faults(model, body.parameters), *_input_faults(model, body.inputs)]
+        if faults:
+            raise InvalidRequest(faults)
+        times = np.arange(body.samples, dtype=np.float64) * body.sample_time
+        signals = _Signals(session, store, times)
+        inputs = [
+            Channel(one.name, times, signals.of(one.name, body.inputs[one.name]), one.unit)
+            for one in model.inputs
+        ]
+    recording = _simulated(model, inputs, body, times)
+    details = {
+        "simulation": {**body.model_dump(mode="json", exclude={"model"}), "model": document},
+        "true_parameters": body.parameters,
+        "warnings": [],
+    }
+    return add_recording(
+        database, store, recording, name=body.name or f"{model.name}, simulated",
+        kind="simulate", key=key, details=details, parents=signals.parents, relation="simulated",
+    )  # fmt: skip
+
+
+class _Signals:
+    """Values of inputs at given times; remembers the datasets they came from."""
+
+    def __init__(self, session: Session, store: ObjectStore, times: FloatArray) -> None:
+        self.parents: list[str] = []
+        self._session, self._store, self._times = session, store, times
+
+    def of(self, name: str, signal: InputIn) -> FloatArray:
+        """Values of one input."""
+        t = self._times
+        match signal:
+            case Wave():
+                omega = signal.omega if signal.omega is not None else 0.0
+                if signal.frequency is not None:
+                    omega = 2 * np.pi * signal.frequency
+                wave = np.cos if signal.kind == "cosine" else np.sin
+                values: FloatArray = signal.offset + signal.amplitude * wave(
+                    omega * t + signal.phase
+                )
+            case StepInput():
+                values = signal.offset + signal.amplitude * (t >= signal.time)
+            case BinaryInput():
+                values = signal.offset + signal.amplitude * _binary(t, signal.period, signal.seed)
+            case ExpressionInput():
+                values = _evaluated(name, signal.expression, t)
+            case DatasetInput():
+                values = self._recorded(name, signal)
+        return np.asarray(values, dtype=np.float64)
+
+    def _recorded(self, name: str, signal: DatasetInput) -> FloatArray:
+        row = DatasetRepository(self._session).get(signal.dataset)
+        try:
+            channel = recording_of(self._store, row.sha256).channel(signal.channel)
+        except InvalidRecord as error:
+            raise InvalidRequest.at(f"/inputs/{name}/channel", str(error)) from None
+        if row.id not in self.parents:
+            self.parents.append(row.id)
+        return np.interp(self._times, channel.times, channel.values)
+
+
+def _model(session: Session, reference: Any) -> tuple[Model, Any]:
+    if not isinstance(reference, str | Mapping):
+        raise InvalidRequest.at("/model", f"need a name or a document; found {reference!r:.60}")
+    return models.resolve(session, reference)
+
+
+def _simulated(
+    model: Model, inputs: list[Channel], body: SimulateIn, times: FloatArray
+) -> Recording:
+    # The compiler comes with this import, and most requests never need it.
+    from sysid.simulation import simulate as simulated
+
+    values = {p.name: p.fixed for p in model.parameters if p.fixed is not None} | body.parameters
+    outputs = simulated(model, inputs, values, times=times).channels
+    for channel in outputs:
+        wrong = np.flatnonzero(~np.isfinite(channel.values))
+        if wrong.size:
+            raise InvalidRequest.at(
+                "/parameters",
+                f"with these values output {channel.name!r} diverges at "
+                f"t = {times[wrong[0]]:g} s; choose others, or a smaller sample_time",
+            )
+    recording = Recording((*inputs, *outputs))
+    if body.noise.sigma == 0:
+        return recording
+    from sysid.derivations import derive
+
+    names = [channel.name for channel in outputs]
+    return derive(recording, [{"noise": {**body.noise.model_dump(), "channels": names}}])
+
+
+def _parameter_faults(model: Model, values: Mapping[str, float]) -> list[FieldError]:
+    known = [p.name for p in model.parameters]
+    faults = [
+        FieldError(f"/parameters/{name}", f"the model has no parameter {name!r}"
+                   f"{nearest(name, known)}")
+        for name in values if name not in known
+    ]  # fmt: skip
+    missing = [p for p in model.parameters if p.fixed is None and p.name not in values]
+    return faults + [
+        FieldError(f"/parameters/{p.name}", f"give the true value of {p.name!r} [{p.unit}]")
+        for p in missing
+    ]
+
+
+def _input_faults(model: Model, inputs: Mapping[str, InputIn]) -> list[FieldError]:
+    known = [one.name for one in model.inputs]
+    faults = [
+        FieldError(f"/inputs/{name}", f"the model has no input {name!r}{nearest(name, known)}")
+        for name in inputs if name not in known
+    ]  # fmt: skip
+    return faults + [
+        FieldError(f"/inputs/{name}", f"give input {name!r}, such as "
+                   '{"kind": "cosine", "amplitude": 1, "frequency": 0.5}')
+        for name in known if name not in inputs
+    ]  # fmt: skip
+
+
+def _binary(times: FloatArray, period: float, seed: int) -> FloatArray:
+    places = (times / period).astype(np.int64)
+    draws = np.random.Generator(np.random.Philox(seed)).integers(0, 2, int(places[-1]) + 1)
+    return np.where(draws[places] == 1, 1.0, -1.0)
+
+
+def _evaluated(name: str, expression: str, times: FloatArray) -> FloatArray:
+    """An expression of t, computed as the output of a model that has nothing else."""
+    from sysid.simulation import simulate as simulated
+
+    from sysid.models.spec import parse_model
+
+    document = {
+        "name": "input", "form": "difference", "states": {"unused": "1"},
+        "equations": {"unused": "0"}, "initial": {"unused": 0}, "outputs": {"value": expression},
+    }  # fmt: skip
+    try:
+        return simulated(parse_model(document), [], {}, times=times).channel("value").values
+    except SysidError as error:
+        pointer = f"/inputs/{name}/expression"
+        detail = str(error).replace("/outputs/value, ", "").replace("/outputs/value: ", "")
+        raise InvalidRequest.at(pointer, detail) from None
