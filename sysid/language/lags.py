@@ -10,6 +10,7 @@ from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary
 
 _PERIOD = Symbol("h", "period")
+_LONGEST = 1e6
 
 
 class Delay(NamedTuple):
@@ -42,6 +43,9 @@ def delay(index: Expression, scope: Scope) -> Delay | str:
         return _negative(back, low, scope)
     if not back:
         return Delay(0, None)
+    # Any period tells a lag without limit; back[CONSTANT] counts samples or seconds.
+    if max(bounds(rest, scope.parameters, 1.0)[1], back.get(CONSTANT, 0.0)) > _LONGEST:
+        return f"the lag {text(rest, scope.clock)} has no limit inside the bounds of its parameters"
     return Delay(0, rest) if scope.form == "differential" else _split(back, low, scope)
 
 
@@ -78,7 +82,7 @@ def past_values(expression: Expression) -> tuple[Past, ...]:
 def _split(back: Polynomial, low: float, scope: Scope) -> Delay:
     constant = back.get(CONSTANT, 0.0)
     unknown = {monomial: value for monomial, value in back.items() if monomial != CONSTANT}
-    offset = min(1, floor(low))
+    offset = 1 if low >= 1 else 0
     if bounds(rebuild(unknown), scope.parameters)[0] >= 0:
         offset = max(offset, floor(constant))
     lag = add(back, {CONSTANT: -float(offset)})

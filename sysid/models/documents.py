@@ -89,6 +89,8 @@ def read_yaml(text: str) -> Any:
 
 def _told(error: yaml.YAMLError) -> str:
     mark = getattr(error, "problem_mark", None)
-    problem = getattr(error, "problem", None) or getattr(error, "reason", None) or "unreadable"
+    problem = str(getattr(error, "problem", None) or getattr(error, "reason", "unreadable"))
+    if problem.startswith("but "):
+        problem = f"{getattr(error, 'context', '')}, {problem}"
     place = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
-    return f"the YAML cannot be read: {place}{' '.join(str(problem).split())}"
+    return f"the YAML cannot be read: {place}{' '.join(problem.split())}"

@@ -150,10 +150,10 @@ def _listed(reader: Reader, written: Sequence[object], scope: Scope) -> tuple[Te
     if not written:
         reader.fault("/terms", "the list is empty; name at least one term, such as y(k-1)")
     for number, one in enumerate(written[: MAX_PARAMETERS + 1]):
-        place = f"/terms/{number}"
+        place, known = f"/terms/{number}", reader.count()
         checked = check(reader.expression(one, place), scope)
         note(reader, checked, place)
-        if checked.tree is None:
+        if checked.tree is None or reader.count() > known:
             continue
         factors = _factors(checked.tree)
         if factors is None:

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from math import inf
 from typing import Any, cast
 
 from sysid.errors import Fault, InvalidModel
@@ -83,7 +82,7 @@ def _head(reader: Reader, fields: Mapping[str, Any]) -> None:
 def _equations(reader: Reader, fields: Mapping[str, Any]) -> Model:
     form: Timing = fields["form"]
     states = signals(reader, fields.get("states"), "/states")
-    if not states:
+    if not fields.get("states"):
         reader.fault("/states", "is missing; name at least one state and its unit, such as {x: m}")
     inputs = signals(reader, fields.get("inputs"), "/inputs")
     found = parameters(reader, fields.get("parameters"))
@@ -133,7 +132,7 @@ def _scope(
 ) -> Scope:
     declared = fields.get("parameters")
     # A parameter with faults is still declared: its name in an equation is not one fault more.
-    intervals = dict.fromkeys(declared, (0.0, inf)) if isinstance(declared, Mapping) else {}
+    intervals = dict.fromkeys(declared, (1.0, 1.0)) if isinstance(declared, Mapping) else {}
     intervals = {name: ends for name, ends in intervals.items() if isinstance(name, str)}
     intervals |= {parameter.name: interval(parameter) for parameter in found}
     named = [tuple(one.name for one in group) for group in (states, inputs)]

@@ -1,0 +1,230 @@
+"""Model documents: what a good one gives, and that every fault of a bad one is told at once."""
+
+from typing import Any
+
+import pytest
+
+from sysid.errors import InvalidModel
+from sysid.language.tree import Past
+from sysid.models.model import (
+    EstimatedInitial,
+    FixedInitial,
+    MeasuredInitial,
+    Quantity,
+    Solver,
+)
+from sysid.models.spec import parse_model
+from sysid.parameters import Parameter
+
+CONTINUOUS: dict[str, Any] = {
+    "name": "delayed-duffing",
+    "form": "differential",
+    "inputs": {"q": "N"},
+    "states": {"x": "m", "v": "m/s"},
+    "parameters": {
+        "c": {"lower": 0, "upper": 1, "unit": "N·s/m"},
+        "L": {"lower": 0, "upper": 1, "unit": "s"},
+    },
+    "constants": {"m": 2},
+    "equations": {"x": "v", "v": "(q(t) - c*v(t - L) - x)/m"},
+    "outputs": {"y": "x"},
+    "initial": {"x": "measured", "v": {"lower": -1, "upper": 1}},
+    "solver": {"method": "semi-implicit", "step": 0.01, "substeps": 2, "history": "zero"},
+}
+DISCRETE: dict[str, Any] = {
+    "name": "recursion",
+    "form": "difference",
+    "states": {"x": None, "w": 1},
+    "parameters": {"d": {"lower": 1, "upper": 9, "fixed": 3}},
+    "equations": {"x": "0.5*w + w(k-3)", "w": "x(k-d)"},
+    "outputs": {"y": {"expression": "2*x", "unit": "mm"}},
+}
+
+
+def faults(base: dict[str, Any], **changes: Any) -> dict[str, str]:
+    with pytest.raises(InvalidModel) as caught:
+        parse_model(base | changes)
+    return {fault.pointer: fault.detail for fault in caught.value.faults}
+
+
+def test_a_differential_document_becomes_a_model() -> None:
+    model = parse_model(CONTINUOUS)
+    assert (model.name, model.title, model.form) == (
+        "delayed-duffing",
+        "delayed-duffing",
+        "differential",
+    )
+    assert model.inputs == (Quantity("q", "N"),)
+    assert model.states == (Quantity("x", "m"), Quantity("v", "m/s"))
+    assert model.parameters[1] == Parameter("L", 0.0, 1.0, "s")
+    assert model.equations[0] == Past("v", "state")
+    assert model.initial == (MeasuredInitial(), EstimatedInitial(-1.0, 1.0))
+    assert model.solver == Solver("semi-implicit", 0.01, 2, "zero", "linear")
+    assert (model.order, model.memory) == ((0, 1), 0)
+
+
+def test_a_difference_document_orders_its_states_and_counts_its_memory() -> None:
+    model = parse_model(DISCRETE)
+    assert model.order == (1, 0)
+    assert model.memory == 3
+    assert model.initial == (FixedInitial(0.0), FixedInitial(0.0))
+    assert model.states == (Quantity("x", "1"), Quantity("w", "1"))
+    assert model.parameters[0].fixed == 3.0
+
+
+def test_an_output_that_is_a_state_has_its_unit_and_another_its_own() -> None:
+    assert parse_model(CONTINUOUS).outputs[0].unit == "m"
+    assert parse_model(DISCRETE).outputs[0].unit == "mm"
+    squared = CONTINUOUS | {"outputs": {"y": "x", "z": "x**2"}}
+    assert parse_model(squared).outputs[1].unit == "1"
+
+
+def test_the_rate_of_a_measured_state_may_start_measured() -> None:
+    both = CONTINUOUS | {"initial": {"x": "measured", "v": "measured"}}
+    assert parse_model(both).initial == (MeasuredInitial(), MeasuredInitial())
+
+
+@pytest.mark.parametrize("document", [CONTINUOUS, DISCRETE])
+def test_the_normal_form_gives_the_same_model_and_is_its_own(document: dict[str, Any]) -> None:
+    model = parse_model(document)
+    assert parse_model(model.document) == model
+
+
+def test_a_document_is_not_changed_by_reading_it() -> None:
+    before = repr(CONTINUOUS)
+    parse_model(CONTINUOUS)
+    assert repr(CONTINUOUS) == before
+
+
+@pytest.mark.parametrize(
+    ("changes", "pointer", "part"),
+    [
+        ({"form": "diference"}, "/form", "did you mean 'difference'?"),
+        ({"form": None}, "/form", "is missing"),
+        ({"name": None}, "/name", "is missing"),
+        ({"name": "two words"}, "/name", "cannot be a model's name"),
+        ({"equation": {}}, "/equation", "did you mean 'equations'?"),
+        ({"title": 3}, "/title", "3 is not a text"),
+        ({"inputs": ["q"]}, "/inputs", "is not a mapping"),
+        ({"inputs": {"q": 7}}, "/inputs/q", "7 is not a text"),
+        ({"inputs": {"x": "N", "q": "N"}}, "/inputs/x", "already declared in /states"),
+        ({"inputs": {"q": "N", "sin": "N"}}, "/inputs/sin", "word of the language"),
+        ({"inputs": {"q": "N", "2a": "N"}}, "/inputs/2a", "cannot be a name"),
+        ({"inputs": {"q": "N", "a/b": "N"}}, "/inputs/a~1b", "cannot be a name"),
+        ({"inputs": {"q": "N", "y": "N"}}, "/outputs/y", "is an input, too"),
+        ({"states": {}}, "/states", "is missing"),
+        ({"constants": {"m": "2"}}, "/constants/m", "'2' is not a number"),
+        ({"constants": {"m": float("nan")}}, "/constants/m", "nan is not a finite number"),
+        ({"constants": {"m": True}}, "/constants/m", "True is not a number"),
+        ({"equations": {"x": "v"}}, "/equations/v", "is missing"),
+        ({"equations": {"x": "v", "v": "0", "u": "1"}}, "/equations/u", "no such state"),
+        ({"equations": {"x": "v", "v": ["x"]}}, "/equations/v", "is not an expression"),
+        ({"equations": {"x": "v", "v": "q - C*v"}}, "/equations/v", "'C' is not declared"),
+        ({"outputs": {}}, "/outputs", "name the measured channel"),
+        ({"outputs": {"y": "z"}}, "/outputs/y", "'z' is not declared"),
+        ({"outputs": {"y": {"expression": "z"}}}, "/outputs/y/expression", "is not declared"),
+        ({"outputs": {"y": {"unit": "m"}}}, "/outputs/y/expression", "is missing"),
+        ({"initial": {"z": 0}}, "/initial/z", "no such state"),
+        ({"initial": {"x": "mesured"}}, "/initial/x", "no start of a state"),
+        ({"initial": {"x": {"lower": 0}}}, "/initial/x/upper", "is missing"),
+        ({"initial": {"x": {"lower": 1, "upper": 1}}}, "/initial/x", "need lower < upper"),
+        ({"outputs": {"y": "2*x"}, "initial": {"x": "measured"}}, "/initial/x", "not measured"),
+        ({"solver": {"method": "rk5"}}, "/solver/method", "did you mean 'rk4'?"),
+        ({"solver": {"step": 0}}, "/solver/step", "need more than 0"),
+        ({"solver": {"step": "smple"}}, "/solver/step", "is not 'sample'"),
+        ({"solver": {"substeps": 1.5}}, "/solver/substeps", "whole number from 1"),
+        ({"solver": {"substep": 2}}, "/solver/substep", "did you mean 'substeps'?"),
+    ],
+)
+def test_a_fault_of_a_differential_document_is_told_where_it_is(
+    changes: dict[str, Any], pointer: str, part: str
+) -> None:
+    found = faults(CONTINUOUS, **changes)
+    assert next(iter(found)) == pointer
+    assert part in found[pointer]
+
+
+@pytest.mark.parametrize(
+    ("entry", "pointer", "part"),
+    [
+        ({"lower": 1, "upper": 0}, "/parameters/L", "need finite lower < upper"),
+        ({"lower": 1, "upper": 1}, "/parameters/L", "need finite lower < upper"),
+        ({"lower": 0}, "/parameters/L/upper", "is missing"),
+        ({"lower": 0, "upper": "1"}, "/parameters/L/upper", "'1' is not a number"),
+        ({"lower": 0, "upper": float("inf")}, "/parameters/L/upper", "not a finite number"),
+        ({"lower": 0, "upper": 10**400}, "/parameters/L/upper", "not a finite number"),
+        ({"lower": 0, "upper": 1, "scale": "log"}, "/parameters/L", "needs lower > 0"),
+        ({"lower": 0, "upper": 1, "scale": "lin"}, "/parameters/L/scale", "'linear', 'log'"),
+        ({"lower": 0, "upper": 1, "fixed": 2}, "/parameters/L", "outside them"),
+        ({"lower": 0, "upper": 1, "uper": 2}, "/parameters/L/uper", "did you mean 'upper'?"),
+        (3, "/parameters/L", "is not a mapping"),
+    ],
+)
+def test_a_fault_of_a_parameter_does_not_make_its_name_unknown(
+    entry: object, pointer: str, part: str
+) -> None:
+    found = faults(CONTINUOUS, parameters={"c": {"lower": 0, "upper": 1}, "L": entry})
+    assert list(found) == [pointer]
+    assert part in found[pointer]
+
+
+@pytest.mark.parametrize(
+    ("changes", "pointer", "part"),
+    [
+        ({"equations": {"x": "x + w", "w": "1"}}, "/equations/x", "the present x(k)"),
+        ({"equations": {"x": "w", "w": "x"}}, "/equations", "depend on each other"),
+        ({"equations": {"x": "w(k - 1 + d/4)", "w": "x"}}, "/equations", "depend on each other"),
+        ({"equations": {"x": "x(k - (d-1)/4)", "w": "1"}}, "/equations/x", "may reach the present"),
+        ({"solver": {"method": "rk4"}}, "/solver/method", "belongs to the differential form"),
+        ({"states": {"x": "1", "w": "1", "h": "m"}}, "/states/h", "word of the language"),
+    ],
+)
+def test_a_fault_of_a_difference_document_is_told_where_it_is(
+    changes: dict[str, Any], pointer: str, part: str
+) -> None:
+    free = {"parameters": {"d": {"lower": 1, "upper": 3}}}
+    found = faults(DISCRETE | free, **changes)
+    assert pointer in found
+    assert part in found[pointer]
+
+
+def test_all_faults_of_a_document_are_told_together_with_their_columns() -> None:
+    document = CONTINUOUS | {
+        "colour": "red",
+        "parameters": {"c": {"lower": 1, "upper": 0}, "L": {"lower": -1, "upper": 1}},
+        "equations": {"x": "vv", "v": "q - c*v(t - L) + __import__('os')"},
+        "solver": {"step": -1},
+    }
+    with pytest.raises(InvalidModel) as caught:
+        parse_model(document)
+    found = {(fault.pointer, fault.column) for fault in caught.value.faults}
+    assert found == {
+        ("/colour", None),
+        ("/parameters/c", None),
+        ("/equations/x", 1),
+        ("/equations/v", 7),
+        ("/equations/v", 18),
+        ("/equations/v", 29),
+        ("/solver/step", None),
+    }
+
+
+@pytest.mark.parametrize("document", [None, 3, "tube", [CONTINUOUS], {}, {3: 4}])
+def test_what_is_no_document_is_refused_in_one_line(document: object) -> None:
+    with pytest.raises(InvalidModel) as caught:
+        parse_model(document)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "pointer"),
+    [
+        ({"states": {f"x{i}": "1" for i in range(65)}}, "/states"),
+        ({"parameters": {f"p{i}": {"lower": 0, "upper": 1} for i in range(257)}}, "/parameters"),
+        ({"equations": {"x": "v", "v": "1+" * 2000 + "1"}}, "/equations/v"),
+        ({"description": "a" * 4001}, "/description"),
+    ],
+)
+def test_documents_beyond_the_limits_are_refused(changes: dict[str, Any], pointer: str) -> None:
+    found = faults(CONTINUOUS, **changes)
+    assert "at most" in found[pointer]
