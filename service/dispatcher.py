@@ -11,14 +11,12 @@ import threading
 import time
 from types import FrameType
 
-from workers.warming import warm
-
 from service.dispatch.claiming import Leases
 from service.dispatch.preparing import JobRuns
 from service.dispatch.recording import Recorder
-from service.dispatch.signals import Recordings
 from service.errors import Misconfigured
 from service.settings import Settings
+from service.storage import migrate
 from service.storage.errors import LeaseLost, StorageError
 from service.storage.objects import ObjectStore, open_store
 from service.storage.queue import Claim
@@ -29,6 +27,7 @@ from workers.cluster import ClusterSettings, RayCrew
 from workers.errors import WorkersError
 from workers.feeding import Feeder
 from workers.ports import Crew
+from workers.warming import warm
 
 _log = logging.getLogger("lagid.dispatcher")
 
@@ -47,7 +46,6 @@ class Dispatcher:
     def __init__(self, database: Database, store: ObjectStore, crew: Crew, lease: float) -> None:
         self.stopping = threading.Event()
         self._database, self._store, self._crew = database, store, crew
-        self._recordings = Recordings(store)
         self._woken = threading.Event()
         self._leases = Leases(database, lease)
         self._feeder = Feeder(crew)
@@ -109,7 +107,7 @@ class Dispatcher:
 
     def _take(self, claim: Claim) -> None:
         job = claim.job.id
-        source = JobRuns(self._database, claim, self._recordings, self._store)
+        source = JobRuns(self._database, claim, self._store)
         recorder = Recorder(self._database, claim, source.save)
         self._recorders[job] = recorder
         self._feeder.add(job, source, recorder)
@@ -148,9 +146,6 @@ class Dispatcher:
 
 def main() -> int:
     """Run a dispatcher with the settings of the environment; gives the exit code."""
-    logging.basicConfig(
-        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
-    )
     try:
         return serve(Settings())
     except (Misconfigured, StorageError, WorkersError) as error:
@@ -166,8 +161,11 @@ def serve(settings: Settings) -> int:
     Misconfigured, StorageError, WorkersError
         If the data folder, the database, the object store or Ray cannot be used.
     """
+    form = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+    logging.basicConfig(level=logging.INFO, format=form)
     settings.prepare_folder()
     database = Database(settings.database)
+    migrate.upgrade(database)
     store = open_store(settings.store)
     compiling = threading.Thread(target=warm, name="warm", daemon=True)
     compiling.start()  # the compiler and Ray's start wait on different things

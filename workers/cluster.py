@@ -70,7 +70,7 @@ class RayCrew:
             os.environ.update(ONE_THREAD)  # inherited by the local workers
         import ray
 
-        self._ray = ray
+        self._ray: Any = ray
         try:
             _initialise(ray, settings, self._folder)
         except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:

@@ -162,6 +162,7 @@ class JobWork:
     def _take(self, run: ActiveRun, one: Done) -> None:
         match one.outcome:
             case Failure() as failure:
+                self._cost = self._cost.observe(one.seconds)
                 self._fail(run.run, failure)
             case Concluded() as concluded:
                 self._cost = self._cost.observe(one.seconds)

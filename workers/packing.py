@@ -60,7 +60,7 @@ def fairest(in_flight: Mapping[Key, int]) -> Key | None:
 
 def slice_seconds(slices: int) -> float:
     """Length of a run's next time slice after `slices` of them."""
-    return min(PACK_SECONDS, FIRST_SLICE_SECONDS * 2**slices)
+    return min(PACK_SECONDS, FIRST_SLICE_SECONDS * 2.0 ** min(slices, 10))
 
 
 def is_worth_spreading(epoch_seconds: float, islands: int, idle: int) -> bool:

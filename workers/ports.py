@@ -8,22 +8,15 @@ from hashlib import blake2b
 from typing import Any, Protocol, TypeAlias
 
 from sysid.ga.island import Island
+from sysid.islands.run_state import RunState
+from sysid.noise import Noise
 from sysid.records import Record
 from sysid.result import Identification
-from sysid.run import RunState
 from sysid.settings import GeneticAlgorithm, Loss, Prediction
 
 Records: TypeAlias = tuple[Record, ...]
 Handle: TypeAlias = Any
 """Names a pack in flight; only the crew that gave it knows more."""
-
-
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """Noise added to the measured outputs before fitting (Eq. 19, 20)."""
-
-    sigma: float = 0.0
-    seed: int = 0
 
 
 @dataclass(frozen=True)

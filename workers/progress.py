@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field, replace
 
 from sysid.ga.island import Island
-from sysid.run import RunState, border, exchange, is_finished
+from sysid.islands.run_state import RunState
+from sysid.run import border, exchange, is_finished
 from workers.packing import is_worth_spreading, slice_seconds
 from workers.ports import Advance, Evolve, Evolved, Item, QueuedRun, RunSpec
 

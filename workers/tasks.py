@@ -4,12 +4,11 @@ import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 
-from sysid.noise import add_noise
-from sysid.problem import Problem
-
 from sysid.errors import SysidError
 from sysid.ga.island import Island
 from sysid.models.spec import parse_model
+from sysid.noise import with_noise
+from sysid.problem import Problem
 from sysid.records import split_record
 from sysid.run import CALL_SECONDS, advance_island, begin, conclude, is_finished
 from sysid.run import advance as advance_run
@@ -50,7 +49,7 @@ def advance(pack: Sequence[Item], keys: Sequence[str], *shared: Records) -> tupl
     """
     records = dict(zip(keys, shared, strict=True))
     begun = time.perf_counter()
-    done = []
+    done: list[Done] = []
     for item in pack:
         started = time.perf_counter()
         if done and started - begun > PACK_LIMIT_SECONDS:
@@ -89,7 +88,7 @@ def _evolved(item: Evolve, problem: Problem) -> Island:
         count = max(1, min(item.target - island.generation, int(CALL_SECONDS / cost)))
         started = time.perf_counter()
         before = island.generation
-        island = advance_island(problem, item.spec.algorithm, island, count, item.spec.seed)
+        island = advance_island(problem, item.spec.algorithm, island, count)
         cost = max((time.perf_counter() - started) / count, 1e-9)
         if island.generation < before + count:
             return island  # it rests
@@ -134,6 +133,5 @@ def prepared(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Records
     if spec.validation_fraction is not None:
         parts = [split_record(record, spec.validation_fraction) for record in estimation]
         estimation, validation = tuple(p[0] for p in parts), tuple(p[1] for p in parts)
-    if spec.noise.sigma > 0:
-        estimation = add_noise(estimation, spec.noise.sigma, spec.noise.seed)
-    return estimation, validation
+    noisy = (with_noise(record, spec.noise, number) for number, record in enumerate(estimation))
+    return tuple(noisy), validation

@@ -1,17 +1,18 @@
 """Compile, or load from the cache, every loop that a run needs, before the first run comes."""
 
 import numpy as np
-from sysid.problem import Problem
 
 from sysid.models.library import load_model
+from sysid.problem import Problem
 from sysid.records import Channel, Record
 from sysid.run import advance, begin, conclude
 from sysid.settings import METHODS, GeneticAlgorithm
+from sysid.types import FloatArray
 
 
 def warm() -> None:
     """A run of a few generations by each method, on a record of a few samples."""
-    times = np.arange(40) * 0.1
+    times: FloatArray = np.arange(40, dtype=np.float64) * 0.5
     values = 1.0 - np.exp(-times)
     record = Record((Channel("u", times, np.ones_like(times)),), (Channel("y", times, values),))
     problem = Problem.build(load_model("fopdt"), (record,))

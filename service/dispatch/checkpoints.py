@@ -4,7 +4,7 @@ import pickle
 import zlib
 from importlib.metadata import version
 
-from sysid.run import RunState
+from sysid.islands.run_state import RunState
 
 _HEADER = f"lagid {version('lagid')} run state 1\n".encode()
 

@@ -108,5 +108,5 @@ class Leases:
         with self._lock:
             still = set(self._held.values())
             self._lost |= {one for one in before.values() if one not in renewed and one in still}
-        if any(reaped):
+        if reaped.requeued or reaped.failed or reaped.cancelled:
             _log.warning("leases of silent dispatchers: %s", reaped)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from service import models
 from service.conversion import algorithm_of, loss_of
 from service.dispatch.checkpoints import unpacked
-from service.dispatch.signals import Recordings, save_fit
+from service.dispatch.signals import save_fit
 from service.errors import ServiceError
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import LeaseLost, StorageError
@@ -19,9 +19,10 @@ from service.storage.tables import Run
 from service.sweeps import body_of
 from sysid.errors import SysidError
 from sysid.models.model import Model
+from sysid.noise import Noise
 from sysid.result import Identification
 from workers.errors import RecordsUnavailable
-from workers.ports import Failure, Noise, ProblemSpec, QueuedRun, Records, RefusedRun, RunSpec
+from workers.ports import Failure, ProblemSpec, QueuedRun, Records, RefusedRun, RunSpec
 from workers.tasks import prepared
 
 _log = logging.getLogger(__name__)
@@ -44,11 +45,10 @@ class JobRuns:
         self,
         database: Database,
         claim: Claim,
-        recordings: Recordings,
         store: ObjectStore,
     ) -> None:
         self._database, self._lease, self._job = database, claim.lease, claim.job
-        self._recordings, self._store = recordings, store
+        self._store = store
         self._problems: dict[str, ProblemSpec] = {}
         self._models: dict[str, Model] = {}
         self._data: dict[str, DataKey] = {}

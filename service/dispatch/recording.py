@@ -15,8 +15,8 @@ from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOut
 from service.storage.queue import Claim, Progress, Queue
 from service.storage.sessions import Database
 from service.storage.tables import State
+from sysid.islands.run_state import RunState
 from sysid.result import Identification, Improvement, Migrant
-from sysid.run import RunState
 from workers.errors import RecordsUnavailable
 from workers.ports import Concluded, Failure
 
@@ -150,8 +150,11 @@ class Recorder:
             queue = Queue(session)
             job = queue.hold(self.lease)
             session.refresh(job)
-            state = State.FAILED if job.n_failed == job.n_runs else State.SUCCEEDED
-            queue.finish(self.lease, state, self._complaint(job.n_failed, job.n_runs))
+            complaint = self._complaint(job.n_failed, job.n_runs)
+            if job.n_failed == job.n_runs:
+                queue.finish(self.lease, State.FAILED, complaint)
+            else:
+                queue.finish(self.lease, State.SUCCEEDED, complaint)
 
     def cancel(self) -> None:
         """End the job as cancelled; what its runs gave before stays."""

@@ -1,0 +1,101 @@
+"""Small identifications for tests of workers and dispatcher."""
+
+from collections.abc import Iterable, Iterator, Mapping
+
+import numpy as np
+
+from sysid.models.library import document
+from sysid.records import Channel, Record
+from sysid.result import Identification
+from sysid.run import RunState
+from sysid.settings import GeneticAlgorithm
+from sysid.types import FloatArray
+from workers.feeding import Feeder
+from workers.ports import (
+    Concluded, Crew, Failure, ProblemSpec, QueuedRun, Records, RefusedRun, RunSpec,
+)  # fmt: skip
+
+
+def step_record(n: int = 120, delay: float = 0.7, seed: int = 3) -> Record:
+    """First order plus dead time, excited by random steps, with a little noise."""
+    draw = np.random.default_rng(seed)
+    times: FloatArray = np.arange(n, dtype=np.float64) * 0.1
+    u = np.repeat(draw.integers(0, 2, n // 10 + 1), 10)[:n].astype(np.float64)
+    y, state = np.empty(n), 0.0
+    lag = round(delay / 0.1)
+    for k in range(n):
+        y[k] = state
+        state += 0.1 * ((2.0 * u[max(k - lag, 0)] if k >= lag else 0.0) - state) / 0.8
+    y += draw.normal(0.0, 0.01, n)
+    return Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
+
+
+RECORDS: Mapping[str, Records] = {"short": (step_record(),), "long": (step_record(4000),)}
+
+
+def spec(seed: int = 1, records: str = "short", generations: int = 60, **settings: object) -> RunSpec:
+    """A small search with two islands."""
+    algorithm = GeneticAlgorithm(
+        **{"population": 16, "generations": generations, "islands": 2, **settings}  # type: ignore[arg-type]
+    )
+    parameters = {"T": {"upper": 10.0}, "L": {"upper": 2.0}}
+    problem = ProblemSpec(document("fopdt"), records, parameters=parameters)
+    return RunSpec(problem, algorithm, seed)
+
+
+class ListedRuns:
+    """A job's runs as a list; implements `workers.ports.JobSource`."""
+
+    def __init__(self, runs: Iterable[QueuedRun | RefusedRun]) -> None:
+        self._runs = list(runs)
+
+    def runs(self) -> Iterator[QueuedRun | RefusedRun]:
+        yield from self._runs
+
+    def records(self, key: str) -> Records:
+        return RECORDS[key]
+
+
+class Notebook:
+    """Keeps what it is told; implements `workers.ports.RunObserver`."""
+
+    def __init__(self) -> None:
+        self.begun: list[str] = []
+        self.states: dict[str, list[RunState]] = {}
+        self.results: dict[str, list[Identification]] = {}
+        self.failures: dict[str, list[Failure]] = {}
+        self.is_stopped = False
+
+    def started(self, run: str) -> None:
+        self.begun.append(run)
+
+    def progress(self, run: str, state: RunState, seconds: float) -> None:
+        self.states.setdefault(run, []).append(state)
+
+    def result(self, run: str, concluded: Concluded, seconds: float) -> None:
+        self.results.setdefault(run, []).append(concluded.identification)
+
+    def failure(self, run: str, failure: Failure) -> None:
+        self.failures.setdefault(run, []).append(failure)
+
+    def should_stop(self) -> bool:
+        return self.is_stopped
+
+
+def carry_out(crew: Crew, specs: Mapping[str, RunSpec], steps: int = 2000) -> Notebook:
+    """Feed one job of these runs to the crew until it has ended."""
+    feeder, notebook = Feeder(crew), Notebook()
+    feeder.add("job", ListedRuns(QueuedRun(run, one) for run, one in specs.items()), notebook)
+    for _ in range(steps):
+        if feeder.step(0.05):
+            return notebook
+    raise AssertionError("the job did not end")
+
+
+def bits(found: Identification) -> tuple[object, ...]:
+    """Everything of a result that must not depend on where it was computed."""
+    return (
+        tuple((one.name, one.value, one.stderr) for one in found.estimates),
+        found.rms, found.evaluations, found.generations, found.history, found.migrations,
+        tuple(values.tobytes() for outputs in found.simulated for values in outputs),
+    )  # fmt: skip

@@ -1,0 +1,214 @@
+"""The driver of a crew, with a crew that answers as the test says; no Ray, no numerics."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+
+from sysid.errors import InvalidSettings
+from tests.runs import ListedRuns, Notebook, spec
+from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
+from workers.feeding import Feeder
+from workers.packing import PACKS_PER_CPU
+from workers.ports import Done, Failure, Item, QueuedRun, Records, RefusedRun
+
+Answer = Callable[[Item], Done | PackLost]
+
+
+class ScriptedCrew:
+    """Answers a pack, when it is waited for, with what the script says of its items."""
+
+    def __init__(self, answer: Answer, slots: int = 2) -> None:
+        self.slots, self.answer = slots, answer
+        self.packs: dict[int, tuple[Item, ...]] = {}
+        self.sent: list[tuple[str, ...]] = []
+        self.cancelled: list[tuple[int, bool]] = []
+        self.is_slow = False
+
+    def share(self, records: Records) -> Any:
+        return records
+
+    def submit(self, pack: Sequence[Item], keys: Sequence[str], shared: Sequence[Any]) -> int:
+        self.packs[len(self.sent)] = tuple(pack)
+        self.sent.append(tuple(item.run for item in pack))
+        return len(self.sent) - 1
+
+    def finished(self, timeout: float) -> tuple[int, ...]:
+        return () if self.is_slow else tuple(reversed(self.packs))
+
+    def fetch(self, handle: int) -> tuple[Done, ...]:
+        answers = [self.answer(item) for item in self.packs.pop(handle)]
+        for one in answers:
+            if isinstance(one, PackLost):
+                raise one
+        return tuple(one for one in answers if isinstance(one, Done))
+
+    def cancel(self, handle: int, *, force: bool) -> None:
+        self.cancelled.append((handle, force))
+
+    def check(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def fails(item: Item) -> Done:
+    """The quickest way to end a run."""
+    return Done(item.run, Failure("as told"), 0.01)
+
+
+def jobs(feeder: Feeder, **sizes: int) -> dict[str, Notebook]:
+    notebooks = {}
+    for job, size in sizes.items():
+        notebooks[job] = Notebook()
+        queued = (QueuedRun(f"{job}{number}", spec()) for number in range(size))
+        feeder.add(job, ListedRuns(queued), notebooks[job])
+    return notebooks
+
+
+def finish(feeder: Feeder) -> list[str]:
+    ended: list[str] = []
+    for _ in range(1000):
+        ended += feeder.step(0.0)
+        if not len(feeder):
+            return ended
+    raise AssertionError("the jobs did not end")
+
+
+def test_every_run_ends_exactly_once_whatever_the_order_of_the_packs() -> None:
+    feeder = Feeder(ScriptedCrew(fails))
+    notebooks = jobs(feeder, a=150, b=1)
+    assert sorted(finish(feeder)) == ["a", "b"]
+    assert {run: len(told) for run, told in notebooks["a"].failures.items()} == {
+        f"a{number}": 1 for number in range(150)
+    }
+    assert sorted(notebooks["a"].begun) == sorted(notebooks["a"].failures)
+
+
+def test_the_packs_in_flight_are_shared_between_jobs() -> None:
+    crew = ScriptedCrew(fails)
+    crew.is_slow = True
+    feeder = Feeder(crew)
+    jobs(feeder, a=100, b=100)
+    feeder.step(0.0)
+    assert len(crew.packs) == PACKS_PER_CPU * crew.slots
+    names = [pack[0][0] for pack in crew.sent]
+    assert names.count("a") == names.count("b")
+
+
+def test_runs_of_known_cost_share_a_pack() -> None:
+    crew = ScriptedCrew(fails)
+    feeder = Feeder(crew)
+    jobs(feeder, a=100)
+    finish(feeder)
+    assert len(crew.sent) < 40
+    assert max(map(len, crew.sent)) > 1
+
+
+def test_a_run_whose_worker_dies_once_is_sent_again() -> None:
+    died: list[str] = []
+
+    def answer(item: Item) -> Done | PackLost:
+        if item.run == "a1" and not died:
+            died.append(item.run)
+            return WorkerDied("killed")
+        return fails(item)
+
+    feeder = Feeder(ScriptedCrew(answer))
+    notebook = jobs(feeder, a=4)["a"]
+    finish(feeder)
+    assert [failure.reason for failure in notebook.failures["a1"]] == ["as told"]
+
+
+def test_a_run_that_kills_every_worker_fails_alone_and_says_so() -> None:
+    def answer(item: Item) -> Done | PackLost:
+        return WorkerDied("out of memory") if item.run == "a1" else fails(item)
+
+    feeder = Feeder(ScriptedCrew(answer))
+    notebook = jobs(feeder, a=4)["a"]
+    finish(feeder)
+    (failure,) = notebook.failures.pop("a1")
+    assert failure.reason == "its worker process died 3 times; the last time: out of memory"
+    assert all(told == [Failure("as told")] for told in notebook.failures.values())
+
+
+def test_a_programming_error_fails_the_runs_of_its_pack_with_its_last_line() -> None:
+    def answer(item: Item) -> Done | PackLost:
+        return PackFailed("Traceback\n  …\nKeyError: 'x'") if item.run == "a0" else fails(item)
+
+    feeder = Feeder(ScriptedCrew(answer))
+    notebook = jobs(feeder, a=2)["a"]
+    finish(feeder)
+    assert notebook.failures["a0"][0].reason == "internal error: KeyError: 'x'"
+    assert notebook.failures["a1"][0].reason == "as told"
+
+
+def test_work_whose_turn_did_not_come_is_sent_again() -> None:
+    late: list[str] = []
+
+    def answer(item: Item) -> Done:
+        if item.run in late:
+            return fails(item)
+        late.append(item.run)
+        return Done(item.run, None, 0.0)
+
+    feeder = Feeder(ScriptedCrew(answer))
+    notebook = jobs(feeder, a=3)["a"]
+    finish(feeder)
+    assert sorted(notebook.failures) == ["a0", "a1", "a2"]
+
+
+def test_a_stopped_job_begins_nothing_more_and_is_told_nothing_more() -> None:
+    crew = ScriptedCrew(fails)
+    crew.is_slow = True
+    feeder = Feeder(crew, grace_seconds=60.0)
+    notebook = jobs(feeder, a=100)["a"]
+    feeder.step(0.0)
+    sent = len(crew.sent)
+    notebook.is_stopped = True
+    feeder.step(0.0)
+    assert sorted(crew.cancelled) == [(handle, False) for handle in range(sent)]
+    crew.is_slow, crew.answer = False, lambda item: PackCancelled("cancelled")
+    assert finish(feeder) == ["a"]
+    assert len(crew.sent) == sent
+    assert notebook.failures == {}
+
+
+def test_a_pack_that_outlives_the_grace_period_is_killed() -> None:
+    crew = ScriptedCrew(fails)
+    crew.is_slow = True
+    feeder = Feeder(crew, grace_seconds=0.0)
+    notebook = jobs(feeder, a=1)["a"]
+    feeder.step(0.0)
+    notebook.is_stopped = True
+    for _ in range(3):
+        feeder.step(0.0)
+    assert crew.cancelled == [(0, False), (0, True)]
+
+
+def test_a_run_without_records_fails_with_the_reason() -> None:
+    class Empty(ListedRuns):
+        def records(self, key: str) -> Records:
+            raise RecordsUnavailable("there is no dataset ds_1")
+
+    feeder, notebook = Feeder(ScriptedCrew(fails)), Notebook()
+    feeder.add("a", Empty([QueuedRun("a0", spec())]), notebook)
+    assert finish(feeder) == ["a"]
+    assert notebook.failures["a0"][0].reason == "there is no dataset ds_1"
+
+
+def test_a_refused_run_fails_with_its_reason_and_the_others_go_on() -> None:
+    feeder, notebook = Feeder(ScriptedCrew(fails)), Notebook()
+    refused = RefusedRun("a0", Failure(str(InvalidSettings("/seed", "negative"))))
+    feeder.add("a", ListedRuns([refused, QueuedRun("a1", spec())]), notebook)
+    finish(feeder)
+    assert notebook.failures["a0"][0].reason == "/seed: negative"
+    assert notebook.failures["a1"][0].reason == "as told"
+
+
+@pytest.mark.parametrize("n_runs", [0, 1])
+def test_a_job_ends_when_nothing_of_it_is_left(n_runs: int) -> None:
+    feeder = Feeder(ScriptedCrew(fails))
+    jobs(feeder, a=n_runs)
+    assert finish(feeder) == ["a"]
