@@ -182,6 +182,25 @@ def test_a_reader_goes_on_after_the_last_event_it_saw(database):
         assert EventRepository(session).last_id("job_none") == 0
 
 
+def test_an_event_is_never_seen_before_one_with_a_smaller_number(database):
+    got, _ = claimed(database)
+    before = len(events(database, got.job.id))
+
+    def write(line):
+        with database.write() as session:
+            EventRepository(session).append(got.job.id, "log", {"line": line})
+
+    with database.write() as slow:
+        EventRepository(slow).append(got.job.id, "log", {"line": "first"})
+        quick = threading.Thread(target=write, args=("second",))
+        quick.start()
+        quick.join(0.3)
+        assert len(events(database, got.job.id)) == before
+    quick.join()
+    lines = [event.data["line"] for event in events(database, got.job.id)[before:]]
+    assert lines == ["first", "second"]
+
+
 def test_a_reader_who_polls_while_two_writers_write_misses_no_event(database):
     got, _ = claimed(database)
     stop, seen = threading.Event(), []
