@@ -1,0 +1,230 @@
+import json
+import math
+
+import numpy as np
+import pytest
+
+from service.web import figures, figures_signals
+from service.web.decimation import MAX_POINTS, extremes, strided, window
+from service.web.evidence import (
+    Experiment,
+    Improvement,
+    OutputTraces,
+    RunEvidence,
+    SoughtParameter,
+    Trace,
+)
+from service.web.theme import DASHES, SERIES, series_style
+
+
+def island(points: int, start: float = 100.0) -> list[Improvement]:
+    return [
+        Improvement(n, 50 * n, start * 0.99**n, "sequence" if n % 5 == 4 else "genetic", (n / 10,))
+        for n in range(points)
+    ]
+
+
+def run(**more: object) -> RunEvidence:
+    known = {
+        "generations": 400,
+        "parameters": [SoughtParameter("L", "s", 0.0, 0.5, value=0.1127, stderr=0.0002)],
+        "history": [island(30), island(20, 80.0)],
+        "epoch": 25,
+        "migrations": [1, 2, 3],
+        "islands": [(2.0, 1.1), (1.5, 1.0), (9.0, None)],
+        "correlation": {"names": ["T", "L"], "matrix": [[1.0, -0.7], [-0.7, 1.0]]},
+    }
+    return RunEvidence(id="run_1", unit="kPa", **{**known, **more})  # type: ignore[arg-type]
+
+
+def signal(samples: int, name: str = "y") -> Trace:
+    times = np.arange(samples) * 0.01
+    return Trace(name, "V", times, np.sin(times))
+
+
+def experiment(samples: int, since: float | None = None) -> Experiment:
+    measured = signal(samples)
+    outputs = (OutputTraces(measured, measured.values + 0.5),)
+    return Experiment("record 1", outputs, (signal(samples, "u"),), since)
+
+
+def drawn(figure: figures.Figure, name: str) -> dict[str, object]:
+    return next(trace for trace in figure["data"] if trace.get("name") == name)
+
+
+@pytest.mark.parametrize("figure", figures.RUN_FIGURES.values(), ids=figures.RUN_FIGURES)
+@pytest.mark.parametrize("evidence", [run(), RunEvidence("run_0", "V")], ids=["full", "empty"])
+def test_every_figure_is_json_without_nan(figure, evidence) -> None:  # type: ignore[no-untyped-def]
+    assert json.loads(json.dumps(figure(evidence), allow_nan=False))["layout"]["height"] > 0
+
+
+def test_a_history_has_a_line_per_island_on_a_log_axis_with_its_unit() -> None:
+    figure = figures.history(run())
+    lines = [trace for trace in figure["data"] if trace["mode"] == "lines"]
+    assert [line["name"] for line in lines] == ["island 1", "island 2"]
+    assert figure["layout"]["yaxis"]["type"] == "log"
+    assert figure["layout"]["yaxis"]["title"]["text"] == "RMS [kPa]"
+
+
+def test_a_history_line_goes_on_to_the_last_generation_at_its_last_value() -> None:
+    line = drawn(figures.history(run()), "island 2")
+    assert line["x"][-1] == 400
+    assert line["y"][-1] == line["y"][-2]
+
+
+def test_a_history_over_evaluations_has_the_evaluations_as_abscissa() -> None:
+    figure = figures.history(run(), "evaluations")
+    assert drawn(figure, "island 1")["x"][:3] == [0, 50, 100]
+    assert figure["layout"]["shapes"] == []
+
+
+def test_the_phases_of_a_history_are_marked_where_they_improved() -> None:
+    marks = drawn(figures.history(run()), "sequence")
+    assert marks["x"] == [4, 9, 14, 19, 24, 29, 4, 9, 14, 19]
+
+
+def test_migrations_stand_at_the_end_of_their_epochs() -> None:
+    shapes = figures.history(run())["layout"]["shapes"]
+    assert [shape["x0"] for shape in shapes] == [25, 50, 75]
+
+
+@pytest.mark.parametrize("points", [999, 1000, 1001, 50_000])
+def test_no_line_of_a_history_or_convergence_has_over_a_thousand_points(points: int) -> None:
+    evidence = run(history=[island(points)], generations=10 * points)
+    for figure in (figures.history(evidence), figures.convergence(evidence)):
+        assert all(len(trace["x"]) <= MAX_POINTS for trace in figure["data"])
+
+
+def test_a_parameter_is_drawn_between_its_bounds_and_its_caption_has_its_error() -> None:
+    figure = figures.convergence(run())
+    low, high = figure["layout"]["yaxis"]["range"]
+    assert low < 0.0 < 0.5 < high
+    assert [shape["y0"] for shape in figure["layout"]["shapes"]] == [0.0, 0.5]
+    assert figure["layout"]["annotations"][0]["text"] == "<b>L</b> = 0.11270 ± 0.00020 s"
+
+
+def test_a_parameter_over_decades_has_a_log_axis() -> None:
+    sought = SoughtParameter("T", "s", 0.01, 100.0, "log")
+    axis = figures.convergence(run(parameters=[sought]))["layout"]["yaxis"]
+    assert axis["type"] == "log"
+    assert axis["range"][0] < -2 < 2 < axis["range"][1]
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 12])
+@pytest.mark.parametrize("columns", [1, 2, 3])
+def test_small_plots_lie_inside_the_figure_and_beside_each_other(count: int, columns: int) -> None:
+    sought = [SoughtParameter(f"p{n}", "1", 0.0, 1.0) for n in range(count)]
+    history = [[Improvement(0, 0, 1.0, "start", (0.5,) * count)]]
+    layout = figures.convergence(run(parameters=sought, history=history), columns)["layout"]
+    boxes = []
+    for n in range(count):
+        axis = "" if n == 0 else str(n + 1)
+        boxes.append((*layout[f"xaxis{axis}"]["domain"], *layout[f"yaxis{axis}"]["domain"]))
+    for left, right, bottom, top in boxes:
+        assert 0 <= left < right <= 1
+        assert 0 <= bottom < top <= 1
+    for i, a in enumerate(boxes):
+        for b in boxes[i + 1 :]:
+            assert a[1] <= b[0] or b[1] <= a[0] or a[3] <= b[2] or b[3] <= a[2]
+
+
+def test_the_waterfall_puts_the_best_island_first() -> None:
+    after = drawn(figures.waterfall(run()), "after refinement")
+    assert after["text"] == ["island 2", "island 1", "island 3"]
+    assert after["y"] == [1.0, 1.1, None]
+
+
+def test_a_response_shows_measured_minus_identified_as_residual() -> None:
+    figure = figures_signals.response(experiment(50))
+    assert drawn(figure, "residual")["y"] == [-0.5] * 50
+
+
+def test_every_row_of_a_response_has_the_same_time_axis() -> None:
+    figure = figures_signals.response(experiment(50))
+    assert all("xaxis" not in trace for trace in figure["data"])
+    assert {trace["yaxis"] for trace in figure["data"]} == {"y", "y2", "y3"}
+
+
+def test_validation_is_shaded_from_its_first_sample_to_the_last() -> None:
+    shape = figures_signals.response(experiment(100, since=0.7))["layout"]["shapes"][0]
+    assert (shape["x0"], shape["x1"]) == (0.7, 0.99)
+
+
+def test_a_record_kept_for_validation_is_shaded_from_its_start() -> None:
+    shape = figures_signals.response(experiment(100, since=-math.inf))["layout"]["shapes"][0]
+    assert shape["x0"] == 0.0
+
+
+def test_a_long_response_is_thinned_and_a_stretch_of_it_is_not() -> None:
+    record = experiment(20_000)
+    whole = figures_signals.response(record)
+    part = figures_signals.response(record, 50.0, 53.0)
+    assert all(len(trace["x"]) <= MAX_POINTS for trace in whole["data"])
+    assert whole["layout"]["meta"]["thinned"]
+    inside = [x for x in drawn(part, "measured")["x"] if 50.0 <= x <= 53.0]
+    assert len(inside) == 301
+
+
+def test_pooled_samples_are_drawn_as_points() -> None:
+    times = np.repeat(np.arange(500) * 0.01, 4)
+    output = OutputTraces(Trace("y", "1", times, times), times)
+    figure = figures_signals.response(Experiment("record 1", (output,), ()))
+    assert drawn(figure, "measured")["mode"] == "markers"
+
+
+def test_the_heights_that_a_page_reserves_are_those_of_the_figures() -> None:
+    assert figures_signals.response(experiment(9))["layout"][
+        "height"
+    ] == figures_signals.response_height(1, 1)
+    assert figures_signals.signals([signal(9), signal(9)])["layout"][
+        "height"
+    ] == figures_signals.signals_height(2)
+    assert figures.convergence(run(), 3)["layout"]["height"] == figures.convergence_height(1, 3)
+    assert figures.correlation(run())["layout"]["height"] == figures.correlation_height(2)
+
+
+def test_the_numbers_of_a_figure_are_one_row_each_in_csv() -> None:
+    lines = figures.as_csv(figures_signals.signals([signal(3, "a,b")])).splitlines()
+    assert lines[0] == "series,x,y"
+    assert lines[1:3] == ['"a,b",0.0,0.0', '"a,b",0.01,0.009999833']
+    assert figures.as_csv(figures.correlation(run())).splitlines()[2] == ",L,T,-0.7"
+
+
+def test_a_figure_in_the_dark_has_the_same_data() -> None:
+    light = figures.history(run())
+    dark = figures.in_theme(light, "dark")
+    assert dark["data"] == light["data"]
+    assert dark["layout"]["template"] != light["layout"]["template"]
+
+
+def test_no_two_of_the_first_islands_look_alike() -> None:
+    styles = [(style["color"], style["dash"]) for style in map(series_style, range(24))]
+    assert len(set(styles)) == len(SERIES) * len(DASHES)
+
+
+def test_thinning_keeps_the_ends_and_a_spike_of_one_sample() -> None:
+    values = np.zeros(100_000)
+    values[77_777] = 5.0
+    kept = extremes(values)
+    assert {0, 77_777, 99_999} <= set(kept.tolist())
+    assert kept.size <= MAX_POINTS
+    assert np.all(np.diff(kept) > 0)
+
+
+def test_thinning_passes_over_missing_values() -> None:
+    values = np.full(5000, np.nan)
+    values[2500] = 1.0
+    assert 2500 in extremes(values)
+
+
+def test_strides_keep_first_and_last() -> None:
+    assert strided(3).tolist() == [0, 1, 2]
+    assert strided(7777)[[0, -1]].tolist() == [0, 7776]
+    assert strided(7777).size <= MAX_POINTS
+
+
+def test_a_window_has_one_sample_more_at_each_side() -> None:
+    times = np.arange(10.0)
+    assert window(times, 3.0, 5.0) == slice(2, 7)
+    assert window(times, None, None) == slice(0, 10)
+    assert window(times, -5.0, 50.0) == slice(0, 10)

@@ -1,0 +1,55 @@
+from datetime import UTC, datetime, timedelta
+
+import pytest
+
+from service.web import formats
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.42, "0.4200"), (10.4912, "10.49"), (12345.6, "12346"), (0.0, "0"), (-0.5, "−0.5000"),
+     (None, "–"), (float("inf"), "–"), (1.5e-7, "1.500·10⁻⁷"), (2.5e9, "2.500·10⁹")],
+)  # fmt: skip
+def test_a_number_has_four_significant_digits(value: float | None, text: str) -> None:
+    assert formats.number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("value", "stderr", "texts"),
+    [(0.119324, 0.00041, ("0.11932", "0.00041")), (12.3456, 1.5, ("12.3", "1.5")),
+     (0.5, 0.0996, ("0.50", "0.10")), (1234.6, 77.0, ("1235", "77")),
+     (0.5, None, ("0.500000", "")), (1.0, 0.0, ("1.00000", ""))],
+)  # fmt: skip
+def test_an_estimate_ends_where_its_error_does(
+    value: float, stderr: float | None, texts: tuple[str, str]
+) -> None:
+    assert formats.estimate(value, stderr) == texts
+
+
+def test_an_interval_has_the_digits_of_the_error() -> None:
+    assert formats.interval((0.11851, 0.12012), 0.0004) == "0.11851 … 0.12012"
+    assert formats.interval(None, 0.1) == ""
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.0184, "18.4 ms"), (3.14159, "3.14 s"), (61, "1 min 1 s"), (3700, "1 h 1 min"), (None, "–")],
+)
+def test_a_duration_has_the_unit_that_suits_it(seconds: float | None, text: str) -> None:
+    assert formats.duration(seconds).replace("\u202f", " ") == text
+
+
+@pytest.mark.parametrize(
+    ("ago", "text"),
+    [(timedelta(seconds=5), "5 s"), (timedelta(minutes=3, seconds=50), "3 min"),
+     (timedelta(hours=30), "1 d"), (timedelta(seconds=-4), "0 s")],
+)  # fmt: skip
+def test_an_age_is_told_in_its_largest_unit(ago: timedelta, text: str) -> None:
+    now = datetime(2026, 1, 1, tzinfo=UTC)
+    assert formats.age(now - ago, now).replace("\u202f", " ") == text
+
+
+def test_large_counts_are_grouped_and_units_of_pure_numbers_are_not_written() -> None:
+    assert formats.count(1234567).replace("\u202f", " ") == "1 234 567"
+    assert formats.unit("1") == ""
+    assert formats.unit("kPa").strip() == "kPa"
