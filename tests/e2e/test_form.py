@@ -1,0 +1,111 @@
+"""The form of a new identification in Chromium."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from service.storage.jobs import JobRepository
+from tests.e2e.conftest import Site
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+EQUATIONS = """\
+name: my-tube
+form: differential
+inputs: {u: kPa}
+states: {y: kPa}
+parameters:
+  K: {lower: 0, upper: 2}
+  T: {lower: 0.01, upper: 2, unit: s}
+  L: {lower: 0, upper: 0.5, unit: s}
+equations:
+  y: (K*u(t - L) - y)/T
+outputs: {y: y}
+initial: {y: 0}
+"""
+
+
+def opened(site: Site, page: Page, query: str = "") -> None:
+    page.goto(f"{site.url}/{query}#new")
+    page.wait_for_function("() => document.querySelector('[name=equations]').value !== ''")
+
+
+def write_own(page: Page, text: str) -> None:
+    page.get_by_label("own equations").check()
+    page.get_by_label("equations in YAML").fill(text)
+
+
+def test_an_unknown_name_in_an_equation_is_told_with_its_column(site: Site, page: Page) -> None:
+    opened(site, page)
+    write_own(page, EQUATIONS.replace("K*u(t - L)", "Kp*u(t - L)"))
+    check = page.locator("#check")
+    expect(check).to_contain_text("column 2")
+    expect(check).to_contain_text("Kp")
+    write_own(page, EQUATIONS)
+    expect(check).to_contain_text("can be used")
+
+
+def test_own_equations_are_submitted_with_bounds_and_channels(site: Site, page: Page) -> None:
+    opened(site, page, f"?dataset={site.filled.dataset}")
+    write_own(page, EQUATIONS)
+    expect(page.locator("#check")).to_contain_text("can be used")
+    page.get_by_label("upper of L").fill("0.3")
+    page.get_by_label("output y").select_option("P2")
+    page.get_by_label("population").fill("24")
+    page.get_by_label("name of the job").fill("by hand")
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    expect(page.locator("h1")).to_have_text("by hand")
+    with site.parts.database.read() as session:
+        spec = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec
+    assert spec["model"]["name"] == "my-tube"
+    assert spec["datasets"] == [site.filled.dataset]
+    assert spec["channels"] == {"u": "P1", "y": "P2"}
+    assert spec["parameters"] == {"L": {"upper": 0.3}}
+    assert spec["algorithm"]["population"] == 24
+
+
+def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
+    opened(site, page, f"?dataset={site.filled.dataset}")
+    page.get_by_label("population").fill("2")
+    page.get_by_role("button", name="Identify").click()
+    expect(page.get_by_label("population")).to_have_attribute("aria-invalid", "true")
+    expect(page.locator('[data-fault="/algorithm"]')).to_contain_text("/algorithm/population")
+    expect(page.get_by_label("population")).to_be_focused()
+
+
+def test_a_csv_file_is_stored_and_chosen(site: Site, page: Page, tmp_path: Path) -> None:
+    path = tmp_path / "step.csv"
+    path.write_text("t [s],u [V],y [V]\n" + "".join(f"{n / 10},{n % 2},{n}\n" for n in range(20)))
+    opened(site, page)
+    page.get_by_label("or upload CSV or MCAP").set_input_files(path)
+    expect(page.locator("#form-state")).to_contain_text("step.csv is stored")
+    expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
+
+
+def test_a_file_that_cannot_be_used_is_told_with_its_place(
+    site: Site, page: Page, tmp_path: Path
+) -> None:
+    path = tmp_path / "bad.csv"
+    path.write_text("t,u,y\n0,1,2\n0.1,oops,2\n0.2,1,2\n")
+    opened(site, page)
+    page.get_by_label("or upload CSV or MCAP").set_input_files(path)
+    expect(page.locator('[data-fault="/datasets"]')).to_contain_text("oops")
+
+
+def test_a_clone_starts_from_the_request_of_the_job(site: Site, page: Page) -> None:
+    opened(site, page, f"?clone={site.filled.finished}")
+    expect(page.get_by_label("name of the job")).to_have_value("tube 40 m, pattern 1")
+    expect(page.get_by_label("validation data")).to_have_value("0.3")
+    expect(page.get_by_label("output p")).to_have_value("P2")
+    document = json.loads(page.get_by_label("equations in YAML").input_value())
+    assert document["name"] == "lagged-tube"
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    with site.parts.database.read() as session:
+        jobs = JobRepository(session)
+        specs = [jobs.get(name).spec for name in (site.filled.finished, page.url.rsplit("/", 1)[1])]
+    assert specs[0] == specs[1]

@@ -1,0 +1,171 @@
+"""The pages in Chromium: what they show, what they do live, what they must never do."""
+
+import re
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from service.storage.queue import Queue
+from tests.e2e.conftest import Site
+from tests.e2e.filled import TRUE, end_running, progress
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+LINES = ".scatterlayer .trace"
+REASON = "the model diverges everywhere"
+
+
+def figure(page: Page, name: str) -> str:
+    """Wait for a plot and give its selector."""
+    page.locator(f'[data-figure="{name}"]').scroll_into_view_if_needed()
+    page.wait_for_selector(f'[data-figure="{name}"] .main-svg')
+    return f'[data-figure="{name}"]'
+
+
+def test_the_list_shows_every_job_with_state_rms_and_unit(site: Site, page: Page) -> None:
+    page.goto(site.url)
+    rows = page.locator("table.jobs tbody tr")
+    expect(rows).to_have_count(5)
+    expect(rows.locator(".chip")).to_have_text(
+        ["queued", "running", "failed", "succeeded", "succeeded"]
+    )
+    expect(rows.nth(4)).to_contain_text(re.compile(r"0\.4200\s*kPa"))
+
+
+def test_the_list_is_filtered_by_state(site: Site, page: Page) -> None:
+    page.goto(site.url)
+    page.get_by_role("link", name="failed", exact=True).click()
+    expect(page.locator("table.jobs tbody tr")).to_have_count(1)
+    expect(page.locator("table.jobs")).to_contain_text("a model that diverges")
+
+
+def test_a_finished_job_shows_estimates_and_plots_and_opens_no_stream(
+    site: Site, page: Page
+) -> None:
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    rows = page.locator("table.estimates tbody tr")
+    expect(rows).to_have_count(len(TRUE))
+    expect(rows.nth(1)).to_have_text(re.compile(r"T\s*0\.34890\s*± 0\.00041\s*s.*identified", re.S))
+    assert page.locator(f"{figure(page, 'history')} {LINES}").count() >= 4
+    assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 4
+    assert page.locator(f"{figure(page, 'convergence')} {LINES}").count() == 4 * len(TRUE)
+    assert page.locator(f"{figure(page, 'correlation')} .hm").count() == 1
+    assert page.locator(f"{figure(page, 'waterfall')} {LINES}").count() == 2
+    expect(page.get_by_text("strongly correlated")).to_be_visible()
+    assert [url for url in asked if url.endswith("/events")] == []
+    assert [url for url in asked if not url.startswith(site.url)] == []
+
+
+def test_plots_take_the_room_that_was_left_for_them(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    height = "document.documentElement.scrollHeight"
+    before = page.evaluate(height)
+    for name in ("history", "convergence", "response", "correlation", "waterfall"):
+        figure(page, name)
+    assert page.evaluate(height) == before
+
+
+def test_the_abscissa_of_the_history_can_be_chosen_by_keyboard(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    plot = figure(page, "history")
+    button = page.get_by_role("button", name="evaluations")
+    button.focus()
+    page.keyboard.press("Enter")
+    expect(page.locator(f"{plot} .xtitle")).to_have_text("evaluations")
+    expect(button).to_have_attribute("aria-pressed", "true")
+    link = page.locator('[data-csv="history"]').get_attribute("href")
+    assert link is not None
+    assert "abscissa=evaluations" in link
+
+
+def test_a_running_job_is_redrawn_as_events_arrive_and_nothing_moves(
+    site: Site, page: Page
+) -> None:
+    filled, database = site.filled, site.parts.database
+    page.goto(f"{site.url}/jobs/{filled.running}")
+    plot = page.locator(figure(page, "history"))
+    last = "plot => Math.max(...plot.data.flatMap(trace => trace.x))"
+    assert plot.evaluate(last) == 60
+    place = plot.bounding_box()
+    loads = page.evaluate("performance.getEntriesByType('navigation').length")
+    progress(database, filled.lease, filled.running_run, 180)
+    page.wait_for_function(
+        "() => Math.max(...document.querySelector('[data-figure=history]')"
+        ".data.flatMap(trace => trace.x)) === 180"
+    )
+    expect(page.locator('[data-live="head"]')).to_contain_text("generation 180")
+    assert plot.bounding_box() == place
+    assert page.evaluate("performance.getEntriesByType('navigation').length") == loads
+
+
+def test_the_result_appears_when_a_running_job_ends(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.running}")
+    figure(page, "history")
+    expect(page.locator("table.estimates")).to_have_count(0)
+    end_running(site.parts.database, site.parts.store, site.filled.lease)
+    expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
+    expect(page.locator("#job .chip")).to_have_text("succeeded")
+    assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 4
+
+
+def test_a_job_is_cancelled_and_resumed_from_its_page(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.queued}")
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.locator("#job .chip")).to_have_text("cancelled")
+    page.get_by_role("button", name="Resume").click()
+    expect(page.locator("#job .chip")).to_have_text("queued")
+    with site.parts.database.write() as session:
+        assert Queue(session).n_queued() == 1
+
+
+def test_a_failed_job_says_why_and_a_name_is_never_markup(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.failed}")
+    expect(page.get_by_role("alert").filter(has_text=REASON).first).to_be_visible()
+    page.goto(f"{site.url}/jobs/{site.filled.running}")
+    expect(page.locator("h1")).to_have_text("tube 80 m <b>live</b>")
+
+
+def test_a_job_of_many_runs_shows_a_table_and_the_best_of_them(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.sweep}")
+    rows = page.locator("table.runs tbody tr")
+    expect(rows).to_have_count(12)
+    expect(page.locator('tr[aria-current="true"]')).to_contain_text("run 1")
+    rows.nth(6).get_by_role("link").click()
+    expect(page.locator('tr[aria-current="true"]')).to_contain_text("run 7")
+    assert page.locator(f"{figure(page, 'history')} {LINES}").count() >= 4
+
+
+def test_the_page_of_a_dataset_draws_its_channels_and_a_zoom_brings_more_samples(
+    site: Site, page: Page
+) -> None:
+    page.goto(f"{site.url}/datasets/{site.filled.dataset}")
+    plot = page.locator(figure(page, "signals"))
+    expect(plot.locator(LINES)).to_have_count(2)
+    assert plot.evaluate("plot => plot.data[0].x.length") <= 1000
+    plot.evaluate("plot => Plotly.relayout(plot, {'xaxis.range[0]': 10, 'xaxis.range[1]': 12})")
+    page.wait_for_function(
+        "() => document.querySelector('[data-figure=signals]')"
+        ".data[0].x.filter(x => x >= 10 && x <= 12).length >= 200"
+    )
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_figures_follow_the_paper(site: Site, page: Page, scheme: str) -> None:
+    page.emulate_media(color_scheme="dark" if scheme == "dark" else "light")
+    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    plot = figure(page, "history")
+    colour = page.locator(f"{plot} .xtitle").evaluate("node => getComputedStyle(node).fill")
+    red = int(re.findall(r"\d+", colour)[0])
+    assert (red > 128) == (scheme == "dark")
+
+
+def test_the_report_is_drawn_without_a_server(site: Site, page: Page) -> None:
+    answer = page.request.get(f"{site.url}/v1/jobs/{site.filled.finished}/report")
+    assert answer.ok
+    page.route("**/*", lambda route: route.abort())
+    page.set_content(answer.text())
+    page.wait_for_selector(".plot .main-svg")
+    assert page.locator(".js-plotly-plot").count() == 5
+    expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))

@@ -1,0 +1,143 @@
+"""Pages, figures and files over HTTP, without a browser."""
+
+import gzip
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from service.settings import Settings
+from service.web import assets
+from tests.e2e.filled import Filled, fill
+
+
+@pytest.fixture(scope="module")
+def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    folder = tmp_path_factory.mktemp("pages")
+    with TestClient(create_app(Settings(data_dir=folder))) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def filled(client: TestClient) -> Filled:
+    parts = client.app.state.parts  # type: ignore[attr-defined]
+    return fill(parts.database, parts.store, parts.settings)
+
+
+def test_an_empty_service_has_a_page_that_says_how_to_begin(tmp_path: Path) -> None:
+    with TestClient(create_app(Settings(data_dir=tmp_path))) as client:
+        answer = client.get("/")
+    assert answer.status_code == 200
+    assert "No identification yet" in answer.text
+
+
+def test_pages_run_no_script_but_those_of_the_service(client: TestClient) -> None:
+    policy = client.get("/").headers["content-security-policy"]
+    assert "script-src 'self';" in policy
+    assert "default-src 'none'" in policy
+
+
+def test_no_page_names_another_host(client: TestClient, filled: Filled) -> None:
+    for path in ("/", f"/jobs/{filled.finished}", f"/datasets/{filled.dataset}"):
+        text = client.get(path).text
+        assert 'src="http' not in text
+        assert 'href="http' not in text
+
+
+def test_what_a_user_writes_is_escaped(client: TestClient, filled: Filled) -> None:
+    for path in ("/", f"/jobs/{filled.running}", f"/v1/jobs/{filled.running}/report"):
+        text = client.get(path).text
+        assert "tube 80 m &lt;b&gt;live&lt;/b&gt;" in text
+        assert "<b>live" not in text
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/jobs/job_x", "/runs/run_x", "/datasets/ds_x", "/static/x.js", "/static/..%2fpages.py",
+     "/v1/runs/run_x/figures/history", "/pages/models/nothing.yaml"],
+)  # fmt: skip
+def test_what_is_not_there_is_not_found(client: TestClient, path: str) -> None:
+    answer = client.get(path)
+    assert answer.status_code == 404
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_the_pages_of_jobs_follow_each_other(client: TestClient, filled: Filled) -> None:
+    assert client.get("/").text.count('<tr data-job="') == 5
+    assert client.get("/", params={"cursor": filled.failed}).text.count('<tr data-job="') == 2
+
+
+def test_plotly_is_served_compressed_and_kept_forever(client: TestClient) -> None:
+    name = f"/static/{assets.plotly_name()}"
+    answer = client.get(name, headers={"Accept-Encoding": "gzip"})
+    assert answer.headers["content-encoding"] == "gzip"
+    assert "immutable" in answer.headers["cache-control"]
+    plain = client.get(name, headers={"Accept-Encoding": "identity"})
+    assert plain.text == answer.text
+    assert len(gzip.compress(plain.content, 1)) < len(plain.content) / 2
+
+
+def test_an_unchanged_file_is_not_sent_again(client: TestClient) -> None:
+    first = client.get("/static/lagid.css")
+    again = client.get("/static/lagid.css", headers={"If-None-Match": first.headers["etag"]})
+    assert (first.status_code, again.status_code, again.content) == (200, 304, b"")
+
+
+@pytest.mark.parametrize("name", ["history", "convergence", "response", "correlation", "waterfall"])
+def test_every_figure_comes_as_plotly_json_and_as_csv(
+    client: TestClient, filled: Filled, name: str
+) -> None:
+    path = f"/v1/runs/{filled.finished_run}/figures/{name}"
+    figure = client.get(path).json()
+    assert set(figure) == {"data", "layout"}
+    assert figure["data"]
+    table = client.get(path, params={"format": "csv"})
+    assert table.headers["content-type"].startswith("text/csv")
+    assert len(table.text.splitlines()) > 3
+
+
+@pytest.mark.parametrize(
+    ("name", "query"),
+    [("history", "abscissa=years"), ("response", "start=nan"), ("history", "theme=pink"),
+     ("history", "nonsense=1"), ("spectrum", "")],
+)  # fmt: skip
+def test_a_figure_that_cannot_be_made_is_a_fault_of_the_request(
+    client: TestClient, filled: Filled, name: str, query: str
+) -> None:
+    answer = client.get(f"/v1/runs/{filled.finished_run}/figures/{name}?{query}")
+    assert answer.status_code == 422
+    assert answer.json()["errors"]
+
+
+def test_an_experiment_beyond_the_last_is_not_found(client: TestClient, filled: Filled) -> None:
+    path = f"/v1/runs/{filled.finished_run}/figures/response?experiment=1"
+    assert "the last is 0" in client.get(path).json()["detail"]
+
+
+def test_the_response_joins_the_parts_of_one_record(client: TestClient, filled: Filled) -> None:
+    path = f"/v1/runs/{filled.finished_run}/figures/response"
+    layout = client.get(path).json()["layout"]
+    assert layout["meta"]["experiments"] == ["record 1"]
+    assert layout["shapes"][0]["x0"] == 21.0
+
+
+def test_a_run_that_has_not_ended_has_an_empty_response(client: TestClient, filled: Filled) -> None:
+    path = f"/v1/runs/{filled.running_run}/figures/response"
+    assert client.get(path).json()["data"] == []
+
+
+def test_the_report_of_a_job_names_no_other_file(client: TestClient, filled: Filled) -> None:
+    answer = client.get(f"/v1/jobs/{filled.sweep}/report")
+    head = answer.text[: answer.text.index("<style>")]
+    assert answer.status_code == 200
+    assert "src=" not in head
+    assert "<link" not in answer.text
+    assert "sha256-" in answer.headers["content-security-policy"]
+
+
+def test_a_model_is_shown_as_yaml(client: TestClient) -> None:
+    answer = client.get("/pages/models/tube.yaml")
+    assert answer.status_code == 200
+    assert "equations:" in answer.text
