@@ -59,11 +59,11 @@ class Arguments:
             self.fail(name, f"found {value!r}; need a positive number")
         return value
 
-    def whole(self, name: str, default: int | None = None) -> int:
-        """Return a whole number, 0 or more."""
+    def whole(self, name: str, default: int | None = None, most: int = 2**63 - 1) -> int:
+        """Return a whole number from 0 to `most`."""
         value = self._given.get(name, default)
-        if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-            self.fail(name, f"found {value!r}; need a whole number, 0 or more")
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
+            self.fail(name, f"found {value!r}; need a whole number from 0 to {most}")
         return value
 
     def text(self, name: str, default: str | None = None) -> str:

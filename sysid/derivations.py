@@ -12,11 +12,13 @@ import numpy as np
 
 from sysid.arguments import Arguments
 from sysid.errors import InvalidRecord, InvalidSettings, nearest
+from sysid.noise import Noise, noise_samples
 from sysid.pooling import pool, select
 from sysid.records import HOLDS, Channel, Hold, Recording, Segment, time_of_cut
 from sysid.resampling import resample
 from sysid.types import FloatArray
 
+KINDS = ("gaussian", "uniform-sum")
 _HOLDS: Mapping[str, Hold] = {hold: hold for hold in HOLDS}
 Step = Callable[[Recording, Arguments], Recording]
 
@@ -48,22 +50,28 @@ def derive(recording: Recording, steps: Sequence[Mapping[str, Any]]) -> Recordin
 
 
 def add_noise(recording: Recording, given: Arguments) -> Recording:
-    """Add white Gaussian noise of standard deviation `sigma` (in the channel's unit).
+    """Add noise of standard deviation `sigma` (in the channel's unit) to the named channels.
 
-    The draw depends on the seed and the channel's name only: the same samples whatever other
-    channels there are.
+    The draw depends on the seed and on the channel's place in the list, as the noise of a job
+    depends on the output's place: the same numbers either way.
     """
-    given.only("sigma", "seed", "channels")
-    sigma, seed = given.number("sigma"), given.whole("seed", 0)
-    if sigma < 0:
-        given.fail("sigma", f"found {sigma!r}; need 0 or more")
-
-    def noisy(channel: Channel) -> FloatArray:
-        key = [seed, *channel.name.encode()]
-        generator = np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
-        return channel.values + sigma * generator.standard_normal(channel.values.size)
-
-    return _changed(recording, given.texts("channels"), noisy)
+    given.only("sigma", "seed", "channels", "kind", "terms", "mean")
+    names = given.texts("channels")
+    try:
+        noise = Noise(
+            given.number("sigma"),
+            given.whole("seed", 0),
+            "uniform-sum" if given.choice("kind", KINDS, "gaussian") == KINDS[1] else "gaussian",
+            given.whole("terms", 12, most=1000),
+            given.number("mean", 0.0),
+        )
+    except InvalidSettings as error:
+        given.fail(error.pointer.rpartition("/")[2], error.detail)
+    return _changed(
+        recording,
+        names,
+        lambda one: one.values + noise_samples(noise, one.values.size, names.index(one.name)),
+    )
 
 
 def trim(recording: Recording, given: Arguments) -> Recording:

@@ -19,6 +19,7 @@ from sysid.types import FloatArray
 Rule = Literal["nanoseconds", "regular", "field"]
 Nanoseconds = NDArray[np.uint64]
 LATEST_NS = 2**63
+LATEST_S = LATEST_NS / 1e9
 TIME_FIELD = "time_s"
 
 
@@ -64,6 +65,8 @@ class Clock:
             raise ValueError(f"{entry!r} is not a rule of times")
         if not isinstance(start, int | float) or not isinstance(period, int | float):
             raise ValueError(f"{entry!r} is not a rule of times")
+        if not (-LATEST_S < epoch <= 0 and abs(start) < LATEST_S and 0 <= period < LATEST_S):
+            raise ValueError(f"{entry!r} goes beyond the clock of a file")
         return cls(rule, epoch, float(start), float(period))
 
 
@@ -76,7 +79,7 @@ def clock_for(times: FloatArray) -> tuple[Clock, Nanoseconds]:
         If they span more than a file's clock can hold (292 years).
     """
     epoch = min(0, floor(float(times[0])))
-    if float(times[-1]) - epoch >= LATEST_NS / 1e9:
+    if epoch <= -LATEST_S or float(times[-1]) - epoch >= LATEST_S:
         raise ValueError(f"times up to {float(times[-1])!r} s do not fit into 63 bits of ns")
     log_times = np.rint((times - epoch) * 1e9).astype(np.uint64)
     if np.array_equal(_seconds(log_times, epoch), times):

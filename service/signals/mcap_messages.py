@@ -176,8 +176,9 @@ class Series:
 
     def add(self, log_time: int, numbers: Numbers) -> None:
         """Add one message."""
-        for name in numbers.keys() - self._columns.keys():
-            self._columns[name] = array("d", [float("nan")]) * len(self._times)
+        for name in numbers:
+            if name not in self._columns:
+                self._columns[name] = array("d", [float("nan")]) * len(self._times)
         self._times.append(log_time)
         for name, column in self._columns.items():
             column.append(numbers.get(name, float("nan")))

@@ -7,6 +7,7 @@ import pytest
 
 from sysid.derivations import derive
 from sysid.errors import InvalidSettings
+from sysid.noise import Noise, with_noise
 from sysid.records import Channel, Recording, Segment
 
 
@@ -68,6 +69,13 @@ def test_noise_has_its_deviation_is_drawn_by_the_seed_and_leaves_others_alone() 
     assert abs(np.mean(added)) < 0.01
     other = derive(start, [{"noise": {"sigma": 0.2, "seed": 8, "channels": ["y"]}}])
     assert not np.array_equal(values(first, "y"), values(other, "y"))
+
+
+def test_noise_is_the_same_as_that_of_a_job() -> None:
+    start = recording()
+    derived = derive(start, [{"noise": {"sigma": 0.2, "seed": 7, "channels": ["y"]}}])
+    record = with_noise(start.record({"u": "u"}, {"y": "y"}), Noise(0.2, 7))
+    np.testing.assert_array_equal(values(derived, "y"), record.outputs[0].values)
 
 
 def test_noise_of_two_channels_is_independent() -> None:
@@ -178,6 +186,8 @@ def test_a_pooled_input_is_the_median_of_each_bin() -> None:
         ([{"noise": {"sigma": -1, "channels": ["y"]}}], "/steps/0/noise/sigma"),
         ([{"noise": {"sigma": 1, "seed": 0.5, "channels": ["y"]}}], "/steps/0/noise/seed"),
         ([{"noise": {"sigma": 1, "channels": ["z"]}}], "/steps/0/noise"),
+        ([{"noise": {"sigma": 1, "seed": 2**64, "channels": ["y"]}}], "/steps/0/noise/seed"),
+        ([{"noise": {"sigma": 1, "terms": 2, "channels": ["y"]}}], "/steps/0/noise/terms"),
         ([{"resample": {"sample_time": 0}}], "/steps/0/resample/sample_time"),
         ([{"resample": {"sample_time": 1e-9}}], "/steps/0/resample/sample_time"),
         ([{"resample": {"sample_time": 1, "method": "cubic"}}], "/steps/0/resample/method"),

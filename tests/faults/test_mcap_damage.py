@@ -1,0 +1,244 @@
+"""Damaged and hostile MCAP files: always one clear error or a right answer, never another end."""
+
+import struct
+import zlib
+from contextlib import suppress
+from dataclasses import replace
+from io import BytesIO
+
+import lz4.frame
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Chunk, DataEnd, Footer, Header, McapRecord, Message, Metadata, Schema
+from mcap.writer import CompressionType
+
+from service.signals.errors import InvalidUpload
+from service.signals.limits import DEFAULT_LIMITS, Limits
+from service.signals.mcap_file import MAGIC
+from service.signals.reader import read_mcap
+from sysid.records import Channel, Recording
+from tests.mcap_files import foreign, json_messages, recorded
+
+TIMES = np.arange(50) * 0.1
+OURS = recorded(Recording((Channel("u", TIMES, np.sin(TIMES)), Channel("y", TIMES, TIMES**2))))
+FOREIGN = {
+    kind: foreign(
+        json_messages("/a", *({"x": k, "y": k / 2} for k in range(20))),
+        compression=kind,
+    )
+    for kind in CompressionType
+}
+FILES = [OURS, *FOREIGN.values()]
+ONE_MIB = 1024**2
+
+
+def refused(content: bytes, limits: Limits = DEFAULT_LIMITS) -> InvalidUpload:
+    with pytest.raises(InvalidUpload) as caught:
+        read_mcap(content, limits)
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+def file_of(*records: McapRecord | bytes) -> bytes:
+    """Return a file of any records, right or wrong, with a right beginning and end."""
+    stream = BytesIO()
+    stream.write(MAGIC)
+    for record in (Header("", "test"), *records, DataEnd(0), Footer(0, 0, 0)):
+        stream.write(record if isinstance(record, bytes) else as_bytes(record))
+    return stream.getvalue() + MAGIC
+
+
+def as_bytes(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
+
+
+def chunk_of(content: bytes, compression: str, packed: bytes, size: int | None = None) -> Chunk:
+    declared = len(content) if size is None else size
+    return Chunk(compression, packed, 0, 0, zlib.crc32(content), declared)
+
+
+CHANNEL = ChannelRecord(1, "/a", "json", {}, 0)
+MESSAGE = Message(1, 5, b'{"x": 2}', 5, 0)
+
+
+def test_the_parts_used_here_make_a_file_that_is_read() -> None:
+    recording, _ = read_mcap(file_of(CHANNEL, MESSAGE), DEFAULT_LIMITS)
+    assert recording.channel("x").values[0] == 2
+
+
+@pytest.mark.parametrize("content", FILES)
+def test_a_file_cut_off_anywhere_is_refused_at_a_byte_of_it(content: bytes) -> None:
+    places = {*range(60), *range(0, len(content), 7), *range(len(content) - 60, len(content))}
+    for length in sorted(places):
+        error = refused(content[:length])
+        assert error.byte is not None
+        assert 0 <= error.byte <= length
+
+
+@pytest.mark.parametrize("content", FILES)
+@given(data=st.data())
+@settings(max_examples=150, deadline=None)
+def test_flipped_bits_are_found_or_change_nothing(content: bytes, data: st.DataObject) -> None:
+    whole, _ = read_mcap(content, DEFAULT_LIMITS)
+    damaged = bytearray(content)
+    for _ in range(data.draw(st.integers(1, 3))):
+        place = data.draw(st.integers(0, len(content) - 1))
+        damaged[place] ^= 1 << data.draw(st.integers(0, 7))
+    try:
+        read, _ = read_mcap(bytes(damaged), DEFAULT_LIMITS)
+    except InvalidUpload:
+        return
+    for before, after in zip(whole.channels, read.channels, strict=True):
+        np.testing.assert_array_equal(before.values, after.values)
+
+
+@given(st.binary(max_size=400), st.sampled_from(FILES), st.data())
+@settings(max_examples=150, deadline=None)
+def test_any_bytes_put_anywhere_are_refused(
+    junk: bytes, content: bytes, data: st.DataObject
+) -> None:
+    place = data.draw(st.integers(0, len(content)))
+    damaged = content[:place] + junk + content[place + data.draw(st.integers(0, 400)) :]
+    with suppress(InvalidUpload):
+        read_mcap(damaged, DEFAULT_LIMITS)
+
+
+@given(st.lists(st.tuples(st.integers(0, 20), st.binary(max_size=80)), max_size=8))
+@settings(max_examples=200, deadline=None)
+def test_records_of_any_content_are_read_or_refused(records: list[tuple[int, bytes]]) -> None:
+    raw = [struct.pack("<BQ", opcode, len(body)) + body for opcode, body in records]
+    for content in (
+        file_of(CHANNEL, *raw, MESSAGE),
+        file_of(chunk_of(b"".join(raw), "", b"".join(raw))),
+    ):
+        with suppress(InvalidUpload):
+            read_mcap(content, DEFAULT_LIMITS)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+@pytest.mark.parametrize("declared", [1000, 64 * ONE_MIB, 2**40])
+def test_a_bomb_is_refused_without_being_unpacked(compression: str, declared: int) -> None:
+    pack = zstandard.compress if compression == "zstd" else lz4.frame.compress
+    packed = pack(bytes(96 * ONE_MIB))
+    assert len(packed) < 0.005 * 96 * ONE_MIB
+    bomb = Chunk(compression, packed, 0, 0, 0, declared)
+    assert "chunk record declares" in refused(file_of(CHANNEL, bomb)).detail
+
+
+def test_a_zstd_frame_that_asks_for_a_huge_window_is_refused() -> None:
+    # Magic, a header without size or single segment, and the window of 3.75 TiB it may ask for.
+    frame = b"\x28\xb5\x2f\xfd" + bytes([0x00, 0xFF]) + b"\x01\x00\x00"
+    assert "cannot be decompressed" in refused(file_of(Chunk("zstd", frame, 0, 0, 0, 10))).detail
+
+
+def test_many_small_chunks_are_counted_together() -> None:
+    content = bytes(60 * ONE_MIB)
+    chunk = chunk_of(
+        content,
+        "zstd",
+        zstandard.compress(b"\x80" + struct.pack("<Q", len(content) - 9) + content[9:]),
+    )
+    chunk = replace(chunk, uncompressed_crc=0)
+    limits = replace(DEFAULT_LIMITS, total_bytes=100 * ONE_MIB)
+    assert "to more than" in refused(file_of(chunk, chunk), limits).detail
+
+
+@pytest.mark.parametrize(
+    ("records", "words"),
+    [
+        ((MESSAGE,), "names channel 1"),
+        ((replace(CHANNEL, schema_id=3),), "names schema 3"),
+        ((CHANNEL, replace(CHANNEL, topic="/b")), "a second time"),
+        ((Schema(0, b"", "", ""),), "not free"),
+        ((Schema(1, b"", "", "a"), Schema(1, b"", "", "b")), "not free"),
+        ((Schema(1, bytes(2 * ONE_MIB), "", "a"),), "at most 1048576"),
+        ((CHANNEL, replace(MESSAGE, log_time=2**63)), "2⁶³"),
+        ((chunk_of(b"", "brotli", b""),), "'brotli'"),
+        ((chunk_of(as_bytes(MESSAGE), "", as_bytes(MESSAGE), 5),), "declares 5 bytes"),
+        ((replace(chunk_of(b"", "", b""), uncompressed_crc=7),), "checksum"),
+        ((chunk_of(b"\5", "", b"\5"),), "inside the head"),
+        ((chunk_of(b"\5" + bytes(7) + b"\1", "", b"\5" + bytes(7) + b"\1"),), "inside the message"),
+        ((b"\0" + bytes(8),), "opcode 0"),
+        ((b"\5" + b"\xff" * 8,), "at most 67108864"),
+        ((struct.pack("<BQ", Opcode.MESSAGE, 3) + b"abc",), "its head alone"),
+        ((struct.pack("<BQI", Opcode.METADATA, 4, 99),), "inner length"),
+        ((Footer(0, 0, 0),), "before the end of the data"),
+        ((DataEnd(0), CHANNEL, MESSAGE), "in the summary"),
+        ((DataEnd(77),), "for the data section"),
+        ((DataEnd(0), Footer(5, 0, 0)), "summary begins"),
+        ((Metadata("lagid.dataset", {"format": "9"}), CHANNEL, MESSAGE), "cannot be used"),
+        ((Metadata("lagid.dataset", {}), CHANNEL, MESSAGE), "cannot be used"),
+    ],
+)  # fmt: skip
+def test_a_record_that_cannot_be_right_is_refused(
+    records: tuple[McapRecord, ...], words: str
+) -> None:
+    assert words in refused(file_of(*records)).detail
+
+
+@pytest.mark.parametrize(
+    ("limits", "words"),
+    [
+        (Limits(file_bytes=10), "at most 10"),
+        (Limits(record_bytes=30), "at most 30"),
+        (Limits(messages=19), "messages to more than 19"),
+        (Limits(channels=1), "more than 1 fields"),
+        (Limits(total_bytes=100), "to more than 100"),
+        (Limits(schema_bytes=1), "at most 1"),
+    ],
+)
+def test_every_limit_is_kept(limits: Limits, words: str) -> None:
+    assert words in refused(FOREIGN[CompressionType.ZSTD], limits).detail
+
+
+def test_the_number_of_channels_is_limited() -> None:
+    channels = [replace(CHANNEL, id=number) for number in range(1, 5)]
+    assert "at most 3" in refused(file_of(*channels), replace(DEFAULT_LIMITS, channels=3)).detail
+
+
+def test_bytes_after_the_end_and_a_wrong_end_are_refused() -> None:
+    assert "after the end" in refused(OURS + b"\0").detail
+    assert "magic bytes" in refused(OURS[:-1] + b"x").detail
+    assert refused(b"PK\x03\x04 not mcap").byte == 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"channels": "[]"},
+        {"channels": "{"},
+        {"channels": '[{"name": "u"}]'},
+        {"channels": '[{"name":"u","unit":"V","hold":"wild","topic":"/a","field":"x"}]'},
+        {"channels": '[{"name":"u","unit":"V","hold":"first","topic":"/b","field":"x"}]'},
+        {"channels": '[{"name":"u","unit":"V","hold":"first","topic":"/a","field":"z"}]'},
+        {"topics": "[]"},
+        {"topics": '{"/a": {"rule": "guess", "epoch": 0, "start": 0, "period": 0}}'},
+        {"topics": '{"/a": {"rule": "regular", "epoch": 0, "start": 0, "period": 1e999}}'},
+        {"topics": '{"/a": {"rule": "regular", "epoch": 0, "start": 0, "period": -1}}'},
+        {"topics": '{"/a": {"rule": "nanoseconds", "epoch": 1e9, "start": 0, "period": 0}}'},
+        {"topics": '{"/a": {"rule": "field", "epoch": -99999999999, "start": 0, "period": 0}}'},
+        {"segments": '[{"start": 1, "stop": 0, "origin": 0, "labels": {}}]'},
+        {"segments": '[{"start": 0, "stop": 0, "origin": 0, "labels": {"a": []}}]'},
+        {"segments": "[" * 3000},
+    ],
+)  # fmt: skip
+def test_a_manifest_that_cannot_be_right_is_refused(change: dict[str, str]) -> None:
+    manifest = {
+        "format": "1",
+        "channels": '[{"name":"u","unit":"V","hold":"first","topic":"/a","field":"x"}]',
+        "topics": '{"/a": {"rule": "nanoseconds", "epoch": 0, "start": 0, "period": 0}}',
+        "segments": "[]",
+    }
+    later = replace(MESSAGE, log_time=10)
+    good = file_of(Metadata("lagid.dataset", manifest), CHANNEL, MESSAGE, later)
+    assert read_mcap(good, DEFAULT_LIMITS)[0].names == ("u",)
+    bad = file_of(Metadata("lagid.dataset", {**manifest, **change}), CHANNEL, MESSAGE, later)
+    refused(bad)

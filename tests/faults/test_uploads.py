@@ -1,0 +1,98 @@
+"""Uploads read in a child process: right answers, and one clear error for whatever goes wrong."""
+
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.signals.errors import InvalidUpload
+from service.signals.limits import DEFAULT_LIMITS, MIB
+from service.signals.upload import Kind, read_untrusted
+from sysid.records import Channel, Recording
+from tests.mcap_files import foreign, json_messages, recorded
+
+TIMES = np.arange(200) * 0.01
+
+
+def saved(folder: Path, content: bytes) -> Path:
+    path = folder / "upload"
+    path.write_bytes(content)
+    return path
+
+
+def refused(path: Path, kind: Kind, **options: object) -> InvalidUpload:
+    with pytest.raises(InvalidUpload) as caught:
+        read_untrusted(path, kind, **options)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+def test_a_csv_upload_is_read_with_its_notes_and_hash(tmp_path: Path) -> None:
+    content = b"n,u [V]\n1,0.5\n1,\n2,0.25\n"
+    read = read_untrusted(saved(tmp_path, content), "csv", sample_time=0.5, segments=("n",))
+    np.testing.assert_array_equal(read.recording.channel("u").values, [0.5, np.nan, 0.25])
+    assert [one.labels["n"] for one in read.recording.segments] == [1.0, 2.0]
+    assert any("missing" in note for note in read.notes)
+    assert read.source_sha256 == sha256(content).hexdigest()
+
+
+def test_an_mcap_upload_comes_through_bit_for_bit(tmp_path: Path) -> None:
+    before = Channel("u", TIMES, np.sin(TIMES), "V", "zero")
+    read = read_untrusted(saved(tmp_path, recorded(Recording((before,)))), "mcap")
+    after = read.recording.channel("u")
+    assert (after.unit, after.hold) == ("V", "zero")
+    np.testing.assert_array_equal(after.values, before.values)
+    np.testing.assert_array_equal(after.times, before.times)
+
+
+def test_the_place_of_a_fault_comes_out_of_the_child(tmp_path: Path) -> None:
+    error = refused(saved(tmp_path, b"t,u\n0,1\n1,x\n"), "csv")
+    assert (error.row, error.column) == (3, "u")
+    content = recorded(Recording((Channel("u", TIMES, TIMES),)))
+    assert refused(saved(tmp_path, content[:-100]), "mcap").byte is not None
+
+
+def test_missing_values_are_said_and_infinite_ones_refused(tmp_path: Path) -> None:
+    messages = json_messages("/a", {"x": 1}, {"x": float("nan")})
+    read = read_untrusted(saved(tmp_path, foreign(messages)), "mcap")
+    assert any("'x': 1 of 2 values are missing" in note for note in read.notes)
+    infinite = foreign(json_messages("/a", {"x": 1}, {"x": float("inf")}))
+    assert "infinite at t = 0.1 s" in refused(saved(tmp_path, infinite), "mcap").detail
+
+
+def test_a_file_larger_than_the_limit_is_refused(tmp_path: Path) -> None:
+    limits = replace(DEFAULT_LIMITS, file_bytes=10)
+    assert "at most 10" in refused(saved(tmp_path, bytes(11)), "csv", limits=limits).detail
+
+
+def test_a_file_that_takes_too_long_is_refused(tmp_path: Path) -> None:
+    limits = replace(DEFAULT_LIMITS, seconds=0.01)
+    assert "takes more than 0.01 s" in refused(saved(tmp_path, b""), "csv", limits=limits).detail
+
+
+@pytest.mark.slow
+def test_a_file_that_burns_the_processor_is_stopped(tmp_path: Path) -> None:
+    rows = "".join(f"{k},\n" for k in range(2_000_000))  # empty fields take the slow way
+    limits = replace(DEFAULT_LIMITS, seconds=0.9)
+    error = refused(saved(tmp_path, f"t,u\n{rows}".encode()), "csv", limits=limits)
+    assert "takes more than 0.9 s" in error.detail
+
+
+@pytest.mark.slow
+def test_a_file_that_needs_too_much_memory_is_refused(tmp_path: Path) -> None:
+    rows = "".join(f"{k},{k}\n" for k in range(300_000))
+    limits = replace(DEFAULT_LIMITS, memory_bytes=64 * MIB)
+    error = refused(saved(tmp_path, f"t,u\n{rows}".encode()), "csv", limits=limits)
+    assert "64 MiB of memory" in error.detail
+
+
+def test_a_file_that_makes_the_reader_stop_is_refused(tmp_path: Path) -> None:
+    limits = replace(DEFAULT_LIMITS, total_bytes=0)  # the child may not write its answer's file
+    error = refused(saved(tmp_path, b"t,u\n0,1\n1,2\n"), "csv", limits=limits)
+    assert "makes its reader stop" in error.detail
+
+
+def test_times_that_no_file_can_hold_are_refused(tmp_path: Path) -> None:
+    assert "63 bits" in refused(saved(tmp_path, b"t,u\n-1e12,1\n0,2\n"), "csv").detail

@@ -1,0 +1,43 @@
+"""Short ways to make MCAP files, ours and other programs'."""
+
+import json
+from collections.abc import Sequence
+from io import BytesIO
+
+from mcap.writer import CompressionType, Writer
+
+from service.signals.writer import write_recording
+from sysid.records import Recording
+
+
+def recorded(recording: Recording, **metadata: str) -> bytes:
+    """Content of the file of a recording."""
+    stream = BytesIO()
+    write_recording(recording, stream, metadata=metadata)
+    return stream.getvalue()
+
+
+def foreign(
+    messages: Sequence[tuple[str, int, bytes]],
+    *,
+    encoding: str = "json",
+    schema: tuple[str, str, bytes] = ("Any", "jsonschema", b"{}"),
+    compression: CompressionType = CompressionType.ZSTD,
+    chunked: bool = True,
+) -> bytes:
+    """Content of a file made by the plain `mcap` writer from (topic, log time in ns, data)."""
+    stream = BytesIO()
+    writer = Writer(stream, compression=compression, use_chunking=chunked)
+    writer.start()
+    number = writer.register_schema(*schema)
+    topics = dict.fromkeys(topic for topic, _, _ in messages)
+    channels = {topic: writer.register_channel(topic, encoding, number) for topic in topics}
+    for topic, log_time, data in messages:
+        writer.add_message(channels[topic], log_time, data, log_time)
+    writer.finish()
+    return stream.getvalue()
+
+
+def json_messages(topic: str, *values: dict[str, object]) -> list[tuple[str, int, bytes]]:
+    """Messages of one topic, a tenth of a second apart."""
+    return [(topic, k * 100_000_000, json.dumps(one).encode()) for k, one in enumerate(values)]

@@ -1,0 +1,51 @@
+"""CSV: what is printed is read back bit for bit, and no bytes whatever end in another error."""
+
+from contextlib import suppress
+
+import numpy as np
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from service.signals.csv_reader import read_csv
+from service.signals.errors import InvalidUpload
+
+VALUES = st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=30)
+
+
+@given(VALUES, st.sampled_from([",", ";", "\t"]), st.sampled_from(["\n", "\r\n"]))
+@settings(deadline=None)
+def test_printed_numbers_come_back_bit_for_bit(
+    values: list[float], separator: str, end: str
+) -> None:
+    rows = [f"t{separator}u", *(f"{k}{separator}{value!r}" for k, value in enumerate(values))]
+    recording, _ = read_csv((end.join(rows) + end).encode())
+    assert recording.channel("u").values.tobytes() == np.array(values).tobytes()
+
+
+@given(VALUES)
+@settings(deadline=None)
+def test_decimal_commas_and_points_give_the_same(values: list[float]) -> None:
+    rows = [f"{k};{value!r}" for k, value in enumerate(values)]
+    points, _ = read_csv("\n".join(["t;u", *rows]).encode())
+    commas, _ = read_csv("\n".join(["t;u", *rows]).replace(".", ",").encode())
+    np.testing.assert_array_equal(points.channel("u").values, commas.channel("u").values)
+
+
+@given(
+    st.one_of(
+        st.binary(max_size=200),
+        st.text('tu,;\t"\n\r0123456789.-+eEnaif_[] ', max_size=120).map(str.encode),
+        st.text("0123456789,.\n-", max_size=60).map(lambda body: b"t,u,n\n" + body.encode()),
+    ),
+    st.sampled_from([None, 0.1]),
+    st.sampled_from([(), ("n",)]),
+)
+@example(b't,u\n0,"' + b"x" * 200_000, None, ())
+@example(b'"' + b"x" * 200_000, None, ())
+@settings(max_examples=400, deadline=None)
+def test_any_bytes_are_read_or_refused(
+    content: bytes, sample_time: float | None, segments: tuple[str, ...]
+) -> None:
+    with suppress(InvalidUpload):
+        recording, _ = read_csv(content, sample_time=sample_time, segments=segments)
+        assert recording.samples > 0

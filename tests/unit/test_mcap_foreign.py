@@ -1,0 +1,139 @@
+"""Files of other programs: what is read, what is left out, and what is refused."""
+
+import numpy as np
+import pytest
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Kind
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
+from mcap.writer import CompressionType
+
+from service.signals.errors import InvalidUpload
+from service.signals.limits import DEFAULT_LIMITS
+from service.signals.reader import read_mcap
+from sysid.records import Recording
+from tests.mcap_files import foreign, json_messages
+
+KINDS = {
+    "value": Kind.TYPE_DOUBLE, "small": Kind.TYPE_FLOAT, "count": Kind.TYPE_INT32,
+    "on": Kind.TYPE_BOOL, "name": Kind.TYPE_STRING,
+}  # fmt: skip
+
+
+def read(content: bytes) -> tuple[Recording, tuple[str, ...]]:
+    return read_mcap(content, DEFAULT_LIMITS)
+
+
+def robot() -> FileDescriptorSet:
+    """Schema of demo.Robot: numbers, a text, a list, and a joint that is itself a message."""
+    files = FileDescriptorSet()
+    file = files.file.add(name="robot.proto", package="demo", syntax="proto3")
+    joint = file.message_type.add(name="Joint")
+    joint.field.add(name="angle", number=1, type=Kind.TYPE_DOUBLE, label=Kind.LABEL_OPTIONAL)
+    robot = file.message_type.add(name="Robot")
+    for number, (name, kind) in enumerate(KINDS.items(), 1):
+        robot.field.add(name=name, number=number, type=kind, label=Kind.LABEL_OPTIONAL)
+    robot.field.add(name="list", number=8, type=Kind.TYPE_DOUBLE, label=Kind.LABEL_REPEATED)
+    robot.field.add(
+        name="joint", number=9, type=Kind.TYPE_MESSAGE, type_name=".demo.Joint",
+        label=Kind.LABEL_OPTIONAL,
+    )  # fmt: skip
+    return files
+
+
+def robot_file(rows: list[dict[str, object]]) -> bytes:
+    pool = DescriptorPool()
+    pool.Add(robot().file[0])
+    made = GetMessageClass(pool.FindMessageTypeByName("demo.Robot"))
+    messages = []
+    for k, row in enumerate(rows):
+        message = made(**{name: value for name, value in row.items() if name != "angle"})
+        message.joint.angle = row.get("angle", 0.0)
+        messages.append(("/robot", k * 10**8, message.SerializeToString()))
+    schema = ("demo.Robot", "protobuf", robot().SerializeToString())
+    return foreign(messages, encoding="protobuf", schema=schema)
+
+
+def test_protobuf_that_omits_zeros_is_read_with_its_nested_numbers() -> None:
+    recording, _ = read(
+        robot_file(
+            [
+                {"value": 1.5, "count": -3, "on": True, "name": "a", "list": [1.0]},
+                {"value": 0.0, "small": 0.5, "angle": 2.0},
+            ]
+        )
+    )
+    assert recording.names == ("value", "small", "count", "on", "joint.angle")
+    columns = {one.name: one.values.tolist() for one in recording.channels}
+    assert columns == {
+        "value": [1.5, 0], "small": [0, 0.5], "count": [-3, 0], "on": [1, 0], "joint.angle": [0, 2],
+    }  # fmt: skip
+    np.testing.assert_array_equal(recording.channels[0].times, [0, 0.1])
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+@pytest.mark.parametrize("chunked", [True, False])
+def test_json_is_read_by_its_keys(compression: CompressionType, chunked: bool) -> None:
+    messages = json_messages("/a", {"x": 1, "in": {"y": 2.5}, "text": "z"}, {"x": 3, "late": True})
+    recording, _ = read(foreign(messages, compression=compression, chunked=chunked))
+    assert set(recording.names) == {"x", "in.y", "late"}
+    np.testing.assert_array_equal(recording.channel("x").values, [1, 3])
+    np.testing.assert_array_equal(recording.channel("in.y").values, [2.5, np.nan])
+    np.testing.assert_array_equal(recording.channel("late").values, [np.nan, 1])
+
+
+def test_topics_keep_their_own_times_and_give_their_names() -> None:
+    content = foreign([*json_messages("/a", {"x": 1}, {"x": 2}), *json_messages("/b", {"x": 3})])
+    recording, _ = read(content)
+    assert recording.names == ("a.x", "b.x")
+    assert [one.times.size for one in recording.channels] == [2, 1]
+
+
+def test_the_times_of_a_clock_are_counted_from_the_first_exactly() -> None:
+    start = 1_700_000_000_123_456_789
+    content = foreign([("/a", start + k * 10**6, b'{"x": 1}') for k in range(3)])
+    recording, notes = read(content)
+    np.testing.assert_array_equal(recording.channels[0].times, [0, 0.001, 0.002])
+    assert any(str(start) in note for note in notes)
+
+
+def test_messages_out_of_order_are_sorted_and_it_is_said() -> None:
+    content = foreign([("/a", 2, b'{"x": 2}'), ("/a", 1, b'{"x": 1}')])
+    recording, notes = read(content)
+    np.testing.assert_array_equal(recording.channels[0].values, [1, 2])
+    assert any("order of time" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (foreign([]), "no channel"),
+        (foreign([("/a", 0, b"\0")], encoding="cdr"), "ROS 2 CDR"),
+        (foreign([("/a", 0, b"\0")], encoding="cbor"), "'cbor'"),
+        (foreign([("/a", 0, b"{")]), "not JSON"),
+        (foreign([("/a", 0, b"[1]")]), "not a JSON object"),
+        (foreign([("/a", 0, b'{"x": "text"}')]), "no signal"),
+        (foreign([("/a", 0, b'{"x": 1' + b"0" * 400 + b"}")]), "too large for a double"),
+        (foreign([("/a", 0, b"[" * 5000 + b"]" * 5000)]), "JSON"),
+        (foreign([("/a", 0, b"\x08")], encoding="protobuf"), "no protobuf schema"),
+        (
+            foreign([("/a", 0, b"\xff")], encoding="protobuf",
+                    schema=("demo.Robot", "protobuf", robot().SerializeToString())),
+            "does not follow its schema",
+        ),
+        (
+            foreign([("/a", 0, b"")], encoding="protobuf",
+                    schema=("demo.Missing", "protobuf", robot().SerializeToString())),
+            "its schema cannot be used",
+        ),
+        (
+            foreign([("/a", 0, b"")], encoding="protobuf", schema=("x", "protobuf", b"\xff\xff")),
+            "its schema cannot be used",
+        ),
+    ],
+)  # fmt: skip
+def test_what_holds_no_signal_is_refused_with_the_reason(content: bytes, words: str) -> None:
+    with pytest.raises(InvalidUpload) as caught:
+        read(content)
+    assert words in caught.value.detail
+    assert "\n" not in caught.value.detail
