@@ -21,6 +21,11 @@ def pointer(*parts: str) -> str:
     return "".join("/" + part.replace("~", "~0").replace("/", "~1") for part in parts)
 
 
+def _printable(text: str) -> str:
+    """The text in one line: a name that was sent may hold anything."""
+    return "".join(one if one.isprintable() else "�" for one in text)
+
+
 class Reader:
     """Takes values from a document and keeps every fault. Each method gives a usable default."""
 
@@ -29,7 +34,7 @@ class Reader:
 
     def fault(self, place: str, detail: str, column: int | None = None) -> None:
         """Note something wrong."""
-        self._faults.append(Fault(place, detail, column))
+        self._faults.append(Fault(_printable(place), _printable(detail), column))
 
     def count(self) -> int:
         """Faults so far."""
