@@ -47,6 +47,7 @@ class Dispatcher:
         self.stopping = threading.Event()
         self._database, self._store, self._crew = database, store, crew
         self._woken = threading.Event()
+        self._woken.set()  # what was queued before is not heard of
         self._leases = Leases(database, lease)
         self._feeder = Feeder(crew)
         self._recorders: dict[str, Recorder] = {}

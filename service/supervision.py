@@ -20,7 +20,7 @@ FIRST_PAUSE_SECONDS = 0.2
 LONGEST_PAUSE_SECONDS = 30.0
 STEADY_SECONDS = 60.0
 """A child that lived so long is restarted after the first pause again."""
-STOP_SECONDS = 2.5
+STOP_SECONDS = 2.0
 
 SUPERVISED = "LAGID_SUPERVISED"
 """Set for the child: it ends when its standard input does, that is, when this process dies."""

@@ -9,6 +9,7 @@ from service.conversion import algorithm_of, loss_of
 from service.dispatch.checkpoints import unpacked
 from service.dispatch.signals import save_fit
 from service.errors import ServiceError
+from service.recordings import recording_of
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import LeaseLost, StorageError
 from service.storage.ledger import RunLedger
@@ -107,7 +108,7 @@ class JobRuns:
             return tuple(
                 record
                 for row in rows
-                for record in self._recordings.read(row.sha256).records(
+                for record in recording_of(self._store, row.sha256).records(
                     dict(inputs), dict(outputs), row.name
                 )
             )

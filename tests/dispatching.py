@@ -1,0 +1,98 @@
+"""A dispatcher as its own process, and jobs put straight into its queue."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from service.datasets import add_recording
+from service.jobs import submit
+from service.schemas_jobs import JobIn
+from service.settings import Settings
+from service.storage.jobs import JobRepository
+from service.storage.migrate import upgrade
+from service.storage.objects import ObjectStore, open_store
+from service.storage.runs import RunRepository
+from service.storage.sessions import Database
+from service.storage.tables import Job, Run, State
+from service.supervision import environment_of, kill_session
+from sysid.records import Recording
+from tests.runs import step_record
+
+LIMIT_SECONDS = 60.0
+
+
+class Place:
+    """A data folder with its database and store, and one dataset in it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.settings = Settings(data_dir=folder, cpus=2, lease_seconds=3.0)
+        self.settings.prepare_folder()
+        self.database = Database(self.settings.database)
+        upgrade(self.database)
+        self.store: ObjectStore = open_store(self.settings.store)
+        self.dataset = self._dataset()
+
+    def submit(self, **body: Any) -> str:
+        """Queue a job on the dataset."""
+        default = {"model": "fopdt", "datasets": [self.dataset], "parameters":
+                   {"T": {"upper": 10.0}, "L": {"upper": 2.0}}}  # fmt: skip
+        with self.database.write() as session:
+            return submit(session, JobIn(**{**default, **body}), self.settings).job.id
+
+    def job(self, job: str) -> Job:
+        with self.database.read() as session:
+            return JobRepository(session).get(job)
+
+    def runs(self, job: str) -> tuple[Run, ...]:
+        with self.database.read() as session:
+            return RunRepository(session).page(job, limit=1000).items
+
+    def cancel(self, job: str) -> None:
+        with self.database.write() as session:
+            JobRepository(session).cancel(job)
+
+    def until(self, job: str, *states: State) -> Job:
+        """Wait until the job is in one of the states."""
+        until(lambda: self.job(job).state in states, f"{job} in {states}")
+        return self.job(job)
+
+    @contextmanager
+    def dispatcher(self) -> Iterator["subprocess.Popen[bytes]"]:
+        """A dispatcher for the length of the block; nothing of it is left afterwards."""
+        log = (self.settings.data_dir / "dispatcher.log").open("ab")
+        child = subprocess.Popen(
+            [sys.executable, "-m", "service.dispatcher"],
+            env={**os.environ, **environment_of(self.settings)},
+            stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+        )  # fmt: skip
+        try:
+            yield child
+            child.send_signal(signal.SIGTERM)
+            child.wait(20.0)
+        finally:
+            kill_session(child.pid)
+            child.wait()
+            log.close()
+
+    def _dataset(self) -> str:
+        record = step_record()
+        recording = Recording((*record.inputs, *record.outputs))
+        stored = add_recording(
+            self.database, self.store, recording, name="steps", kind="upload", key="steps",
+            details={},
+        )  # fmt: skip
+        return stored.dataset.id
+
+
+def until(holds: Callable[[], bool], what: str) -> None:
+    """Wait for something that must come true."""
+    limit = time.monotonic() + LIMIT_SECONDS
+    while not holds():
+        assert time.monotonic() < limit, f"{what} did not come true"
+        time.sleep(0.05)
