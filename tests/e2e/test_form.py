@@ -48,8 +48,8 @@ def test_an_unknown_name_in_an_equation_is_told_with_its_column(site: Site, page
     expect(check).to_contain_text("can be used")
 
 
-def test_own_equations_are_submitted_with_bounds_and_channels(site: Site, page: Page) -> None:
-    opened(site, page, f"?dataset={site.filled.dataset}")
+def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, page: Page) -> None:
+    opened(own_site, page, f"?dataset={own_site.filled.dataset}")
     write_own(page, EQUATIONS)
     expect(page.locator("#check")).to_contain_text("can be used")
     page.get_by_label("upper of L").fill("0.3")
@@ -59,10 +59,10 @@ def test_own_equations_are_submitted_with_bounds_and_channels(site: Site, page: 
     page.get_by_role("button", name="Identify").click()
     page.wait_for_url(re.compile(r"/jobs/job_"))
     expect(page.locator("h1")).to_have_text("by hand")
-    with site.parts.database.read() as session:
+    with own_site.parts.database.read() as session:
         spec = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec
     assert spec["model"]["name"] == "my-tube"
-    assert spec["datasets"] == [site.filled.dataset]
+    assert spec["datasets"] == [own_site.filled.dataset]
     assert spec["channels"] == {"u": "P1", "y": "P2"}
     assert spec["parameters"] == {"L": {"upper": 0.3}}
     assert spec["algorithm"]["population"] == 24
@@ -77,10 +77,10 @@ def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
     expect(page.get_by_label("population")).to_be_focused()
 
 
-def test_a_csv_file_is_stored_and_chosen(site: Site, page: Page, tmp_path: Path) -> None:
+def test_a_csv_file_is_stored_and_chosen(own_site: Site, page: Page, tmp_path: Path) -> None:
     path = tmp_path / "step.csv"
     path.write_text("t [s],u [V],y [V]\n" + "".join(f"{n / 10},{n % 2},{n}\n" for n in range(20)))
-    opened(site, page)
+    opened(own_site, page)
     page.get_by_label("or upload CSV or MCAP").set_input_files(path)
     expect(page.locator("#form-state")).to_contain_text("step.csv is stored")
     expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
@@ -96,8 +96,8 @@ def test_a_file_that_cannot_be_used_is_told_with_its_place(
     expect(page.locator('[data-fault="/datasets"]')).to_contain_text("oops")
 
 
-def test_a_clone_starts_from_the_request_of_the_job(site: Site, page: Page) -> None:
-    opened(site, page, f"?clone={site.filled.finished}")
+def test_a_clone_starts_from_the_request_of_the_job(own_site: Site, page: Page) -> None:
+    opened(own_site, page, f"?clone={own_site.filled.finished}")
     expect(page.get_by_label("name of the job")).to_have_value("tube 40 m, pattern 1")
     expect(page.get_by_label("validation data")).to_have_value("0.3")
     expect(page.get_by_label("output p")).to_have_value("P2")
@@ -105,7 +105,9 @@ def test_a_clone_starts_from_the_request_of_the_job(site: Site, page: Page) -> N
     assert document["name"] == "lagged-tube"
     page.get_by_role("button", name="Identify").click()
     page.wait_for_url(re.compile(r"/jobs/job_"))
-    with site.parts.database.read() as session:
+    with own_site.parts.database.read() as session:
         jobs = JobRepository(session)
-        specs = [jobs.get(name).spec for name in (site.filled.finished, page.url.rsplit("/", 1)[1])]
+        specs = [
+            jobs.get(name).spec for name in (own_site.filled.finished, page.url.rsplit("/", 1)[1])
+        ]
     assert specs[0] == specs[1]

@@ -81,10 +81,10 @@ def test_the_abscissa_of_the_history_can_be_chosen_by_keyboard(site: Site, page:
 
 
 def test_a_running_job_is_redrawn_as_events_arrive_and_nothing_moves(
-    site: Site, page: Page
+    own_site: Site, page: Page
 ) -> None:
-    filled, database = site.filled, site.parts.database
-    page.goto(f"{site.url}/jobs/{filled.running}")
+    filled, database = own_site.filled, own_site.parts.database
+    page.goto(f"{own_site.url}/jobs/{filled.running}")
     plot = page.locator(figure(page, "history"))
     last = "plot => Math.max(...plot.data.flatMap(trace => trace.x))"
     assert plot.evaluate(last) == 60
@@ -100,23 +100,23 @@ def test_a_running_job_is_redrawn_as_events_arrive_and_nothing_moves(
     assert page.evaluate("performance.getEntriesByType('navigation').length") == loads
 
 
-def test_the_result_appears_when_a_running_job_ends(site: Site, page: Page) -> None:
-    page.goto(f"{site.url}/jobs/{site.filled.running}")
+def test_the_result_appears_when_a_running_job_ends(own_site: Site, page: Page) -> None:
+    page.goto(f"{own_site.url}/jobs/{own_site.filled.running}")
     figure(page, "history")
     expect(page.locator("table.estimates")).to_have_count(0)
-    end_running(site.parts.database, site.parts.store, site.filled.lease)
+    end_running(own_site.parts.database, own_site.parts.store, own_site.filled.lease)
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
     expect(page.locator("#job .chip")).to_have_text("succeeded")
     assert page.locator(f"{figure(page, 'response')} {LINES}").count() == 4
 
 
-def test_a_job_is_cancelled_and_resumed_from_its_page(site: Site, page: Page) -> None:
-    page.goto(f"{site.url}/jobs/{site.filled.queued}")
+def test_a_job_is_cancelled_and_resumed_from_its_page(own_site: Site, page: Page) -> None:
+    page.goto(f"{own_site.url}/jobs/{own_site.filled.queued}")
     page.get_by_role("button", name="Cancel").click()
     expect(page.locator("#job .chip")).to_have_text("cancelled")
     page.get_by_role("button", name="Resume").click()
     expect(page.locator("#job .chip")).to_have_text("queued")
-    with site.parts.database.write() as session:
+    with own_site.parts.database.write() as session:
         assert Queue(session).n_queued() == 1
 
 

@@ -6,7 +6,7 @@ import { fillTable, overrides, showFaults, clearFaults } from './fields.js';
 const panel = document.getElementById('new');
 const form = document.getElementById('job-form');
 const field = (name) => form.elements.namedItem(name);
-const state = { dataset: null, model: null, extra: {}, started: false };
+const state = { dataset: null, model: null, cloned: null, extra: {}, started: false };
 const query = new URLSearchParams(location.search);
 
 async function start() {
@@ -49,7 +49,9 @@ async function fillFrom(job) {
     await listed(request.parameters);
   } else {
     field('source').value = 'own';
-    await own(JSON.stringify(request.model, null, 2), request.parameters);
+    const text = JSON.stringify(request.model, null, 2);
+    state.cloned = { text, model: request.model };
+    await own(text, request.parameters);
   }
   mapChannels(request.channels);
 }
@@ -113,9 +115,10 @@ async function check(changes) {
   const found = await ask('/v1/models:check', {
     method: 'POST', headers: { 'Content-Type': 'application/yaml' }, body: field('equations').value,
   });
-  if (now !== turn) return; // a later text was checked meanwhile
+  if (now !== turn) return false; // a later text is being checked
   verdict(found);
   if (found.valid) take(found.normal_form, changes);
+  return found.valid;
 }
 
 function verdict(found) {
@@ -170,6 +173,10 @@ const number = (name) => {
   return text === '' ? null : Number.isNaN(Number(text)) ? text : Number(text);
 };
 
+const isOwn = () => field('source').value === 'own';
+/** A cloned document that was not changed goes out as it was; any other in its normal form. */
+const ownModel = () => (field('equations').value === state.cloned?.text ? state.cloned.model : state.model);
+
 function body() {
   const { sweep, ...kept } = state.extra;
   const algorithm = { ...kept.algorithm, method: field('method').value };
@@ -182,7 +189,7 @@ function body() {
     ...kept,
     ...(sweep?.axes?.length ? { sweep } : {}),
     name: field('name').value.trim() || null,
-    model: field('source').value === 'own' ? state.model : field('model').value,
+    model: isOwn() ? ownModel() : field('model').value,
     datasets: datasets.filter(Boolean),
     channels: channels(),
     validation: validation === 'clone' ? kept.validation : validation ? { fraction: Number(validation) } : null,
@@ -201,6 +208,11 @@ async function submit(event) {
   button.disabled = true;
   say('submitting…');
   try {
+    if (isOwn() && !(await check())) {
+      say('the model cannot be used yet');
+      button.disabled = false;
+      return field('equations').focus();
+    }
     const job = await post('/v1/jobs', body());
     location.assign(`/jobs/${encodeURIComponent(job.id)}`);
   } catch (error) {
@@ -242,7 +254,9 @@ field('model').addEventListener('change', shown(() => {
   return listed();
 }));
 for (const one of field('source'))
-  one.addEventListener('change', shown(() => (field('source').value === 'own' ? own() : listed())));
+  one.addEventListener('change', shown(() => (isOwn() ? own() : listed())));
+field('equations').addEventListener('input', () =>
+  document.getElementById('check').replaceChildren(element('span', 'checking…', 'muted')));
 field('equations').addEventListener('input', delayed(shown(() => check()), 300));
 form.addEventListener('submit', submit);
 panel.addEventListener('toggle', shown(() => panel.open && start()));
