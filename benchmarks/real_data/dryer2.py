@@ -21,7 +21,7 @@ def main() -> None:
         raw = client.add_dataset(folder / "dryer2" / "dryer2.csv", name="dryer2")
         common = [
             {"offset": {"u": 5.0}},
-            {"hold": {"channels": ["u"], "hold": "zero"}},
+            {"hold": {"u": "zero"}},
         ]
         first = client.derive(raw["id"], [{"trim": {"rows": [0, 500]}}, *common], name="dryer2 a")
         last = client.derive(raw["id"], [{"trim": {"rows": [500, 1000]}}, *common], name="dryer2 b")

@@ -47,7 +47,7 @@ def main() -> None:
         return
     with service() as (client, _):
         source = folder / "pneuact_tube" / "pneuact_tube.csv"
-        raw = client.add_dataset(source, name="pneuact tube", segments=LABELS)
+        raw = client.add_dataset(source, name="pneuact tube", segments=",".join(LABELS))
         even = client.derive(raw["id"], steps(0), name="8 m, 5 bar, fill, even repeats")
         odd = client.derive(raw["id"], steps(1), name="8 m, 5 bar, fill, odd repeats")
         run = identify(
@@ -59,6 +59,7 @@ def main() -> None:
                 "validation": {"datasets": [odd["id"]]},
                 "channels": {"u": "p_in_bar", "y": "p_out_bar"},
                 "loss": {"kind": "soft-l1", "scale": 0.1},
+                "parameters": {"L": {"upper": 0.5}},  # the record lasts one second
             },
         )
     print_estimates("tube, 8 m, 5 bar, fill", run)

@@ -30,7 +30,7 @@ def main() -> None:
         return
     with service() as (client, _):
         raw = client.add_dataset(folder / "silverbox" / "silverbox_snls80mv.csv", name="silverbox")
-        held = {"hold": {"channels": ["u"], "hold": "band-limited"}}
+        held = {"hold": {"u": "band-limited"}}
 
         def part(name: str, rows: list[int]) -> str:
             steps: list[dict[str, Any]] = [{"trim": {"rows": rows}}, held]
