@@ -53,9 +53,10 @@ def _blocks(
     lines: Iterable[str], layout: Layout
 ) -> Iterator[tuple[list[Values], NDArray[np.int64]]]:
     reader = csv.reader(lines, delimiter=layout.separator, strict=True)
-    next(reader)
-    before = 1
+    before = 0
     try:
+        next(reader)
+        before = 1
         while fields := list(islice(reader, BLOCK_ROWS)):
             numbers = np.arange(before + 1, before + 1 + len(fields))
             before += len(fields)
@@ -66,7 +67,7 @@ def _blocks(
             if fields:
                 yield _block(fields, layout, numbers), numbers
     except csv.Error as error:
-        raise InvalidUpload(f"this row cannot be read ({error})", row=before + 1) from None
+        raise InvalidUpload(f"this row cannot be read ({error})", row=reader.line_num) from None
 
 
 def _block(fields: list[list[str]], layout: Layout, numbers: NDArray[np.int64]) -> list[Values]:

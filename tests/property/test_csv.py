@@ -42,6 +42,7 @@ def test_decimal_commas_and_points_give_the_same(values: list[float]) -> None:
 )
 @example(b't,u\n0,"' + b"x" * 200_000, None, ())
 @example(b'"' + b"x" * 200_000, None, ())
+@example(b'"t","u"x\n0,1\n', None, ())
 @settings(max_examples=400, deadline=None)
 def test_any_bytes_are_read_or_refused(
     content: bytes, sample_time: float | None, segments: tuple[str, ...]

@@ -179,3 +179,7 @@ def test_time_told_twice_or_wrongly_is_refused() -> None:
 def test_an_unknown_label_column_is_refused_with_the_nearest() -> None:
     assert "did you mean 'length'" in refused("t,length\n0,1\n", segments=("lenght",)).detail
     assert "no signal" in refused("t,length\n0,1\n", segments=("length",)).detail
+
+
+def test_a_stray_quote_is_told_with_its_row() -> None:
+    assert refused('t,u\n0,1\n1,2\n2,"3"x\n').row == 4
