@@ -91,7 +91,8 @@ class Problem:
         return _built(*arguments)
 
     def __reduce__(self) -> _Rebuild:
-        return _built, self.arguments
+        rebuild = _built if len(self.arguments) > 2 else simulation_problem
+        return rebuild, self.arguments
 
     def fitness(self, theta: FloatArray) -> FloatArray:
         """J of individuals (P, D) → (P,), smaller is better; ``inf`` where one diverges."""
@@ -195,6 +196,15 @@ def _built(
     free = tuple(parameter for parameter in everything if parameter.is_free)
     evaluator = _evaluator(model, experiments, everything, prediction == "one-step", loss)
     return Problem(model, records, everything, free, evaluator, experiments, arguments)
+
+
+def simulation_problem(model: Model, record: Record) -> Problem:
+    """A problem that only simulates: every parameter is fixed, and nothing is compared."""
+    arguments = (model, record)
+    weights = {output.name: 1.0 for output in model.outputs}
+    experiment = lay_out(model, record, 0, model.parameters, weights, 0, simulates_only=True)
+    evaluator = _evaluator(model, (experiment,), model.parameters, False, Loss())
+    return Problem(model, (record,), model.parameters, (), evaluator, (experiment,), arguments)
 
 
 def _evaluator(

@@ -86,7 +86,14 @@ class _Block:
         loop.update(turn.row, states.end_row(turn.row))
         loop.update(turn.step, lanes.builder.add(turn.step, lanes.integer(1)))
         loop.repeat()
-        return comparison.loss
+        return self._unless_diverged(comparison.loss, states)
+
+    def _unless_diverged(self, loss: Value, states: States) -> Value:
+        """The loss, or nan where a state is not finite even if the outputs hide it."""
+        for name in states.names:
+            last = states.line[name][0]
+            loss = self.lanes.add(loss, self.lanes.sub(last, last))
+        return loss
 
     def _theta(self, row: Value) -> Value:
         b = self.lanes.builder

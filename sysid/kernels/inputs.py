@@ -17,6 +17,8 @@ DENSE = 8
 MOST_POINTS = 64
 """Fine points in an integration step at most."""
 
+_JITTER = 0.05  # of a fine point, that times written with few digits are off
+
 _HALF_WIDTH = 48  # of the band-limited interpolation, in samples
 _KAISER = 8.0  # 80 dB
 
@@ -77,12 +79,12 @@ def _points(channel: Channel, start: float, step: float) -> int:
         for points in range(2, MOST_POINTS + 1, 2):
             if _is_aligned(channel.times, start, step / points):
                 return points
-    return int(np.clip(2 * ceil(DENSE * step / period / 2 - 1e-9), 4, MOST_POINTS))
+    return int(np.clip(2 * ceil(DENSE * step / period / 2 - 1e-3), 4, MOST_POINTS))
 
 
 def _is_aligned(times: FloatArray, start: float, spacing: float) -> bool:
     places = (times - start) / spacing
-    return bool(np.max(np.abs(places - np.round(places))) < 1e-3)
+    return bool(np.max(np.abs(places - np.round(places))) < _JITTER)
 
 
 def sampling_period(channel: Channel) -> float | None:

@@ -99,10 +99,11 @@ def numbers(
         Scale of the soft-l1 loss.
     """
     page = _Page(Layout.of(model))
-    reach = ceil(lag) + furthest(model) + 5
+    cap = ceil(lag)  # a lag rounded to whole steps may exceed its bound by part of one
+    reach = cap + furthest(model) + 5
     rows = max(min(grid.last + reach + 3, 2 * reach + _SLACK), 2 * reach + 3)
     page.ints[:3] = [grid.last, reach, rows]
-    page.floats[:3] = [grid.integration_step, lag, scale]
+    page.floats[:3] = [grid.integration_step, cap, scale]
     for i, start in enumerate(starts):
         page.floats[page.layout.initial(i)] = start.given[0]
         page.put("state", i, row=start.row, given=page.add_floats(start.given))

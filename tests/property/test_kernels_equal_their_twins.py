@@ -1,0 +1,112 @@
+"""A kernel computes what its plain twin computes, for every form, method and interpolation."""
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sysid.models.model import Model
+from sysid.problem import Problem
+from tests import reference
+from tests.models import difference, differential, individuals, record
+
+LAGGED = {
+    "x": "v",
+    "v": "u(t) + u(t-L) - c*v(t-L) - b*x - 0.5*x**3 - 0.2*x(t-2*L)"
+    " + 0.1*sin(t)*where(x > 0 and v < 1, 1, -1)",
+}
+RECURSION = {
+    "w": "0.9*w(k-1) + 0.1*u(k)",
+    "x": "1.5*x(k-1) - 0.7*x(k-2) - 0.01*c*x(k-1-L/h)**3 + 0.02*x(k-2-L/h) + h*u(k-1)"
+    " + h*u(k-L/h) + 0.1*w(k-L/h) + 0.01*w + 0.001*x(k-12) + 0.01*tanh(k*x(k-1))",
+}
+
+
+def assert_equal(problem: Problem, one_step: bool = False) -> None:
+    theta = individuals(problem, 4)
+    expected = np.array([reference.predictions(problem, one, one_step) for one in theta])
+    np.testing.assert_allclose(problem.predictions(theta), expected, rtol=1e-9, atol=1e-11)
+    if not one_step:
+        costs = [reference.fitness(problem, one) for one in theta]
+        np.testing.assert_allclose(problem.fitness(theta), costs, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("interpolation", "history"),
+    [*product(("linear", "cubic", "nearest"), ("constant", "zero"))],
+)
+def test_a_recursion_equals_its_twin(interpolation: str, history: str) -> None:
+    solver = {"interpolation": interpolation, "history": history}
+    model = difference(RECURSION, "x + 0.1*x(k - L/h)", solver=solver)
+    assert_equal(Problem.build(model, [record(26)]))
+
+
+@pytest.mark.parametrize("method", ["rk4", "euler", "semi-implicit"])
+@pytest.mark.parametrize(
+    ("interpolation", "substeps", "irregular", "hold"),
+    [
+        ("linear", 1, False, "first"),
+        ("linear", 3, True, "zero"),
+        ("cubic", 1, False, "band-limited"),
+        ("nearest", 2, True, "first"),
+    ],
+)
+def test_a_differential_model_equals_its_twin(
+    method: str, interpolation: str, substeps: int, irregular: bool, hold: Any
+) -> None:
+    solver = {"method": method, "interpolation": interpolation, "substeps": substeps}
+    start = {"x": 0.3, "v": {"lower": -1, "upper": 1}}
+    model = differential(LAGGED, "x(t-L) + v", solver=solver, initial=start)
+    assert_equal(Problem.build(model, [record(24, irregular=irregular, hold=hold)]))
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "cubic"])
+def test_one_step_prediction_equals_its_twin(interpolation: str) -> None:
+    model = difference(RECURSION, "x", solver={"interpolation": interpolation})
+    assert_equal(Problem.build(model, [record(24)], prediction="one-step"), one_step=True)
+    model = differential(LAGGED, "x", solver={"interpolation": interpolation, "substeps": 2})
+    assert_equal(Problem.build(model, [record(24)], prediction="one-step"), one_step=True)
+
+
+def test_a_measured_start_gives_the_first_samples_of_a_recursion() -> None:
+    model = difference(RECURSION, "x", initial={"x": "measured", "w": 0})
+    problem = Problem.build(model, [record(24)])
+    assert_equal(problem)
+    found = problem.predictions(individuals(problem, 3))[:, : model.memory]
+    np.testing.assert_array_equal(found, np.tile(record(24).outputs[0].values[:12], (3, 1)))
+
+
+def test_several_experiments_and_outputs_equal_their_twin() -> None:
+    model = differential(
+        LAGGED, "x", outputs={"y": "x", "z": "v - u(t-L)"},
+        initial={"x": {"lower": -1, "upper": 1}, "v": 0.1},
+    )  # fmt: skip
+    records = [record(20, outputs=("y", "z")), record(25, 0.04, seed=5, outputs=("z", "y"))]
+    problem = Problem.build(model, records, skip=3)
+    assert [p.name for p in problem.space] == ["c", "L", "b", "x(0)", "x(0)[2]"]
+    assert_equal(problem)
+
+
+_leaves = st.sampled_from(["x(k-1)", "u(k)", "c", "L", "0.5", "h", "k", "x(k-1-L/h)", "u(k-1-L/h)"])
+_functions = ("sin", "cos", "tanh", "atan", "abs", "sign", "exp")
+
+
+def _grown(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
+    return st.one_of(
+        st.builds("({} {} {})".format, inner, st.sampled_from("+-*"), inner),
+        st.builds("{}({})".format, st.sampled_from(_functions), inner),
+        st.builds("{}({}, {})".format, st.sampled_from(("min", "max")), inner, inner),
+        st.builds("where({} < {}, {}, {})".format, inner, inner, inner, inner),
+        st.builds("(tanh({})**{})".format, inner, st.sampled_from((2, 3, 5))),
+        st.builds("(-({}))".format, inner),
+    )
+
+
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(st.recursive(_leaves, _grown, max_leaves=6))
+def test_any_expression_equals_its_twin(text: str) -> None:
+    model: Model = difference({"x": f"0.5*x(k-1) + 0.3*tanh({text})"}, "x")
+    assert_equal(Problem.build(model, [record(24)]))

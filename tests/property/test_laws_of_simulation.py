@@ -1,0 +1,137 @@
+"""Laws that hold for every simulation of a population."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sysid.models.model import Model
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+from sysid.simulation import simulate
+from tests.models import (
+    difference,
+    differential,
+    duffing,
+    individuals,
+    lag_element,
+    record,
+    with_output,
+)
+
+MODELS = [duffing(), lag_element(), lag_element(solver={"method": "euler", "substeps": 2})]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_permuting_individuals_permutes_fitness_bit_for_bit(model: Model) -> None:
+    problem = Problem.build(model, [record(40)])
+    theta = individuals(problem, 37)
+    order = np.random.default_rng(3).permutation(37)
+    np.testing.assert_array_equal(problem.fitness(theta)[order], problem.fitness(theta[order]))
+    np.testing.assert_array_equal(
+        problem.predictions(theta)[order], problem.predictions(theta[order])
+    )
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_an_individual_has_the_same_bits_alone_and_among_others(model: Model) -> None:
+    problem = Problem.build(model, [record(40)])
+    theta = individuals(problem, 35)
+    alone = [problem.fitness(one[np.newaxis])[0] for one in theta]
+    np.testing.assert_array_equal(problem.fitness(theta), alone)
+
+
+@pytest.mark.parametrize(
+    ("model", "irregular"), [*((model, False) for model in MODELS), (MODELS[1], True)]
+)
+def test_the_free_run_of_the_true_model_gives_zero_error(model: Model, irregular: bool) -> None:
+    blank = record(40, irregular=irregular)
+    theta = individuals(Problem.build(model, [blank]), 5)
+    for one in theta[2:]:
+        truth = Problem.build(model, [blank]).predictions(one[np.newaxis])[0]
+        problem = Problem.build(model, [with_output(blank, truth)])
+        assert problem.fitness(one[np.newaxis])[0] == 0.0
+
+
+@pytest.mark.parametrize("hold", ["first", "zero", "band-limited"])
+@pytest.mark.parametrize("samples", [1, 7])
+def test_a_lag_delays_the_output_of_a_linear_system_by_itself(hold: str, samples: int) -> None:
+    """Whole samples: the lagged response is the one without lag, shifted."""
+    excited = record(60, hold=hold)  # type: ignore[arg-type]
+    u = excited.inputs[0]
+    quiet = np.where(np.arange(60) < 10, 0.0, u.values)
+    excited = Record((Channel("u", u.times, quiet, hold=u.hold),), excited.outputs)
+    problem = Problem.build(lag_element(), [excited])
+    lag = samples * 0.05
+    prompt, late = problem.predictions(np.array([[1.0, 0.0, 0.4], [1.0, lag, 0.4]]))
+    tolerance = {"first": 1e-9, "zero": 5e-2, "band-limited": 1e-3}[hold]
+    np.testing.assert_allclose(late[samples:], prompt[:-samples], atol=tolerance)
+
+
+def test_fitness_is_continuous_in_the_lag_down_to_none() -> None:
+    model = differential({"x": "v", "v": "u(t-L) - c*v(t-L) - b*x(t-L)"}, "x(t-L)")
+    problem = Problem.build(model, [record(40)])
+    lags = np.array([0.0, 1e-9, 0.025 - 1e-9, 0.025, 0.025 + 1e-9, 0.05 - 1e-9, 0.05, 0.05 + 1e-9])
+    theta = np.column_stack([np.full(8, 0.3), lags, np.full(8, 4.0)])
+    fitness = problem.fitness(theta)
+    for i in (0, 2, 3, 5, 6):
+        assert fitness[i] == pytest.approx(fitness[i + 1], abs=1e-7)
+
+
+def test_without_lag_the_integration_agrees_with_scipy() -> None:
+    model = differential({"x": "v", "v": "u(t) - c*v - b*x - 0.5*x**3"}, "x", initial={"x": 0.3,
+                         "v": -0.2}, solver={"substeps": 4})  # fmt: skip
+    times = 0.05 * np.arange(101)
+    u = np.interp(times, [0.0, 1.0, 2.5, 5.0], [0.0, 1.0, -1.0, 0.5])
+    found = simulate(model, [Channel("u", times, u)], {"c": 0.3, "L": 0, "b": 4}, times=times)
+
+    def slope(t: float, x: np.ndarray) -> list[float]:
+        return [x[1], np.interp(t, times, u) - 0.3 * x[1] - 4 * x[0] - 0.5 * x[0] ** 3]
+
+    expected = solve_ivp(slope, (0, 5), [0.3, -0.2], t_eval=times, rtol=1e-10, atol=1e-12,
+                         max_step=0.05)  # fmt: skip
+    np.testing.assert_allclose(found.channels[0].values, expected.y[0], atol=2e-8)
+
+
+@pytest.mark.parametrize(("interpolation", "error"), [("linear", 1e-9), ("cubic", 1e-5)])
+def test_a_delay_differential_equation_has_its_known_solution(
+    interpolation: str, error: float
+) -> None:
+    """dx/dt = -x(t - 1) from x = 1: a polynomial on each interval of length 1.
+
+    The cubic is not exact across the bend at the start.
+    """
+    model = differential(
+        {"x": "-x(t - 1)"}, "x", initial={"x": 1}, solver={"interpolation": interpolation}
+    )
+    times = 0.01 * np.arange(201)
+    values = {"c": 0, "L": 0, "b": 1}
+    found = simulate(model, [Channel("u", times, times)], values, times=times)
+    t = times
+    expected = np.where(t <= 1, 1 - t, 1 - t + (t - 1) ** 2 / 2)
+    np.testing.assert_allclose(found.channels[0].values, expected, atol=error)
+
+
+def test_a_long_record_gives_what_its_beginning_gives() -> None:
+    """The history's buffer is moved many times in a long record, and never in a short one."""
+    model, long = duffing(), record(5000)
+    values = {"c": 0.2, "L": 0.63, "b": 5.0, "a": 1.0}
+    times = long.inputs[0].times
+    whole = simulate(model, long.inputs, values, times=times).channels[0].values
+    part = simulate(model, long.inputs, values, times=times[:300]).channels[0].values
+    np.testing.assert_array_equal(whole[:300], part)
+    fields = {"interpolation": "linear"}
+    filtered = difference({"x": "0.9*x(k-1) - 0.02*x(k-1-L/h) + u(k)"}, "x", solver=fields)
+    found = simulate(filtered, long.inputs, {"c": 0, "L": 0.63, "b": 0}, times=times)
+    x, u = found.channels[0].values, long.inputs[0].values
+    lagged = 0.4 * x[987:4986] + 0.6 * x[986:4985]  # 0.63 s are 12.6 samples
+    expected = 0.9 * x[999:4998] - 0.02 * lagged + u[1000:4999]
+    np.testing.assert_allclose(x[1000:4999], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_a_diverging_individual_has_infinite_fitness_and_harms_nobody() -> None:
+    model = difference({"x": "b*x(k-1)**2 + c*u(k)"}, "min(x, 5)")
+    problem = Problem.build(model, [record(60)])
+    theta = np.array([[0.5, 0.0, 9.0], [0.5, 0.0, 0.1]])
+    fitness = problem.fitness(theta)
+    assert fitness[0] == np.inf
+    assert fitness[1] == problem.fitness(theta[1:])[0] < np.inf

@@ -1,0 +1,224 @@
+"""Plain twins of compiled code: slow, short, and written from the definition alone.
+
+The twin of a kernel walks the expression tree for one individual, one sample at a time, with
+floats. It shares with the kernel how records are laid out, and nothing else.
+"""
+
+from collections.abc import Mapping
+from math import floor
+
+import numpy as np
+
+from sysid.experiments import Experiment, initial_name
+from sysid.kernels.inputs import FineInput
+from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.models.model import EstimatedInitial, MeasuredInitial, Model
+from sysid.problem import Problem
+from sysid.types import FloatArray
+
+_FUNCTIONS = {
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
+    "abs": np.abs, "sign": np.sign, "min": np.minimum, "max": np.maximum, "tanh": np.tanh,
+    "atan": np.arctan,
+}  # fmt: skip
+_OPERATORS = {
+    "+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide, "**": np.power,
+    "<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal,
+    "==": np.equal, "!=": np.not_equal, "and": np.logical_and, "or": np.logical_or,
+}  # fmt: skip
+
+
+def predictions(problem: Problem, theta: FloatArray, one_step: bool = False) -> FloatArray:
+    """Simulated values (M,) of one individual (D,)."""
+    free = iter(theta)
+    values = {
+        p.name: float(next(free)) if p.fixed is None else p.fixed for p in problem.all_parameters
+    }
+    parts: list[FloatArray] = []
+    with np.errstate(all="ignore"):
+        for e, experiment in enumerate(problem.experiments):
+            twin = Twin(problem.model, experiment, e, values, one_step)
+            grid = twin.outputs()
+            for i, samples in enumerate(experiment.outputs):
+                places = np.arange(experiment.grid.points)
+                parts.append(np.interp(samples.places, places, grid[i]))
+    return np.concatenate(parts)
+
+
+def fitness(problem: Problem, theta: FloatArray) -> float:
+    """J of one individual (Eq. 10), by squares."""
+    weight, measured = problem.evaluator.weight, problem.evaluator.measured
+    error = weight * (predictions(problem, theta) - measured)
+    return float(np.sqrt(np.sum(error**2) / np.count_nonzero(weight)))
+
+
+class Twin:
+    """One individual in one experiment."""
+
+    def __init__(
+        self, model: Model, experiment: Experiment, number: int, values: Mapping[str, float],
+        one_step: bool,
+    ) -> None:  # fmt: skip
+        self.model, self.experiment, self.values = model, experiment, values
+        self.one_step = one_step
+        self.difference = model.form != "differential"
+        self.step = experiment.grid.integration_step
+        self.names = [state.name for state in model.states]
+        self.past: dict[str, list[float]] = {}
+        self.given: dict[str, list[float]] = {}
+        for i, start in enumerate(model.initial):
+            name = self.names[i]
+            given = experiment.starts[i].given
+            if isinstance(start, EstimatedInitial):
+                given = np.array([values[initial_name(name, number)]])
+            self.past[name] = [float(given[0])]
+            later = given[1:] if isinstance(start, MeasuredInitial) else given[:0]
+            self.given[name] = [float(v) for v in later]
+        self.first = {name: past[0] for name, past in self.past.items()}
+        zero = model.solver.history == "zero"
+        self.before = dict.fromkeys(self.names, 0.0) if zero else self.first
+
+    # ---- the walk through time ------------------------------------------------------------
+    def outputs(self) -> FloatArray:
+        """Each output at each grid point."""
+        grid, found = self.experiment.grid, []
+        for m in range(grid.last + 1):
+            if m % grid.substeps == 0:
+                now = self._now()
+                found.append([
+                    self._value(output.expression, m, 0.0, now, -1)
+                    for output in self.model.outputs
+                ])  # fmt: skip
+                if self.one_step:
+                    self._replace(m // grid.substeps)
+            if m < grid.last:
+                for name, value in self._next(m).items():
+                    self.past[name].append(value)
+        return np.array(found).T
+
+    def _now(self) -> dict[str, float]:
+        return {name: past[-1] for name, past in self.past.items()}
+
+    def _replace(self, n: int) -> None:
+        for output, samples in zip(self.model.outputs, self.experiment.outputs, strict=True):
+            match output.expression:
+                case Past(name, "state", 0, None):
+                    self.past[name][-1] = float(samples.on_grid[n])
+
+    def _next(self, m: int) -> dict[str, float]:
+        if not self.difference:
+            return self._integrated(m)
+        if m + 1 < self.model.memory:
+            return {n: self.given[n][m] if self.given[n] else self.first[n] for n in self.names}
+        values: dict[str, float] = {}
+        for i in self.model.order:
+            values[self.names[i]] = self._value(self.model.equations[i], m, 1.0, values, i)
+        return values
+
+    def _integrated(self, m: int) -> dict[str, float]:
+        h, now, method = self.step, self._now(), self.model.solver.method
+        if method == "rk4":
+            a = self._slopes(m, 0.0, now)
+            b = self._slopes(m, 0.5, self._moved(now, h / 2, a))
+            c = self._slopes(m, 0.5, self._moved(now, h / 2, b))
+            d = self._slopes(m, 1.0, self._moved(now, h, c))
+            return {n: now[n] + h / 6 * (a[n] + 2 * b[n] + 2 * c[n] + d[n]) for n in now}
+        values = dict(now)
+        updated = {}
+        for i, equation in enumerate(self.model.equations):
+            name = self.names[i]
+            updated[name] = now[name] + h * self._value(equation, m, 0.0, values, i)
+            if method == "semi-implicit":
+                values[name] = updated[name]
+        return updated
+
+    def _slopes(self, m: int, c: float, values: dict[str, float]) -> dict[str, float]:
+        return {
+            name: self._value(equation, m, c, values, i)
+            for i, (name, equation) in enumerate(zip(self.names, self.model.equations, strict=True))
+        }
+
+    @staticmethod
+    def _moved(now: dict[str, float], h: float, slope: dict[str, float]) -> dict[str, float]:
+        return {n: now[n] + h * slope[n] for n in now}
+
+    # ---- expressions ----------------------------------------------------------------------
+    def _value(
+        self, e: Expression, m: int, c: float, values: dict[str, float], equation: int
+    ) -> float:
+        """An expression `c` steps after step m, where the states have `values`."""
+
+        def value(one: Expression) -> float:
+            return self._value(one, m, c, values, equation)
+
+        match e:
+            case Number(number):
+                return number
+            case Symbol(name, "parameter"):
+                return self.values[name]
+            case Symbol(_, "period"):
+                return self.step
+            case Symbol(_, kind):
+                return m + c if kind == "index" else (m + c) * self.step
+            case Past(_, "input", _, _):
+                return self._input(e, m, c)
+            case Past():
+                return self._state(e, m, c, values, equation)
+            case Unary(operator, operand):
+                return -value(operand) if operator == "-" else not value(operand)
+            case Binary(operator, left, right):
+                return _OPERATORS[operator](np.float64(value(left)), np.float64(value(right)))
+            case Call("where", (condition, a, b)):
+                return value(a) if value(condition) else value(b)
+            case Call(function, arguments):
+                return _FUNCTIONS[function](*(np.float64(value(a)) for a in arguments))
+
+    def _lag(self, past: Past) -> float:
+        lag = self._value(past.lag, 0, 0.0, {}, 0) if past.lag is not None else 0.0
+        lag = max(lag, 0.0) if self.difference else max(lag, 0.0) / self.step
+        return float(floor(lag + 0.5)) if self.model.solver.interpolation == "nearest" else lag
+
+    def _state(
+        self, past: Past, m: int, c: float, values: dict[str, float], equation: int
+    ) -> float:
+        if past.lag is None and past.offset == 0:
+            return values[past.name]
+        semi = not self.difference and self.model.solver.method == "semi-implicit"
+        if semi and self.names.index(past.name) < equation:
+            c = 1.0  # already updated: as it is at the end of the step
+        place = c - past.offset
+        at = place - self._lag(past)
+        now = self.past[past.name][m]
+        if at > 0:
+            return now + at / place * (values.get(past.name, now) - now)
+        return self._between(past.name, m, at)
+
+    def _between(self, name: str, m: int, at: float) -> float:
+        """A state `at` steps after step m (at ≤ 0), between its finished samples."""
+        i = floor(at)
+        f = at - i
+
+        def sample(steps: int) -> float:
+            place = m + min(steps, 0)
+            return self.past[name][place] if place >= 0 else self.before[name]
+
+        if self.model.solver.interpolation != "cubic":
+            return sample(i) + f * (sample(i + 1) - sample(i))
+        nodes = (-1, 0, 1, 2) if i <= -2 else (-1, 0, 1)
+        weights = [np.prod([(f - o) / (n - o) for o in nodes if o != n]) for n in nodes]
+        return float(sum(w * sample(i + n) for w, n in zip(weights, nodes, strict=True)))
+
+    def _input(self, past: Past, m: int, c: float) -> float:
+        names = [quantity.name for quantity in self.model.inputs]
+        fine = self.experiment.inputs[names.index(past.name)]
+        start = fine.begin if self.difference else 0
+        place = m + c - past.offset
+        if past.lag is None and not self.difference:
+            return float(fine.values[fine.zero + m * fine.points + _inside(fine, c)])
+        at = fine.zero + start + (place - self._lag(past)) * fine.points
+        i = floor(at)
+        return float(fine.values[i] + (at - i) * (fine.values[i + 1] - fine.values[i]))
+
+
+def _inside(fine: FineInput, c: float) -> int:
+    return {0.0: fine.begin, 0.5: fine.points // 2, 1.0: fine.end}[c]

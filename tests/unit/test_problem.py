@@ -1,0 +1,197 @@
+"""Problems: which channel is which, what is scored, what cannot be used and how that is said."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid.errors import InvalidBounds, InvalidRecord, InvalidSettings, RecordTooShort
+from sysid.kernels.calls import compiled
+from sysid.kernels.evaluation import population_fitness
+from sysid.kernels.evaluator import Evaluator
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+from sysid.settings import Loss
+from sysid.types import FloatArray
+from tests.models import difference, differential, duffing, individuals, lag_element, record
+
+
+@compiled
+def least(evaluator: Evaluator, theta: FloatArray) -> float:
+    """Stands for a search: compiled, kept on disk, called with the evaluator as it is."""
+    return float(np.min(population_fitness(evaluator, theta)))
+
+
+def test_an_evaluator_goes_into_compiled_functions_as_it_is() -> None:
+    problem = Problem.build(duffing(), [record()])
+    theta = individuals(problem, 20)
+    assert least(problem.evaluator, theta) == problem.fitness(theta).min()
+
+
+def test_a_problem_is_rebuilt_from_a_pickle_and_gives_the_same_bits() -> None:
+    problem = Problem.build(duffing(), [record()], parameters={"c": {"fixed": 0.2}}, skip=2)
+    again: Problem = pickle.loads(pickle.dumps(problem))
+    theta = individuals(problem, 5)
+    assert [p.name for p in again.space] == ["L", "b", "a"]
+    np.testing.assert_array_equal(again.fitness(theta), problem.fitness(theta))
+
+
+def test_j_is_the_rms_error_over_the_scored_samples() -> None:
+    model, blank = duffing(), record()
+    y = blank.outputs[0].values.copy()
+    y[[7, 12]] = np.nan
+    problem = Problem.build(model, [replace(blank, outputs=(Channel("y", blank.outputs[0].times,
+                            y),))], skip=5)  # fmt: skip
+    theta = individuals(problem, 3)
+    error = (problem.predictions(theta) - y)[:, 5:]
+    expected = np.sqrt(np.nanmean(error**2, axis=1))
+    np.testing.assert_allclose(problem.fitness(theta), expected, rtol=1e-12)
+    assert problem.n_scored == 23
+    metrics = problem.metrics(theta[1])
+    assert metrics.rms == pytest.approx(expected[1])
+    assert metrics.unit == problem.unit == "m"
+    assert metrics.channels[0].samples == 23
+    assert metrics.fit_percent == pytest.approx(metrics.channels[0].fit_percent)
+
+
+def test_soft_l1_is_squares_for_small_errors_and_linear_for_large_ones() -> None:
+    problem = Problem.build(duffing(), [record()])
+    theta = individuals(problem, 3)
+    wide = Problem.build(duffing(), [record()], loss=Loss("soft-l1", 1e6))
+    np.testing.assert_allclose(wide.fitness(theta), problem.fitness(theta), rtol=1e-9)
+    narrow = Problem.build(duffing(), [record()], loss=Loss("soft-l1", 0.1))
+    error = problem.predictions(theta) - record().outputs[0].values
+    cost = 2 * 0.01 * (np.sqrt(1 + (error / 0.1) ** 2) - 1)
+    np.testing.assert_allclose(narrow.fitness(theta), np.sqrt(cost.mean(axis=1)), rtol=1e-12)
+
+
+def test_outputs_are_weighted_by_their_deviation_or_as_asked() -> None:
+    outputs = {"y": "x", "z": "2*x"}
+    model = differential({"x": "(u(t) - x)*b"}, "x", outputs=outputs)
+    data = record(outputs=("y", "z"))
+    problem = Problem.build(model, [data])
+    deviation = [np.std(channel.values) for channel in data.outputs]
+    parts = problem.split(problem.evaluator.weight)[0]
+    np.testing.assert_allclose(parts["y"], 1 / deviation[0])
+    np.testing.assert_allclose(parts["z"], 1 / deviation[1])
+    assert problem.unit == "1"
+    assert problem.output_scale == pytest.approx(1.0)
+    chosen = Problem.build(model, [data], weights={"y": 3.0, "z": 0.5})
+    theta = individuals(chosen, 2)
+    part = chosen.split(chosen.predictions(theta)[0])[0]
+    errors = [(3.0 * (part["y"] - data.outputs[0].values)),
+              (0.5 * (part["z"] - data.outputs[1].values))]  # fmt: skip
+    expected = np.sqrt(np.mean(np.concatenate(errors) ** 2))
+    assert chosen.fitness(theta)[0] == pytest.approx(expected)
+
+
+def test_channels_are_found_by_name_and_others_are_ignored() -> None:
+    data = record()
+    times = data.inputs[0].times
+    extra = Channel("temperature", times, np.full(times.size, np.nan))
+    more = Record((extra, *data.inputs), (extra, *data.outputs))
+    theta = individuals(Problem.build(duffing(), [data]), 2)
+    first, second = (Problem.build(duffing(), [one]).fitness(theta) for one in (data, more))
+    np.testing.assert_array_equal(first, second)
+
+
+def test_a_measured_start_takes_the_first_value_and_its_rate_the_first_difference() -> None:
+    model = differential({"x": "v", "v": "-b*x"}, "x", initial={"x": "measured", "v": "measured"})
+    data = record()
+    y, times = data.outputs[0].values, data.outputs[0].times
+    starts = Problem.build(model, [data]).experiments[0].starts
+    assert starts[0].given[0] == y[0]
+    assert starts[1].given[0] == pytest.approx((y[1] - y[0]) / times[1])
+
+
+def test_times_with_few_digits_are_on_the_grid() -> None:
+    times = np.round(np.arange(3000) / 610.35, 5)
+    data = Record((Channel("u", times, np.sin(times)),), (Channel("y", times, times),))
+    grid = Problem.build(lag_element(), [data]).experiments[0].grid
+    assert grid.points == 3000
+    assert grid.step == pytest.approx(1 / 610.35, rel=1e-5)
+
+
+def test_an_output_that_begins_after_the_input_is_simulated_from_the_input_on() -> None:
+    data = record(40)
+    late = replace(data, outputs=(data.outputs[0].between(0.5, 9.0),))
+    whole, part = (Problem.build(lag_element(), [one]) for one in (data, late))
+    theta = individuals(whole, 3)
+    np.testing.assert_allclose(part.predictions(theta), whole.predictions(theta)[:, 10:])
+
+
+def _with(values: FloatArray, role: str, name: str = "") -> Record:
+    data = record()
+    channel = getattr(data, role)[0]
+    changed = replace(channel, values=values, name=name or channel.name)
+    return replace(data, **{role: (changed,)})
+
+
+GAP = np.where(np.arange(30) == 4, np.nan, 1.0)
+MISSING = np.full(30, np.nan)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (_with(np.ones(30), "inputs", "u1"), r"no input 'u'; did you mean 'u1'\?"),
+        (_with(np.ones(30), "outputs", "yy"), r"no output 'y'; did you mean 'yy'\?"),
+        (_with(GAP, "inputs"), r"input 'u' has no finite value at 0\.2 s \(sample 4"),
+        (_with(MISSING, "outputs"), r"output 'y' has 30 samples and none with a value"),
+        (record(irregular=True), r"output 'y' is not sampled regularly: sample \d+ at"),
+    ],
+)
+def test_a_record_that_cannot_be_used_is_said_to_be_so(data: Record, message: str) -> None:
+    with pytest.raises(InvalidRecord, match=message):
+        Problem.build(duffing(), [data])
+
+
+def test_no_record_and_a_constant_output_among_several_are_refused() -> None:
+    with pytest.raises(InvalidRecord, match="no record"):
+        Problem.build(duffing(), [])
+    model = differential({"x": "(u(t) - x)*b"}, "x", outputs={"y": "x", "z": "2*x"})
+    data = record(outputs=("y", "z"))
+    flat = replace(data, outputs=(data.outputs[0], replace(data.outputs[1], values=np.ones(30))))
+    with pytest.raises(InvalidRecord, match="'z' is constant"):
+        Problem.build(model, [flat])
+
+
+def test_a_record_shorter_than_the_largest_lag_is_refused() -> None:
+    with pytest.raises(RecordTooShort, match=r"lasts 0\.25 s, but the lag of 'x' needs more than"):
+        Problem.build(duffing(), [record(6)])
+    with pytest.raises(RecordTooShort, match=r"the lag of 'u' needs more than 0\.4 s"):
+        Problem.build(lag_element(), [record(6)])
+    far = difference({"x": "0.5*x(k-12)"}, "x")
+    with pytest.raises(RecordTooShort, match="the model's memory"):
+        Problem.build(far, [record(10)])
+
+
+def test_options_that_cannot_be_used_are_refused() -> None:
+    model, data = duffing(), [record()]
+    with pytest.raises(InvalidSettings, match="/prediction"):
+        Problem.build(model, data, prediction="free")  # type: ignore[arg-type]
+    with pytest.raises(InvalidSettings, match="/skip"):
+        Problem.build(model, data, skip=-1)
+    with pytest.raises(InvalidSettings, match="/weights/z: the model has no output"):
+        Problem.build(model, data, weights={"z": 1.0})
+    with pytest.raises(InvalidSettings, match="not a positive number"):
+        Problem.build(model, data, weights={"y": 0.0})
+    with pytest.raises(InvalidSettings, match="no parameter 'q'"):
+        Problem.build(model, data, parameters={"q": {"fixed": 1.0}})
+    with pytest.raises(InvalidBounds):
+        Problem.build(model, data, parameters={"c": {"lower": 2.0}})
+    with pytest.raises(InvalidSettings, match=r"need \(P, 4\)"):
+        Problem.build(model, data).fitness(np.zeros((3, 5)))
+    with pytest.raises(InvalidSettings, match="may take"):
+        step = {"step": 1e-9}
+        Problem.build(lag_element(solver=step), data)
+
+
+def test_a_state_that_nothing_measures_cannot_start_measured() -> None:
+    model = differential({"x": "v", "v": "-b*x"}, "2*x", initial={"x": 0, "v": 0})
+    measured = Problem.build(
+        differential({"x": "v", "v": "-b*x"}, "x", initial={"x": "measured", "v": 0}), [record()]
+    ).model.initial
+    with pytest.raises(InvalidRecord, match="state 'x' is to start at its measured value"):
+        Problem.build(replace(model, initial=measured), [record()])

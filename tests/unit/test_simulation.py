@@ -1,0 +1,52 @@
+"""Simulation for a user: values in, a recording out."""
+
+import numpy as np
+import pytest
+
+from sysid.errors import InvalidRecord, InvalidSettings
+from sysid.records import Channel
+from sysid.simulation import simulate
+from tests.models import differential, lag_element, record
+
+TIMES = 0.05 * np.arange(60)
+STEP = Channel("u", TIMES, np.where(TIMES >= 0.5, 1.0, 0.0), hold="zero")
+
+
+def test_the_step_response_of_a_lag_element_is_known() -> None:
+    values = {"c": 2.0, "L": 0.2, "b": 0.3}
+    found = simulate(lag_element(solver={"substeps": 4}), [STEP], values, times=TIMES)
+    since = np.maximum(TIMES - 0.7, 0.0)
+    expected = 2.0 * (1 - np.exp(-since / 0.3))
+    assert found.names == ("y",)
+    np.testing.assert_allclose(found.channels[0].values, expected, atol=1e-2)
+
+
+def test_values_may_lie_outside_the_bounds_and_times_be_irregular() -> None:
+    times = np.sort(np.random.default_rng(0).random(50)) * 3
+    values = {"c": 9.0, "L": 1.2, "b": 3.0}
+    found = simulate(lag_element(), [STEP], values, times=times).channels[0].values
+    expected = 9.0 * (1 - np.exp(-np.maximum(times - 1.7, 0.0) / 3.0))
+    np.testing.assert_allclose(found, expected, atol=0.05)
+
+
+def test_initial_values_can_be_given() -> None:
+    model = differential({"x": "-x"}, "x", initial={"x": {"lower": 0, "upper": 1}})
+    values = {"c": 0, "L": 0, "b": 0}
+    found = simulate(model, record(60).inputs, values | {"x(0)": 4.0}, times=TIMES)
+    np.testing.assert_allclose(found.channels[0].values, 4 * np.exp(-TIMES), rtol=1e-6)
+    with pytest.raises(InvalidSettings, match=r"/parameters/x\(0\): a value is missing"):
+        simulate(model, record(60).inputs, values, times=TIMES)
+
+
+def test_what_is_missing_or_unknown_is_said() -> None:
+    values = {"c": 1.0, "L": 0.1, "b": 1.0}
+    with pytest.raises(InvalidSettings, match="/parameters/b: a value is missing"):
+        simulate(lag_element(), [STEP], {"c": 1.0, "L": 0.1}, times=TIMES)
+    with pytest.raises(InvalidSettings, match="no parameter 'B'"):
+        simulate(lag_element(), [STEP], values | {"B": 1.0}, times=TIMES)
+    with pytest.raises(InvalidSettings, match="not a finite number"):
+        simulate(lag_element(), [STEP], values | {"b": np.nan}, times=TIMES)
+    with pytest.raises(InvalidRecord, match="no input 'u'"):
+        simulate(lag_element(), [], values, times=TIMES)
+    with pytest.raises(InvalidRecord, match="need two times or more"):
+        simulate(lag_element(), [STEP], values, times=TIMES[:1])
