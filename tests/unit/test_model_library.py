@@ -17,7 +17,7 @@ from tests.meaning import simulate
 
 BUILT_IN = (
     "coulomb-delay", "coulomb-eq16", "delayed-logistic", "delayed-van-der-pol", "duffing-delay",
-    "duffing-eq16", "exponential", "fopdt", "mackey-glass", "narx", "silverbox", "sopdt", "tube",
+    "duffing-eq16", "emps", "exponential", "fopdt", "mackey-glass", "narx", "silverbox", "sopdt", "tube",
     "tube-second-order",
 )  # fmt: skip
 
