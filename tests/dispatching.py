@@ -53,6 +53,11 @@ class Place:
         with self.database.read() as session:
             return RunRepository(session).page(job, limit=1000).items
 
+    def history(self, run: str) -> list[tuple[int, int, float]]:
+        with self.database.read() as session:
+            points = RunRepository(session).history(run)
+            return [(point.island, point.generation, point.rms) for point in points]
+
     def cancel(self, job: str) -> None:
         with self.database.write() as session:
             JobRepository(session).cancel(job)

@@ -12,7 +12,14 @@ from sysid.settings import GeneticAlgorithm
 from sysid.types import FloatArray
 from workers.feeding import Feeder
 from workers.ports import (
-    Concluded, Crew, Failure, ProblemSpec, QueuedRun, Records, RefusedRun, RunSpec,
+    Concluded,
+    Crew,
+    Failure,
+    ProblemSpec,
+    QueuedRun,
+    Records,
+    RefusedRun,
+    RunSpec,
 )  # fmt: skip
 
 
@@ -33,7 +40,9 @@ def step_record(n: int = 120, delay: float = 0.7, seed: int = 3) -> Record:
 RECORDS: Mapping[str, Records] = {"short": (step_record(),), "long": (step_record(4000),)}
 
 
-def spec(seed: int = 1, records: str = "short", generations: int = 60, **settings: object) -> RunSpec:
+def spec(
+    seed: int = 1, records: str = "short", generations: int = 60, **settings: object
+) -> RunSpec:
     """A small search with two islands."""
     algorithm = GeneticAlgorithm(
         **{"population": 16, "generations": generations, "islands": 2, **settings}  # type: ignore[arg-type]

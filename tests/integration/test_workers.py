@@ -1,0 +1,107 @@
+"""Runs on two workers of a local Ray."""
+
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
+from workers.feeding import Feeder
+from workers.inline import InlineCrew
+from workers.ports import QueuedRun
+
+pytestmark = [pytest.mark.ray, pytest.mark.slow]
+
+
+def test_many_small_runs_on_ray_give_the_bits_of_the_plain_loop(ray_crew) -> None:
+    specs = {f"r{seed}": spec(seed, generations=20) for seed in range(1, 9)}
+    plain, spread = carry_out(InlineCrew(), specs), carry_out(ray_crew, specs)
+    assert plain.failures == spread.failures == {}
+    for run in specs:
+        assert [bits(one) for one in spread.results[run]] == [bits(plain.results[run][0])]
+
+
+def test_one_large_run_spread_by_islands_gives_the_bits_of_the_plain_loop(
+    ray_crew, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
+    monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 0.001)
+    specs = {"r": spec(2, "long", generations=120, islands=4, migration=every(20))}
+    spread = carry_out(ray_crew, specs)
+    assert spread.failures == {}
+    assert len(spread.states["r"]) >= 4
+    monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 1000.0)
+    monkeypatch.setattr("workers.packing.PACK_SECONDS", 1000.0)
+    plain = carry_out(InlineCrew(), specs)
+    assert len(plain.states.get("r", [])) == 0  # one call, from the start to the end
+    assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])
+
+
+def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(ray_crew) -> None:
+    one = spec(3, "long", generations=120)
+    whole = carry_out(ray_crew, {"r": one})
+    middle = whole.states["r"][0]
+    feeder, notebook = Feeder(ray_crew), Notebook()
+    feeder.add("job", ListedRuns([QueuedRun("r", one, middle)]), notebook)
+    while not feeder.step(0.05):
+        pass
+    assert bits(notebook.results["r"][0]) == bits(whole.results["r"][0])
+
+
+def test_a_cancelled_job_frees_the_workers_soon_and_they_go_on_working(ray_crew) -> None:
+    feeder, notebook = Feeder(ray_crew, grace_seconds=5.0), Notebook()
+    feeder.add("job", ListedRuns([QueuedRun("r", spec(1, "long", generations=10**6))]), notebook)
+    while not notebook.states:
+        feeder.step(0.05)
+    notebook.is_stopped = True
+    begun = time.monotonic()
+    while not feeder.step(0.05):
+        assert time.monotonic() - begun < 10.0
+    assert carry_out(ray_crew, {"r": spec()}).failures == {}
+
+
+def test_a_run_survives_the_death_of_its_worker(ray_crew) -> None:
+    one = spec(4, "long", generations=400)
+    killed: list[int] = []
+
+    def kill_one_worker() -> None:
+        while not killed:
+            for pid in workers_of(os.getpid()):
+                os.kill(pid, signal.SIGKILL)
+                killed.append(pid)
+                return
+            time.sleep(0.01)
+
+    thread = threading.Thread(target=kill_one_worker)
+    feeder, notebook = Feeder(ray_crew), Notebook()
+    feeder.add("job", ListedRuns([QueuedRun("r", one)]), notebook)
+    feeder.step(0.05)
+    thread.start()
+    while not feeder.step(0.05):
+        pass
+    thread.join()
+    assert notebook.failures == {}
+    assert len(notebook.results["r"]) == 1
+
+
+def workers_of(pid: int) -> list[int]:
+    """Processes of this session's Ray that compute a pack now."""
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (entry / "cmdline").read_bytes()
+            session = os.getsid(int(entry.name))
+        except (OSError, ProcessLookupError):
+            continue
+        if command.startswith(b"ray::advance") and session == os.getsid(pid):
+            found.append(int(entry.name))
+    return found
+
+
+def every(generations: int):
+    from sysid.settings import Migration
+
+    return Migration(every=generations)
