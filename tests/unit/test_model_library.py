@@ -17,8 +17,8 @@ from tests.meaning import simulate
 
 BUILT_IN = (
     "coulomb-delay", "coulomb-eq16", "delayed-logistic", "delayed-van-der-pol", "duffing-delay",
-    "duffing-eq16", "emps", "exponential", "fopdt", "mackey-glass", "narx", "silverbox", "sopdt", "tube",
-    "tube-second-order",
+    "duffing-eq16", "emps", "exponential", "fopdt", "mackey-glass", "narx", "silverbox", "sopdt",
+    "tube", "tube-second-order",
 )  # fmt: skip
 
 FOLDER = Path(folder.__path__[0])
