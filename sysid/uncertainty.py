@@ -24,7 +24,9 @@ from sysid.types import FloatArray
 _DIFFERENCES = (1e-5, 1e-3, 1e-2)  # of the range; the larger ones where the output does not move
 _RANK = 1e-7  # of the largest singular value: below, the differences are rounding
 _SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
-_MEMBER = 0.05  # share of a weak direction (squared) from which a parameter is of its group
+# Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
+# about, and of one that has no effect at all, which is known to many digits.
+_WEAK_MEMBER, _NULL_MEMBER = 0.05, 1e-5
 _AT_BOUND = 1e-6
 
 
@@ -103,7 +105,7 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
         singular_values=singular,
         noise_sd=noise,
     )
-    blind = np.any(directions[~known] ** 2 > _MEMBER, axis=0) if not known.all() else None
+    blind = np.any(directions[~known] ** 2 > _NULL_MEMBER, axis=0) if not known.all() else None
     estimates = _estimates(problem, theta, statuses, np.sqrt(np.diag(physical)), blind, n - d)
     return Analysis(estimates, uncertainty, min(gain, 1.0), count)
 
@@ -134,7 +136,7 @@ def _statuses(
     for value, direction, seen in zip(singular, directions, known, strict=True):
         if seen and noise < _SAYS_NOTHING * value:
             continue
-        members = np.flatnonzero(direction**2 > _MEMBER)
+        members = np.flatnonzero(direction**2 > (_WEAK_MEMBER if seen else _NULL_MEMBER))
         for d in members:
             if statuses[d] != "unidentifiable":
                 statuses[d] = "unidentifiable" if members.size == 1 else "group"
@@ -153,7 +155,7 @@ def _correlation(covariance: FloatArray) -> FloatArray:
     safe = np.where(deviation > 0, deviation, 1.0)
     correlation = covariance / np.outer(safe, safe)
     np.fill_diagonal(correlation, 1.0)
-    return np.clip(correlation, -1.0, 1.0)
+    return np.asarray(np.clip(correlation, -1.0, 1.0))
 
 
 def _estimates(

@@ -52,10 +52,10 @@ def flip(child: WordArray, position: int, bits: int) -> None:
 @compiled
 def scheduled(starts: IntArray, rates: FloatArray, generation: int) -> float:
     """Mutation rate at a generation: that of the last entry that has begun."""
-    rate = rates[0]
+    rate = float(rates[0])
     for i in range(starts.size):
         if starts[i] <= generation:
-            rate = rates[i]
+            rate = float(rates[i])
     return rate
 
 

@@ -1,0 +1,202 @@
+"""Laws of a run: it does not matter where it is cut, nor who evolves which island."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sysid.ga.chromosome import decoded, located
+from sysid.ga.island import Island, evolve
+from sysid.islands.archipelago import found, plans
+from sysid.problem import Problem
+from sysid.run import (
+    RunState,
+    advance,
+    advance_island,
+    begin,
+    border,
+    exchange,
+    is_finished,
+    is_resting,
+)  # fmt: skip
+from sysid.settings import (
+    METHODS,
+    GeneticAlgorithm,
+    IslandChange,
+    Migration,
+    SearchMethod,
+    SequenceSearch,
+    Stop,
+)  # fmt: skip
+from tests.searching import bits, example
+
+METHOD = st.sampled_from(METHODS)
+
+
+def small(method: SearchMethod = "improved", **changes: object) -> GeneticAlgorithm:
+    values: dict[str, object] = {
+        "method": method, "population": 24, "generations": 40, "islands": 3, "stagnation": 5,
+        "migration": Migration(every=10),
+    }  # fmt: skip
+    return GeneticAlgorithm(**(values | changes))  # type: ignore[arg-type]
+
+
+def problem() -> Problem:
+    return example(n=80)
+
+
+def alone(method: SearchMethod, seed: int, **changes: object) -> tuple[Island, object]:
+    algorithm = small(method, **changes)
+    return found(problem(), algorithm, seed)[1], plans(problem(), algorithm, seed)[1]
+
+
+@settings(max_examples=25, deadline=None)
+@given(METHOD, st.integers(0, 2**63 - 1), st.integers(0, 30), st.integers(0, 30))
+def test_evolving_twice_is_evolving_the_sum(
+    method: SearchMethod, seed: int, first: int, second: int
+) -> None:
+    island, plan = alone(method, seed)
+    evaluator = problem().evaluator
+    at_once = evolve(evaluator, plan, island, first + second)
+    in_two = evolve(evaluator, plan, evolve(evaluator, plan, island, first), second)
+    assert bits(at_once) == bits(in_two)
+
+
+@pytest.mark.parametrize("kind", ["paper", "adaptive"])
+def test_a_sequence_search_can_be_cut_anywhere(kind: str) -> None:
+    island, plan = alone("improved", 5, stagnation=3, sequence=SequenceSearch(kind))  # type: ignore[arg-type]
+    evaluator = problem().evaluator
+    stepwise = island
+    for _ in range(150):
+        stepwise = evolve(evaluator, plan, stepwise, 1)
+    assert bits(stepwise) == bits(evolve(evaluator, plan, island, 150))
+    assert "sequence" in {step.phase for step in stepwise.history}
+
+
+@settings(max_examples=25, deadline=None)
+@given(METHOD, st.integers(0, 1000), st.integers(0, 60))
+def test_the_fittest_survives_a_step(method: SearchMethod, seed: int, age: int) -> None:
+    island, plan = alone(method, seed)
+    before = evolve(problem().evaluator, plan, island, age)
+    after = evolve(problem().evaluator, plan, before, 1)
+    there = np.any(np.all(after.words == before.words[0], axis=1))
+    assert there or after.fitness[0] < before.fitness[0]
+    assert after.fitness[0] <= before.fitness[0]
+
+
+@settings(max_examples=20, deadline=None)
+@given(METHOD, st.integers(0, 1000), st.integers(0, 60))
+def test_fitness_is_that_of_the_chromosome_and_ascends(
+    method: SearchMethod, seed: int, age: int
+) -> None:
+    island, plan = alone(method, seed)
+    after = evolve(problem().evaluator, plan, island, age)
+    theta = located(problem().evaluator, decoded(after.words, plan.bits))  # type: ignore[attr-defined]
+    assert np.array_equal(after.fitness, problem().fitness(theta))
+    assert np.all(np.diff(after.fitness) >= 0)
+    assert after.history[-1].rms == after.fitness[0]
+    assert after.history[-1].parameters == tuple(theta[0])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_run_cut_after_every_call_gives_the_same_bits(method: SearchMethod) -> None:
+    algorithm = small(method)
+    whole = advance(problem(), algorithm, begin(problem(), algorithm, 3))
+    cut = begin(problem(), algorithm, 3)
+    while not is_finished(algorithm, cut):
+        cut = pickle.loads(pickle.dumps(advance(problem(), algorithm, cut, 0.0)))
+    assert bits(cut) == bits(whole)
+
+
+def test_islands_evolved_apart_and_exchanged_are_the_plain_loop() -> None:
+    algorithm = small(stop=Stop(evaluations=900))
+    whole = advance(problem(), algorithm, begin(problem(), algorithm, 9))
+    state = begin(problem(), algorithm, 9)
+    while not is_finished(algorithm, state):
+        target = border(algorithm, state)
+        moved = [
+            advance_island(problem(), algorithm, island, target - island.generation)
+            for island in reversed(state.islands)
+        ]
+        state = exchange(algorithm, state, moved[::-1])
+    assert bits(state) == bits(whole)
+
+
+def test_the_same_seed_repeats_and_another_does_not() -> None:
+    def run(seed: int) -> RunState:
+        return advance(problem(), small(), begin(problem(), small(), seed))
+
+    assert bits(run(1)) == bits(run(1))
+    assert run(1).islands[0].words.tobytes() != run(2).islands[0].words.tobytes()
+
+
+def test_islands_of_one_seed_begin_apart() -> None:
+    islands = begin(problem(), small("simple"), 1).islands
+    words = np.concatenate([island.words for island in islands])
+    assert np.unique(words, axis=0).shape == words.shape
+
+
+def test_first_individuals_of_the_improved_method_are_stratified() -> None:
+    islands = begin(problem(), small(), 1).islands
+    places = np.sort(np.concatenate([i.words for i in islands]) / (2**24 - 1), axis=0)
+    strata = np.arange(24)[:, None]
+    assert np.all((places * 24 >= strata - 1e-5) & (places * 24 <= strata + 1 + 1e-5))
+
+
+def test_a_warm_start_begins_at_the_given_values() -> None:
+    warm = {"c": 0.31, "L": 0.42, "b": 3.0, "a": 2.0, "unknown": 1.0}
+    state = begin(problem(), small(), 1, warm)
+    one = advance_island(problem(), small(), state.islands[2], 0)
+    theta = np.array([[warm[p.name] for p in problem().space]])
+    assert one.champion_rms <= problem().fitness(theta)[0] * (1 + 1e-5)
+
+
+def test_evaluations_end_a_run_and_all_are_counted() -> None:
+    algorithm = small(generations=10**6, stop=Stop(evaluations=2000))
+    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
+    assert 1700 <= state.evaluations <= 2000
+    assert state.evaluations == sum(island.evaluations for island in state.islands)
+
+
+def test_a_simple_generation_simulates_its_children_only() -> None:
+    algorithm = GeneticAlgorithm(method="simple", generations=10)
+    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
+    assert state.evaluations == 50 + 10 * 25
+
+
+def test_the_target_rms_ends_a_run() -> None:
+    algorithm = small(generations=10**6, stop=Stop(rms=0.05))
+    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
+    assert state.rms <= 0.05
+    plan = plans(problem(), algorithm, 1)
+    assert any(is_resting(p, i) for p, i in zip(plan, state.islands, strict=True))
+
+
+def test_seconds_end_a_run() -> None:
+    algorithm = small(generations=10**9, stop=Stop(seconds=0.05))
+    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
+    assert is_finished(algorithm, state)
+    assert state.seconds >= 0.05
+
+
+def test_should_stop_is_heard_between_calls() -> None:
+    algorithm = small(generations=10**9)
+    answers = iter([False, False, False, True])
+    state = begin(problem(), algorithm, 1)
+    state = advance(problem(), algorithm, state, None, lambda: next(answers))
+    assert not is_finished(algorithm, state)
+    assert state.evaluations > 0
+
+
+def test_islands_may_differ_in_method_and_bits() -> None:
+    changes = (IslandChange(), IslandChange(method="simple", bits=12), IslandChange(bits=20))
+    algorithm = small(islands=changes)
+    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
+    assert int(state.islands[1].words.max()) < 2**12
+    assert state.migrations
+    cut = begin(problem(), algorithm, 1)
+    while not is_finished(algorithm, cut):
+        cut = advance(problem(), algorithm, cut, 0.0)
+    assert bits(cut) == bits(state)

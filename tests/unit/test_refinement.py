@@ -1,0 +1,61 @@
+"""Least squares from the champions: never worse, inside the bounds, counted."""
+
+import numpy as np
+import pytest
+
+from sysid.models.library import load_model
+from sysid.problem import Problem
+from sysid.refinement import refine
+from sysid.settings import Loss
+from tests.searching import example, noisy, record
+
+NEAR = np.array([0.22, 0.52, 5.1, 1.1])
+
+
+def test_refinement_finds_the_optimum_beside_its_start() -> None:
+    end = refine(example(sd=0.0), [NEAR])[0]
+    assert end is not None
+    assert end.rms < 1e-10
+    assert np.allclose(end.theta, [0.2, 0.5, 5.0, 1.0], atol=1e-8)
+
+
+def test_no_refined_start_is_worse_or_out_of_bounds() -> None:
+    problem = example()
+    starts = problem.evaluator.upper * np.random.default_rng(1).random((6, 4))
+    before = problem.fitness(starts)
+    for value, end in zip(before, refine(problem, list(starts)), strict=True):
+        if end is not None:
+            assert end.rms <= value
+            assert end.rms == problem.fitness(end.theta[None])[0]
+            assert np.all((end.theta >= 0) & (end.theta <= problem.evaluator.upper))
+            assert end.evaluations > 0
+
+
+def test_starts_beside_each_other_are_refined_once() -> None:
+    ends = refine(example(), [NEAR, NEAR + 1e-5, NEAR - 1e-5])
+    assert sum(end is not None for end in ends) == 1
+
+
+def test_a_spent_budget_leaves_the_starts_alone() -> None:
+    assert refine(example(), [NEAR], evaluations=5) == (None,)
+    end = refine(example(), [NEAR], evaluations=30)[0]
+    assert end is not None
+    assert end.evaluations <= 32
+
+
+def test_an_optimum_on_the_bound_is_reached_exactly() -> None:
+    changes = {"a": {"lower": 1.5, "upper": 5.0}}  # the true value is 1
+    problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], parameters=changes)
+    end = refine(problem, [np.array([0.2, 0.5, 5.0, 2.0])])[0]
+    assert end is not None
+    assert end.theta[3] == 1.5
+
+
+def test_robust_refinement_withstands_outliers() -> None:
+    y = noisy()
+    y[::20] += 2.0
+    model = load_model("duffing-eq16")
+    robust = Problem.build(model, [record(y)], loss=Loss("soft-l1", 0.02))
+    end = refine(robust, [NEAR])[0]
+    assert end is not None
+    assert end.theta[1] == pytest.approx(0.5, abs=0.02)

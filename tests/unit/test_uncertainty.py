@@ -1,0 +1,150 @@
+"""Standard errors, correlations and identifiability, against theory and repetition."""
+
+import numpy as np
+import pytest
+
+from sysid.models.library import load_model
+from sysid.problem import Problem
+from sysid.records import Record
+from sysid.refinement import refine
+from sysid.result import Estimate
+from sysid.settings import Loss
+from sysid.types import FloatArray
+from sysid.uncertainty import analyse
+from tests.searching import DUFFING, example, force, noisy, record
+
+# Cramér-Rao bound of Example 1, measurement noise of sd 0.01, 300 samples (from theory).
+BOUND = {"c": 0.0049, "L": 0.0025, "b": 0.0198, "a": 0.0268}
+
+
+def truth(problem: Problem) -> FloatArray:
+    return np.array([DUFFING[p.name] for p in problem.space])
+
+
+def by_name(estimates: tuple[Estimate, ...]) -> dict[str, Estimate]:
+    return {e.name: e for e in estimates}
+
+
+def test_standard_errors_of_example_1_are_the_cramer_rao_bound() -> None:
+    problem = example()
+    start = refine(problem, [truth(problem)])[0]
+    assert start is not None
+    for estimate in analyse(problem, start.theta).estimates:
+        assert estimate.stderr == pytest.approx(BOUND[estimate.name], rel=0.15)
+        assert estimate.status == "identified"
+
+
+def test_estimates_scatter_as_their_standard_errors_say() -> None:
+    scores = []
+    for seed in range(40):
+        problem = Problem.build(load_model("duffing-eq16"), [record(noisy(seed=seed))])
+        end = refine(problem, [truth(problem)])[0]
+        assert end is not None
+        for estimate in analyse(problem, end.theta).estimates:
+            assert estimate.stderr is not None
+            scores.append((estimate.value - DUFFING[estimate.name]) / estimate.stderr)
+    assert np.mean(np.square(scores)) == pytest.approx(1.0, abs=0.35)
+
+
+def test_intervals_are_of_the_t_distribution() -> None:
+    problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], skip=288)
+    analysis = analyse(problem, truth(problem))
+    estimate = analysis.estimates[0]
+    assert estimate.stderr is not None
+    assert estimate.interval95 is not None
+    half = 0.5 * (estimate.interval95[1] - estimate.interval95[0])
+    assert half / estimate.stderr == pytest.approx(2.306, abs=1e-3)  # 8 degrees of freedom
+
+
+def test_without_noise_the_standard_errors_vanish() -> None:
+    problem = example(sd=0.0)
+    analysis = analyse(problem, truth(problem))
+    assert all(e.stderr is not None and e.stderr < 1e-9 for e in analysis.estimates)
+    assert all(e.status == "identified" for e in analysis.estimates)
+
+
+def test_the_correlation_matrix_is_one_of_correlations() -> None:
+    uncertainty = analyse(example(), truth(example())).uncertainty
+    assert uncertainty is not None
+    assert np.allclose(uncertainty.correlation, uncertainty.correlation.T)
+    assert np.allclose(np.diag(uncertainty.correlation), 1.0)
+    assert np.all(np.linalg.eigvalsh(uncertainty.correlation) > 0)
+    assert uncertainty.noise_sd == pytest.approx(0.01, rel=0.15)
+    assert uncertainty.condition > 1
+
+
+def document(equation: str) -> dict[str, object]:
+    return {
+        "name": "test", "form": "difference", "inputs": {"q": "N"}, "states": {"x": "m"},
+        "parameters": {
+            "g": {"lower": 0.0, "upper": 10.0}, "h2": {"lower": 0.0, "upper": 10.0},
+            "u": {"lower": 0.0, "upper": 10.0},
+        },
+        "equations": {"x": equation}, "outputs": {"y": "x"}, "initial": {"x": 0},
+    }  # fmt: skip
+
+
+def analysed(equation: str, theta: list[float]) -> dict[str, Estimate]:
+    model = load_model(document(equation))
+    input_ = force(50)
+    y = 0.9 * np.concatenate([[0.0], input_.values[:-1]])
+    y = y + 0.1 * np.random.default_rng(0).standard_normal(50)
+    output = record(y).outputs
+    problem = Problem.build(model, [Record((input_,), output)])
+    return by_name(analyse(problem, np.array(theta)).estimates)
+
+
+def test_a_parameter_without_effect_is_unidentifiable_and_says_so() -> None:
+    found = analysed("g*q(k-1) + h2*0.1*sin(k) + 0*u", [0.9, 0.3, 5.0])
+    assert found["u"].status == "unidentifiable"
+    assert found["u"].stderr is None
+    assert "does not change" in found["u"].reason
+    assert found["g"].status == "identified"
+
+
+def test_factors_of_one_product_are_a_group() -> None:
+    found = analysed("g*h2*q(k-1) + u*sin(k)", [0.3, 3.0, 0.5])
+    assert [found[name].status for name in ("g", "h2", "u")] == ["group", "group", "identified"]
+    assert found["g"].stderr is None
+    assert "combination" in found["g"].reason
+
+
+def test_an_estimate_at_its_bound_has_a_standard_error() -> None:
+    found = analysed("g*q(k-1) + h2*sin(k) + u*cos(2*k)", [0.9, 0.0, 0.1])
+    assert found["h2"].status == "at bound"
+    assert found["h2"].stderr is not None
+    assert found["h2"].reason
+
+
+def test_as_many_samples_as_parameters_give_no_standard_error() -> None:
+    model = load_model("duffing-eq16")
+    problem = Problem.build(model, [record(noisy())], skip=296)
+    analysis = analyse(problem, truth(problem))
+    assert analysis.uncertainty is None
+    assert all(e.stderr is None and "4 samples" in e.reason for e in analysis.estimates)
+
+
+def test_fixed_parameters_are_reported_as_given() -> None:
+    changes = {"b": {"fixed": 5.0}}
+    problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], parameters=changes)
+    found = by_name(analyse(problem, np.array([0.2, 0.5, 1.0])).estimates)
+    assert found["b"].status == "fixed"
+    assert found["b"].value == 5.0
+    assert found["b"].stderr is None
+
+
+def test_outliers_widen_robust_standard_errors_little() -> None:
+    y = noisy()
+    outliers = y.copy()
+    outliers[::30] += 1.0
+    loss = Loss("soft-l1", 0.02)
+
+    def errors(values: FloatArray, loss: Loss) -> FloatArray:
+        problem = Problem.build(load_model("duffing-eq16"), [record(values)], loss=loss)
+        end = refine(problem, [truth(problem)])[0]
+        assert end is not None
+        return np.array([e.stderr for e in analyse(problem, end.theta).estimates], dtype=float)
+
+    plain, robust = errors(y, Loss()), errors(outliers, loss)
+    assert np.all(robust < 2 * plain)
+    assert np.all(errors(outliers, Loss()) > 5 * plain)
