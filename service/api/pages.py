@@ -72,6 +72,12 @@ def model_text(name: str, session: ReadSession) -> Response:
     return PlainTextResponse(pages.model_text(session, name))
 
 
+@router.get("/pages/jobs/{job_id}/model.yaml", **Hidden)
+def job_model_text(job_id: str, session: ReadSession) -> Response:
+    """The model of a job as the text that the form shows for its clone."""
+    return PlainTextResponse(pages.job_model_text(session, job_id))
+
+
 @router.get("/static/{name}", **Hidden)
 def static(name: str, request: Request) -> Response:
     """Our own files, and Plotly out of its installed wheel."""

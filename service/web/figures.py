@@ -262,7 +262,7 @@ def _small_plot(
     column: tuple[int, int],
 ) -> None:
     axis = "" if number == 0 else str(number + 1)
-    left, right = _share(*column, gap=0.09)
+    left, right = _share(*column, gap=0.15)
     bottom, top = (1 - v for v in reversed(_share(*row, gap=0.34)))
     end = _end(run, "generations")
     for island, points in enumerate(run.history):

@@ -109,7 +109,16 @@ def dataset_page(session: Session, dataset_id: str) -> str:
 
 def model_text(session: Session, name: str) -> str:
     """A model as YAML, to be read in the form and changed there."""
-    document = models.one(session, name).document
+    return _as_yaml(models.one(session, name).document)
+
+
+def job_model_text(session: Session, job_id: str) -> str:
+    """The model document of a job as YAML, for a job that is cloned."""
+    model = JobRepository(session).get(job_id).spec["model"]
+    return _as_yaml(models.one(session, model).document if isinstance(model, str) else model)
+
+
+def _as_yaml(document: dict[str, Any] | None) -> str:
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
 
 

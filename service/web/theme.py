@@ -41,6 +41,8 @@ def template(theme: Theme) -> dict[str, Any]:
         "ticklen": 4, "automargin": False, "title": {"standoff": 8},
     }  # fmt: skip
     return {
+        # Plotly takes a transparent cell for a white one and would write on it in black.
+        "data": {"heatmap": [{"textfont": {"color": ink["text"]}}]},
         "layout": {
             "paper_bgcolor": "rgba(0,0,0,0)",
             "plot_bgcolor": "rgba(0,0,0,0)",
@@ -59,5 +61,5 @@ def template(theme: Theme) -> dict[str, Any]:
                 "color": ink["line"],
                 "activecolor": ink["text"],
             },
-        }
+        },
     }

@@ -1,10 +1,10 @@
 """The form of a new identification in Chromium."""
 
-import json
 import re
 from pathlib import Path
 
 import pytest
+import yaml
 from playwright.sync_api import Page, expect
 
 from service.storage.jobs import JobRepository
@@ -101,7 +101,7 @@ def test_a_clone_starts_from_the_request_of_the_job(own_site: Site, page: Page) 
     expect(page.get_by_label("name of the job")).to_have_value("tube 40 m, pattern 1")
     expect(page.get_by_label("validation data")).to_have_value("0.3")
     expect(page.get_by_label("output p")).to_have_value("P2")
-    document = json.loads(page.get_by_label("equations in YAML").input_value())
+    document = yaml.safe_load(page.get_by_label("equations in YAML").input_value())
     assert document["name"] == "lagged-tube"
     page.get_by_role("button", name="Identify").click()
     page.wait_for_url(re.compile(r"/jobs/job_"))

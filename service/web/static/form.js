@@ -49,7 +49,7 @@ async function fillFrom(job) {
     await listed(request.parameters);
   } else {
     field('source').value = 'own';
-    const text = JSON.stringify(request.model, null, 2);
+    const text = await ask(`/pages/jobs/${encodeURIComponent(job)}/model.yaml`);
     state.cloned = { text, model: request.model };
     await own(text, request.parameters);
   }
@@ -124,7 +124,7 @@ async function check(changes) {
 function verdict(found) {
   const place = document.getElementById('check');
   field('equations').ariaInvalid = String(!found.valid);
-  if (found.valid) return place.replaceChildren(element('span', '✓ the model can be used', 'status identified'));
+  if (found.valid) return place.replaceChildren(element('span', 'the model can be used', 'status identified'));
   const list = document.createElement('ul');
   for (const one of found.errors) {
     const where = [one.pointer, one.column && `column ${one.column}`].filter(Boolean).join(', ');
@@ -132,7 +132,7 @@ function verdict(found) {
     item.append(element('b', where), ` ${one.detail}`);
     list.append(item);
   }
-  place.replaceChildren(element('span', '△ the model cannot be used yet', 'fault'), list);
+  place.replaceChildren(element('span', 'the model cannot be used yet', 'fault'), list);
 }
 
 function take(document, changes) {
