@@ -152,14 +152,6 @@ class Twin:
             return self._value(one, m, c, values, equation)
 
         match e:
-            case Number(number):
-                return number
-            case Symbol(name, "parameter"):
-                return self.values[name]
-            case Symbol(_, "period"):
-                return self.step
-            case Symbol(_, kind):
-                return m + c if kind == "index" else (m + c) * self.step
             case Past(_, "input", _, _):
                 return self._input(e, m, c)
             case Past():
@@ -172,6 +164,19 @@ class Twin:
                 return value(a) if value(condition) else value(b)
             case Call(function, arguments):
                 return _FUNCTIONS[function](*(np.float64(value(a)) for a in arguments))
+        return self._leaf(e, m + c)
+
+    def _leaf(self, e: Number | Symbol, place: float) -> float:
+        match e:
+            case Number(number):
+                return number
+            case Symbol(name, "parameter"):
+                return self.values[name]
+            case Symbol(_, "period"):
+                return self.step
+            case Symbol(_, "index"):
+                return place
+        return place * self.step
 
     def _lag(self, past: Past) -> float:
         lag = self._value(past.lag, 0, 0.0, {}, 0) if past.lag is not None else 0.0

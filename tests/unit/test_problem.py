@@ -183,9 +183,9 @@ def test_options_that_cannot_be_used_are_refused() -> None:
         Problem.build(model, data, parameters={"c": {"lower": 2.0}})
     with pytest.raises(InvalidSettings, match=r"need \(P, 4\)"):
         Problem.build(model, data).fitness(np.zeros((3, 5)))
+    tiny_steps = lag_element(solver={"step": 1e-9})
     with pytest.raises(InvalidSettings, match="may take"):
-        step = {"step": 1e-9}
-        Problem.build(lag_element(solver=step), data)
+        Problem.build(tiny_steps, data)
 
 
 def test_a_state_that_nothing_measures_cannot_start_measured() -> None:

@@ -1,0 +1,145 @@
+"""Speed of the compiled kernels, beside a reference in C where one is at hand.
+
+The reference is the folder ``bench`` beside the measured data (`LAGID_DATA`): the paper's
+recursion in C, compiled here with the machine's own compiler.
+"""
+
+import importlib.util
+import os
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from benchmarks.table import Row, Skipped, parser, report
+from sysid.kernels.compiler import kernel_key
+from sysid.kernels.emission import kernel_code
+from sysid.kernels.layout import Variant
+from sysid.kernels.machine import object_code, store, stored
+from sysid.models.model import Model
+from sysid.models.spec import parse_model
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+
+DATA = Path(os.environ.get("LAGID_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+BOUNDS = {"c": [0, 1], "L": [0, 1], "b": [0, 10], "a": [0, 5]}
+FORCE = "c*(x(k-1 - L/h) - x(k-2 - L/h))/h + b*x(k-2) + a*x(k-2)**3 - q(k-2)"
+RATE = "q(t) - c*v(t - L) - b*x - a*x**3"
+
+
+def duffing(form: str) -> Model:
+    """The paper's Example 1 as recursion (Eq. 16) or as differential equation (Eq. 13)."""
+    recursion = {"x": f"2*x(k-1) - x(k-2) - h**2*({FORCE})"}
+    equations = recursion if form == "difference" else {"x": "v", "v": RATE}
+    parameters = {name: {"lower": low, "upper": high} for name, (low, high) in BOUNDS.items()}
+    return parse_model(
+        {
+            "name": "duffing", "form": form, "inputs": {"q": "N"},
+            "states": dict.fromkeys(equations, "m"), "parameters": parameters,
+            "equations": equations, "outputs": {"y": "x"}, "initial": dict.fromkeys(equations, 0),
+        }
+    )  # fmt: skip
+
+
+def problem(model: Model, samples: int) -> Problem:
+    """The model on the reference's record."""
+    period, k = 0.02, np.arange(samples)
+    force = Channel("q", period * k, 10 * np.cos(5 * period * k), "N")
+    measured = Channel("y", period * k, np.sin(period * k), "m")
+    return Problem.build(model, [Record((force,), (measured,))])
+
+
+def individuals(count: int) -> np.ndarray:
+    """Candidates inside the bounds."""
+    return np.random.default_rng(0).random((count, 4)) * [1, 1, 10, 5]
+
+
+def microseconds(work: Callable[[], object], repeats: int) -> float:
+    """Least time of some repeats of ten calls each."""
+    work()
+    least = np.inf
+    for _ in range(repeats):
+        start = time.perf_counter()
+        for _ in range(10):
+            work()
+        least = min(least, (time.perf_counter() - start) / 10)
+    return 1e6 * least
+
+
+def reference() -> Callable[[int, int], float] | None:
+    """The C reference's own timing program, or None where it or a compiler is absent."""
+    path = DATA.parent / "bench" / "kernel_speed.py"
+    specification = importlib.util.spec_from_file_location("kernel_speed", path)
+    if not path.is_file() or shutil.which("cc") is None or specification is None:
+        return None
+    module = importlib.util.module_from_spec(specification)
+    if specification.loader is None:
+        return None
+    specification.loader.exec_module(module)
+    made: Callable[[int, int], float] = module.reference_microseconds
+    return made
+
+
+def against_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
+    """Time of a population, call and allocation included, beside C; both the least of several."""
+    rows: list[Row] = []
+    skipped: list[Skipped] = []
+    timed_c = reference()
+    for count in (48, 512):
+        example, theta = problem(duffing("difference"), 300), individuals(count)
+        ours, c = np.inf, np.inf
+        for _ in range(3):  # in turns, so that a disturbance meets both
+            ours = min(ours, microseconds(lambda e=example, t=theta: e.fitness(t), repeats))
+            if timed_c is not None:
+                c = min(c, timed_c(count, 300))
+        name = f"duffing-eq16, {count} individuals × 300 samples"
+        rows.append(Row(name, ours, "µs"))
+        if timed_c is None:
+            skipped.append(Skipped(f"{name}: C", "no C reference beside LAGID_DATA, or no cc"))
+        else:
+            rows.append(Row(f"{name}: time ÷ C reference", ours / c, "", 1.0))
+    return rows, skipped
+
+
+def others(repeats: int) -> list[Row]:
+    """The differential form, a long record, and what a new model costs."""
+    model = duffing("differential")
+    lagged, long = problem(model, 300), problem(duffing("difference"), 20_000)
+    few, one_block = individuals(48), individuals(16)
+    rows = [
+        Row("duffing-delay (RK4), 48 × 300", microseconds(lambda: lagged.fitness(few), repeats),
+            "µs"),
+        Row("duffing-eq16, 16 × 20,000 samples",
+            microseconds(lambda: long.fitness(one_block), max(repeats // 5, 2)) / 1000, "ms"),
+    ]  # fmt: skip
+    start = time.perf_counter()
+    code = kernel_code(model, Variant())
+    written = time.perf_counter()
+    compiled = object_code(code)
+    done = time.perf_counter()
+    rows.append(Row("write the code of a new model", 1e3 * (written - start), "ms"))
+    rows.append(Row("compile it", 1e3 * (done - written), "ms"))
+    with TemporaryDirectory() as folder:
+        os.environ["LAGID_CACHE_DIR"] = folder
+        key = kernel_key(model, Variant())
+        store(key, compiled)
+        start = time.perf_counter()
+        stored(key)
+        rows.append(Row("find it again on disk", 1e3 * (time.perf_counter() - start), "ms", 10.0))
+    return rows
+
+
+def main() -> None:
+    """Measure and print."""
+    options = parser(__doc__ or "").parse_args()
+    repeats = 10 if options.quick else 50
+    rows, skipped = against_c(repeats)
+    report("Kernels", [*rows, *others(repeats)], skipped, options)
+
+
+if __name__ == "__main__":
+    main()
