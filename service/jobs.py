@@ -17,7 +17,7 @@ from service.storage.ledger import Cell as StoredCell
 from service.storage.ledger import add_runs
 from service.storage.lineage import LineageRepository
 from service.storage.tables import Job, State
-from service.sweeps import Cell, Step, body_of, count, expand, steps_of
+from service.sweeps import Cell, Step, body_of, count, expand, groups_of, steps_of
 
 # Any number does for these; to check each of a hundred thousand seeds would only take time.
 UNCHECKED = ("/seed", "/noise/seed", "/noise/sigma", "/priority")
@@ -35,13 +35,14 @@ def submit(session: Session, body: JobIn, settings: Settings, key: str | None = 
     """
     document = body.normal_form()
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
-    groups = steps_of(body)
-    n_runs = count(groups)
+    axes = groups_of(body)
+    n_runs = count(body, axes)
     if n_runs > settings.max_runs_per_job:
         raise InvalidRequest.at(
             "/sweep/axes",
             f"the sweep has {n_runs} runs; at most {settings.max_runs_per_job} a job",
         )
+    groups = steps_of(body, axes)
     checker = JobChecker(session)
     _check(checker, document, groups)
     spec = checker.resolved(document)

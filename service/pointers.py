@@ -25,7 +25,7 @@ def explained(entries: Iterable[Mapping[str, Any]], body: Any, kind: Any) -> Ite
     """
     seen: set[str] = set()
     for entry in entries:
-        pointer = pointer_into(body, entry["loc"])
+        pointer = pointer_into(body, entry["loc"], is_missing=entry["type"] == "missing")
         # A union gives one entry per member; the first is about the member most often meant.
         if pointer not in seen:
             seen.add(pointer)
@@ -42,15 +42,18 @@ def detail_of(entry: Mapping[str, Any], known: Sequence[str]) -> str:
     return f"{entry['msg']}; found {found if len(found) <= SHOWN else found[:SHOWN] + '…'}"
 
 
-def pointer_into(body: Any, loc: Location) -> str:
-    """JSON pointer of a Pydantic location, without the names that unions put into it."""
+def pointer_into(body: Any, loc: Location, *, is_missing: bool = False) -> str:
+    """JSON pointer of a Pydantic location, without the names that unions put into it.
+
+    `is_missing`: the last part is not in the body, and should be.
+    """
     parts: list[str] = []
     here = body
     for position, part in enumerate(loc):
-        inside = _is_in(here, part)
-        if inside:
+        if _is_in(here, part):
             here = here[part]
-        if inside or (position == len(loc) - 1 and isinstance(here, dict | list)):
+            parts.append(escaped(part))
+        elif is_missing and position == len(loc) - 1:
             parts.append(escaped(part))
     return "".join(f"/{part}" for part in parts)
 

@@ -13,6 +13,7 @@ from pydantic_core import PydanticCustomError
 from service.schemas import Answer, Body, Pointer
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Whole = Annotated[int, Field(gt=-(2**62), lt=2**62)]
 Mutation = Annotated[list[tuple[int, float]], Field(min_length=1)]
 
 
@@ -114,7 +115,7 @@ class Axis(Body):
 
     path: Pointer
     values: list[Any] | None = Field(default=None, min_length=1)
-    range: list[int] | None = Field(default=None, min_length=2, max_length=3)
+    range: list[Whole] | None = Field(default=None, min_length=2, max_length=3)
     log: tuple[float, float, int] | None = None
     zip: str | None = None
     labels: list[dict[str, float | str]] | None = None

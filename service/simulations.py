@@ -1,6 +1,7 @@
 """Use case: a dataset simulated from a model, its true parameters, inputs, and noise."""
 
 from collections.abc import Mapping
+from math import pi
 from typing import Any
 
 import numpy as np
@@ -75,22 +76,18 @@ class _Signals:
         t = self._times
         match signal:
             case Wave():
-                omega = signal.omega if signal.omega is not None else 0.0
-                if signal.frequency is not None:
-                    omega = 2 * np.pi * signal.frequency
-                wave = np.cos if signal.kind == "cosine" else np.sin
-                values: FloatArray = signal.offset + signal.amplitude * wave(
-                    omega * t + signal.phase
-                )
+                angle = _omega(signal) * t + signal.phase
+                wave = np.cos(angle) if signal.kind == "cosine" else np.sin(angle)
+                return np.asarray(signal.offset + signal.amplitude * wave)
             case StepInput():
-                values = signal.offset + signal.amplitude * (t >= signal.time)
+                return np.asarray(signal.offset + signal.amplitude * (t >= signal.time))
             case BinaryInput():
-                values = signal.offset + signal.amplitude * _binary(t, signal.period, signal.seed)
+                draws = _binary(t, signal.period, signal.seed)
+                return np.asarray(signal.offset + signal.amplitude * draws)
             case ExpressionInput():
-                values = _evaluated(name, signal.expression, t)
+                return _evaluated(name, signal.expression, t)
             case DatasetInput():
-                values = self._recorded(name, signal)
-        return np.asarray(values, dtype=np.float64)
+                return self._recorded(name, signal)
 
     def _recorded(self, name: str, signal: DatasetInput) -> FloatArray:
         row = DatasetRepository(self._session).get(signal.dataset)
@@ -100,7 +97,7 @@ class _Signals:
             raise InvalidRequest.at(f"/inputs/{name}/channel", str(error)) from None
         if row.id not in self.parents:
             self.parents.append(row.id)
-        return np.interp(self._times, channel.times, channel.values)
+        return np.asarray(np.interp(self._times, channel.times, channel.values))
 
 
 def _model(session: Session, reference: Any) -> tuple[Model, Any]:
@@ -135,7 +132,8 @@ def _simulated(
 
 
 def _parameter_faults(model: Model, values: Mapping[str, float]) -> list[FieldError]:
-    known = [p.name for p in model.parameters]
+    # A start that the model does not fix, or another than its own, is given as `x(0)`.
+    known = [*(p.name for p in model.parameters), *(f"{one.name}(0)" for one in model.states)]
     faults = [
         FieldError(f"/parameters/{name}", f"the model has no parameter {name!r}"
                    f"{nearest(name, known)}")
@@ -161,6 +159,13 @@ def _input_faults(model: Model, inputs: Mapping[str, InputIn]) -> list[FieldErro
     ]  # fmt: skip
 
 
+def _omega(wave: Wave) -> float:
+    """Angular frequency in rad/s."""
+    if wave.frequency is not None:
+        return 2 * pi * wave.frequency
+    return wave.omega or 0.0
+
+
 def _binary(times: FloatArray, period: float, seed: int) -> FloatArray:
     places = (times / period).astype(np.int64)
     draws = np.random.Generator(np.random.Philox(seed)).integers(0, 2, int(places[-1]) + 1)
@@ -169,9 +174,8 @@ def _binary(times: FloatArray, period: float, seed: int) -> FloatArray:
 
 def _evaluated(name: str, expression: str, times: FloatArray) -> FloatArray:
     """An expression of t, computed as the output of a model that has nothing else."""
-    from sysid.simulation import simulate as simulated
-
     from sysid.models.spec import parse_model
+    from sysid.simulation import simulate as simulated
 
     document = {
         "name": "input", "form": "difference", "states": {"unused": "1"},

@@ -1,6 +1,7 @@
 """What the commands share: options, consoles, tables, and errors as one line."""
 
 import json
+import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,8 @@ from rich.table import Table
 
 from service.client import DEFAULT_URL, Client
 
-out = Console(highlight=False)
+WIDE = 200  # where nobody looks, a line is not folded at 80 columns
+out = Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 Url = Annotated[str, typer.Option("--url", envvar="LAGID_URL", help="Address of the server.")]
@@ -52,10 +54,10 @@ def print_table(
 ) -> None:
     """Print rows under headings; a heading that begins with ``>`` is set to the right."""
     table = Table(title=title or None, box=None, pad_edge=False, title_justify="left")
-    for heading in headings:
+    for number, heading in enumerate(headings):
         table.add_column(
             heading.removeprefix(">"), justify="right" if heading.startswith(">") else "left",
-            overflow="fold",
+            overflow="fold", no_wrap=number == 0,
         )  # fmt: skip
     for row in rows:
         table.add_row(*(shown(value) for value in row))

@@ -3,6 +3,7 @@
 import errno
 import signal
 import socket
+import threading
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import FrameType
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
 
     from service.settings import Settings
+    from service.supervision import Supervisor
 
 CLOSE_S = 3  # what an open answer may take once the process is asked to end
 
@@ -46,15 +48,15 @@ def serve(
 
         open_parts(settings).database.dispose()  # what cannot be opened is told now, in one line
         _end_on_signals()
-        child: AbstractContextManager[Any] = nullcontext()
+        child: AbstractContextManager[Supervisor | None] = nullcontext()
         if with_dispatcher:
             child = supervised_dispatcher(settings)
-        with child:
+        with child as supervisor:
             bound = listener.getsockname()[1]
             folder = settings.data_dir.absolute()
             out.print(f"lagid serves http://{settings.host}:{bound}/ (data in {folder}); "
                       "Ctrl-C ends it", soft_wrap=True)  # fmt: skip
-            _run(create_app(settings), listener)
+            _run(create_app(settings), listener, supervisor)
 
 
 def dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
@@ -111,13 +113,15 @@ def listening(host: str, port: int) -> socket.socket:
     return listener
 
 
-def _run(app: "FastAPI", listener: socket.socket) -> None:
+def _run(app: "FastAPI", listener: socket.socket, supervisor: "Supervisor | None") -> None:
     import uvicorn
 
     class Server(uvicorn.Server):
-        """Tells open event streams at once that the process is to end."""
+        """Tells open event streams and the dispatcher at once that the process is to end."""
 
         def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            if supervisor is not None:
+                threading.Thread(target=supervisor.stop, name="end").start()
             parts = getattr(app.state, "parts", None)
             if parts is not None:
                 parts.stopping.set()

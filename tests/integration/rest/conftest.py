@@ -1,0 +1,33 @@
+"""The web application on a fresh data folder, with a recording and a model in it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.app import create_app
+from tests.rest import CSV, recording, settings_of
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """One application for the tests of a module, without a dispatcher."""
+    app = create_app(settings_of(tmp_path_factory.mktemp("data"), max_upload_bytes=200_000))
+    with TestClient(app, raise_server_exceptions=False) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def dataset(server: TestClient) -> str:
+    """Identifier of a stored recording of 30 s with channels u and y."""
+    answer = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV)
+    assert answer.status_code == 201, answer.text
+    return str(answer.json()["id"])
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Iterator[TestClient]:
+    """An application of the test's own."""
+    with TestClient(create_app(settings_of(tmp_path)), raise_server_exceptions=False) as client:
+        yield client

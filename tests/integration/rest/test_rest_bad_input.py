@@ -1,0 +1,273 @@
+"""Bad input over REST: a problem document that says what was wrong, where, and what was found."""
+
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from tests.rest import CSV, recording, refused
+
+MODEL: dict[str, Any] = {
+    "name": "own", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
+    "parameters": {"K": {"lower": 0, "upper": 5}, "L": {"lower": 0, "upper": 2}},
+    "equations": {"x": "K*u(t - L) - x"}, "outputs": {"y": "x"}, "initial": {"x": 0},
+}  # fmt: skip
+
+
+def with_changes(dataset: str, changes: dict[str, Any]) -> dict[str, Any]:
+    return {"model": "fopdt", "datasets": [dataset], **changes}
+
+
+JOBS: list[tuple[dict[str, Any], str, str]] = [
+    ({"model": "fopd"}, "/model", "did you mean 'fopdt'?"),
+    ({"model": 7}, "/model", "found 7"),
+    ({"datasets": ["ds_nothing"]}, "/datasets/0", "no dataset 'ds_nothing'"),
+    ({"datasets": []}, "/datasets", "found []"),
+    ({"datasets": ["./recording.csv"]}, "/datasets/0", "lagid dataset add"),
+    ({"channels": {"u": "volts"}}, "/channels/u", "no channel 'volts'"),
+    ({"channels": {"w": "u"}}, "/channels/w", "no signal 'w'"),
+    ({"algorithm": {"populaton": 50}}, "/algorithm/populaton", "did you mean 'population'?"),
+    ({"algoritm": {}}, "/algoritm", "did you mean 'algorithm'?"),
+    ({"algorithm": {"method": "best"}}, "/algorithm/method", "found 'best'"),
+    ({"algorithm": {"population": 2}}, "/algorithm/population", "found 2"),
+    ({"algorithm": {"population": 12, "islands": 4}}, "/algorithm/population", "4 islands"),
+    ({"algorithm": {"mutation": [[5, 0.2]]}}, "/algorithm/mutation", "generation 0"),
+    ({"parameters": {"LL": {"upper": 1}}}, "/parameters/LL", "no parameter 'LL'"),
+    ({"parameters": {"L": {"lower": 4, "upper": 1}}}, "/parameters/L", "[4, 1]"),
+    ({"parameters": {"L": {"lower": -1}}}, "/parameters", "-1 s"),
+    ({"parameters": {"L": {"uper": 1}}}, "/parameters/L/uper", "did you mean 'upper'?"),
+    ({"parameters": {"L": {"upper": 100}}}, "/datasets/0", "lasts 29.9 s"),
+    ({"loss": {"kind": "cubes"}}, "/loss/kind", "found 'cubes'"),
+    ({"weights": {"z": 1}}, "/weights/z", "no output 'z'"),
+    ({"weights": {"y": -1}}, "/weights/y", "found -1"),
+    ({"skip": 300}, "/datasets/0", "300 samples"),
+    ({"validation": {}}, "/validation", "either"),
+    ({"validation": {"fraction": 1.5}}, "/validation/fraction", "found 1.5"),
+    ({"validation": {"datasets": ["ds_x"]}}, "/validation/datasets/0", "'ds_x'"),
+    ({"seed": -1}, "/seed", "found -1"),
+    ({"trend": {"x": "length_m"}}, "/trend", "unknown field"),
+]
+
+
+@pytest.mark.parametrize(("changes", "pointer", "words"), JOBS)
+def test_a_job_that_cannot_be_used_is_refused_with_the_place_and_what_was_found(
+    server: TestClient, dataset: str, changes: dict[str, Any], pointer: str, words: str
+) -> None:
+    answer = server.post("/v1/jobs", json=with_changes(dataset, changes))
+    faults = refused(answer, 422, "invalid")
+    assert [fault for fault in faults if fault["pointer"] == pointer and words in fault["detail"]]
+
+
+AXES: list[tuple[dict[str, Any], str, str]] = [
+    ({"path": "/noise/sigm", "values": [1]}, "path", "did you mean 'sigma'?"),
+    ({"path": "noise", "values": [1]}, "path", "found 'noise'"),
+    ({"path": "/name", "values": ["a"]}, "path", "cannot be swept"),
+    ({"path": "/seed"}, "", "exactly one of"),
+    ({"path": "/seed", "values": [1], "range": [0, 2]}, "", "values and range"),
+    ({"path": "/seed", "range": [5, 2]}, "range", "[5, 2]"),
+    ({"path": "/seed", "range": [0, 900000]}, "axes", "900000 runs"),
+    ({"path": "/noise/sigma", "log": [0, 1, 3]}, "log", "start > 0"),
+    ({"path": "/noise/sigma", "values": [0.1, "x"]}, "values/1", "found 'x'"),
+    ({"path": "/algorithm/method", "values": ["simple", "bes"]}, "values/1", "found 'bes'"),
+    ({"path": "/parameters/L/upper", "values": [1, -1]}, "values/1", "/parameters/L"),
+    ({"path": "/seed", "values": [1, 2], "labels": [{"n": 1}]}, "labels", "1 labels for 2"),
+    ({"path": "/datasets", "values": [["nope"]]}, "values/0", "no dataset 'nope'"),
+    ({"path": "/model", "values": ["fopdt", "sopd"]}, "values/1", "no model 'sopd'"),
+]
+
+
+@pytest.mark.parametrize(("axis", "place", "words"), AXES)
+def test_a_sweep_that_cannot_be_expanded_is_refused_at_its_axis(
+    server: TestClient, dataset: str, axis: dict[str, Any], place: str, words: str
+) -> None:
+    body = with_changes(dataset, {"sweep": {"axes": [axis]}})
+    faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
+    pointer = "/sweep/axes" if place == "axes" else f"/sweep/axes/0/{place}".rstrip("/")
+    assert [fault for fault in faults if fault["pointer"] == pointer and words in fault["detail"]]
+
+
+def test_every_fault_of_a_job_is_told_at_once(server: TestClient, dataset: str) -> None:
+    body = {"model": "nope", "datasets": ["gone", dataset], "algorithm": {"bits": 24}}
+    faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
+    assert {fault["pointer"] for fault in faults} == {"/model", "/datasets/0"}
+
+
+MODELS: list[tuple[dict[str, Any], str, int | None, str]] = [
+    ({"equations": {"x": "K*u(t - L) - z"}}, "/equations/x", 14, "'z'"),
+    ({"equations": {"x": "__import__('os')"}}, "/equations/x", 1, "__import__"),
+    ({"equations": {"x": "K*u(t + L) - x"}}, "/equations/x", 3, "L"),
+    ({"parameters": {"K": {"lower": 5, "upper": 0}, "L": {"lower": 0, "upper": 2}}},
+     "/parameters/K", None, "[5, 0]"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "pointer", "column", "words"), MODELS)
+def test_a_model_with_a_fault_is_refused_with_its_column(
+    server: TestClient, dataset: str, changes: dict[str, Any], pointer: str,
+    column: int | None, words: str,
+) -> None:  # fmt: skip
+    document = {**MODEL, **changes}
+    told = server.post("/v1/models:check", json=document).json()
+    assert told["valid"] is False
+    fault = told["errors"][0]
+    assert fault["pointer"].startswith(pointer)
+    assert fault["column"] == column
+    assert words in fault["detail"]
+    refused(server.post("/v1/models", json=document), 422, "invalid")
+    answer = server.post("/v1/jobs", json={"model": document, "datasets": [dataset]})
+    assert refused(answer, 422, "invalid")[0]["pointer"].startswith(f"/model{pointer}")
+
+
+@pytest.mark.parametrize("text", [b"{", b"[1,2]", b'{"a": NaN}', b"\xff\xfe", b"null"])
+def test_the_check_of_a_model_answers_whatever_is_sent(server: TestClient, text: bytes) -> None:
+    answer = server.post(
+        "/v1/models:check", content=text, headers={"content-type": "application/json"}
+    )
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["valid"] is False
+    assert answer.json()["errors"][0]["detail"]
+
+
+def test_an_own_model_cannot_take_the_name_of_a_built_in_one(server: TestClient) -> None:
+    answer = server.post("/v1/models", json={**MODEL, "name": "tube"})
+    assert refused(answer, 422, "invalid")[0]["pointer"] == "/name"
+
+
+UPLOADS: list[tuple[bytes, str]] = [
+    (b"t,u,y\n0,1,2\n0.1,volt,3\n", "row 3, column 'u'"),
+    (b"t\n0\n1\n", "column"),
+    (b"t,u,y\n", "row"),
+    (b"", "empty"),
+    (b"t,u,y\n0,1,2\n0.2,1,2\n0.1,1,2\n", "decreases"),
+    (b"t,u,y\n0,1,2\n0.1,1,2\n0.1,1,2\n", "repeats"),
+]
+
+
+@pytest.mark.parametrize(("content", "words"), UPLOADS)
+def test_a_csv_that_cannot_be_read_is_refused_with_its_row(
+    server: TestClient, content: bytes, words: str
+) -> None:
+    answer = server.post("/v1/datasets", content=content, headers=CSV)
+    refused(answer, 422, "invalid-upload")
+    assert words in answer.json()["detail"]
+
+
+def test_a_damaged_mcap_is_refused(server: TestClient, dataset: str) -> None:
+    whole = server.get(f"/v1/datasets/{dataset}/content").content
+    kind = {"content-type": "application/x-mcap"}
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 0x10
+    for damaged in (whole[: len(whole) // 2], bytes(flipped), b"\x89MCAP0\r\n"):
+        answer = server.post("/v1/datasets", content=damaged, headers=kind)
+        refused(answer, 422, "invalid-upload")
+
+
+def test_an_upload_of_another_kind_is_refused(server: TestClient) -> None:
+    answer = server.post("/v1/datasets", content=b"x", headers={"content-type": "image/png"})
+    refused(answer, 415, "unsupported-media-type")
+    assert "'image/png'" in answer.json()["detail"]
+
+
+def test_an_upload_over_the_limit_is_refused(server: TestClient) -> None:
+    large = b"t,u,y\n" + b"0,0,0\n" * 60_000
+    refused(server.post("/v1/datasets", content=large, headers=CSV), 413, "too-large")
+    pieces = (large[i : i + 1000] for i in range(0, len(large), 1000))
+    refused(server.post("/v1/datasets", content=pieces, headers=CSV), 413, "too-large")
+
+
+def test_a_form_without_a_file_is_refused(server: TestClient) -> None:
+    answer = server.post("/v1/datasets", files={"note": (None, "text")})
+    assert refused(answer, 422, "invalid")[0]["pointer"] == "/file"
+
+
+SIMULATIONS: list[tuple[dict[str, Any], str, str]] = [
+    ({"model": "nope"}, "/model", "no model 'nope'"),
+    ({"parameters": {"K": 1, "T": 1, "y0": 0}}, "/parameters/L", "true value"),
+    ({"parameters": {"K": 1, "T": 1, "L": 0.5, "Z": 1}}, "/parameters/Z", "no parameter 'Z'"),
+    ({"inputs": {}}, "/inputs/u", "give input 'u'"),
+    ({"inputs": {"u": {"kind": "cosine"}}}, "/inputs/u", "omega"),
+    ({"inputs": {"u": {"kind": "saw"}}}, "/inputs/u", "saw"),
+    ({"inputs": {"u": {"kind": "expression", "expression": "cos(w*t)"}}},
+     "/inputs/u/expression", "'w'"),
+    ({"samples": 1}, "/samples", "found 1"),
+    ({"sample_time": 0}, "/sample_time", "found 0"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "pointer", "words"), SIMULATIONS)
+def test_a_simulation_that_cannot_be_done_is_refused(
+    server: TestClient, changes: dict[str, Any], pointer: str, words: str
+) -> None:
+    body: dict[str, Any] = {
+        "model": "fopdt", "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0}, "samples": 20,
+        "inputs": {"u": {"kind": "step"}}, "sample_time": 0.1, **changes,
+    }  # fmt: skip
+    faults = refused(server.post("/v1/datasets:simulate", json=body), 422, "invalid")
+    assert [fault for fault in faults if fault["pointer"] == pointer and words in fault["detail"]]
+
+
+@pytest.mark.parametrize(
+    ("steps", "pointer"),
+    [
+        ([{"smooth": {}}], "/steps/0/smooth"),
+        ([{"trim": {"start": 5, "stop": 2}}], "/steps/0/trim/stop"),
+        ([{"detrend": {}}, {"noise": {"sigma": -1, "channels": ["y"]}}], "/steps/1/noise/sigma"),
+    ],
+)
+def test_a_derivation_that_cannot_be_done_is_refused_at_its_step(
+    server: TestClient, dataset: str, steps: list[Any], pointer: str
+) -> None:
+    answer = server.post(f"/v1/datasets/{dataset}:derive", json={"steps": steps})
+    assert refused(answer, 422, "invalid")[0]["pointer"] == pointer
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/v1/nothing", "/v1/jobs/job_0", "/v1/jobs/job_0/runs", "/v1/jobs/job_0/events",
+        "/v1/runs/run_0", "/v1/runs/run_0/history", "/v1/runs/run_0/signals.mcap",
+        "/v1/datasets/ds_0", "/v1/datasets/ds_0/content", "/v1/models/nothing",
+    ],
+)  # fmt: skip
+def test_what_is_not_there_is_not_found(server: TestClient, path: str) -> None:
+    refused(server.get(path), 404, "not-found")
+
+
+def test_an_action_on_a_job_that_is_not_there_is_not_found(server: TestClient) -> None:
+    for verb in ("cancel", "resume", "clone"):
+        refused(server.post(f"/v1/jobs/job_0:{verb}"), 404, "not-found")
+
+
+def test_a_method_that_a_path_does_not_have_is_refused(server: TestClient) -> None:
+    refused(server.delete("/v1/jobs"), 405, "method-not-allowed")
+
+
+def test_a_body_that_is_not_json_is_refused(server: TestClient) -> None:
+    json_type = {"content-type": "application/json"}
+    answer = server.post("/v1/jobs", content=b'{"model": ', headers=json_type)
+    assert "not JSON" in refused(answer, 422, "invalid")[0]["detail"]
+
+
+@pytest.mark.parametrize(
+    ("query", "pointer"),
+    [("limit=0", "?limit"), ("limit=x", "?limit"), ("state=done", "?state"),
+     ("limit=5000", "?limit")],
+)  # fmt: skip
+def test_a_query_value_that_cannot_be_used_is_named(
+    server: TestClient, query: str, pointer: str
+) -> None:
+    faults = refused(server.get(f"/v1/jobs?{query}"), 422, "invalid")
+    assert faults[0]["pointer"].startswith(pointer) or faults[0]["pointer"] == "?0"
+
+
+def test_a_text_that_no_database_can_keep_is_refused(server: TestClient, dataset: str) -> None:
+    body = with_changes(dataset, {"name": "nul \x00"})
+    refused(server.post("/v1/jobs", json=body), 422, "invalid")
+
+
+def test_an_unknown_channel_names_those_that_are_there(own: TestClient) -> None:
+    answer = own.post("/v1/datasets?name=p", content=recording(columns=("P1", "P2")), headers=CSV)
+    body = {"model": "fopdt", "datasets": [answer.json()["id"]]}
+    faults = refused(own.post("/v1/jobs", json=body), 422, "invalid")
+    assert faults[0]["pointer"] == "/channels"
+    assert "P1, P2" in faults[0]["detail"]

@@ -1,0 +1,42 @@
+"""What tests of the REST interface share."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.settings import Settings
+
+CSV = {"content-type": "text/csv"}
+PROBLEM = "application/problem+json"
+
+
+def recording(n: int = 300, period: float = 0.1, columns: tuple[str, ...] = ("u", "y")) -> bytes:
+    """CSV of a step response with gain 2, time constant 1 s and dead time 0.5 s."""
+    t = np.arange(n) * period
+    u = np.where((t // 7) % 2 == 0, 0.0, 1.0)
+    y = np.zeros(n)
+    lag = round(0.5 / period)
+    for k in range(1, n):
+        y[k] = y[k - 1] + period * (2 * u[max(k - 1 - lag, 0)] - y[k - 1])
+    rows = [",".join(["t", *columns])]
+    rows += [f"{a:.6g},{b:.6g},{c:.6g}" for a, b, c in zip(t, u, y, strict=True)]
+    return ("\n".join(rows) + "\n").encode()
+
+
+def settings_of(folder: Path, **changes: object) -> Settings:
+    values = {"data_dir": folder, "poll_seconds": 0.02, **changes}
+    return Settings.model_validate(values)
+
+
+def refused(answer: Any, status: int, kind: str) -> list[dict[str, Any]]:
+    """The faults of a problem document, after a look at its form."""
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == PROBLEM
+    document = answer.json()
+    assert document["type"] == f"/problems/{kind}"
+    assert document["status"] == status
+    assert document["title"]
+    assert document["detail"]
+    assert "Traceback" not in answer.text
+    return list(document.get("errors", []))
