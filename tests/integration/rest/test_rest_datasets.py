@@ -1,0 +1,160 @@
+"""Datasets over REST: stored once, read in parts, derived, simulated, traced back."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from service.signals.reader import read_recording
+from tests.rest import CSV, recording, refused
+
+SIMULATION: dict[str, Any] = {
+    "name": "example", "model": "duffing-eq16",
+    "parameters": {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0},
+    "inputs": {"q": {"kind": "cosine", "amplitude": 10, "omega": 5}},
+    "samples": 60, "sample_time": 0.02,
+}  # fmt: skip
+
+
+def test_the_same_bytes_again_give_the_same_dataset(server: TestClient, dataset: str) -> None:
+    again = server.post("/v1/datasets?name=other", content=recording(), headers=CSV)
+    assert again.status_code == 200
+    assert again.json()["id"] == dataset
+    read_otherwise = server.post("/v1/datasets?sample_time=0.2", content=b"u,y\n1,2\n2,3\n",
+                                 headers=CSV)  # fmt: skip
+    assert read_otherwise.json()["sample_time"] == pytest.approx(0.2)
+
+
+def test_a_dataset_tells_its_channels_and_its_sampling(server: TestClient, dataset: str) -> None:
+    told = server.get(f"/v1/datasets/{dataset}").json()
+    assert [channel["name"] for channel in told["channels"]] == ["u", "y"]
+    assert told["samples"] == 300
+    assert told["sample_time"] == pytest.approx(0.1)
+    listed = server.get("/v1/datasets").json()["items"]
+    assert dataset in [one["id"] for one in listed]
+
+
+def test_a_form_of_a_browser_is_an_upload_too(server: TestClient) -> None:
+    file = ("filled in.csv", recording(40), "application/vnd.ms-excel")
+    answer = server.post("/v1/datasets", files={"file": file})
+    assert answer.status_code == 201, answer.text
+    assert answer.json()["name"] == "filled in"
+
+
+def test_content_goes_up_again_as_mcap_with_the_same_samples(
+    server: TestClient, dataset: str
+) -> None:
+    content = server.get(f"/v1/datasets/{dataset}/content").content
+    kind = {"content-type": "application/x-mcap"}
+    copy = server.post("/v1/datasets?name=copy", content=content, headers=kind).json()
+    first, second = (read_recording(server.get(f"/v1/datasets/{one}/content").content)
+                     for one in (dataset, copy["id"]))  # fmt: skip
+    for name in ("u", "y"):
+        np.testing.assert_array_equal(first.channel(name).values, second.channel(name).values)
+        np.testing.assert_array_equal(first.channel(name).times, second.channel(name).times)
+
+
+def test_content_as_csv_goes_up_again_with_the_same_samples(server: TestClient) -> None:
+    text = b"run,t,u [V],y\n1,0,1,2\n1,0.1,0.1,3\n2,0,5,0.30000000000000004\n2,0.1,7,\n"
+    stored = server.post("/v1/datasets?segments=run", content=text, headers=CSV).json()
+    again = server.get(f"/v1/datasets/{stored['id']}/content.csv").content
+    copy = server.post("/v1/datasets?segments=run", content=again, headers=CSV).json()
+    assert copy["segments"] == stored["segments"]
+    first, second = (read_recording(server.get(f"/v1/datasets/{one['id']}/content").content)
+                     for one in (stored, copy))  # fmt: skip
+    np.testing.assert_array_equal(first.channel("y").values, second.channel("y").values)
+    assert second.channel("u").unit == "V"
+
+
+def test_parts_of_content_make_the_whole(server: TestClient, dataset: str) -> None:
+    path = f"/v1/datasets/{dataset}/content"
+    whole = server.get(path)
+    assert whole.headers["accept-ranges"] == "bytes"
+    assert whole.headers["access-control-allow-origin"] == "*"
+    size = len(whole.content)
+    head = server.get(path, headers={"Range": "bytes=0-99"})
+    rest = server.get(path, headers={"Range": "bytes=100-"})
+    tail = server.get(path, headers={"Range": "bytes=-7"})
+    assert (head.status_code, rest.status_code, tail.status_code) == (206, 206, 206)
+    assert head.headers["content-range"] == f"bytes 0-99/{size}"
+    assert head.content + rest.content == whole.content
+    assert tail.content == whole.content[-7:]
+    assert server.head(path).headers["content-length"] == str(size)
+
+
+def test_a_range_outside_the_content_is_refused(server: TestClient, dataset: str) -> None:
+    path = f"/v1/datasets/{dataset}/content"
+    size = len(server.get(path).content)
+    answer = server.get(path, headers={"Range": f"bytes={size}-"})
+    refused(answer, 416, "range")
+    assert answer.headers["content-range"] == f"bytes */{size}"
+
+
+def test_content_that_is_known_is_not_sent_again(server: TestClient, dataset: str) -> None:
+    path = f"/v1/datasets/{dataset}/content"
+    etag = server.get(path).headers["etag"]
+    assert server.get(path, headers={"If-None-Match": etag}).status_code == 304
+    assert server.get(path, headers={"If-None-Match": '"x"'}).status_code == 200
+    refused(server.get(path, headers={"If-Match": '"x"'}), 412, "stale")
+    other = server.get(path, headers={"Range": "bytes=0-9", "If-Range": '"x"'})
+    assert other.status_code == 200
+
+
+def test_reduced_signals_keep_the_extremes(server: TestClient, dataset: str) -> None:
+    whole = server.get(f"/v1/datasets/{dataset}/signals?max_points=1000").json()["channels"][1]
+    few = server.get(f"/v1/datasets/{dataset}/signals?max_points=20").json()["channels"][1]
+    assert len(whole["values"]) == 300
+    assert len(few["values"]) <= 20
+    assert max(few["values"]) == max(whole["values"])
+    assert min(few["values"]) == min(whole["values"])
+
+
+def test_a_simulation_with_noise_differs_by_the_noise_alone_and_is_made_once(
+    server: TestClient,
+) -> None:
+    clean = server.post("/v1/datasets:simulate", json=SIMULATION).json()
+    body = {**SIMULATION, "noise": {"sigma": 0.01, "seed": 1}}
+    noisy, again = (server.post("/v1/datasets:simulate", json=body) for _ in range(2))
+    assert noisy.status_code == 201
+    assert again.status_code == 200
+    assert noisy.json()["id"] == again.json()["id"]
+    a, b = (read_recording(server.get(f"/v1/datasets/{one}/content").content)
+            for one in (clean["id"], noisy.json()["id"]))  # fmt: skip
+    np.testing.assert_array_equal(a.channel("q").values, b.channel("q").values)
+    error = b.channel("y").values - a.channel("y").values
+    assert 0.005 < float(np.std(error)) < 0.02
+
+
+def test_an_input_is_the_same_as_a_formula_and_as_a_frequency(server: TestClient) -> None:
+    kinds: list[dict[str, Any]] = [
+        {"kind": "expression", "expression": "10*cos(5*t)"},
+        {"kind": "cosine", "amplitude": 10, "frequency": 5 / (2 * np.pi)},
+        {"kind": "sine", "amplitude": 10, "omega": 5, "phase": np.pi / 2},
+    ]
+    values = []
+    for kind in kinds:
+        body = {**SIMULATION, "inputs": {"q": kind}}
+        made = server.post("/v1/datasets:simulate", json=body).json()
+        content = server.get(f"/v1/datasets/{made['id']}/content").content
+        values.append(read_recording(content).channel("y").values)
+    np.testing.assert_allclose(values[0], values[1], atol=1e-9)
+    np.testing.assert_allclose(values[0], values[2], atol=1e-9)
+
+
+def test_lineage_leads_from_a_derived_dataset_to_its_source(
+    server: TestClient, dataset: str
+) -> None:
+    path = f"/v1/datasets/{dataset}:derive"
+    body = {"steps": [{"trim": {"start": 0, "stop": 20}}]}
+    child = server.post(path, json=body).json()
+    assert server.post(path, json=body).json()["id"] == child["id"]
+    edge = {"parent": dataset, "child": child["id"], "relation": "derived"}
+    assert edge in server.get(f"/v1/datasets/{child['id']}/lineage").json()["edges"]
+    assert edge in server.get(f"/v1/datasets/{dataset}/lineage").json()["edges"]
+
+
+def test_metrics_count_jobs_by_state(server: TestClient) -> None:
+    text = server.get("/metrics").text
+    assert 'lagid_jobs{state="queued"}' in text
+    assert server.get("/healthz").json() == {"status": "ok"}

@@ -1,0 +1,152 @@
+"""Jobs over REST, without a dispatcher: submitted, listed, controlled, followed."""
+
+from typing import Any
+
+from starlette.testclient import TestClient
+
+from service.api.deps import Parts
+from service.storage.queue import Queue
+from service.storage.tables import State
+from tests.rest import refused
+
+
+def submit(server: TestClient, dataset: str, **changes: Any) -> dict[str, Any]:
+    answer = server.post("/v1/jobs", json={"model": "fopdt", "datasets": [dataset], **changes})
+    assert answer.status_code == 202, answer.text
+    job: dict[str, Any] = answer.json()
+    assert answer.headers["location"] == f"/v1/jobs/{job['id']}"
+    return job
+
+
+def events(server: TestClient, job: str, **headers: str) -> list[str]:
+    answer = server.get(f"/v1/jobs/{job}/events", headers=headers)
+    assert answer.status_code in (200, 204)
+    return [line.removeprefix("event: ") for line in answer.text.splitlines()
+            if line.startswith("event: ")]  # fmt: skip
+
+
+def test_a_job_without_a_dispatcher_is_accepted_and_waits(server: TestClient, dataset: str) -> None:
+    assert server.get("/readyz").status_code == 503
+    job = submit(server, dataset, name="first")
+    read = server.get(f"/v1/jobs/{job['id']}").json()
+    assert read["state"] == "queued"
+    assert read["name"] == "first"
+    assert read["request"]["datasets"] == [dataset]
+    assert read["request"]["algorithm"]["bits"] == 24
+
+
+def test_a_dataset_may_be_named_instead_of_identified(server: TestClient, dataset: str) -> None:
+    job = submit(server, "steps")
+    assert server.get(f"/v1/jobs/{job['id']}").json()["request"]["datasets"] == [dataset]
+
+
+def test_the_same_key_gives_the_same_job_and_another_body_is_refused(
+    server: TestClient, dataset: str
+) -> None:
+    body = {"model": "fopdt", "datasets": [dataset]}
+    key = {"Idempotency-Key": "once"}
+    first, again = (server.post("/v1/jobs", json=body, headers=key) for _ in range(2))
+    assert first.json()["id"] == again.json()["id"]
+    other = server.post("/v1/jobs", json={**body, "seed": 9}, headers=key)
+    refused(other, 422, "invalid")
+
+
+def test_crossed_axes_give_a_run_for_each_cell_and_zipped_ones_step_together(
+    server: TestClient, dataset: str
+) -> None:
+    axes = [
+        {"path": "/seed", "range": [0, 3]},
+        {"path": "/noise/sigma", "log": [0.01, 1, 3], "zip": "n"},
+        {"path": "/noise/seed", "values": [7, 8, 9], "zip": "n"},
+    ]
+    job = submit(server, dataset, sweep={"axes": axes})
+    assert job["progress"]["runs"] == 9
+    runs = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
+    cells = [tuple(run["cell"].values()) for run in runs]
+    assert [cell[0] for cell in cells] == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+    assert [cell[2] for cell in cells[:3]] == [7, 8, 9]
+    assert abs(cells[1][1] - 0.1) < 1e-12
+    assert runs[0]["progress"] == 0.0
+
+
+def test_the_pages_of_runs_together_are_all_runs_in_order(server: TestClient, dataset: str) -> None:
+    job = submit(server, dataset, sweep={"axes": [{"path": "/seed", "range": [0, 7]}]})
+    numbers, cursor = [], ""
+    while cursor is not None:
+        page = server.get(f"/v1/jobs/{job['id']}/runs?limit=3{cursor and f'&cursor={cursor}'}")
+        numbers += [run["number"] for run in page.json()["items"]]
+        cursor = page.json()["next"]
+    assert numbers == list(range(7))
+    only = server.get(f"/v1/jobs/{job['id']}/runs", params={"cell": "/seed=4"}).json()["items"]
+    assert [run["number"] for run in only] == [4]
+
+
+def test_labels_of_an_axis_over_datasets_go_to_the_runs(server: TestClient, dataset: str) -> None:
+    axis = {"path": "/datasets", "values": [[dataset], ["steps"]],
+            "labels": [{"length_m": 5}, {"length_m": 8}]}  # fmt: skip
+    job = submit(server, dataset, sweep={"axes": [axis]})
+    runs = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
+    assert [run["labels"]["length_m"] for run in runs] == [5, 8]
+    assert [run["cell"]["/datasets"] for run in runs] == [[dataset], [dataset]]
+
+
+def test_an_own_model_is_kept_as_it_was_when_the_job_was_submitted(
+    server: TestClient, dataset: str
+) -> None:
+    document = server.get("/v1/models/fopdt").json()["document"]
+    first = server.post("/v1/models", json={**document, "name": "mine"})
+    assert first.json()["version"] == 1
+    job = submit(server, dataset, model="mine")
+    changed = {**document, "name": "mine", "title": "changed"}
+    assert server.post("/v1/models", json=changed).json()["version"] == 2
+    request = server.get(f"/v1/jobs/{job['id']}").json()["request"]
+    assert request["model"] == first.json()["document"]
+    assert server.get("/v1/models/mine@1").json()["document"] == first.json()["document"]
+
+
+def test_a_queued_job_is_cancelled_at_once_resumed_and_cloned(
+    server: TestClient, dataset: str
+) -> None:
+    job = submit(server, dataset, seed=5)["id"]
+    refused(server.post(f"/v1/jobs/{job}:resume"), 409, "conflict")
+    assert server.post(f"/v1/jobs/{job}:cancel").json()["state"] == "cancelled"
+    assert events(server, job) == ["state", "state", "end"]
+    assert server.post(f"/v1/jobs/{job}:resume").json()["state"] == "queued"
+    twin = server.post(f"/v1/jobs/{job}:clone").json()
+    assert twin["id"] != job
+    assert server.get(f"/v1/jobs/{twin['id']}").json()["request"]["seed"] == 5
+
+
+def test_events_resume_after_the_last_one_known_and_end_with_the_job(
+    own: TestClient,
+) -> None:
+    answer = own.post("/v1/datasets:simulate", json={
+        "name": "s", "model": "fopdt", "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
+        "inputs": {"u": {"kind": "binary", "period": 2}}, "samples": 300, "sample_time": 0.1,
+    })  # fmt: skip
+    job = submit(own, answer.json()["id"])["id"]
+    parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
+    with parts.database.write() as session:
+        claim = Queue(session).claim("test")
+        assert claim is not None
+    with parts.database.write() as session:
+        Queue(session).tell(claim.lease, "log", {"text": "half way"})
+        Queue(session).finish(claim.lease, State.FAILED, "no candidate was finite")
+    assert events(own, job) == ["state", "state", "log", "state", "end"]
+    assert events(own, job, **{"Last-Event-ID": "3"}) == ["state", "end"]
+    assert events(own, job, **{"Last-Event-ID": "5"}) == []
+    refused(own.get(f"/v1/jobs/{job}/events", headers={"Last-Event-ID": "x"}), 422, "invalid")
+    read = own.get(f"/v1/jobs/{job}").json()
+    assert (read["state"], read["error"]) == ("failed", "no candidate was finite")
+    refused(own.post(f"/v1/jobs/{job}:cancel"), 409, "conflict")
+
+
+def test_an_open_stream_ends_when_the_process_is_to_end(own: TestClient) -> None:
+    answer = own.post("/v1/datasets:simulate", json={
+        "name": "s", "model": "fopdt", "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
+        "inputs": {"u": {"kind": "step"}}, "samples": 300, "sample_time": 0.1,
+    })  # fmt: skip
+    job = submit(own, answer.json()["id"])["id"]
+    parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
+    parts.stopping.set()
+    assert events(own, job) == []  # the stream would not end otherwise: the job is queued
