@@ -1,7 +1,7 @@
 """Inputs between their samples: each is laid once onto a fine uniform grid that kernels read."""
 
 from dataclasses import dataclass
-from math import ceil, floor
+from math import ceil
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -145,8 +145,3 @@ def _is_regular(times: FloatArray, period: float) -> bool:
         period > 0
         and np.max(np.abs(times - times[0] - period * np.arange(times.size))) < 0.05 * period
     )
-
-
-def whole_steps(duration: float, step: float) -> int:
-    """Steps that fit into a duration, forgiving a millionth of a step."""
-    return floor(duration / step + 1e-6)

@@ -4,7 +4,6 @@ Both begin with a head of fixed places; the arrays follow, and the head says whe
 count from the experiment's own beginning.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 from sysid.models.model import Model
@@ -89,6 +88,3 @@ class Layout:
     def initial(self, number: int) -> int:
         """Place (in floats) of a state's initial value."""
         return len(NUMBERS) + number
-
-
-Head = Mapping[str, int]
