@@ -15,10 +15,8 @@ loss : P sums; the kernel *adds* the experiment's loss, Σ w²e² for squares or
 A kernel raises nothing: a diverging simulation leaves ``inf`` or ``nan`` in its own column.
 """
 
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
-import numba
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
@@ -29,17 +27,6 @@ LANES = 16
 ARGUMENTS = ("P", "theta", "stride", "ints", "floats", "work", "predictions",
              "predictions_stride", "loss")  # fmt: skip
 _NUMBERS = ("P", "stride", "predictions_stride")
-
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-
-
-def compiled(function: _Function) -> _Function:
-    """Compile with Numba: cached on disk, the GIL released, division as in IEEE 754.
-
-    No `fastmath`: a loop over individuals has nothing to gain, and ``isfinite`` must work.
-    """
-    made: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return cast(_Function, made)
 
 
 def kernel_type() -> ir.FunctionType:

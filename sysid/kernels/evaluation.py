@@ -6,7 +6,8 @@ order, nor on the copies that fill the last lanes.
 
 import numpy as np
 
-from sysid.kernels.calls import LANES, call_kernel, compiled
+from sysid.kernels.caching import compiled
+from sysid.kernels.calls import LANES, call_kernel
 from sysid.kernels.evaluator import Evaluator
 from sysid.types import FloatArray
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sysid.errors import InvalidBounds, InvalidRecord, InvalidSettings, RecordTooShort
-from sysid.kernels.calls import compiled
+from sysid.kernels.caching import compiled
 from sysid.kernels.evaluation import population_fitness
 from sysid.kernels.evaluator import Evaluator
 from sysid.problem import Problem
