@@ -54,7 +54,7 @@ def jobs_page(session: Session, state: State | None, cursor: str | None) -> str:
     states = [state] if state else []
     page = JobRepository(session).page(cursor=cursor, limit=JOBS_PER_PAGE, states=states)
     now = datetime.now(UTC)
-    jobs = [job_view(job, unit_of(job.spec), now) for job in page.items]
+    jobs = [job_view(job, unit_of(session, job.spec), now) for job in page.items]
     chosen = {"state": state.value} if state else {}
     return render(
         "jobs.html", jobs=jobs, state=state.value if state else "",
@@ -73,10 +73,10 @@ def job_page(
     runs = RunRepository(session)
     page = runs.page(job.id, cursor=cursor, limit=RUNS_PER_PAGE)
     chosen = runs.get(run_id) if run_id else _best(runs, job)
-    view = job_view(job, unit_of(job.spec), datetime.now(UTC))
+    view = job_view(job, unit_of(session, job.spec), datetime.now(UTC))
     return render(
-        "job.html", job=view, runs=[run_summary(job, run) for run in page.items],
-        run=run_in_full(job, chosen) if chosen else None,
+        "job.html", job=view, runs=[run_summary(session, job, run) for run in page.items],
+        run=run_in_full(session, job, chosen) if chosen else None,
         next_runs=_query({"cursor": page.next}) if page.next else "",
         datasets=dataset_links(session, job), commands=_commands(view, base_url),
         events=[event_view(one) for one in _events(session, job)],
@@ -122,12 +122,12 @@ def _as_yaml(document: dict[str, Any] | None) -> str:
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
 
 
-def run_summary(job: Job, run: Run) -> RunView:
+def run_summary(session: Session, job: Job, run: Run) -> RunView:
     """A run as a line of a table."""
-    return run_view(run, unit_of(run_body(job, run)), {})
+    return run_view(run, unit_of(session, run_body(job, run)), {})
 
 
-def run_in_full(job: Job, run: Run) -> RunView:
+def run_in_full(session: Session, job: Job, run: Run) -> RunView:
     """A run with what its plots need to be laid out before they are drawn."""
     body = run_body(job, run)
     sought = sought_parameters(run, body)
@@ -139,7 +139,7 @@ def run_in_full(job: Job, run: Run) -> RunView:
         "correlation": correlation_height(len(sought)) if result.get("correlation") else 0,
         "waterfall": WATERFALL_HEIGHT if result.get("islands") else 0,
     }
-    return run_view(run, unit_of(body), heights)
+    return run_view(run, unit_of(session, body), heights)
 
 
 def _counts(body: dict[str, Any]) -> tuple[int, int]:

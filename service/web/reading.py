@@ -9,6 +9,8 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from service.storage.datasets import DatasetRepository
+from service.storage.errors import NotFound
 from service.storage.runs import RunRepository
 from service.storage.tables import Job, Run
 from service.sweeps import body_of
@@ -39,12 +41,28 @@ def _model(reference: str) -> Model | None:
         return None
 
 
-def unit_of(body: Body) -> str:
-    """Unit of the RMS: the output's, or standard deviations of several outputs together."""
+def unit_of(session: Session, body: Body) -> str:
+    """Unit of the RMS: the output's, or standard deviations of several outputs together.
+
+    A model that fits any unit says "1"; then the unit is that of the recorded channel.
+    """
     model = model_of(body)
     if model is None:
         return "1"
-    return model.outputs[0].unit if len(model.outputs) == 1 else "σ"
+    if len(model.outputs) > 1:
+        return "σ"
+    output = model.outputs[0]
+    if output.unit != "1":
+        return output.unit
+    return _recorded_unit(session, body, body.get("channels", {}).get(output.name, output.name))
+
+
+def _recorded_unit(session: Session, body: Body, channel: str) -> str:
+    try:
+        channels = DatasetRepository(session).get(body["datasets"][0]).channels
+    except NotFound:
+        return "1"
+    return next((str(one["unit"]) for one in channels if one["name"] == channel), "1")
 
 
 def sought_parameters(run: Run, body: Body) -> list[SoughtParameter]:
@@ -72,7 +90,7 @@ def evidence_of(session: Session, job: Job, run: Run) -> RunEvidence:
     algorithm = body.get("algorithm", {})
     result = run.result or {}
     return RunEvidence(
-        id=run.id, unit=unit_of(body),
+        id=run.id, unit=unit_of(session, body),
         generations=run.generations or (job.generation if job.n_runs == 1 else 0),
         evaluations=run.evaluations, history=history,
         parameters=_covering(sought_parameters(run, body), history),

@@ -35,9 +35,11 @@ def job_report(session: Session, store: ObjectStore, job_id: str) -> str:
     chosen = RunRepository(session).page(job.id, limit=RUNS_IN_FULL, order=order).items
     made = datetime.now(UTC)
     return render(
-        "report.html", job=job_view(job, unit_of(job.spec), made), made=made,
-        runs=[run_summary(job, run) for run in runs],
-        sections=[(run_in_full(job, run), _figures(session, store, job, run)) for run in chosen],
+        "report.html", job=job_view(job, unit_of(session, job.spec), made), made=made,
+        runs=[run_summary(session, job, run) for run in runs],
+        sections=[
+            (run_in_full(session, job, run), _figures(session, store, job, run)) for run in chosen
+        ],
         datasets=dataset_links(session, job), policy=policy(), style=_style(),
         plotly_code=_plotly(), draw=_draw(),
         templates=_json({"light": template("light"), "dark": template("dark")}),
