@@ -1,0 +1,80 @@
+"""From a file on a user's disk to estimates on the page, through the whole service."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page, expect
+
+from service.embedded import embedded_service
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(240)]
+
+K, T, L, STEP = 2.0, 0.35, 0.12, 0.02
+LAST = "plot => Math.max(0, ...(plot.data ?? []).flatMap(trace => trace.x))"
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with embedded_service(tmp_path_factory.mktemp("whole"), cpus=2) as url:
+        yield url
+
+
+def recording(path: Path) -> Path:
+    """A first-order lag behind a dead time, integrated exactly between the samples, as CSV."""
+    times = np.arange(600) * STEP
+    u = np.where(times % 3 < 1.5, 1.0, -0.5)
+    pole, delay = np.exp(-STEP / T), round(L / STEP)
+    y = np.zeros_like(u)
+    for n in range(1, u.size):
+        past = u[max(n - 1 - delay, 0)]
+        y[n] = pole * y[n - 1] + K * (1 - pole) * past
+    y += 0.005 * np.random.default_rng(3).standard_normal(y.size)
+    lines = [f"{t:.2f},{a},{b:.6f}" for t, a, b in zip(times, u, y, strict=True)]
+    path.write_text("t [s],u [V],y [V]\n" + "\n".join(lines) + "\n")
+    return path
+
+
+def filled_in(service: str, page: Page, path: Path, name: str) -> None:
+    page.goto(f"{service}/#new")
+    page.wait_for_function("() => document.querySelector('[name=equations]').value !== ''")
+    page.get_by_label("or upload CSV or MCAP").set_input_files(path)
+    expect(page.locator("#dataset-facts")).to_have_text("u [V] · y [V]")
+    page.get_by_label("Model", exact=True).select_option("fopdt")
+    expect(page.get_by_label("equations in YAML")).to_have_value(re.compile("name: fopdt"))
+    page.get_by_label("name of the job").fill(name)
+
+
+def test_a_file_becomes_estimates_with_their_errors(
+    service: str, page: Page, tmp_path: Path
+) -> None:
+    filled_in(service, page, recording(tmp_path / "step.csv"), "whole way")
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    expect(page.locator("#job .chip")).to_have_text("succeeded", timeout=60_000)
+    table = page.locator("table.estimates tbody")
+    expect(table).to_contain_text("identified")
+    delay = table.locator("tr", has=page.get_by_role("rowheader", name="L")).locator("td").first
+    assert float(delay.inner_text()) == pytest.approx(L, abs=0.02)
+    page.locator('[data-figure="response"]').scroll_into_view_if_needed()
+    expect(page.locator('[data-figure="response"] .scatterlayer .trace')).to_have_count(4)
+
+
+def test_a_long_search_is_watched_and_cancelled(service: str, page: Page, tmp_path: Path) -> None:
+    filled_in(service, page, recording(tmp_path / "step.csv"), "long")
+    page.get_by_label("generations").fill("10000000")
+    page.get_by_label("method").select_option("simple")
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    expect(page.locator("#job .chip")).to_have_text("running", timeout=30_000)
+    plot = page.locator('[data-figure="history"]')
+    expect(plot.locator(".scatterlayer .trace").first).to_be_attached(timeout=30_000)
+    seen = plot.evaluate(LAST)
+    page.wait_for_function(
+        f"seen => ({LAST})(document.querySelector('[data-figure=history]')) > seen", arg=seen
+    )
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.locator("#job .chip")).to_have_text("cancelled", timeout=30_000)
+    expect(page.get_by_role("button", name="Resume")).to_be_visible()
