@@ -1,10 +1,13 @@
 """From the end of a search to its result: refinement, uncertainty, validation, warnings."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sysid.errors import DivergedEverywhere
 from sysid.islands.archipelago import of_island
 from sysid.islands.run_state import RunState
+from sysid.metrics import Metrics
 from sysid.problem import Problem, metrics_of
 from sysid.refinement import Refined, refine
 from sysid.result import Estimate, Identification, Improvement, IslandSummary
@@ -12,8 +15,6 @@ from sysid.settings import GeneticAlgorithm
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis, analyse
 from sysid.warnings import warnings_of
-
-_NONE: tuple[float | None, float | None, tuple[tuple[FloatArray, ...], ...]] = (None, None, ())
 
 
 def conclude(
@@ -45,16 +46,14 @@ def conclude(
     analysis = analyse(problem, theta)
     simulated = problem.predictions(theta[None])[0]
     metrics = metrics_of(problem, simulated)
-    rms_validation, fit_validation, simulated_validation = (
-        _NONE if validation is None else _validated(validation, analysis.estimates)
-    )
+    kept = None if validation is None else _validated(validation, analysis.estimates)
     limit = algorithm.safe_limit
     return Identification(
         estimates=analysis.estimates,
         rms=metrics.rms,
         fit_percent=metrics.fit_percent,
-        rms_validation=rms_validation,
-        fit_percent_validation=fit_validation,
+        rms_validation=None if kept is None else kept.metrics.rms,
+        fit_percent_validation=None if kept is None else kept.metrics.fit_percent,
         valid=limit is None or metrics.rms <= limit,
         evaluations=_evaluations(state, refined, analysis),
         generations=max(island.generation for island in state.islands),
@@ -63,7 +62,9 @@ def conclude(
         migrations=state.migrations,
         uncertainty=analysis.uncertainty,
         simulated=_split(problem, simulated),
-        simulated_validation=simulated_validation,
+        simulated_validation=() if kept is None else kept.simulated,
+        agreement=metrics.channels,
+        agreement_validation=() if kept is None else kept.metrics.channels,
         warnings=warnings_of(problem, algorithm, analysis, simulated, metrics.rms),
     )
 
@@ -125,10 +126,13 @@ def _split(problem: Problem, values: FloatArray) -> tuple[tuple[FloatArray, ...]
     return tuple(tuple(part[name] for name in names) for part in problem.split(values))
 
 
-def _validated(
-    validation: Problem, estimates: tuple[Estimate, ...]
-) -> tuple[float, float, tuple[tuple[FloatArray, ...], ...]]:
-    """RMS, fit and simulation on data that were not used.
+class _Validated(NamedTuple):
+    metrics: Metrics
+    simulated: tuple[tuple[FloatArray, ...], ...]
+
+
+def _validated(validation: Problem, estimates: tuple[Estimate, ...]) -> _Validated:
+    """Agreement and simulation on data that were not used.
 
     The model's parameters are those of the estimate. An initial state belongs to its record, so
     those of the validation records are found on them, alone.
@@ -147,5 +151,4 @@ def _validated(
         start = refine(known, [middle])[0]
         theta = middle if start is None else start.theta
     simulated = known.predictions(theta[None])[0]
-    metrics = metrics_of(known, simulated)
-    return metrics.rms, metrics.fit_percent, _split(known, simulated)
+    return _Validated(metrics_of(known, simulated), _split(known, simulated))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
+from sysid.metrics import ChannelMetrics
 from sysid.types import FloatArray
 
 EstimateStatus = Literal["identified", "group", "at bound", "unidentifiable", "fixed"]
@@ -80,7 +81,8 @@ class Identification:
     `rms` is J of Eq. 10 over all scored samples, in the output's unit when there is one output
     (else in units of the outputs' standard deviations). `history` has one tuple of improvements
     per island. `simulated` has per experiment, per output, the model's output at the measured
-    times. `fit_percent` and `rms_validation` are None without validation data.
+    times. `fit_percent_validation` and `rms_validation` are None without validation data.
+    `agreement` and `agreement_validation` tell each output of each experiment on its own.
     """
 
     estimates: tuple[Estimate, ...]
@@ -97,4 +99,6 @@ class Identification:
     uncertainty: Uncertainty | None
     simulated: tuple[tuple[FloatArray, ...], ...]
     simulated_validation: tuple[tuple[FloatArray, ...], ...]
+    agreement: tuple[ChannelMetrics, ...]
+    agreement_validation: tuple[ChannelMetrics, ...]
     warnings: tuple[str, ...]

@@ -90,10 +90,8 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
     known = singular > _RANK * max(singular[0], np.finfo(float).tiny)
     inverse = (directions[known].T / singular[known] ** 2) @ directions[known]
     covariance, noise = _covariance(error, columns, inverse, loss_scale(problem))
-    gradient = columns.T @ error
-    loss = float(error @ error)
-    gain = float(gradient @ inverse @ gradient) / loss if loss > 0 else 0.0
     place = placed(problem.evaluator, theta[None])[0]
+    gain = _possible_gain(_influence(error, loss_scale(problem)), columns, place)
     statuses = _statuses(place, singular, directions, known, noise)
     scale = _physical(problem, theta)
     physical = covariance * np.outer(scale, scale)
@@ -110,6 +108,27 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
     return Analysis(estimates, uncertainty, min(gain, 1.0), count)
 
 
+def _influence(error: FloatArray, scale: float) -> FloatArray:
+    """ψ(e): the residuals as the loss sees them, with soft-l1 those of outliers bounded."""
+    return error if scale == 0.0 else error / np.sqrt(1.0 + (error / scale) ** 2)
+
+
+def _possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray) -> float:
+    """Part of Σψ² in the span of those sensitivities along which the parameters may move.
+
+    It is zero at a local optimum. A parameter at its bound whose slope leads out of the bounds
+    may not move: there the bound is what holds it, and the estimate is optimal inside it.
+    """
+    total = float(influence @ influence)
+    downhill = -(columns.T @ influence)
+    held = ((place < _AT_BOUND) & (downhill < 0)) | ((place > 1.0 - _AT_BOUND) & (downhill > 0))
+    if total == 0.0 or held.all():
+        return 0.0
+    left, singular, _ = np.linalg.svd(columns[:, ~held], full_matrices=False)
+    span = left[:, singular > _RANK * max(singular[0], np.finfo(float).tiny)]
+    return float(np.sum((span.T @ influence) ** 2)) / total
+
+
 def _covariance(
     error: FloatArray, columns: FloatArray, inverse: FloatArray, scale: float
 ) -> tuple[FloatArray, float]:
@@ -118,9 +137,10 @@ def _covariance(
     if scale == 0.0:
         variance = float(error @ error) / (n - d)
         return variance * inverse, float(np.sqrt(variance))
+    influence = _influence(error, scale)
     share = 1.0 / np.sqrt(1.0 + (error / scale) ** 2)
     bread = np.linalg.pinv((columns.T * share**3) @ columns, rcond=_RANK**2, hermitian=True)
-    filling = (columns.T * (share * error) ** 2) @ columns
+    filling = (columns.T * influence**2) @ columns
     noise = float(1.4826 * np.median(np.abs(error)))  # of the bulk, not of the outliers
     return n / (n - d) * bread @ filling @ bread, noise
 

@@ -64,9 +64,8 @@ def main() -> None:
         )
     print_estimates("tube, 8 m, 5 bar, fill", run)
     lag = parameter(run, "L")
-    names = run["identifiability"]["names"]
-    table = run["identifiability"]["correlation"]
-    correlation = table[names.index("T")][names.index("L")]
+    names, matrix = run["correlation"]["names"], run["correlation"]["matrix"]
+    correlation = matrix[names.index("T")][names.index("L")]
     print("\npublished: medians over pressures, fit 93-94 % from 3 m up; L = 20.8 ms at 8 m")
     rows = [
         Row("validation fit", run["fit_percent"]["validation"], "%", 93.0, ">="),

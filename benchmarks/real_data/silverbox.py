@@ -49,8 +49,11 @@ def main() -> None:
         )
     print_estimates("Silverbox, 20,000 samples", run)
     print(f"\n{PUBLISHED}")
-    rms = {one["dataset"]: 1e3 * one["rms"] for one in run["validation"]}
-    rows = [Row(f"RMS, {name}", rms[ds], "mV", BARS_MV[name]) for name, ds in tests.items()]
+    rms = [1e3 * one["rms"] for one in run["agreement"]["validation"]]
+    rows = [
+        Row(f"RMS, {name}", value, "mV", BARS_MV[name])
+        for name, value in zip(tests, rms, strict=True)
+    ]
     lag = parameter(run, "L")
     rows.append(Row("|L| / standard error", abs(lag["value"]) / lag["stderr"], "1", 1.0))
     rows.append(peak_memory_row())

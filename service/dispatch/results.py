@@ -8,6 +8,7 @@ import numpy as np
 
 from service.storage.ledger import HistoryPoint, MigrantPoint, RunOutcome
 from service.storage.tables import State
+from sysid.metrics import ChannelMetrics
 from sysid.result import Estimate, Identification, Improvement, Migrant, Uncertainty
 
 
@@ -38,6 +39,10 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
         "fit_percent": {
             "estimation": _finite(found.fit_percent),
             "validation": _finite(found.fit_percent_validation),
+        },
+        "agreement": {
+            "estimation": [_agreement(one) for one in found.agreement],
+            "validation": [_agreement(one) for one in found.agreement_validation],
         },
         "evaluations": found.evaluations,
         "generations": found.generations,
@@ -94,6 +99,17 @@ def _estimate(one: Estimate) -> dict[str, Any]:
         "interval95": None if one.interval95 is None else [_finite(v) for v in one.interval95],
         "status": one.status,
         "reason": one.reason,
+    }
+
+
+def _agreement(one: ChannelMetrics) -> dict[str, Any]:
+    return {
+        "experiment": one.experiment,
+        "output": one.output,
+        "unit": one.unit,
+        "samples": one.samples,
+        "rms": _finite(one.rms),
+        "fit_percent": _finite(one.fit_percent),
     }
 
 

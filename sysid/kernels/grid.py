@@ -17,6 +17,7 @@ MOST_STEPS = 20_000_000
 """Integration steps of one experiment at most."""
 
 _JITTER = 0.05  # of a sampling period, that a recursion forgives
+_FINER = 4  # grid points in the median distance of irregular samples, for what lies between
 _ON_GRID = 0.01  # of a grid step, within which a sample counts as on the point
 
 
@@ -69,7 +70,7 @@ def grid_of(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel])
     """
     if is_difference(model):
         return _sample_grid(outputs)
-    step = model.solver.step or _output_period(outputs)
+    step = model.solver.step or _simulation_step(outputs)
     first = min(float(channel.times[0]) for channel in outputs)
     begin = min([first, *(float(channel.times[0]) for channel in inputs)])
     start = first - ceil((first - begin) / step - 1e-6) * step
@@ -112,6 +113,17 @@ def _sample_grid(outputs: Sequence[Channel]) -> Grid:
     end = max(float(channel.times[-1]) for channel in outputs)
     _check_length((end - start) / period)
     return Grid(start, period, round((end - start) / period) + 1, 1)
+
+
+def _simulation_step(outputs: Sequence[Channel]) -> float:
+    """The outputs' period; a part of it where their samples lie anywhere between its multiples."""
+    period = _output_period(outputs)
+    first = min(float(channel.times[0]) for channel in outputs)
+    for channel in outputs:
+        places = (channel.times - first) / period
+        if np.any(np.abs(places - np.round(places)) > _JITTER):
+            return period / _FINER
+    return period
 
 
 def _output_period(outputs: Sequence[Channel]) -> float:
