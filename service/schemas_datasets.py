@@ -69,7 +69,11 @@ InputIn = Annotated[
 
 
 class SimulateIn(Body):
-    """A dataset made from a model: its true parameters, its inputs, the noise on its outputs."""
+    """A dataset made from a model: its true parameters, its inputs, the noise on its outputs.
+
+    A state's start may be given among the parameters as ``x(0)``; a state that the model does not
+    start itself starts at zero.
+    """
 
     name: str | None = Field(default=None, max_length=200)
     model: Any

@@ -24,7 +24,7 @@ from service.storage.datasets import DatasetRepository, Stored
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from sysid.errors import InvalidRecord, SysidError, nearest
-from sysid.models.model import Model
+from sysid.models.model import FixedInitial, Model
 from sysid.records import Channel, Recording
 from sysid.types import FloatArray
 
@@ -112,7 +112,13 @@ def _simulated(
     # The compiler comes with this import, and most requests never need it.
     from sysid.simulation import simulate as simulated
 
-    values = {p.name: p.fixed for p in model.parameters if p.fixed is not None} | body.parameters
+    rest = {
+        f"{state.name}(0)": 0.0
+        for state, start in zip(model.states, model.initial, strict=True)
+        if not isinstance(start, FixedInitial)
+    }
+    known = {p.name: p.fixed for p in model.parameters if p.fixed is not None}
+    values = {**rest, **known, **body.parameters}
     outputs = simulated(model, inputs, values, times=times).channels
     for channel in outputs:
         wrong = np.flatnonzero(~np.isfinite(channel.values))

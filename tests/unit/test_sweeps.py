@@ -1,0 +1,73 @@
+"""Sweeps: from axes to cells, and from a cell to the body of a run."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.errors import InvalidRequest
+from service.schemas_jobs import JobIn
+from service.sweeps import Cell, body_of, count, expand, groups_of, steps_of
+
+
+def job(*axes: dict[str, Any], **fields: Any) -> JobIn:
+    body = {"model": "m", "datasets": ["ds_1", "ds_2"], "sweep": {"axes": list(axes)}}
+    return JobIn.model_validate({**body, **fields})
+
+
+def cells(body: JobIn) -> list[Cell]:
+    return list(expand(steps_of(body, groups_of(body))))
+
+
+def test_without_axes_there_is_one_cell_that_changes_nothing() -> None:
+    body = job()
+    assert cells(body) == [Cell()]
+    whole = body.normal_form()
+    assert body_of(whole, {}) == {name: value for name, value in whole.items() if name != "sweep"}
+
+
+@given(st.lists(st.integers(1, 4), max_size=3))
+def test_the_number_of_cells_is_the_product_of_the_axes(lengths: list[int]) -> None:
+    paths = ["/seed", "/noise/sigma", "/algorithm/generations"]
+    body = job(*({"path": path, "values": list(range(1, n + 1))}
+                 for path, n in zip(paths, lengths, strict=False)))  # fmt: skip
+    found = cells(body)
+    assert len(found) == count(body, groups_of(body))
+    assert len({tuple(cell.values.items()) for cell in found}) == len(found)
+
+
+def test_a_cell_changes_its_fields_and_nothing_else() -> None:
+    whole = job().normal_form()
+    changed = body_of(whole, {"/noise/sigma": 0.5, "/parameters/L/upper": 2.0, "/datasets/1": "x"})
+    assert changed["noise"] == {"sigma": 0.5, "seed": 0}
+    assert changed["parameters"] == {"L": {"upper": 2.0}}
+    assert changed["datasets"] == ["ds_1", "x"]
+    assert whole == job().normal_form()
+    assert body_of(whole, {"/datasets": "ds_9"})["datasets"] == ["ds_9"]
+
+
+def test_a_logarithmic_axis_has_both_ends_and_equal_ratios() -> None:
+    body = job({"path": "/noise/sigma", "log": [0.001, 1, 4]})
+    values = [cell.values["/noise/sigma"] for cell in cells(body)]
+    assert values == pytest.approx([0.001, 0.01, 0.1, 1])
+    assert values[-1] == 1
+
+
+def test_a_pointer_with_a_slash_in_a_name_is_read_as_written() -> None:
+    changed = body_of(job().normal_form(), {"/parameters/a~1b/fixed": 1.0})
+    assert changed["parameters"] == {"a/b": {"fixed": 1.0}}
+
+
+def test_zipped_axes_of_different_lengths_are_refused_at_the_second() -> None:
+    body = job({"path": "/seed", "range": [0, 3], "zip": "z"},
+               {"path": "/noise/seed", "range": [0, 2], "zip": "z"})  # fmt: skip
+    with pytest.raises(InvalidRequest) as refused:
+        groups_of(body)
+    assert refused.value.errors[0].pointer == "/sweep/axes/1/zip"
+
+
+def test_an_axis_that_is_there_twice_is_refused() -> None:
+    body = job({"path": "/seed", "range": [0, 3]}, {"path": "/seed", "values": [7]})
+    with pytest.raises(InvalidRequest, match="already an axis"):
+        groups_of(body)
