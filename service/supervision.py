@@ -38,7 +38,7 @@ class Supervisor:
     ) -> None:
         self._command, self._environment, self._log_path = tuple(command), dict(environment), log
         self._stopping = threading.Event()
-        self._lock = threading.Lock()
+        self._lock, self._one_stop = threading.Lock(), threading.Lock()
         self._child: subprocess.Popen[bytes] | None = None
         self._thread = threading.Thread(target=self._keep_running, name="supervisor", daemon=True)
 
@@ -47,7 +47,16 @@ class Supervisor:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the child: asked first, killed after `STOP_SECONDS`; then whatever it left."""
+        """End the child: asked first, killed after `STOP_SECONDS`; then whatever it left.
+
+        A second call, from another thread too, waits for the first: a child that is asked twice
+        would not end in order.
+        """
+        with self._one_stop:
+            if not self._stopping.is_set():
+                self._stop()
+
+    def _stop(self) -> None:
         with self._lock:
             self._stopping.set()
             child = self._child

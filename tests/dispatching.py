@@ -24,7 +24,7 @@ from service.supervision import environment_of, kill_session
 from sysid.records import Recording
 from tests.runs import step_record
 
-LIMIT_SECONDS = 60.0
+LIMIT_SECONDS = 120.0
 
 
 class Place:

@@ -24,7 +24,7 @@ from workers.warming import warm
 
 _log = logging.getLogger(__name__)
 
-START_SECONDS = 90.0
+START_SECONDS = 180.0
 FETCH_SECONDS = 20.0
 SILENCE_SECONDS = 10.0
 """After so long without a finished task a no-op task asks whether Ray is alive."""
