@@ -1,6 +1,7 @@
 """The library call: from a model and records to an identification, in this process."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from sysid.models.model import Model
@@ -59,13 +60,10 @@ def identify(
         If an argument cannot be used.
     """
     algorithm = settings or GeneticAlgorithm()
-
-    def problem(given: Sequence[Record]) -> Problem:
-        return Problem.build(
-            model, given, parameters=parameters, prediction=prediction, loss=loss,
-            weights=weights, skip=skip,
-        )  # fmt: skip
-
+    problem = partial(
+        Problem.build, model, parameters=parameters, prediction=prediction, loss=loss,
+        weights=weights, skip=skip,
+    )  # fmt: skip
     estimation = _several(records)
     if noise is not None:
         estimation = tuple(with_noise(record, noise, e) for e, record in enumerate(estimation))
