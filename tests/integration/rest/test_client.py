@@ -1,0 +1,110 @@
+"""The light client against the application, without a socket."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from starlette.testclient import TestClient
+
+from service.client import AsyncClient, Client, ProblemError, ServerUnreachable
+from tests.rest import recording
+
+MANY = {"axes": [{"path": "/seed", "range": [0, 600]}]}
+
+
+class Through(httpx.BaseTransport):
+    """Sends a client's requests to an application of this process."""
+
+    def __init__(self, server: TestClient) -> None:
+        self._server = server
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        answer = self._server.request(
+            request.method, str(request.url), content=request.read(),
+            headers=dict(request.headers),
+        )  # fmt: skip
+        headers = [(k, v) for k, v in answer.headers.items() if k != "content-encoding"]
+        return httpx.Response(answer.status_code, headers=headers, content=answer.content)
+
+
+@pytest.fixture
+def client(server: TestClient) -> Client:
+    return Client("http://testserver", transport=Through(server))
+
+
+def job_of(dataset: str, **changes: Any) -> dict[str, Any]:
+    return {"model": "fopdt", "datasets": [dataset], **changes}
+
+
+def test_a_file_and_its_bytes_give_the_same_dataset(client: Client, tmp_path: Path) -> None:
+    path = tmp_path / "filled.csv"
+    path.write_bytes(recording(50))
+    stored = client.add_dataset(path)
+    assert stored["name"] == "filled"
+    assert client.add_dataset(recording(50))["id"] == stored["id"]
+    assert client.dataset(stored["id"])["samples"] == 50
+    content = client.content(stored["id"])
+    assert client.add_dataset(content, "copy")["channels"] == stored["channels"]
+    assert {"filled", "copy"} <= {one["name"] for one in client.datasets()}
+
+
+def test_every_run_of_every_page_is_given(client: Client, dataset: str) -> None:
+    job = client.submit(job_of(dataset, sweep=MANY))
+    assert [run["number"] for run in client.runs(job["id"])] == list(range(600))
+    assert client.jobs(limit=1)[0]["id"] == job["id"]
+
+
+def test_wait_ends_when_the_job_has_and_tells_every_state(client: Client, dataset: str) -> None:
+    job = client.submit(job_of(dataset), idempotency_key="wait")
+    states: list[str] = []
+
+    def progress(state: dict[str, Any]) -> None:
+        states.append(state["state"])
+        if len(states) == 1:
+            client.cancel(job["id"])
+
+    assert client.wait(job["id"], progress, poll=0.01)["state"] == "cancelled"
+    assert states == ["queued", "cancelled"]
+    kinds = [event["event"] for event in client.events(job["id"])]
+    assert kinds == ["state", "state", "end"]
+    assert client.resume(job["id"])["state"] == "queued"
+    assert client.clone(job["id"])["id"] != job["id"]
+
+
+def test_a_problem_has_its_document_and_a_readable_line(client: Client, dataset: str) -> None:
+    with pytest.raises(ProblemError, match="did you mean 'fopdt'") as refused:
+        client.submit(job_of(dataset, model="fopd"))
+    assert refused.value.status == 422
+    assert refused.value.document["errors"][0]["pointer"] == "/model"
+    assert "\n" not in str(refused.value)
+
+
+def test_models_are_read_checked_and_stored(client: Client) -> None:
+    document = client.model("fopdt")["document"]
+    assert client.check_model(document)["valid"] is True
+    assert client.add_model({**document, "name": "own"})["version"] == 1
+    assert "own" in {one["name"] for one in client.models()}
+
+
+def test_a_server_that_is_not_there_is_said_with_what_to_do() -> None:
+    with pytest.raises(ServerUnreachable, match="lagid serve"):
+        Client("http://127.0.0.1:1").jobs()
+
+
+def test_the_asynchronous_client_does_the_same(server: TestClient, dataset: str) -> None:
+    async def work() -> None:
+        transport = httpx.ASGITransport(server.app)  # type: ignore[arg-type]
+        async with AsyncClient("http://testserver", transport=transport) as client:
+            stored = await client.add_dataset(recording(), "again")
+            assert stored["id"] == dataset
+            job = await client.submit(job_of(dataset, sweep=MANY))
+            numbers = [run["number"] async for run in client.runs(job["id"])]
+            assert numbers == list(range(600))
+            await client.cancel(job["id"])
+            assert (await client.wait(job["id"]))["state"] == "cancelled"
+            with pytest.raises(ProblemError, match="no run"):
+                await client.run("run_0")
+
+    asyncio.run(work())

@@ -1,0 +1,259 @@
+"""The command line: what it prints, its exit codes, and one readable line for a mistake."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from service.embedded import free_port
+from tests.rest import recording
+
+OWN = """
+name: own
+form: differential
+inputs: {u: V}
+states: {x: m}
+parameters: {K: {lower: 0, upper: 5}, T: {lower: 0.1, upper: 5}, L: {lower: 0, upper: 2, unit: s}}
+equations: {x: (K*u(t - L) - x)/T}
+outputs: {y: x}
+initial: {x: measured}
+"""
+
+
+def lagid(*words: object, **environment: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [sys.executable, "-m", "service.cli.main", *map(str, words)],
+        capture_output=True, text=True, timeout=90, check=False,
+        env={**os.environ, "LAGID_URL": "http://127.0.0.1:1", **environment},
+    )  # fmt: skip
+
+
+def refused(done: "subprocess.CompletedProcess[str]", code: int = 1) -> str:
+    """The one line of a command that was refused."""
+    assert done.returncode == code, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1, done.stderr
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A web process without a dispatcher."""
+    folder = tmp_path_factory.mktemp("served")
+    port = free_port()
+    child = subprocess.Popen(
+        [sys.executable, "-m", "service.cli.main", "serve", "--no-dispatcher",
+         "--port", str(port), "--data-dir", str(folder)],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    url = f"http://127.0.0.1:{port}"
+    assert child.stdout is not None
+    assert url in child.stdout.readline()
+    _wait_until_answering(url)
+    yield url
+    child.send_signal(signal.SIGTERM)
+    assert child.wait(timeout=10) == 0
+    child.stdout.close()
+
+
+def _wait_until_answering(url: str) -> None:
+    for _ in range(300):
+        try:
+            httpx.get(f"{url}/healthz").raise_for_status()
+            return
+        except httpx.HTTPError:
+            time.sleep(0.1)
+    raise AssertionError("the server does not answer")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recordings") / "steps.csv"
+    path.write_bytes(recording())
+    return path
+
+
+def test_help_names_every_command() -> None:
+    text = lagid("--help").stdout
+    for command in ("serve", "identify", "submit", "watch", "jobs", "runs", "datasets", "models",
+                    "dataset", "cancel", "db", "doctor", "demo", "dispatcher"):  # fmt: skip
+        assert command in text
+
+
+def test_a_command_that_is_called_wrongly_exits_with_2(data: Path) -> None:
+    assert lagid("submitt").returncode == 2
+    assert lagid("identify", data).returncode == 2
+    line = refused(lagid("identify", data, "--model", "fopdt", "--set", "seed"), 2)
+    assert "path=value" in line
+    line = refused(lagid("identify", data, "--model", "fopdt", "--set", "algorithm.bit=3"), 2)
+    assert "did you mean 'bits'?" in line
+
+
+def test_no_server_is_said_with_what_to_do() -> None:
+    assert "lagid serve" in refused(lagid("jobs"))
+
+
+def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        line = refused(lagid("serve", "--port", port, "--data-dir", tmp_path))
+    assert f"port {port}" in line
+    assert "in use" in line
+
+
+def test_a_data_folder_that_is_not_writable_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    line = refused(lagid("serve", "--port", 0, "--data-dir", tmp_path / "file" / "data"))
+    assert "not writable" in line
+
+
+def test_another_host_is_refused_without_keys(tmp_path: Path) -> None:
+    line = refused(lagid("serve", "--host", "0.0.0.0", "--data-dir", tmp_path))
+    assert "LAGID_ALLOW_OPEN_HOST" in line
+
+
+def test_a_setting_that_cannot_be_used_names_its_variable(tmp_path: Path) -> None:
+    line = refused(lagid("serve", "--data-dir", tmp_path, LAGID_PORT="many"))
+    assert "LAGID_PORT" in line
+
+
+def test_built_in_models_are_listed_shown_and_checked(tmp_path: Path) -> None:
+    environment = {"LAGID_URL": ""}
+    listed = json.loads(lagid("models", "list", "--json", **environment).stdout)
+    assert {"tube", "duffing-eq16"} <= {one["name"] for one in listed}
+    shown = tmp_path / "tube.yaml"
+    shown.write_text(lagid("models", "show", "tube", **environment).stdout)
+    assert lagid("models", "check", shown).returncode == 0
+
+
+def test_a_fault_of_a_model_has_its_column(tmp_path: Path) -> None:
+    path = tmp_path / "own.yaml"
+    path.write_text(OWN.replace("- x)/T", "- z)/T"))
+    line = refused(lagid("models", "check", path))
+    assert "column" in line
+    assert "'z'" in line
+
+
+@pytest.mark.slow
+def test_identify_finds_gain_lag_and_time_constant_in_this_process(
+    data: Path, tmp_path: Path
+) -> None:
+    model = tmp_path / "own.yaml"
+    model.write_text(OWN)
+    result = tmp_path / "out.json"
+    done = lagid("identify", data, "--model", model, "--set", "algorithm.generations=150",
+                 "--set", "validation.fraction=0.3", "--json", result)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "±" in done.stdout
+    found = {one["name"]: one for one in json.loads(result.read_text())["parameters"]}
+    truth = {"K": 2.0, "T": 1.0, "L": 0.5}
+    for name, value in truth.items():
+        assert np.isclose(found[name]["value"], value, atol=0.2)
+    assert json.loads(result.read_text())["fit_percent"]["validation"] > 80
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--model", "fopd"], "did you mean 'fopdt'?"),
+        (["--model", "missing.yaml"], "missing.yaml"),
+        (["--model", "fopdt", "--channels", "u=volts"], "no channel 'volts'"),
+        (["--model", "fopdt", "--channels", "w=u"], "no signal 'w'"),
+        (["--model", "fopdt", "--set", "parameters.L.lower=9"], "[9, 5]"),
+    ],
+)
+def test_a_mistake_of_identify_is_one_line(data: Path, words: list[str], expected: str) -> None:
+    assert expected in refused(lagid("identify", data, *words))
+
+
+def test_a_recording_that_is_not_there_or_not_readable_is_one_line(tmp_path: Path) -> None:
+    assert "there is no file" in refused(lagid("identify", tmp_path / "x.csv", "--model", "fopdt"))
+    bad = tmp_path / "bad.csv"
+    bad.write_text("t,u,y\n0,1,2\n0.1,volt,2\n")
+    assert "row 3" in refused(lagid("identify", bad, "--model", "fopdt"))
+
+
+def test_a_recording_and_a_job_go_to_the_server_and_can_be_cancelled(
+    server: str, data: Path, tmp_path: Path
+) -> None:
+    environment = {"LAGID_URL": server}
+    stored = json.loads(lagid("dataset", "add", data, "--json", **environment).stdout)
+    assert stored["name"] == "steps"
+    assert "steps" in lagid("datasets", **environment).stdout
+    job = tmp_path / "job.yaml"
+    job.write_text("model: fopdt\ndatasets: [steps]\nseed: 3\n")
+    done = lagid("submit", job, "--json", **environment)
+    submitted: dict[str, Any] = json.loads(done.stdout)
+    assert submitted["id"] in lagid("jobs", **environment).stdout
+    assert "queued" in lagid("runs", **environment).stdout
+    assert "cancelled" in lagid("cancel", submitted["id"], **environment).stdout
+    watched = lagid("watch", submitted["id"], "--json", **environment)
+    assert watched.returncode == 1
+    assert json.loads(watched.stdout)["state"] == "cancelled"
+    assert "queued" in lagid("resume", submitted["id"], **environment).stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("model: fopdt\ndatasets: [steps.csv]\n", "lagid dataset add steps.csv"),
+        ("- a\n", "does not hold a job"),
+        ("model: [\n", "line"),
+        ("model: fopdt\ndatasets: [nothing]\n", "no dataset 'nothing'"),
+        ("model: fopdt\ndatasets: []\nsed: 1\n", "did you mean 'seed'?"),
+    ],
+)
+def test_a_job_file_that_cannot_be_used_is_one_line(
+    server: str, tmp_path: Path, text: str, expected: str
+) -> None:
+    job = tmp_path / "job.yaml"
+    job.write_text(text)
+    assert expected in refused(lagid("submit", job, LAGID_URL=server))
+
+
+def test_an_open_event_stream_does_not_hold_up_the_end(tmp_path: Path) -> None:
+    port = free_port()
+    url = f"http://127.0.0.1:{port}"
+    child = subprocess.Popen(
+        [sys.executable, "-m", "service.cli.main", "serve", "--no-dispatcher",
+         "--port", str(port), "--data-dir", str(tmp_path)],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    _wait_until_answering(url)
+    with httpx.Client(base_url=url, timeout=30) as http:
+        csv = {"content-type": "text/csv"}
+        dataset = http.post("/v1/datasets", content=recording(), headers=csv).json()["id"]
+        job = http.post("/v1/jobs", json={"model": "fopdt", "datasets": [dataset]}).json()["id"]
+        with http.stream("GET", f"/v1/jobs/{job}/events") as stream:
+            lines = stream.iter_lines()
+            assert next(lines).startswith("retry")
+            child.send_signal(signal.SIGTERM)
+            for _ in lines:
+                pass  # the stream ends, and so does the loop
+    assert child.wait(timeout=20) == 0
+
+
+def test_tables_are_made_and_checked_by_command(tmp_path: Path) -> None:
+    assert "no database" in refused(lagid("db", "check", "--data-dir", tmp_path))
+    assert lagid("db", "upgrade", "--data-dir", tmp_path).returncode == 0
+    assert "at head" in lagid("db", "check", "--data-dir", tmp_path).stdout
+
+
+@pytest.mark.slow
+def test_the_doctor_finds_a_sound_installation(tmp_path: Path) -> None:
+    done = lagid("doctor", "--data-dir", tmp_path, LAGID_PORT=str(free_port()))
+    assert done.returncode == 0, done.stderr
+    assert "compiled" in done.stdout
