@@ -37,7 +37,7 @@ from sysid.kernels.evaluator import Evaluator
 from sysid.types import FloatArray, IntArray, WordArray
 
 TRIALS = 3
-DIFFERENCE_STEP = 1e-6  # of the range: far above rounding, far below what curvature needs
+FINE = 1e-6  # of the range: far above rounding, far below what curvature needs
 FACTOR = 10.0  # between the dampings of two trials
 FIRST_DAMPING = 1e-2
 N_HORIZONS = 5
@@ -76,14 +76,16 @@ def start_development(
     counters[DEVELOPMENTS] += 1
     counters[SEQUENCE], counters[STEP], counters[FAILED] = 1, 0, 0
     memory[DAMPING], memory[HORIZON] = FIRST_DAMPING, 1.0
-    memory[DIFFERENCE] = DIFFERENCE_STEP
     word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    # The first searches take derivatives, the others slopes over some of the range: where switches
+    # (dry friction) make the fitness rough, these tell what lies behind the next ripple.
+    coarse = counters[SETTLED] == 1 or counters[DEVELOPMENTS] % 2 == 0
+    memory[DIFFERENCE] = 10.0 ** (-2.0 - 4.0 * unit(word[2])) if coarse else FINE
     chosen, counters[PROBES] = 0, 0
     if counters[DEVELOPMENTS] % 2 == 0:
         memory[HORIZON] = 0.5 ** below(word[0], N_HORIZONS)
         chosen = below(word[1], 2 * words.shape[0])
     elif counters[SETTLED]:
-        memory[DIFFERENCE] = 10.0 ** (-2.0 - 4.0 * unit(word[0]))
         counters[PROBES] = words.shape[0]
     if chosen < words.shape[0]:
         memory[OLD] = fitness[chosen]
@@ -138,7 +140,7 @@ def _trials(plan: Plan, counters: IntArray, memory: FloatArray, matrix: FloatArr
         for d in range(point.size):
             draw = 1 + t * point.size + d
             word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
-            size = base * 10.0 ** (-2.0 * unit(word[2]))
+            size = base * 10.0 ** (1.5 - 2.5 * unit(word[2]))
             deviation[d] = (
                 size * np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(2.0 * np.pi * unit(word[1]))
             )
