@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from service import models
 from service.conversion import algorithm_of, faults_of, loss_of
 from service.errors import FieldError
-from service.pointers import pointer_into
+from service.pointers import explained
 from service.schemas_jobs import JobIn
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import NotFound
@@ -145,11 +145,8 @@ def value_faults(pointer: str, body: Body) -> list[FieldError]:
     try:
         JobIn.model_validate(body)
     except ValidationError as error:
-        return [
-            FieldError(pointer, f"{pointer_into(body, entry['loc'])}: {entry['msg']}; "
-                       f"found {entry['input']!r:.60}")
-            for entry in error.errors()
-        ]  # fmt: skip
+        faults = explained(error.errors(), body, JobIn)
+        return [FieldError(pointer, f"{one.pointer}: {one.detail}") for one in faults]
     return []
 
 

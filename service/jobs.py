@@ -17,7 +17,7 @@ from service.storage.ledger import Cell as StoredCell
 from service.storage.ledger import add_runs
 from service.storage.lineage import LineageRepository
 from service.storage.tables import Job, State
-from service.sweeps import Cell, Step, body_of, count, expand, groups_of, steps_of
+from service.sweeps import Cell, Step, body_of, count, expand, groups_of, steps_of, value_at
 
 # Any number does for these; to check each of a hundred thousand seeds would only take time.
 UNCHECKED = ("/seed", "/noise/seed", "/noise/sigma", "/priority")
@@ -52,7 +52,7 @@ def submit(session: Session, body: JobIn, settings: Settings, key: str | None = 
     )  # fmt: skip
     submission = JobRepository(session).submit(new, key=key, request_hash=digest)
     if submission.is_new:
-        cells = (_resolved(checker, cell) for cell in expand(groups))
+        cells = (_resolved(checker, spec, cell) for cell in expand(groups))
         add_runs(session, submission.job, _stored(spec, cells))
         lineage = LineageRepository(session)
         lineage.link(submission.job.id, spec["datasets"], "estimation")
@@ -121,9 +121,13 @@ def _step_faults(checker: JobChecker, document: dict[str, Any], step: Step) -> I
         yield FieldError(step.pointer, f"{fault.pointer}: {fault.detail}", fault.column)
 
 
-def _resolved(checker: JobChecker, cell: Cell) -> Cell:
-    """The cell with own models as documents and datasets as identifiers."""
+def _resolved(checker: JobChecker, spec: Mapping[str, Any], cell: Cell) -> Cell:
+    """The cell with own models as documents, datasets as identifiers, objects with defaults."""
     values = dict(cell.values)
+    objects = [path for path, value in values.items() if isinstance(value, dict)]
+    if objects:
+        whole = JobIn.model_validate(body_of(spec, values)).normal_form()
+        values.update({path: value_at(whole, path) for path in objects})
     if "/model" in values:
         model = checker.model(values["/model"])
         values["/model"] = model[1] if isinstance(model, tuple) else values["/model"]

@@ -126,10 +126,11 @@ def _free_names(session: Session, run: Run) -> list[str]:
 def _progress(run: Run, job: Job, known: Reached | None) -> float:
     if run.state.is_terminal:
         return 1.0
-    if known is None:
-        return 0.0
+    # A single run's generation is the job's; the history lags behind where nothing gets better.
+    of_job = job.generation if job.n_runs == 1 else 0
+    reached_so_far = max(of_job, known.generation if known is not None else 0)
     generations: int = body_of_run(run, job)["algorithm"]["generations"]
-    return min(known.generation / generations, ALMOST)
+    return min(reached_so_far / generations, ALMOST)
 
 
 def _wanted(name: str, filters: Sequence[str]) -> Mapping[str, Any]:

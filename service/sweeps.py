@@ -89,6 +89,14 @@ def body_of(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str,
     return body
 
 
+def value_at(document: Mapping[str, Any], path: str) -> Any:
+    """The value of a field that is there."""
+    here: Any = document
+    for part in _parts(path):
+        here = here[int(part)] if isinstance(here, list) else here[part]
+    return here
+
+
 def length_of(axis: Axis) -> int:
     """Number of values of an axis."""
     if axis.log is not None:
@@ -178,7 +186,7 @@ def _unknown_path(document: Mapping[str, Any], path: str) -> str | None:
         return f"{path!r} cannot be swept"
     if parts[0] in ("channels", "weights") and len(parts) == 2:
         return None  # which signals there are, the check of each value tells
-    if parts[0] == "parameters" and len(parts) == 3:
+    if parts[0] == "parameters" and len(parts) in (2, 3):
         return None
     here: Any = document
     for part in parts:

@@ -155,7 +155,7 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
     model.write_text(OWN)
     result = tmp_path / "out.json"
     done = lagid("identify", data, "--model", model, "--set", "algorithm.generations=150",
-                 "--set", "validation.fraction=0.3", "--json", result)  # fmt: skip
+                 "--set", "validation.fraction=0.4", "--json", result)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "±" in done.stdout
     found = {one["name"]: one for one in json.loads(result.read_text())["parameters"]}

@@ -71,6 +71,7 @@ AXES: list[tuple[dict[str, Any], str, str]] = [
     ({"path": "/algorithm/method", "values": ["simple", "bes"]}, "values/1", "found 'bes'"),
     ({"path": "/parameters/L/upper", "values": [1, -1]}, "values/1", "/parameters/L"),
     ({"path": "/seed", "values": [1, 2], "labels": [{"n": 1}]}, "labels", "1 labels for 2"),
+    ({"path": "/algorithm", "values": [{}, {"metod": 1}]}, "values/1", "did you mean 'method'?"),
     ({"path": "/datasets", "values": [["nope"]]}, "values/0", "no dataset 'nope'"),
     ({"path": "/model", "values": ["fopdt", "sopd"]}, "values/1", "no model 'sopd'"),
 ]

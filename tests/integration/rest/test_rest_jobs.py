@@ -150,3 +150,15 @@ def test_an_open_stream_ends_when_the_process_is_to_end(own: TestClient) -> None
     parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
     parts.stopping.set()
     assert events(own, job) == []  # the stream would not end otherwise: the job is queued
+
+
+def test_an_axis_over_an_object_gives_each_run_the_whole_object(
+    server: TestClient, dataset: str
+) -> None:
+    values = [{"method": "simple"}, {"bits": 12}]
+    job = submit(server, dataset, sweep={"axes": [{"path": "/algorithm", "values": values}]})
+    runs = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
+    found = [run["cell"]["/algorithm"] for run in runs]
+    assert [(one["method"], one["bits"]) for one in found] == [("simple", 24), ("improved", 12)]
+    axis = {"path": "/parameters/L", "values": [{"upper": 1}, {"upper": 2}]}
+    assert submit(server, dataset, sweep={"axes": [axis]})["progress"]["runs"] == 2
