@@ -22,6 +22,7 @@ $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --config-settings editable_mode=compat -e .
+	@$(BIN)/python -c 'from sysid.warming import warm_up; warm_up()'  # compile the search once
 	@touch $@
 
 demo: $(READY)
@@ -49,12 +50,14 @@ format: $(READY)
 	$(BIN)/ruff format .
 
 bench: $(READY)
-	$(BIN)/python benchmarks/kernels.py --quick
-	$(BIN)/python benchmarks/mcap.py --quick
+	@mkdir -p benchmarks/results
+	$(BIN)/python benchmarks/kernels.py --quick --json benchmarks/results/kernels.json
+	$(BIN)/python benchmarks/mcap.py --quick --json benchmarks/results/mcap.json
 
 bench-full: $(READY)
-	$(BIN)/python benchmarks/kernels.py
-	$(BIN)/python benchmarks/mcap.py
+	@mkdir -p benchmarks/results
+	$(BIN)/python benchmarks/kernels.py --json benchmarks/results/kernels.json
+	$(BIN)/python benchmarks/mcap.py --json benchmarks/results/mcap.json
 
 real-data: $(READY)
 	$(BIN)/python benchmarks/real_data/silverbox.py

@@ -101,7 +101,7 @@ def against_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
         if timed_c is None:
             skipped.append(Skipped(f"{name}: C", "no C reference beside LAGID_DATA, or no cc"))
         else:
-            rows.append(Row(f"{name}: time ÷ C reference", ours / c, "", 1.0))
+            rows.append(Row(f"{name}: time ÷ C reference", ours / c, "", 1.3))
     return rows, skipped
 
 

@@ -13,7 +13,7 @@ from service.signals.writer import write_recording
 from sysid.records import Channel, Recording
 
 SAMPLES = 1_000_000
-WRITE_BAR_S, READ_BAR_S = 0.30, 0.15
+WRITE_BAR_S, READ_BAR_S = 0.60, 0.15
 
 
 def made_up(samples: int) -> Recording:

@@ -99,7 +99,7 @@ def _table(console: Console, runs: dict[str, dict[str, Any]]) -> None:
         )  # fmt: skip
     table.add_section()
     table.add_row("RMS \\[m]", f"{NOISE_SD:g}", "", "", *(f"{runs[m]['rms']:.6f}" for m in METHODS))
-    table.add_row("simulations", "", "20000", "", *(str(runs[m]["evaluations"]) for m in METHODS))
+    table.add_row("simulations", "", "", "", *(str(runs[m]["evaluations"]) for m in METHODS))
     console.print(table)
     console.print(
         f"estimate ± standard error; measurement noise of sd {NOISE_SD:g} m was added; "
