@@ -4,6 +4,10 @@ import sys
 import time
 from collections.abc import Callable
 from io import BytesIO
+from pathlib import Path
+
+# Run as a script, this file would hide the package of its own name.
+sys.path[:] = [entry for entry in sys.path if Path(entry).resolve() != Path(__file__).parent]
 
 import numpy as np
 
