@@ -6,7 +6,6 @@ import subprocess
 from pathlib import Path
 
 import pytest
-import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 CODE = ("sysid", "workers", "service", "migrations", "tests", "benchmarks")
@@ -84,10 +83,3 @@ def test_the_core_never_runs_text_as_code(call: str) -> None:
         if pattern.search(path.read_text())
     ]
     assert users == []
-
-
-def test_the_compose_file_starts_the_same_commands_as_the_readme() -> None:
-    services = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text())["services"]
-    assert {"web", "dispatcher", "database"} <= set(services)
-    assert services["web"]["command"][:2] == ["lagid", "serve"]
-    assert services["dispatcher"]["command"][:2] == ["lagid", "dispatcher"]
