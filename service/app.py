@@ -2,14 +2,12 @@
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
-from service.api import datasets, events, health, jobs, models, problems, runs
+from service.api import datasets, events, health, jobs, models, pages, problems, runs
 from service.api.deps import Parts
 from service.settings import Settings
 from service.storage import migrate
@@ -36,13 +34,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         description=DESCRIPTION,
         lifespan=_lifespan(chosen),
         separate_input_output_schemas=False,
+        docs_url=None,  # FastAPI's own page loads its scripts from elsewhere; ours is at /docs
+        redoc_url=None,
     )
     problems.install(app)
-    for module in (health, datasets, models, jobs, events, runs):
-        app.include_router(module.router)
     # Exact REST paths come first: a page's path may have parameters.
-    if find_spec("service.api.pages") is not None:
-        app.include_router(import_module("service.api.pages").router)
+    for module in (health, datasets, models, jobs, events, runs, pages):
+        app.include_router(module.router)
     return app
 
 

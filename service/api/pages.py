@@ -40,6 +40,12 @@ StateFilter = Annotated[State | None, Query()]
 Choice = Annotated[FigureChoice, Query()]
 
 
+@router.get("/docs", **Hidden)
+def reference_page(request: Request) -> Response:
+    """The REST interface for people."""
+    return _Page(pages.reference_page(request.app.openapi()))
+
+
 @router.get("/", **Hidden)
 def jobs_page(session: ReadSession, state: StateFilter = None, cursor: Cursor = None) -> Response:
     """The list of jobs, and the form of a new identification."""

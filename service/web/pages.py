@@ -1,6 +1,6 @@
 """The pages: what each template is given."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -23,6 +23,7 @@ from service.storage.tables import Dataset, Job, Run, State
 from service.web import assets, figures_signals, formats
 from service.web.figures import WATERFALL_HEIGHT, convergence_height, correlation_height
 from service.web.reading import model_of, run_body, sought_parameters, unit_of
+from service.web.reference import operations
 from service.web.views import JobView, RunView, event_view, job_view, run_view
 
 JOBS_PER_PAGE = 50
@@ -47,6 +48,15 @@ def environment() -> Environment:
 def render(template: str, **context: Any) -> str:
     """A template with its context, as of now."""
     return environment().get_template(template).render(now=datetime.now(UTC), **context)
+
+
+def reference_page(document: Mapping[str, Any]) -> str:
+    """The REST interface, from its OpenAPI document."""
+    about = document["info"]["description"]
+    return render(
+        "reference.html", about=about, version=document["info"]["version"],
+        operations=operations(document),
+    )  # fmt: skip
 
 
 def jobs_page(session: Session, state: State | None, cursor: str | None) -> str:
