@@ -19,7 +19,7 @@ from service.settings import Settings
 from service.storage import migrate
 from service.storage.errors import LeaseLost, StorageError
 from service.storage.objects import ObjectStore, open_store
-from service.storage.queue import Claim
+from service.storage.queue import Claim, Lease
 from service.storage.sessions import Database
 from service.storage.wakeup import new_waker
 from service.supervision import SUPERVISED
@@ -43,15 +43,16 @@ MAX_JOBS = 8
 class Dispatcher:
     """Joins the queue, the workers and the records of several jobs at a time."""
 
-    def __init__(self, database: Database, store: ObjectStore, crew: Crew, lease: float) -> None:
+    def __init__(self, database: Database, store: ObjectStore, crew: Crew, leases: Leases) -> None:
         self.stopping = threading.Event()
         self._database, self._store, self._crew = database, store, crew
         self._woken = threading.Event()
         self._woken.set()  # what was queued before is not heard of
-        self._leases = Leases(database, lease)
-        self._feeder = Feeder(crew)
-        self._recorders: dict[str, Recorder] = {}
-        self._lost: set[str] = set()
+        self._leases = leases
+        # By lease: a job may come back under a new attempt while packs of the old one fly.
+        self._feeder: Feeder[Lease] = Feeder(crew)
+        self._recorders: dict[Lease, Recorder] = {}
+        self._lost: set[Lease] = set()
         self._looked = 0.0
         self._waking = threading.Thread(target=self._listen, name="waker", daemon=True)
 
@@ -79,25 +80,29 @@ class Dispatcher:
             self._woken.clear()
             self._looked = time.monotonic()
             self._attend()
-        for job in self._feeder.step(STEP_SECONDS if self._recorders else 0.0):
-            self._end(job)
-        for job, recorder in self._recorders.items():
+        for lease in self._feeder.step(STEP_SECONDS if self._recorders else 0.0):
+            self._end(lease)
+        for recorder in self._kept():
             try:
                 recorder.flush()
             except LeaseLost as error:
-                self._lose(job, error)
+                self._lose(recorder, error)
 
     def _attend(self) -> None:
         signals = self._leases.look()
-        for job in signals.to_cancel & self._recorders.keys():
-            self._recorders[job].is_stopped = True
-        for job, recorder in self._recorders.items():
-            if job not in self._lost and self._leases.is_lost(recorder.lease):
-                self._lose(job, LeaseLost(job, recorder.lease.attempt))
+        for recorder in self._kept():
+            lease = recorder.lease
+            if self._leases.is_lost(lease):
+                self._lose(recorder, LeaseLost(lease.job_id, lease.attempt))
+            elif lease.job_id in signals.to_cancel:
+                recorder.is_stopped = True
         if signals.is_waiting and len(self._recorders) < MAX_JOBS:
             claim = self._leases.claim()
             if claim is not None:
                 self._take(claim)
+
+    def _kept(self) -> list[Recorder]:
+        return [one for lease, one in self._recorders.items() if lease not in self._lost]
 
     def _listen(self) -> None:
         with new_waker(self._database, self.stopping) as waker:
@@ -107,23 +112,22 @@ class Dispatcher:
         self._woken.set()
 
     def _take(self, claim: Claim) -> None:
-        job = claim.job.id
         source = JobRuns(self._database, claim, self._store)
         recorder = Recorder(self._database, claim, source.save)
-        self._recorders[job] = recorder
-        self._feeder.add(job, source, recorder)
-        _log.info("%s: %d runs, attempt %d", job, claim.job.n_runs, claim.lease.attempt)
+        self._recorders[claim.lease] = recorder
+        self._feeder.add(claim.lease, source, recorder)
+        _log.info("%s: %d runs, attempt %d", claim.job.id, claim.job.n_runs, claim.lease.attempt)
 
-    def _lose(self, job: str, error: LeaseLost) -> None:
+    def _lose(self, recorder: Recorder, error: LeaseLost) -> None:
         _log.warning("stop at once: %s", error)
-        self._lost.add(job)
-        self._recorders[job].is_stopped = True
-
-    def _end(self, job: str) -> None:
-        recorder = self._recorders.pop(job)
+        self._lost.add(recorder.lease)
         self._leases.forget(recorder.lease)
-        if job in self._lost:
-            self._lost.discard(job)
+        recorder.is_stopped = True
+
+    def _end(self, lease: Lease) -> None:
+        recorder = self._recorders.pop(lease)
+        if lease in self._lost:
+            self._lost.discard(lease)
             return
         try:
             if recorder.is_stopped:
@@ -132,14 +136,15 @@ class Dispatcher:
                 recorder.finish()
         except LeaseLost as error:
             _log.warning("its end was not written: %s", error)
+        self._leases.forget(lease)
 
     def _give_back(self) -> None:
         self._feeder.stop()
-        for job, recorder in self._recorders.items():
+        for recorder in self._kept():
             try:
                 recorder.keep()
             except LeaseLost as error:
-                self._lose(job, error)
+                self._lose(recorder, error)
         self._leases.release_all()
         self._leases.stop()
         _log.info("stopped")
@@ -174,7 +179,7 @@ def serve(settings: Settings) -> int:
     try:
         compiling.join()
         crew.warm()
-        dispatcher = Dispatcher(database, store, crew, settings.lease_seconds)
+        dispatcher = Dispatcher(database, store, crew, Leases(database, settings.lease_seconds))
         _stop_on_signals(dispatcher.stopping)
         dispatcher.run()
     finally:

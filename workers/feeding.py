@@ -2,7 +2,8 @@
 
 import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
+from typing import Generic, TypeVar
 
 from workers.errors import PackFailed, PackLost
 from workers.jobwork import JobWork
@@ -15,28 +16,30 @@ GRACE_SECONDS = 1.0
 """A cancelled pack that has not ended by then loses its worker."""
 
 
-class Feeder:
-    """The driver of a crew. `add` jobs, then call `step` until they have ended."""
+Key = TypeVar("Key", bound=Hashable)
+
+
+class Feeder(Generic[Key]):
+    """The driver of a crew. `add` jobs, then call `step` until they have ended.
+
+    A job goes by a key of the caller's, which must not be in use.
+    """
 
     def __init__(self, crew: Crew, *, grace_seconds: float = GRACE_SECONDS) -> None:
         self._crew = crew
         self._grace = grace_seconds
-        self._jobs: dict[str, JobWork] = {}
-        self._stopped: dict[str, float] = {}  # when the job was told to stop; inf once forced
+        self._jobs: dict[Key, JobWork] = {}
+        self._stopped: dict[Key, float] = {}  # when the job was told to stop; inf once forced
 
     def __len__(self) -> int:
         return len(self._jobs)
 
-    @property
-    def is_hungry(self) -> bool:
-        """Whether another job would find a core at once."""
-        return self._room > 0 and not any(work.has_ready for work in self._going())
-
-    def add(self, job: str, source: JobSource, observer: RunObserver) -> None:
+    def add(self, job: Key, source: JobSource, observer: RunObserver) -> None:
         """Take on a job."""
+        assert job not in self._jobs
         self._jobs[job] = JobWork(source, observer, self._crew)
 
-    def step(self, timeout: float) -> tuple[str, ...]:
+    def step(self, timeout: float) -> tuple[Key, ...]:
         """Feed, wait at most `timeout` seconds, collect; returns the jobs that ended.
 
         Raises
@@ -56,7 +59,7 @@ class Feeder:
             self._stopped.pop(job, None)
         return ended
 
-    def stop(self, jobs: Iterable[str] | None = None) -> None:
+    def stop(self, jobs: Iterable[Key] | None = None) -> None:
         """Stop jobs (all if not given): soft now, by force after the grace period."""
         for job in tuple(self._jobs if jobs is None else jobs):
             if job in self._jobs and job not in self._stopped:
@@ -69,15 +72,12 @@ class Feeder:
         in_flight = sum(len(work.flying) for work in self._jobs.values())
         return PACKS_PER_CPU * self._crew.slots - in_flight
 
-    def _going(self) -> list[JobWork]:
-        return [work for job, work in self._jobs.items() if job not in self._stopped]
-
     def _feed(self) -> None:
         while self._room > 0:
             hungry = {
                 job: len(work.flying)
                 for job, work in self._jobs.items()
-                if job not in self._stopped and work.has_ready
+                if job not in self._stopped and work.read_ahead()
             }
             chosen = fairest(hungry)
             if chosen is None:
@@ -86,18 +86,21 @@ class Feeder:
             self._jobs[chosen].feed(idle if len(hungry) == 1 else 0)
 
     def _collect(self, handle: Handle) -> None:
-        job, work = next((j, w) for j, w in self._jobs.items() if handle in w.flying)
+        owner = next((j for j, work in self._jobs.items() if handle in work.flying), None)
         try:
             done = self._crew.fetch(handle)
         except PackLost as error:
-            self._mourn(job, work, handle, error)
+            if owner is not None:
+                self._mourn(owner, self._jobs[owner], handle, error)
             return
-        if job in self._stopped:
-            del work.flying[handle]
+        if owner is None:  # the crew does not know it any more, that is all
+            _log.warning("a pack of no job came back")
+        elif owner in self._stopped:
+            del self._jobs[owner].flying[handle]
         else:
-            work.absorb(handle, done)
+            self._jobs[owner].absorb(handle, done)
 
-    def _mourn(self, job: str, work: JobWork, handle: Handle, error: PackLost) -> None:
+    def _mourn(self, job: Key, work: JobWork, handle: Handle, error: PackLost) -> None:
         if job in self._stopped:
             del work.flying[handle]
         elif isinstance(error, PackFailed):
@@ -115,6 +118,6 @@ class Feeder:
                 self._stopped[job] = float("inf")
                 self._cancel(job, force=True)
 
-    def _cancel(self, job: str, *, force: bool) -> None:
+    def _cancel(self, job: Key, *, force: bool) -> None:
         for handle in self._jobs[job].flying:
             self._crew.cancel(handle, force=force)

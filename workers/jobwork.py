@@ -7,7 +7,6 @@ from typing import Any
 from workers.errors import RecordsUnavailable
 from workers.packing import Cost, deal, pack_size
 from workers.ports import (
-    Advance,
     Advanced,
     Concluded,
     Crew,
@@ -51,15 +50,24 @@ class JobWork:
         self._exhausted = False
 
     @property
-    def has_ready(self) -> bool:
-        """Whether a run waits for a worker."""
-        self._read_ahead()
-        return bool(self._ready)
-
-    @property
     def is_done(self) -> bool:
-        """Whether nothing waits and nothing is with the workers."""
-        return not self.flying and not self.has_ready
+        """Whether all runs were read, nothing waits and nothing is with the workers."""
+        return self._exhausted and not self.flying and not self._ready
+
+    def read_ahead(self) -> bool:
+        """Ask the source for as many runs as may be needed soon; whether a run waits now."""
+        wanted = PREFETCH * self._crew.slots
+        while not self._exhausted and len(self._ready) < wanted:
+            queued = next(self._coming, None)
+            if queued is None:
+                self._exhausted = True
+            elif isinstance(queued, RefusedRun):
+                self.observer.failure(queued.run, queued.failure)
+            else:
+                run = ActiveRun.of(queued)
+                self._active[run.run] = run
+                self._ready.append(run)
+        return bool(self._ready)
 
     def feed(self, idle: int) -> None:
         """Send the next pack, or one run's islands as several packs if `idle` cores allow."""
@@ -110,19 +118,6 @@ class JobWork:
         self._ready.clear()
         self._exhausted = True
 
-    def _read_ahead(self) -> None:
-        wanted = PREFETCH * self._crew.slots
-        while not self._exhausted and len(self._ready) < wanted:
-            queued = next(self._coming, None)
-            if queued is None:
-                self._exhausted = True
-            elif isinstance(queued, RefusedRun):
-                self.observer.failure(queued.run, queued.failure)
-            else:
-                run = ActiveRun.of(queued)
-                self._active[run.run] = run
-                self._ready.append(run)
-
     def _take_fresh(self, size: int) -> list[ActiveRun]:
         """The next `size` runs that have not been begun and see the same records."""
         chosen = [self._ready.popleft()]
@@ -147,10 +142,14 @@ class JobWork:
             for name in {item.run for item in items}:
                 self._fail(name, Failure(str(error), type(error).__name__))
             return
-        for item in items:
-            if isinstance(item, Advance) and item.state is None:
-                self.observer.started(item.run)
+        for name in dict.fromkeys(item.run for item in items):
+            self._tell_begin(self._active[name])
         self.flying[self._crew.submit(items, keys, shared)] = tuple(items)
+
+    def _tell_begin(self, run: ActiveRun) -> None:
+        if not run.is_begun:
+            run.is_begun = True
+            self.observer.started(run.run)
 
     def _share(self, key: str) -> Any:
         if key not in self._shared:

@@ -170,7 +170,7 @@ class RunObserver(Protocol):
     """Who is told about the runs of one job."""
 
     def started(self, run: str) -> None:
-        """The run was given to a worker for the first time."""
+        """The run was given to a worker for the first time, from its checkpoint or the start."""
 
     def progress(self, run: str, state: RunState, seconds: float) -> None:
         """The run can go on from `state` after `seconds` of compute time."""

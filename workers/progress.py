@@ -18,6 +18,8 @@ class ActiveRun:
 
     Attributes
     ----------
+    is_begun : bool
+        Whether a worker was given it, by this driver.
     slices : int
         Time slices done; 0 before the first.
     strikes : int
@@ -35,6 +37,7 @@ class ActiveRun:
     run: str
     spec: RunSpec
     state: RunState | None
+    is_begun: bool = False
     slices: int = 0
     strikes: int = 0
     seconds: float = 0.0

@@ -1,15 +1,17 @@
 """The one kind of task: advance a pack of work. Stateless but for a cache of built problems."""
 
+import logging
 import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 from sysid.errors import SysidError
 from sysid.ga.island import Island
 from sysid.models.spec import parse_model
 from sysid.noise import with_noise
 from sysid.problem import Problem
-from sysid.records import split_record
+from sysid.records import split_record, start_of_validation
 from sysid.run import CALL_SECONDS, advance_island, begin, conclude, is_finished
 from sysid.run import advance as advance_run
 from workers.ports import (
@@ -26,6 +28,8 @@ from workers.ports import (
     Records,
 )  # fmt: skip
 
+_log = logging.getLogger(__name__)
+
 PACK_LIMIT_SECONDS = 1.0
 """No further item is begun after that; what is left goes back unchanged."""
 
@@ -37,7 +41,8 @@ _problems: OrderedDict[str, tuple[Problem, Problem | None]] = OrderedDict()
 def advance(pack: Sequence[Item], keys: Sequence[str], *shared: Records) -> tuple[Done, ...]:
     """Work on every item of the pack in turn.
 
-    What is wrong with a run comes back as its `Failure`; only programming errors raise.
+    What is wrong with a run comes back as its `Failure`, programming errors too: the other runs
+    of the pack have no part in them.
 
     Parameters
     ----------
@@ -68,6 +73,9 @@ def _outcome(item: Item, records: Mapping[str, Records]) -> Outcome:
         return _advanced(item, problem, validation)
     except SysidError as error:
         return Failure(str(error), type(error).__name__)
+    except Exception as error:  # noqa: BLE001 - the process border: its pack-mates go on
+        _log.exception("run %s met a programming error", item.run)
+        return Failure(f"internal error: {type(error).__name__}: {error}", "InternalError")
 
 
 def _advanced(item: Advance, problem: Problem, validation: Problem | None) -> Outcome:
@@ -117,13 +125,18 @@ def build(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Problem, P
     model = parse_model(spec.model)
     estimation, validation = prepared(spec, records)
 
-    def problem(chosen: Records) -> Problem:
-        return Problem.build(
-            model, chosen, parameters=spec.parameters, prediction=spec.prediction,
-            loss=spec.loss, weights=spec.weights, skip=spec.skip,
-        )  # fmt: skip
-
-    return problem(estimation), None if validation is None else problem(validation)
+    problem = partial(
+        Problem.build, model, parameters=spec.parameters, prediction=spec.prediction,
+        loss=spec.loss, skip=spec.skip,
+    )  # fmt: skip
+    posed = problem(estimation, weights=spec.weights)
+    if validation is None:
+        return posed, None
+    since = None
+    if spec.validation_fraction is not None:  # the last part is simulated with all before it
+        validation = records[spec.records]
+        since = [start_of_validation(one, spec.validation_fraction) for one in validation]
+    return posed, problem(validation, weights=posed.output_weights, scored_from=since)
 
 
 def prepared(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Records, Records | None]:

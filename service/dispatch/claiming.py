@@ -6,13 +6,15 @@ import secrets
 import socket
 import threading
 import time
+from collections.abc import Callable
 from datetime import timedelta
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.storage.columns import utc_now
 from service.storage.dispatchers import DispatcherRepository
 from service.storage.errors import LeaseLost
-from service.storage.queue import Claim, Lease, Queue
+from service.storage.queue import Claim, Clock, Lease, Queue
 from service.storage.sessions import Database
 from service.storage.watch import Signals, look
 
@@ -23,33 +25,48 @@ class Leases:
     """The jobs this dispatcher may write for.
 
     A thread renews all leases with one statement, three times within their length, and reaps the
-    expired leases of others. A lease that did not come back is `is_lost` at once.
+    expired ones of anybody. A lease that did not come back is `is_lost` at once; one that was
+    forgotten is renewed no longer, and expires.
+
+    Parameters
+    ----------
+    seconds : float
+        Length of a lease.
+    clock, stopwatch : callable
+        The time of day as rows have it, and the seconds that pass for this process.
     """
 
-    def __init__(self, database: Database, seconds: float) -> None:
+    def __init__(
+        self,
+        database: Database,
+        seconds: float,
+        *,
+        clock: Clock = utc_now,
+        stopwatch: Callable[[], float] = time.monotonic,
+    ) -> None:
         self.owner = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
         self._database, self._length = database, timedelta(seconds=seconds)
-        self._held: dict[str, Lease] = {}
-        self._lost: set[Lease] = set()
+        self._clock, self._stopwatch = clock, stopwatch
+        self._held: dict[Lease, float] = {}  # when each was renewed
         self._lock = threading.Lock()
         self._ending = threading.Event()
-        self._renewed = time.monotonic()
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
 
     def start(self, details: dict[str, object]) -> None:
         """Announce the dispatcher and begin to beat."""
         with self._database.write() as session:
             DispatcherRepository(session).announce(self.owner, dict(details))
-            Queue(session).reap()
+            Queue(session, self._clock).reap()
         self._thread.start()
 
     def claim(self) -> Claim | None:
         """Take the next job, if one waits."""
+        begun = self._stopwatch()
         with self._database.write() as session:
-            claim = Queue(session).claim(self.owner, self._length)
+            claim = Queue(session, self._clock).claim(self.owner, self._length)
         if claim is not None:
             with self._lock:
-                self._held[claim.lease.job_id] = claim.lease
+                self._held[claim.lease] = begun
         return claim
 
     def look(self) -> Signals:
@@ -59,24 +76,25 @@ class Leases:
 
     def is_lost(self, lease: Lease) -> bool:
         """Whether the lease is known to be lost, or was not renewed in time."""
-        late = time.monotonic() - self._renewed > self._length.total_seconds()
         with self._lock:
-            return late or lease in self._lost
+            renewed = self._held.get(lease)
+        if renewed is None:
+            return True
+        return self._stopwatch() - renewed > self._length.total_seconds()
 
     def forget(self, lease: Lease) -> None:
-        """The job has ended, or is another's: renew it no longer."""
+        """The job has ended, or was dropped: renew its lease no longer."""
         with self._lock:
-            self._held.pop(lease.job_id, None)
-            self._lost.discard(lease)
+            self._held.pop(lease, None)
 
     def release_all(self) -> None:
         """Give every job back, so that another dispatcher has it at once."""
         with self._lock:
-            held = tuple(self._held.values())
+            held = tuple(self._held)
         for lease in held:
             try:
                 with self._database.write() as session:
-                    Queue(session).release(lease)
+                    Queue(session, self._clock).release(lease)
             except LeaseLost:
                 _log.info("%s was no longer ours", lease.job_id)
             self.forget(lease)
@@ -88,25 +106,29 @@ class Leases:
         with self._database.write() as session:
             DispatcherRepository(session).leave(self.owner)
 
+    def renew(self) -> None:
+        """One heartbeat: renew what is held, and reap what has expired."""
+        begun = self._stopwatch()
+        with self._lock:
+            before = tuple(self._held)
+        with self._database.write() as session:
+            DispatcherRepository(session).beat(self.owner)
+            queue = Queue(session, self._clock)
+            renewed = {one.lease for one in queue.heartbeat(before, self._length)}
+            reaped = queue.reap()
+        with self._lock:
+            for lease in before:
+                if lease not in renewed:
+                    self._held.pop(lease, None)
+                elif lease in self._held:
+                    self._held[lease] = begun
+        if reaped.requeued or reaped.failed or reaped.cancelled:
+            _log.warning("leases that had expired: %s", reaped)
+
     def _beat(self) -> None:
         pause = self._length.total_seconds() / 3
         while not self._ending.wait(pause):
             try:
-                self._renew()
+                self.renew()
             except SQLAlchemyError:  # an unreachable database may come back before the lease ends
                 _log.exception("no heartbeat could be written")
-
-    def _renew(self) -> None:
-        begun = time.monotonic()
-        with self._lock:
-            before = dict(self._held)
-        with self._database.write() as session:
-            DispatcherRepository(session).beat(self.owner)
-            renewed = {held.lease for held in Queue(session).heartbeat(self.owner, self._length)}
-            reaped = Queue(session).reap()
-        self._renewed = begun
-        with self._lock:
-            still = set(self._held.values())
-            self._lost |= {one for one in before.values() if one not in renewed and one in still}
-        if reaped.requeued or reaped.failed or reaped.cancelled:
-            _log.warning("leases of silent dispatchers: %s", reaped)

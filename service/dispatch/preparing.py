@@ -17,8 +17,10 @@ from service.storage.objects import ObjectStore
 from service.storage.queue import Claim
 from service.storage.sessions import Database
 from service.storage.tables import Run
+from service.storage.tally import forget_progress
 from service.sweeps import body_of
 from sysid.errors import SysidError
+from sysid.islands.run_state import RunState
 from sysid.models.model import Model
 from sysid.noise import Noise
 from sysid.result import Identification
@@ -57,11 +59,13 @@ class JobRuns:
     def runs(self) -> Iterator[QueuedRun | RefusedRun]:
         """The unfinished runs in order, each from its checkpoint if it has one."""
         try:
-            states = self._checkpoints()
+            checkpoints = self._checkpoints()
             rows = self._pending(-1)
             while rows:
+                states = {row.id: unpacked(checkpoints.pop(row.id, None)) for row in rows}
+                self._begin_anew([run for run, state in states.items() if state is None])
                 for row in rows:
-                    yield self._queued(row, states.pop(row.id, None))
+                    yield self._queued(row, states.pop(row.id))
                 rows = self._pending(rows[-1].number)
         except LeaseLost as error:  # the recorder will meet it too, and stop the job
             _log.warning("no more runs: %s", error)
@@ -139,13 +143,18 @@ class JobRuns:
         with self._database.write() as session:
             return RunLedger(session, self._lease).pending(READ_AHEAD, after)
 
-    def _queued(self, row: Run, state: bytes | None) -> QueuedRun | RefusedRun:
+    def _begin_anew(self, runs: list[str]) -> None:
+        if self._lease.attempt > 1 and runs:
+            with self._database.write() as session:
+                forget_progress(session, self._lease, runs)
+
+    def _queued(self, row: Run, state: RunState | None) -> QueuedRun | RefusedRun:
         try:
             spec = self.specification(row.cell)
         except (SysidError, ServiceError, StorageError) as error:
             return RefusedRun(row.id, Failure(str(error), type(error).__name__))
         self._problems[row.id] = spec.problem
-        return QueuedRun(row.id, spec, unpacked(state))
+        return QueuedRun(row.id, spec, state)
 
     def _model(self, reference: Any) -> Model:
         name = reference if isinstance(reference, str) else repr(reference)

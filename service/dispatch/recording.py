@@ -15,6 +15,7 @@ from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOut
 from service.storage.queue import Claim, Progress, Queue
 from service.storage.sessions import Database
 from service.storage.tables import State
+from service.storage.tally import tally
 from sysid.islands.run_state import RunState
 from sysid.result import Identification, Improvement, Migrant
 from workers.errors import RecordsUnavailable
@@ -37,6 +38,7 @@ class _Live:
 
     state: RunState
     seconds: float
+    begun_at: int = 0  # its generation when this attempt took it up
     written: dict[int, int] = field(default_factory=dict)
     migrants: int = 0
     changed: bool = True
@@ -50,6 +52,7 @@ class _Pending:
     outcomes: list[RunOutcome] = field(default_factory=list)
     history: list[HistoryPoint] = field(default_factory=list)
     migrants: list[MigrantPoint] = field(default_factory=list)
+    complaints: list[tuple[str, str]] = field(default_factory=list)
 
 
 class Recorder:
@@ -62,12 +65,15 @@ class Recorder:
     def __init__(self, database: Database, claim: Claim, save_signals: SaveSignals) -> None:
         self.lease = claim.lease
         self.is_stopped = False
-        self._reasons: list[str] = []
+        with database.write() as session:
+            before = tally(session, claim.lease, KEPT_REASONS)
+        self._reasons = list(before.reasons)
+        self._waiting = before.waiting  # evaluations of runs that have not gone on yet
         self._database, self._save_signals = database, save_signals
         self._live: dict[str, _Live] = {}
         self._pending = _Pending()
         self._n_runs, self._n_done = claim.job.n_runs, claim.job.n_done
-        self._evaluations, self._generation = 0, 0
+        self._evaluations, self._generation = before.evaluations, before.generations
         self._best = math.inf if claim.job.best_rms is None else claim.job.best_rms
         self._generations = max(1, int(claim.job.spec["algorithm"]["generations"]))
         self._n_begun, self._begun = claim.job.n_done, time.monotonic()
@@ -80,12 +86,17 @@ class Recorder:
 
     def progress(self, run: str, state: RunState, seconds: float) -> None:
         """The run can go on from `state`."""
-        live = self._live.setdefault(run, _Live(state, seconds))
+        live = self._live.get(run)
+        if live is None:
+            begun_at = state.generation if run in self._waiting else 0
+            live = self._live[run] = _Live(state, seconds, begun_at)
+            self._waiting.pop(run, None)
         live.state, live.seconds, live.changed = state, seconds, True
         self._news = True
 
     def result(self, run: str, concluded: Concluded, seconds: float) -> None:
         """The run is complete."""
+        self._waiting.pop(run, None)
         found, live = concluded.identification, self._live.pop(run, None)
         self._collect_history(run, found.history, found.migrations, live)
         try:
@@ -105,14 +116,17 @@ class Recorder:
 
     def failure(self, run: str, failure: Failure) -> None:
         """The run cannot be carried out."""
-        live = self._live.pop(run, None)
+        live, evaluations = self._live.pop(run, None), self._waiting.pop(run, 0)
         if live is not None:
             self._collect_history(run, live.state.history, live.state.migrations, live)
-            self._evaluations += live.state.evaluations
-        outcome = RunOutcome(run_id=run, state=State.FAILED, error=failure.reason)
-        self._pending.outcomes.append(outcome)
+            evaluations = live.state.evaluations
+        self._evaluations += evaluations
+        self._pending.outcomes.append(RunOutcome(
+            run_id=run, state=State.FAILED, error=failure.reason, evaluations=evaluations
+        ))  # fmt: skip
         if failure.reason not in self._reasons and len(self._reasons) < KEPT_REASONS:
             self._reasons.append(failure.reason)
+            self._pending.complaints.append((run, failure.reason))
         self._n_done += 1
         self._news = True
 
@@ -167,7 +181,9 @@ class Recorder:
         states = [live.state for live in self._live.values()]
         best = min([self._best, *(state.rms for state in states)])
         return Progress(
-            evaluations=self._evaluations + sum(state.evaluations for state in states),
+            evaluations=self._evaluations
+            + sum(self._waiting.values())
+            + sum(state.evaluations for state in states),
             generation=max([self._generation, *(state.generation for state in states)]),
             best_rms=best if math.isfinite(best) else None,
             seconds_left=self._seconds_left(),
@@ -177,10 +193,11 @@ class Recorder:
         """What is left if the rest goes as fast as what was done since the claim."""
         total = self._generations * self._n_runs
         open_runs = sum(live.state.generation for live in self._live.values())
-        done = (self._n_done - self._n_begun) * self._generations + open_runs
+        before = sum(live.begun_at for live in self._live.values())
+        done = (self._n_done - self._n_begun) * self._generations + open_runs - before
         left = total - self._n_done * self._generations - open_runs
         elapsed = time.monotonic() - self._begun
-        return max(0.0, elapsed * left / done) if done else None
+        return max(0.0, elapsed * left / done) if done > 0 else None
 
     def _complaint(self, n_failed: int, n_runs: int) -> str | None:
         if n_failed == 0:
@@ -203,6 +220,8 @@ class Recorder:
         ledger, pending = RunLedger(session, self.lease), self._pending
         ledger.start(pending.started)
         ledger.record(pending.outcomes, pending.history, pending.migrants)
+        for run, reason in pending.complaints:
+            Queue(session).tell(self.lease, "log", {"message": f"{run} failed: {reason}"})
         if tell:
             for run, live in self._live.items():
                 points = history_points(run, live.state.history, live.written)

@@ -8,12 +8,12 @@ Times are those of the caller's clock: a wrong clock delays or hastens the reape
 dispatcher may write is decided by the attempt alone.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, case, func, select, update
+from sqlalchemy import ColumnElement, and_, case, false, func, or_, select, update
 from sqlalchemy.orm import Session, aliased
 
 from service.storage.columns import Document, utc_now
@@ -104,16 +104,20 @@ class Queue:
         self._events.append_state(job)
         return Claim(Lease(job.id, job.attempt, owner), job)
 
-    def heartbeat(self, owner: str, lease: timedelta = LEASE) -> tuple[Held, ...]:
-        """Renew every lease of an owner; those it does not get back are lost."""
+    def heartbeat(self, held: Collection[Lease], lease: timedelta = LEASE) -> tuple[Held, ...]:
+        """Renew these leases; those that do not come back are lost.
+
+        A lease that its dispatcher has dropped is not among them, so that the reaper finds it.
+        """
+        owners = {one.job_id: one.owner for one in held}
         renewed = (
             update(Job)
-            .where(Job.lease_owner == owner, Job.state == State.RUNNING)
+            .where(or_(false(), *(and_(*one.fence()) for one in held)))
             .values(lease_until=self._clock() + lease)
             .returning(Job.id, Job.attempt, Job.cancel_requested)
         )
         rows = self._session.execute(renewed, execution_options=IN_PLACE)
-        return tuple(Held(Lease(job, attempt, owner), stop) for job, attempt, stop in rows)
+        return tuple(Held(Lease(job, attempt, owners[job]), stop) for job, attempt, stop in rows)
 
     def hold(self, lease: Lease) -> Job:
         """The job, locked against every other writer until the transaction ends.
@@ -192,10 +196,6 @@ class Queue:
             fates[self._bury(job)].append(job.id)
         queued, failed, cancelled = State.QUEUED, State.FAILED, State.CANCELLED
         return Reaped(tuple(fates[queued]), tuple(fates[failed]), tuple(fates[cancelled]))
-
-    def n_queued(self) -> int:
-        """How many jobs wait, over all projects."""
-        return self._session.scalar(select(func.count()).where(Job.state == State.QUEUED)) or 0
 
     def _change(self, lease: Lease, values: dict[str, Any]) -> Job:
         changed = update(Job).where(*lease.fence()).values(values).returning(Job)

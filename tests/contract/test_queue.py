@@ -10,7 +10,7 @@ from service.storage.events import EventRepository
 from service.storage.jobs import JobRepository
 from service.storage.ledger import Cell, RunLedger, RunOutcome
 from service.storage.queue import Lease, Progress, Queue
-from service.storage.tables import Job, State
+from service.storage.tables import State
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
 
 LEASE = timedelta(seconds=30)
@@ -100,18 +100,19 @@ def test_a_claim_that_is_rolled_back_leaves_the_job_queued(database):
     assert claim(database).lease == Lease(job_id, 1, "d1")
 
 
-def test_one_heartbeat_renews_all_leases_of_its_owner_and_no_others(database, clock):
-    mine = {submit(database), submit(database)}
-    for _ in mine:
-        claim(database, "d1", clock)
-    other = submit(database)
+def test_one_heartbeat_renews_the_leases_given_and_no_others(database, clock):
+    for _ in range(2):
+        submit(database)
+    mine = {claim(database, "d1", clock).lease for _ in range(2)}
+    others = {submit(database), submit(database)}
+    claim(database, "d1", clock)  # of the same owner, who has dropped it
     claim(database, "d2", clock)
     clock.advance(20)
     with database.write() as session:
-        held = Queue(session, clock).heartbeat("d1")
-    assert {one.lease for one in held} == {Lease(job_id, 1, "d1") for job_id in mine}
+        held = Queue(session, clock).heartbeat(mine)
+    assert {one.lease for one in held} == mine
     clock.advance(11)
-    assert reap(database, clock).requeued == (other,)
+    assert set(reap(database, clock).requeued) == others
 
 
 def test_a_heartbeat_tells_of_a_wish_to_cancel(database):
@@ -119,16 +120,26 @@ def test_a_heartbeat_tells_of_a_wish_to_cancel(database):
     with database.write() as session:
         JobRepository(session).cancel(got.job.id)
     with database.write() as session:
-        (held,) = Queue(session).heartbeat("d1")
+        (held,) = Queue(session).heartbeat([got.lease])
     assert held.cancel_requested
 
 
 def test_a_heartbeat_does_not_get_back_a_lease_that_was_lost(database, clock):
     submit(database)
-    lose(database, clock)
-    claim(database, "d2", clock)
+    lost, _ = lose(database, clock)
+    claim(database, "silent", clock)  # under a new attempt
     with database.write() as session:
-        assert Queue(session, clock).heartbeat("silent") == ()
+        assert Queue(session, clock).heartbeat([lost.lease]) == ()
+
+
+def test_a_heartbeat_of_no_lease_renews_nothing(database, clock):
+    job_id = submit(database)
+    claim(database, "d1", clock)
+    clock.advance(20)
+    with database.write() as session:
+        assert Queue(session, clock).heartbeat([]) == ()
+    clock.advance(11)
+    assert reap(database, clock).requeued == (job_id,)
 
 
 def test_the_reaper_leaves_a_living_lease_alone(database, clock):
@@ -233,7 +244,7 @@ LATE_WRITES = {
 def test_a_late_writer_is_refused_and_changes_nothing(database, clock, write):
     got, (run_id,) = claimed(database)
     with database.write() as session:
-        Queue(session, clock).heartbeat("d1")  # in the past of the true clock: it expires
+        Queue(session, clock).heartbeat([got.lease])  # in the past of the true clock: it expires
     clock.advance(31)
     assert reap(database, clock).requeued == (got.job.id,)
     with database.read() as session:
@@ -292,11 +303,3 @@ def test_progress_is_kept_and_told_and_the_best_never_rises(database):
         events = EventRepository(session).after(got.job.id)
     told = [event.data["best_rms"] for event in events if event.kind == "progress"]
     assert told == [0.5, 0.5, 0.2, 0.2]
-
-
-def test_the_queue_counts_what_waits(database):
-    submit(database), submit(database)
-    claim(database)
-    with database.read() as session:
-        assert Queue(session).n_queued() == 1
-        assert session.query(Job).count() == 2

@@ -5,7 +5,8 @@ import re
 import pytest
 from playwright.sync_api import Page, expect
 
-from service.storage.queue import Queue
+from service.storage.jobs import JobRepository
+from service.storage.tables import State
 from tests.e2e.conftest import Site
 from tests.e2e.filled import TRUE, end_running, progress
 
@@ -117,7 +118,7 @@ def test_a_job_is_cancelled_and_resumed_from_its_page(own_site: Site, page: Page
     page.get_by_role("button", name="Resume").click()
     expect(page.locator("#job .chip")).to_have_text("queued")
     with own_site.parts.database.write() as session:
-        assert Queue(session).n_queued() == 1
+        assert JobRepository(session).counts()[State.QUEUED] == 1
 
 
 def test_a_failed_job_says_why_and_a_name_is_never_markup(site: Site, page: Page) -> None:
