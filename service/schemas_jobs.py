@@ -13,8 +13,13 @@ from pydantic_core import PydanticCustomError
 from service.schemas import Answer, Body, Pointer
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Whole = Annotated[int, Field(gt=-(2**62), lt=2**62)]
-Mutation = Annotated[list[tuple[int, float]], Field(min_length=1)]
+# The bounds are those of `sysid.settings`, which a client does not load.
+Count = Annotated[int, Field(ge=1, le=10**9)]
+Evaluations = Annotated[int, Field(ge=1, le=10**12)]
+Generation = Annotated[int, Field(ge=0, le=10**9)]
+Mutation = Annotated[list[tuple[Generation, float]], Field(min_length=1, max_length=1000)]
 
 
 class ParameterIn(Body):
@@ -49,7 +54,7 @@ class LossIn(Body):
 class NoiseIn(Body):
     """Noise added to the measured outputs before fitting, for sensitivity studies."""
 
-    sigma: float = Field(default=0.0, ge=0)
+    sigma: Sigma = 0.0
     seed: Seed = 0
 
 
@@ -64,17 +69,17 @@ class SequenceIn(Body):
 class MigrationIn(Body):
     """Exchange between islands."""
 
-    every: int = Field(default=25, ge=1)
+    every: Count = 25
     topology: Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"] = (
         "one-way-ring"
     )
-    migrants: int = Field(default=2, ge=0)
+    migrants: int = Field(default=2, ge=0, le=100_000)
 
 
 class StopIn(Body):
     """End conditions besides the generations."""
 
-    evaluations: int | None = Field(default=None, ge=1)
+    evaluations: Evaluations | None = None
     seconds: float | None = Field(default=None, gt=0)
     rms: float | None = Field(default=None, gt=0)
 
@@ -96,7 +101,7 @@ class AlgorithmIn(Body):
     bits: int = Field(default=24, ge=1, le=32)
     selection_rate: float = Field(default=0.5, gt=0, lt=1)
     mutation: Mutation = Field(default=[(0, 0.2), (50, 0.8)])
-    stagnation: int = Field(default=30, ge=1)
+    stagnation: Count = 30
     sequence: SequenceIn = SequenceIn()
     islands: int | list[IslandIn] | None = None
     migration: MigrationIn = MigrationIn()

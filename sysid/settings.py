@@ -12,6 +12,10 @@ SearchMethod = Literal["simple", "improved-paper", "improved"]
 TopologyName = Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"]
 Prediction = Literal["simulation", "one-step"]
 METHODS: tuple[SearchMethod, ...] = ("simple", "improved-paper", "improved")
+# What the compiled search counts in 64 bits, with room to add; no run of years comes near them.
+MOST_GENERATIONS = 10**9
+MOST_EVALUATIONS = 10**12
+Schedule = tuple[tuple[int, float], ...]
 TOPOLOGIES: tuple[TopologyName, ...] = (
     "one-way-ring", "ring", "fully-connected", "star", "unconnected",
 )  # fmt: skip
@@ -43,10 +47,11 @@ class Migration:
     migrants: int = 2
 
     def __post_init__(self) -> None:
-        _require(self.every >= 1, "migration/every", self.every, "1 or more")
+        _require_count(self.every, "migration/every")
         _require(self.topology in TOPOLOGIES, "migration/topology", self.topology,
                  ", ".join(TOPOLOGIES))  # fmt: skip
-        _require(self.migrants >= 0, "migration/migrants", self.migrants, "0 or more")
+        _require(0 <= self.migrants <= MOST_GENERATIONS, "migration/migrants", self.migrants,
+                 f"0 to {MOST_GENERATIONS}")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +66,8 @@ class Stop:
         for name in ("evaluations", "seconds", "rms"):
             value = getattr(self, name)
             _require(value is None or value > 0, f"stop/{name}", value, "positive")
+        _require(self.evaluations is None or self.evaluations <= MOST_EVALUATIONS,
+                 "stop/evaluations", self.evaluations, f"1 to {MOST_EVALUATIONS}")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +76,11 @@ class IslandChange:
 
     method: SearchMethod | None = None
     bits: int | None = None
-    mutation: tuple[tuple[int, float], ...] | None = None
+    mutation: Schedule | None = None
+
+    def __post_init__(self) -> None:
+        if self.mutation is not None:
+            _require_schedule(self.mutation, "islands")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +107,7 @@ class GeneticAlgorithm:
     generations: int = 400
     bits: int = 24
     selection_rate: float = 0.5
-    mutation: tuple[tuple[int, float], ...] = ((0, 0.2), (50, 0.8))
+    mutation: Schedule = ((0, 0.2), (50, 0.8))
     stagnation: int = 30
     sequence: SequenceSearch = field(default_factory=SequenceSearch)
     islands: int | tuple[IslandChange, ...] | None = None
@@ -108,17 +119,12 @@ class GeneticAlgorithm:
     def __post_init__(self) -> None:
         _require(self.method in METHODS, "method", self.method, ", ".join(METHODS))
         _require(self.population >= 4, "population", self.population, "4 or more")
-        _require(self.generations >= 1, "generations", self.generations, "1 or more")
+        _require_count(self.generations, "generations")
         _require(1 <= self.bits <= 32, "bits", self.bits, "1 to 32")
         _require(0 < self.selection_rate < 1, "selection_rate", self.selection_rate,
                  "between 0 and 1")  # fmt: skip
-        _require(self.stagnation >= 1, "stagnation", self.stagnation, "1 or more")
-        generations = [generation for generation, _ in self.mutation]
-        _require(bool(generations) and generations[0] == 0
-                 and generations == sorted(set(generations))
-                 and all(0 <= rate <= 1 for _, rate in self.mutation),
-                 "mutation", self.mutation,
-                 "[generation, rate] pairs from generation 0 up, rates 0 to 1")  # fmt: skip
+        _require_count(self.stagnation, "stagnation")
+        _require_schedule(self.mutation, "mutation")
         _require(self.safe_limit is None or self.safe_limit > 0, "safe_limit", self.safe_limit,
                  "positive")  # fmt: skip
         _require(self.n_islands >= 1, "islands", self.islands, "1 or more")
@@ -150,3 +156,18 @@ class Loss:
 def _require(holds: bool, pointer: str, found: object, right: str) -> None:
     if not holds:
         raise InvalidSettings(f"/algorithm/{pointer}", f"found {found!r}; need {right}")
+
+
+def _require_count(found: int, pointer: str) -> None:
+    _require(1 <= found <= MOST_GENERATIONS, pointer, found, f"1 to {MOST_GENERATIONS}")
+
+
+def _require_schedule(found: Schedule, pointer: str) -> None:
+    generations = [generation for generation, _ in found]
+    holds = (
+        bool(generations) and generations[0] == 0 and generations[-1] <= MOST_GENERATIONS
+        and generations == sorted(set(generations))
+        and all(0 <= rate <= 1 for _, rate in found)
+    )  # fmt: skip
+    right = f"[generation, rate] pairs from generation 0 up to {MOST_GENERATIONS}, rates 0 to 1"
+    _require(holds, pointer, found, right)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,28 @@ from service.conversion import algorithm_of, loss_of
 from service.errors import Misconfigured
 from service.schemas_jobs import JobIn
 from service.settings import Settings, is_loopback
-from sysid.settings import GeneticAlgorithm, IslandChange, Loss
+from sysid.errors import InvalidSettings
+from sysid.settings import GeneticAlgorithm, IslandChange, Loss, Migration, Stop
+
+
+@pytest.mark.parametrize(
+    ("change", "pointer"),
+    [
+        (lambda: GeneticAlgorithm(stagnation=10**30), "/algorithm/stagnation"),
+        (lambda: GeneticAlgorithm(generations=10**30), "/algorithm/generations"),
+        (lambda: GeneticAlgorithm(mutation=((0, 0.2), (10**30, 0.8))), "/algorithm/mutation"),
+        (lambda: IslandChange(mutation=((0, 0.2), (10**30, 0.8))), "/algorithm/islands"),
+        (lambda: Migration(every=10**30), "/algorithm/migration/every"),
+        (lambda: Migration(migrants=10**30), "/algorithm/migration/migrants"),
+        (lambda: Stop(evaluations=10**40), "/algorithm/stop/evaluations"),
+    ],
+)
+def test_a_number_that_the_compiled_search_cannot_count_is_refused(
+    change: Callable[[], object], pointer: str
+) -> None:
+    with pytest.raises(InvalidSettings, match="need") as refused:
+        change()
+    assert refused.value.pointer == pointer
 
 
 def test_the_defaults_of_the_job_body_are_those_of_the_core() -> None:
