@@ -1,7 +1,8 @@
 """What can be known of a job before it runs: every fault is found here, and found now."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Any
 
 from pydantic import ValidationError
 from sqlalchemy.orm import Session
@@ -23,7 +24,26 @@ from sysid.models.model import EstimatedInitial, Model
 from sysid.parameters import Parameter, override
 
 Body = dict[str, Any]
-T = TypeVar("T")
+MOST_GENES = 10_000_000  # individuals times parameters: 80 MB for each copy of a population
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    """What is known of the length of one record; `words` say which part of it is meant."""
+
+    duration: float
+    samples: int
+    period: float | None
+    words: str = ""
+
+    def without(self, fraction: float) -> "_Piece | None":
+        """The part for estimation; None if it, or the part for validation, has no sample."""
+        left = self.samples - round(fraction * self.samples)
+        if not 0 < left < self.samples:
+            return None
+        # Where an irregular record is cut is not known here: its whole length is asked for.
+        duration = self.duration if self.period is None else (left - 1) * self.period
+        return _Piece(duration, left, self.period, "of the part for estimation: ")
 
 
 class JobChecker:
@@ -47,8 +67,10 @@ class JobChecker:
         parameters = _tried(
             override, found, self._all_parameters(body, model[0]), body["parameters"]
         )
+        found += _freedom_faults(parameters, body["algorithm"]["population"])
         own = (parameters or model[0].parameters)[: len(model[0].parameters)]
         _tried(check_lags, found, model[0], own)
+        found += self._repeated(body)
         found += self._data(body, model[0], own)
         return found + list(_signal_faults(body, model[0]))
 
@@ -128,16 +150,40 @@ class JobChecker:
             if isinstance(dataset, str):
                 yield FieldError(pointer, dataset)
 
+    def _repeated(self, body: Body) -> Iterator[FieldError]:
+        """Datasets that are named twice, or kept for validation though they are fitted."""
+        places: dict[str, tuple[str, str]] = {}
+        for pointer, reference in _references(body):
+            dataset = self.dataset(reference)
+            if isinstance(dataset, str):
+                continue
+            first, name = places.setdefault(dataset.sha256, (pointer, reference))
+            if first != pointer:
+                yield FieldError(
+                    pointer, f"{reference!r} is the same recording as {name!r} at {first}; "
+                    "name another, or leave it out",
+                )  # fmt: skip
+
     def _data(
         self, body: Body, model: Model, parameters: tuple[Parameter, ...]
     ) -> Iterator[FieldError]:
+        kept: float | None = (body["validation"] or {}).get("fraction")
         for pointer, reference in _references(body):
             dataset = self.dataset(reference)
             if isinstance(dataset, str):
                 yield FieldError(pointer, dataset)
                 continue
             yield from _channel_faults(body["channels"], model, dataset)
-            yield from _length_faults(pointer, model, parameters, dataset, body["skip"])
+            for piece in _pieces(dataset):
+                estimated = piece if kept is None else piece.without(kept)
+                if estimated is not None:
+                    yield from _length_faults(pointer, model, parameters, estimated, body["skip"])
+                else:
+                    yield FieldError(
+                        "/validation/fraction",
+                        f"found {kept!r}: one part of a record of {piece.samples} samples would "
+                        "be empty",
+                    )
 
 
 def value_faults(pointer: str, body: Body) -> list[FieldError]:
@@ -146,7 +192,7 @@ def value_faults(pointer: str, body: Body) -> list[FieldError]:
         JobIn.model_validate(body)
     except ValidationError as error:
         faults = explained(error.errors(), body, JobIn)
-        return [FieldError(pointer, f"{one.pointer}: {one.detail}") for one in faults]
+        return [FieldError(pointer, str(one)) for one in faults]
     return []
 
 
@@ -211,22 +257,45 @@ def _channel_faults(
             )
 
 
+def _pieces(dataset: Dataset) -> list[_Piece]:
+    """The records that a dataset gives: its segments, or all of it."""
+    period = dataset.sample_time
+    spans = [one["stop"] - one["start"] for one in dataset.details.get("segments") or []]
+    if not spans:
+        return [_Piece(dataset.duration, dataset.n_samples, period)]
+    if period is None:  # how many samples each has is not stored; all together are enough to ask
+        return [_Piece(min(spans), dataset.n_samples, None)]
+    return [_Piece(span, round(span / period) + 1, period) for span in sorted(set(spans))]
+
+
 def _length_faults(
-    pointer: str, model: Model, parameters: tuple[Parameter, ...], dataset: Dataset, skip: int
+    pointer: str, model: Model, parameters: tuple[Parameter, ...], piece: _Piece, skip: int
 ) -> Iterator[FieldError]:
-    pieces = dataset.details.get("segments") or []
-    duration = min([piece["stop"] - piece["start"] for piece in pieces] or [dataset.duration])
-    samples = dataset.n_samples
-    period = model.solver.step or dataset.sample_time or duration / max(samples - 1, 1)
+    period = model.solver.step or piece.period or piece.duration / max(piece.samples - 1, 1)
     needed, signal = longest_delay(model, parameters, period)
-    if duration <= needed:
-        error = RecordTooShort(duration, needed, f"the largest lag of {signal!r}")
-        yield FieldError(pointer, str(error))
-    if samples <= model.memory + skip:
+    what = f"the largest lag of {signal!r}" if needed else "a simulation"
+    if piece.duration <= needed:
+        error = RecordTooShort(piece.duration, needed, what)
+        yield FieldError(pointer, f"{piece.words}{error}")
+    if piece.samples <= model.memory + skip:
         yield FieldError(
             pointer,
-            f"the record has {samples} samples; the model's memory ({model.memory}) and 'skip' "
-            f"({skip}) need more",
+            f"{piece.words}the record has {piece.samples} samples; the model's memory "
+            f"({model.memory}) and 'skip' ({skip}) need more",
+        )
+
+
+def _freedom_faults(
+    parameters: tuple[Parameter, ...] | None, population: int
+) -> Iterator[FieldError]:
+    free = [one for one in parameters or () if one.is_free]
+    if parameters is not None and not free:
+        yield FieldError("/parameters", "every parameter is fixed; leave one free")
+    if population * len(free) > MOST_GENES:
+        yield FieldError(
+            "/algorithm/population",
+            f"found {population} individuals of {len(free)} free parameters; need at most "
+            f"{MOST_GENES // len(free)}, so that the population fits into memory",
         )
 
 

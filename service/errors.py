@@ -39,6 +39,9 @@ class FieldError:
     detail: str
     column: int | None = None
 
+    def __str__(self) -> str:
+        return f"{self.pointer}: {self.detail}" if self.pointer else self.detail
+
     def as_dict(self) -> dict[str, Any]:
         """The entry of a problem document's ``errors``."""
         entry: dict[str, Any] = {"pointer": self.pointer, "detail": self.detail}
@@ -119,8 +122,7 @@ class InvalidRequest(ServiceError):
 
     def __init__(self, errors: Iterable[FieldError]) -> None:
         found = tuple(errors)
-        where = "; ".join(f"{error.pointer}: {error.detail}" for error in found)
-        super().__init__(where, found)
+        super().__init__("; ".join(map(str, found)), found)
 
     @classmethod
     def at(cls, pointer: str, detail: str) -> "InvalidRequest":

@@ -5,12 +5,13 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.orm import Session
 
 from service.checks import JobChecker, value_faults
 from service.errors import FieldError, InvalidRequest
 from service.schemas import Page
-from service.schemas_jobs import JobIn, JobOut, Progress
+from service.schemas_jobs import JobIn, JobOut, Progress, Seed, Sigma
 from service.settings import Settings
 from service.storage.jobs import JobRepository, NewJob, Submission
 from service.storage.ledger import Cell as StoredCell
@@ -19,8 +20,13 @@ from service.storage.lineage import LineageRepository
 from service.storage.tables import Job, State
 from service.sweeps import Cell, Step, body_of, count, expand, groups_of, steps_of, value_at
 
-# Any number does for these; to check each of a hundred thousand seeds would only take time.
-UNCHECKED = ("/seed", "/noise/seed", "/noise/sigma", "/priority")
+# Fields that no other field depends on: their values are checked alone, a whole body for each of
+# a hundred thousand seeds would only take time.
+ALONE: Mapping[str, TypeAdapter[Any]] = {
+    "/seed": TypeAdapter(Seed),
+    "/noise/seed": TypeAdapter(Seed),
+    "/noise/sigma": TypeAdapter(Sigma),
+}
 
 
 def submit(session: Session, body: JobIn, settings: Settings, key: str | None = None) -> Submission:
@@ -94,31 +100,46 @@ def page(session: Session, cursor: str | None, limit: int, states: list[State]) 
 def _check(checker: JobChecker, document: dict[str, Any], groups: list[list[Step]]) -> None:
     errors = checker.errors(body_of(document, {}))
     if not errors:
-        errors = [fault for step in _worth_checking(groups)
-                  for fault in _step_faults(checker, document, step)]  # fmt: skip
+        errors = list(_sweep_faults(checker, document, groups))
     if errors:
         unique = dict.fromkeys(errors)
         raise InvalidRequest(unique)
 
 
-def _worth_checking(groups: list[list[Step]]) -> Iterator[Step]:
-    for group in groups:
-        is_plain = all(path in UNCHECKED for path in group[0].cell.values)
-        yield from _ends(group) if is_plain and not group[0].is_listed else group
+def _sweep_faults(
+    checker: JobChecker, document: dict[str, Any], groups: list[list[Step]]
+) -> Iterator[FieldError]:
+    """Faults of the values; of a range or a logarithmic axis, those of its first bad value."""
+    told: set[str] = set()
+    for step in (step for group in groups for step in group):
+        if step.pointer in told or _is_good_alone(step.cell):
+            continue
+        found = list(_step_faults(checker, document, step))
+        if found:
+            told.add(step.pointer)
+        yield from found
 
 
-def _ends(group: list[Step]) -> list[Step]:
-    return [group[0], group[-1]]
+def _is_good_alone(cell: Cell) -> bool:
+    return all(path in ALONE and _fits(ALONE[path], value) for path, value in cell.values.items())
+
+
+def _fits(kind: TypeAdapter[Any], value: Any) -> bool:
+    try:
+        kind.validate_python(value)
+    except ValidationError:
+        return False
+    return True
 
 
 def _step_faults(checker: JobChecker, document: dict[str, Any], step: Step) -> Iterator[FieldError]:
     body = body_of(document, step.cell.values)
     wrong = value_faults(step.pointer, body)
     yield from wrong
-    if wrong or all(path in UNCHECKED for path in step.cell.values):
+    if wrong:
         return
     for fault in checker.errors(JobIn.model_validate(body).normal_form()):
-        yield FieldError(step.pointer, f"{fault.pointer}: {fault.detail}", fault.column)
+        yield FieldError(step.pointer, str(fault), fault.column)
 
 
 def _resolved(checker: JobChecker, spec: Mapping[str, Any], cell: Cell) -> Cell:

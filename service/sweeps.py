@@ -25,14 +25,10 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What one position of one group of axes sets, and where in the body it was written.
-
-    `is_listed`: the values were written out one by one, so that each may be wrong on its own.
-    """
+    """What one position of one group of axes sets, and where in the body it was written."""
 
     pointer: str
     cell: Cell
-    is_listed: bool = True
 
 
 def groups_of(job: JobIn) -> list[list[int]]:
@@ -130,8 +126,7 @@ def _zipped(axes: list[Axis], numbers: list[int]) -> list[Step]:
         for _, axis, _ in columns:
             labels.update(axis.labels[position] if axis.labels else {})
         cell = Cell({axis.path: values[position] for _, axis, values in columns}, labels)
-        is_listed = any(axis.values is not None for _, axis, _ in columns)
-        steps.append(Step(_pointer(numbers[0], axes[numbers[0]], position), cell, is_listed))
+        steps.append(Step(_pointer(numbers[0], axes[numbers[0]], position), cell))
     return steps
 
 

@@ -18,6 +18,7 @@ from service.errors import (
     NotFound,
     ServiceError,
     Unavailable,
+    UnsupportedMediaType,
 )
 from service.pointers import body_type, detail_of, explained
 from service.storage.errors import StorageError
@@ -93,6 +94,9 @@ def _sysid_error(request: Request, error: Exception) -> Response:
 
 def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
+    reason = _unreadable(error.__cause__)
+    if error.status_code == HTTPStatus.BAD_REQUEST and reason:
+        return _service_error(request, InvalidRequest.at("", reason))
     status = HTTPStatus(error.status_code)
     kind = KINDS.get(status, status.phrase.lower().replace(" ", "-"))
     detail = error.detail
@@ -103,6 +107,11 @@ def _http_error(request: Request, error: Exception) -> Response:
 
 def _validation_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
+    if isinstance(error.body, bytes):  # FastAPI reads no body that is not announced as JSON
+        kind = request.headers.get("content-type", "")
+        return _service_error(
+            request, UnsupportedMediaType(f"found {kind!r}; need application/json")
+        )
     return _service_error(request, InvalidRequest(_field_errors(request, error)))
 
 
@@ -111,6 +120,18 @@ def _unexpected(request: Request, error: Exception) -> Response:
     log.error("%s %s failed: %r", request.method, request.url.path, error)
     detail = "an unexpected error; it is in the log of the server"
     return problem(request, 500, "internal", "The service failed", detail)
+
+
+def _unreadable(cause: BaseException | None) -> str | None:
+    """Why a body could not be read as JSON, where FastAPI only says that it could not."""
+    match cause:
+        case UnicodeDecodeError():
+            return f"the body is not UTF-8 text: byte {cause.start} does not fit"
+        case RecursionError():
+            return "the body is nested too deeply"
+        case ValueError():
+            return "the body has a number with too many digits; need at most 4300"
+    return None
 
 
 def _field_errors(request: Request, error: RequestValidationError) -> Iterator[FieldError]:
@@ -122,5 +143,6 @@ def _field_errors(request: Request, error: RequestValidationError) -> Iterator[F
         elif place == "body":
             entries.append({**entry, "loc": loc})
         else:
-            yield FieldError(f"?{loc[-1] if loc else ''}", detail_of(entry, ()))
+            # What follows the name is a position among its values.
+            yield FieldError(f"?{loc[0] if loc else ''}", detail_of(entry, ()))
     yield from explained(entries, error.body, body_type(request.scope.get("endpoint")))

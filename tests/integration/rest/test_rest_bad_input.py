@@ -46,6 +46,23 @@ JOBS: list[tuple[dict[str, Any], str, str]] = [
     ({"validation": {"datasets": ["ds_x"]}}, "/validation/datasets/0", "'ds_x'"),
     ({"seed": -1}, "/seed", "found -1"),
     ({"trend": {"x": "length_m"}}, "/trend", "unknown field"),
+    ({"algorithm": {"stop": {"evaluations": 10**40}}}, "/algorithm/stop/evaluations", "10000000"),
+    ({"algorithm": {"stagnation": 10**30}}, "/algorithm/stagnation", "1000000000"),
+    ({"algorithm": {"mutation": [[0, 0.2], [10**30, 0.8]]}}, "/algorithm/mutation/1/0", "found 1"),
+    ({"algorithm": {"migration": {"every": 10**30}}}, "/algorithm/migration/every", "found 1"),
+    (
+        {"validation": {"fraction": 0.9}, "parameters": {"L": {"upper": 5}}},
+        "/datasets/0",
+        "part for estimation: the record lasts 2.9 s",
+    ),
+    ({"validation": {"fraction": 0.9}, "skip": 30}, "/datasets/0", "30 samples"),
+    ({"validation": {"fraction": 0.001}}, "/validation/fraction", "would be empty"),
+    ({"validation": {"fraction": 0.999}}, "/validation/fraction", "would be empty"),
+    (
+        {"parameters": {name: {"fixed": 1} for name in ("K", "T", "L", "y0", "x(0)")}},
+        "/parameters",
+        "leave one free",
+    ),
 ]
 
 
@@ -67,6 +84,10 @@ AXES: list[tuple[dict[str, Any], str, str]] = [
     ({"path": "/seed", "range": [5, 2]}, "range", "[5, 2]"),
     ({"path": "/seed", "range": [0, 900000]}, "axes", "900000 runs"),
     ({"path": "/noise/sigma", "log": [0, 1, 3]}, "log", "start > 0"),
+    ({"path": "/seed", "log": [1, 10, 5]}, "log", "found 1.778"),
+    ({"path": "/noise/seed", "log": [1, 10, 3]}, "log", "found 3.16"),
+    ({"path": "/seed", "range": [-3, 5]}, "range", "found -3"),
+    ({"path": "/algorithm/population", "log": [16, 64, 4]}, "log", "found 25.3"),
     ({"path": "/noise/sigma", "values": [0.1, "x"]}, "values/1", "found 'x'"),
     ({"path": "/algorithm/method", "values": ["simple", "bes"]}, "values/1", "found 'bes'"),
     ({"path": "/parameters/L/upper", "values": [1, -1]}, "values/1", "/parameters/L"),
@@ -247,18 +268,75 @@ def test_a_body_that_is_not_json_is_refused(server: TestClient) -> None:
     json_type = {"content-type": "application/json"}
     answer = server.post("/v1/jobs", content=b'{"model": ', headers=json_type)
     assert "not JSON" in refused(answer, 422, "invalid")[0]["detail"]
+    assert answer.json()["detail"].startswith("the body is not JSON")  # and no empty place
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b'{"model": "\xff"}', "not UTF-8 text: byte 11"),
+        (b"[" * 200_000, "nested too deeply"),
+        (b'{"seed": ' + b"9" * 5000 + b"}", "too many digits"),
+    ],
+)
+def test_a_body_that_no_json_reader_takes_is_refused_with_the_reason(
+    server: TestClient, text: bytes, words: str
+) -> None:
+    answer = server.post("/v1/jobs", content=text, headers={"content-type": "application/json"})
+    assert words in refused(answer, 422, "invalid")[0]["detail"]
+
+
+def test_a_body_that_is_not_said_to_be_json_is_of_another_kind(server: TestClient) -> None:
+    for kind in ("text/plain", "application/x-www-form-urlencoded"):
+        answer = server.post("/v1/jobs", content=b"{}", headers={"content-type": kind})
+        refused(answer, 415, "unsupported-media-type")
+        assert kind in answer.json()["detail"]
+
+
+def test_a_recording_is_not_taken_twice(server: TestClient, dataset: str) -> None:
+    for changes, pointer in (
+        ({"datasets": [dataset, "steps"]}, "/datasets/1"),
+        ({"validation": {"datasets": [dataset]}}, "/validation/datasets/0"),
+    ):
+        answer = server.post("/v1/jobs", json=with_changes(dataset, changes))
+        fault = refused(answer, 422, "invalid")[0]
+        assert fault["pointer"] == pointer
+        assert "same recording" in fault["detail"]
+
+
+def test_a_fixed_start_is_no_free_parameter_and_an_estimated_one_is(
+    server: TestClient, dataset: str
+) -> None:
+    model = {**MODEL, "initial": {"x": {"lower": -1, "upper": 1}}}
+    fixed = {"K": {"fixed": 1}, "L": {"fixed": 1}}
+    body = {"model": model, "datasets": [dataset], "parameters": fixed}
+    assert server.post("/v1/jobs", json=body).status_code == 202
+    body["parameters"] = {**fixed, "x(0)": {"fixed": 0}}
+    assert (
+        refused(server.post("/v1/jobs", json=body), 422, "invalid")[0]["pointer"] == "/parameters"
+    )
+
+
+def test_a_population_that_no_memory_holds_is_refused(server: TestClient, dataset: str) -> None:
+    names = [f"k{i}" for i in range(101)]
+    model = {**MODEL, "parameters": {name: {"lower": 0, "upper": 1} for name in names},
+             "equations": {"x": " + ".join(names) + " + u"}}  # fmt: skip
+    body = {"model": model, "datasets": [dataset], "algorithm": {"population": 100_000}}
+    fault = refused(server.post("/v1/jobs", json=body), 422, "invalid")[0]
+    assert fault["pointer"] == "/algorithm/population"
+    assert "at most 99009" in fault["detail"]
 
 
 @pytest.mark.parametrize(
     ("query", "pointer"),
     [("limit=0", "?limit"), ("limit=x", "?limit"), ("state=done", "?state"),
-     ("limit=5000", "?limit")],
+     ("limit=5000", "?limit"), ("state=queued&state=foo", "?state")],
 )  # fmt: skip
 def test_a_query_value_that_cannot_be_used_is_named(
     server: TestClient, query: str, pointer: str
 ) -> None:
     faults = refused(server.get(f"/v1/jobs?{query}"), 422, "invalid")
-    assert faults[0]["pointer"].startswith(pointer) or faults[0]["pointer"] == "?0"
+    assert faults[0]["pointer"] == pointer
 
 
 def test_a_text_that_no_database_can_keep_is_refused(server: TestClient, dataset: str) -> None:
