@@ -8,7 +8,7 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypedDict
 
 import httpx
 
@@ -23,8 +23,15 @@ TIMEOUT_S = 60.0
 PAGE = 500
 
 
-def _headers(key: str | None) -> dict[str, str]:
-    return {"Authorization": f"Bearer {key}"} if key else {}
+class _Options(TypedDict):
+    base_url: str
+    headers: dict[str, str]
+    timeout: float
+
+
+def _options(url: str, key: str | None) -> _Options:
+    headers = {"Authorization": f"Bearer {key}"} if key else {}
+    return _Options(base_url=url, headers=headers, timeout=TIMEOUT_S)
 
 
 class Client:
@@ -55,9 +62,7 @@ class Client:
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         self.url = url.rstrip("/")
-        self._http = httpx.Client(
-            base_url=self.url, headers=_headers(key), timeout=TIMEOUT_S, transport=transport
-        )
+        self._http = httpx.Client(**_options(self.url, key), transport=transport)
 
     def __enter__(self) -> Self:
         return self
@@ -251,9 +256,7 @@ class AsyncClient:
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self.url = url.rstrip("/")
-        self._http = httpx.AsyncClient(
-            base_url=self.url, headers=_headers(key), timeout=TIMEOUT_S, transport=transport
-        )
+        self._http = httpx.AsyncClient(**_options(self.url, key), transport=transport)
 
     async def __aenter__(self) -> Self:
         return self

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -21,9 +21,16 @@ Url = Annotated[str, typer.Option("--url", envvar="LAGID_URL", help="Address of 
 Key = Annotated[
     str | None, typer.Option("--key", envvar="LAGID_KEY", help="API key.", show_default=False)
 ]
+Segments = Annotated[
+    str | None, typer.Option(help="CSV columns of labels that part the rows: col,col.")
+]
+SampleTime = Annotated[
+    float | None, typer.Option(help="Sampling period in s, for a CSV without times.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for machines.")]
 
-__all__ = ["DEFAULT_URL", "AsJson", "Key", "Url", "connected", "fail", "out", "print_json"]
+__all__ = ["DEFAULT_URL", "AsJson", "Key", "SampleTime", "Segments", "Url", "connected", "fail",
+           "out", "print_json"]  # fmt: skip
 
 
 @contextmanager
@@ -65,6 +72,17 @@ def print_table(
         out.print(table)
     else:
         out.print(empty)
+
+
+def print_listing(
+    found: list[dict[str, Any]], as_json: bool, headings: Sequence[str],
+    row: Callable[[dict[str, Any]], Sequence[object]], *, empty: str,
+) -> None:  # fmt: skip
+    """Print what a server lists: as JSON, or one `row` each under headings."""
+    if as_json:
+        print_json(found)
+    else:
+        print_table(headings, map(row, found), empty=empty)
 
 
 def shown(value: object) -> str:

@@ -9,12 +9,14 @@ from service.cli.common import (
     DEFAULT_URL,
     AsJson,
     Key,
+    SampleTime,
+    Segments,
     Url,
     connected,
     fail,
     out,
     print_json,
-    print_table,
+    print_listing,
     read_file,
 )
 from service.documents import read_yaml
@@ -28,13 +30,12 @@ def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) ->
     """List the recordings of the server."""
     with connected(url, key) as client:
         found = client.datasets()
-    if as_json:
-        print_json(found)
-        return
-    print_table(
+    print_listing(
+        found,
+        as_json,
         ("id", "name", "kind", ">samples", ">duration [s]", "channels"),
-        ((one["id"], one["name"], one["kind"], one["samples"], one["duration"], _channels(one))
-         for one in found),
+        lambda one: (one["id"], one["name"], one["kind"], one["samples"], one["duration"],
+                     _channels(one)),
         empty="no datasets; add one: lagid dataset add recording.csv",
     )  # fmt: skip
 
@@ -43,12 +44,8 @@ def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) ->
 def add(
     file: Annotated[Path, typer.Argument(help="CSV or MCAP file.")],
     name: Annotated[str | None, typer.Option(help="Name; by default that of the file.")] = None,
-    segments: Annotated[
-        str | None, typer.Option(help="CSV columns of labels that part the rows: col,col.")
-    ] = None,
-    sample_time: Annotated[
-        float | None, typer.Option(help="Sampling period in s, for a CSV without times.")
-    ] = None,
+    segments: Segments = None,
+    sample_time: SampleTime = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,

@@ -16,6 +16,7 @@ from service.cli.common import (
     fail,
     out,
     print_json,
+    print_listing,
     print_table,
     read_file,
 )
@@ -61,15 +62,13 @@ def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) ->
     """List the jobs of the server, latest first."""
     with connected(url, key) as client:
         found = client.jobs()
-    if as_json:
-        print_json(found)
-        return
-    print_table(
+    print_listing(
+        found,
+        as_json,
         ("id", "name", "state", "model", ">runs", ">best RMS", "submitted"),
-        ((one["id"], one["name"], one["state"], one["model"],
-          f"{one['progress']['finished']}/{one['progress']['runs']}",
-          one["progress"]["best_rms"], one["created_at"][:19].replace("T", " "))
-         for one in found),
+        lambda one: (one["id"], one["name"], one["state"], one["model"],
+                     f"{one['progress']['finished']}/{one['progress']['runs']}",
+                     one["progress"]["best_rms"], one["created_at"][:19].replace("T", " ")),
         empty="no jobs; submit one: lagid submit job.yaml",
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from service.cli.common import (
     fail,
     out,
     print_json,
-    print_table,
+    print_listing,
     read_file,
 )
 from service.documents import read_yaml
@@ -44,14 +44,13 @@ def listing(
     if url is not None:
         with connected(url, key) as client:
             found = client.models()
-    if as_json:
-        print_json(found)
-        return
-    print_table(
+    print_listing(
+        found,
+        as_json,
         ("name", ">version", "form", "inputs", "outputs", "parameters", "title"),
-        ((one["name"], one["version"] or "built in", one["form"], ", ".join(one["inputs"]),
-          ", ".join(one["outputs"]), ", ".join(one["parameters"]), one["title"])
-         for one in found),
+        lambda one: (one["name"], one["version"] or "built in", one["form"],
+                     ", ".join(one["inputs"]), ", ".join(one["outputs"]),
+                     ", ".join(one["parameters"]), one["title"]),
         empty="no models",
     )  # fmt: skip
 

@@ -119,10 +119,10 @@ def _packages() -> str:
 def _kernels() -> str:
     """Compile a model and simulate it: the harmonic oscillator without force rests."""
     import numpy as np
-    from sysid.simulation import simulate
 
     from sysid.models.library import load_model
     from sysid.records import Channel
+    from sysid.simulation import simulate
 
     model = load_model("duffing-eq16")
     times = np.arange(20, dtype=np.float64) * 0.02
