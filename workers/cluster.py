@@ -1,8 +1,8 @@
 """Start or join Ray, and give it packs of work; nothing else of the program imports Ray.
 
-What Ray 2.60 does unasked, and what is done about it, stands in ``docs/decisions/0007-driving-ray.md``: it joins any
-cluster it finds, retries killed tasks, hangs when its raylet is gone, and listens on every
-interface (therefore the token).
+What Ray 2.60 does unasked, and what is done about it, stands in
+``docs/decisions/0007-driving-ray.md``: it joins any cluster it finds, retries killed tasks, hangs
+when its raylet is gone, and listens on every interface (therefore the token).
 """
 
 import contextlib
