@@ -15,7 +15,10 @@ from sysid.language.tree import Past
 from sysid.models.model import EstimatedInitial, FixedInitial, Model
 from sysid.parameters import Parameter
 from sysid.records import Channel, Record
-from sysid.types import FloatArray
+from sysid.types import BoolArray, FloatArray
+
+# Beyond these, a weight is a mistake, and squares of weighted residuals might not be numbers.
+_LEAST_WEIGHT, _MOST_WEIGHT = 1e-100, 1e100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,10 +61,13 @@ def output_weights(
 ) -> dict[str, float]:
     """Weight of each output: 1 for one output, else as given or 1 / its standard deviation.
 
+    With one output a weight would only change the unit of J, and the meaning of a loss scale and
+    a target RMS with it; so none is applied.
+
     Raises
     ------
     InvalidSettings
-        If a weight names no output or is not a positive number.
+        If a weight names no output or is not a number from 1e-100 to 1e100.
     InvalidRecord
         If an output without a given weight is constant.
     """
@@ -71,9 +77,10 @@ def output_weights(
             raise InvalidSettings(
                 f"/weights/{name}", f"the model has no output {name!r}{nearest(name, names)}"
             )
-        if not 0 < weight < np.inf:
-            raise InvalidSettings(f"/weights/{name}", f"{weight!r} is not a positive number")
-    if weights is None and len(names) == 1:
+        if not _LEAST_WEIGHT <= weight <= _MOST_WEIGHT:
+            need = f"need a number from {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g}"
+            raise InvalidSettings(f"/weights/{name}", f"{weight!r} is not a weight; {need}")
+    if len(names) == 1:
         return {names[0]: 1.0}
     given = weights or {}
     return {
@@ -96,8 +103,9 @@ def _reciprocal_deviation(name: str, records: Sequence[Record], skip: int) -> fl
 def lay_out(
     model: Model, record: Record, experiment: int, parameters: Sequence[Parameter],
     weights: Mapping[str, float], skip: int, simulates_only: bool = False,
+    scored_from: float = -np.inf,
 ) -> Experiment:  # fmt: skip
-    """Lay one record out for a model.
+    """Lay one record out for a model; samples before `scored_from` (s) are not scored.
 
     Raises
     ------
@@ -108,7 +116,7 @@ def lay_out(
     outputs = [_channel(record.outputs, output.name, "output") for output in model.outputs]
     if not simulates_only:
         for channel in outputs:
-            _check_scored(channel, skip)
+            _check_scored(channel, skip, scored_from)
     grid = grid_of(model, inputs, outputs)
     if is_difference(model) and grid.points <= model.memory:
         raise RecordTooShort(grid.duration, model.memory * grid.step, "the model's memory")
@@ -119,7 +127,7 @@ def lay_out(
     return Experiment(
         grid,
         tuple(fine_inputs(model, inputs, spans, grid)),
-        tuple(_samples(model, grid, c, weights[c.name], skip) for c in outputs),
+        tuple(_samples(model, grid, c, weights[c.name], skip, scored_from) for c in outputs),
         tuple(_starts(model, grid, outputs, experiment, rows)),
         max([0.0, *largest_lags(model, "state", spans, grid).values()]),
     )
@@ -144,18 +152,25 @@ def _input(record: Record, name: str) -> Channel:
     return channel
 
 
-def _check_scored(channel: Channel, skip: int) -> None:
-    if not np.any(np.isfinite(channel.values[skip:])):
+def _check_scored(channel: Channel, skip: int, scored_from: float) -> None:
+    if not np.any(_is_scored(channel, skip, scored_from)):
+        later = "" if scored_from == -np.inf else f" and from {scored_from:g} s on"
         raise InvalidRecord(
             f"output {channel.name!r} has {channel.values.size} samples and none with a value "
-            f"after the first {skip}; nothing is left to compare with"
+            f"after the first {skip}{later}; nothing is left to compare with"
         )
 
 
-def _samples(model: Model, grid: Grid, channel: Channel, weight: float, skip: int) -> Samples:
-    known = np.isfinite(channel.values)
-    weights = np.where(known & (np.arange(known.size) >= skip), weight, 0.0)
-    values = np.where(known, channel.values, 0.0)
+def _is_scored(channel: Channel, skip: int, scored_from: float) -> BoolArray:
+    late = (np.arange(channel.times.size) >= skip) & (channel.times >= scored_from)
+    return np.asarray(np.isfinite(channel.values) & late)
+
+
+def _samples(
+    model: Model, grid: Grid, channel: Channel, weight: float, skip: int, scored_from: float
+) -> Samples:
+    weights = np.where(_is_scored(channel, skip, scored_from), weight, 0.0)
+    values = np.where(np.isfinite(channel.values), channel.values, 0.0)
     return Samples(sample_places(grid, model, channel), values, weights,
                    _on_grid(grid, channel))  # fmt: skip
 

@@ -16,7 +16,9 @@ _DIFFERENCE = 1e-6  # of the range
 _STEPS = 60
 _LONG = 2_000_000  # measured values times parameters: from here on, few starts and steps
 _AT_BOUND = 1e-6
-_REJECTED = 1e10  # residual of a diverged simulation: finite, so that a smaller step is tried
+# Residual of a diverged simulation, in units of the outputs: finite, so that a smaller step is
+# tried.
+_REJECTED = 1e10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,9 +60,9 @@ def _refined(
     problem: Problem, start: FloatArray, place: FloatArray, rms: float, left: int
 ) -> Refined:
     """Least squares from one start; the search may use `left` simulations."""
-    search = _LeastSquares(problem)
+    search = _LeastSquares(problem, max(problem.output_scale, rms))
     steps = min(_STEPS, left // (place.size + 2))
-    scale = loss_scale(problem)
+    scale = loss_scale(problem) / search.unit
     solved = least_squares(
         search.residuals, place, search.jacobian, bounds=(0.0, 1.0), method="trf",
         loss="soft_l1" if scale > 0 else "linear", f_scale=scale or 1.0,
@@ -73,21 +75,27 @@ def _refined(
 
 
 class _LeastSquares:
-    """Residuals and Jacobian over places in [0, 1], counting simulations."""
+    """Residuals and Jacobian over places in [0, 1], counting simulations.
 
-    def __init__(self, problem: Problem) -> None:
+    Residuals are in units of about the outputs' `scale`, so that the tolerances of the search and
+    what counts as diverged do not depend on the outputs' unit. It is a power of two: no rounding.
+    """
+
+    def __init__(self, problem: Problem, scale: float) -> None:
         self.problem, self.evaluations = problem, 0
+        self.unit = float(np.ldexp(1.0, int(np.frexp(scale)[1]))) if scale > 0 else 1.0
         self._scored = problem.evaluator.weight > 0
 
     def _predictions(self, places: FloatArray) -> FloatArray:
         self.evaluations += places.shape[0]
         theta = located(self.problem.evaluator, np.ascontiguousarray(places))
-        weight = self.problem.evaluator.weight[self._scored]
+        weight = self.problem.evaluator.weight[self._scored] / self.unit
         return np.asarray(weight * self.problem.predictions(theta)[:, self._scored])
 
     def residuals(self, place: FloatArray) -> FloatArray:
         evaluator = self.problem.evaluator
-        measured = evaluator.weight[self._scored] * evaluator.measured[self._scored]
+        weight = evaluator.weight[self._scored] / self.unit
+        measured = weight * evaluator.measured[self._scored]
         with np.errstate(invalid="ignore", over="ignore"):
             error = self._predictions(place[None])[0] - measured
         finite = bool(np.all(np.abs(error) < _REJECTED))

@@ -34,7 +34,10 @@ class Estimate:
 
 
 class Improvement(NamedTuple):
-    """A better champion of one island: the RMS history is kept as these only, without loss."""
+    """A better champion of one island: the RMS history is kept as these only, without loss.
+
+    `rms` is the fitness: J of Eq. 10, with soft-l1 √(robust loss / n) in its stead.
+    """
 
     generation: int
     evaluations: int
@@ -54,7 +57,10 @@ class Migrant(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class IslandSummary:
-    """What one island found, before and after refinement (for the waterfall)."""
+    """What one island found, before and after refinement (for the waterfall).
+
+    The two RMS are fitnesses: J of Eq. 10, with soft-l1 √(robust loss / n) in its stead.
+    """
 
     champion_rms: float
     refined_rms: float | None

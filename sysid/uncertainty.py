@@ -7,21 +7,24 @@ scale: of its logarithm).
 With squares the covariance is s²(SᵀS)⁻¹, s² = Σe²/(n − D). With the soft-l1 loss it is that of an
 M-estimator (sandwich): n/(n − D) · (SᵀKS)⁻¹ (SᵀΨ²S) (SᵀKS)⁻¹ with ψ = e/√(1 + (e/s)²) and
 K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals unduly.
+
+Where the output does not change on a plateau of width w (a lag that is rounded to whole samples),
+nothing tells where in it the parameter lies: w²/12 is added to its variance.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import stdtrit
 
-from sysid.ga.chromosome import located, placed
+from sysid.ga.chromosome import placed
 from sysid.islands.archipelago import loss_scale
 from sysid.parameters import Parameter
 from sysid.problem import Problem
 from sysid.result import Estimate, EstimateStatus, Uncertainty
+from sysid.sensitivities import sensitivities
 from sysid.types import FloatArray
 
-_DIFFERENCES = (1e-5, 1e-3, 1e-2)  # of the range; the larger ones where the output does not move
 _RANK = 1e-7  # of the largest singular value: below, the differences are rounding
 _SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
 # Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
@@ -51,37 +54,9 @@ class Analysis:
     evaluations: int
 
 
-def sensitivities(problem: Problem, theta: FloatArray) -> tuple[FloatArray, FloatArray, int]:
-    """Weighted residuals (n,), S (n, D) by central differences, and the simulations run.
-
-    Beside a bound the difference is one-sided. A column that stays zero is tried again with
-    larger steps: with a rounded lag the output moves in jumps only.
-    """
-    scored = problem.evaluator.weight > 0
-    weight = problem.evaluator.weight[scored]
-    place = placed(problem.evaluator, theta[None])[0]
-    columns = np.zeros((weight.size, place.size))
-    count = 1
-    predicted = problem.predictions(theta[None])[0][scored]
-    for step in _DIFFERENCES:
-        flat = np.flatnonzero(~np.any(columns != 0.0, axis=0))
-        if flat.size == 0:
-            break
-        low, high = np.maximum(place - step, 0.0), np.minimum(place + step, 1.0)
-        around = np.repeat(place[None], 2 * flat.size, axis=0)
-        for row, d in enumerate(flat):
-            around[2 * row, d], around[2 * row + 1, d] = low[d], high[d]
-        moved = problem.predictions(located(problem.evaluator, around))[:, scored]
-        count += around.shape[0]
-        with np.errstate(invalid="ignore", over="ignore"):
-            slopes = (moved[1::2] - moved[0::2]) / (high - low)[flat][:, None]
-        columns[:, flat] = (weight * np.where(np.isfinite(slopes), slopes, 0.0)).T
-    return weight * (predicted - problem.evaluator.measured[scored]), columns, count
-
-
 def analyse(problem: Problem, theta: FloatArray) -> Analysis:
     """Standard errors, correlations and identifiability at an estimate (D,)."""
-    error, columns, count = sensitivities(problem, theta)
+    error, columns, plateau, one_sided, count = sensitivities(problem, theta)
     n, d = columns.shape
     if n <= d:
         reason = f"{n} samples are not more than {d} parameters"
@@ -91,10 +66,12 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
     inverse = (directions[known].T / singular[known] ** 2) @ directions[known]
     covariance, noise = _covariance(error, columns, inverse, loss_scale(problem))
     place = placed(problem.evaluator, theta[None])[0]
-    gain = _possible_gain(_influence(error, loss_scale(problem)), columns, place)
+    # No step of least squares gains from a parameter on a plateau: there the loss is flat.
+    sloping = np.where(plateau > 0, 0.0, columns)
+    gain = _possible_gain(_influence(error, loss_scale(problem)), sloping, place)
     statuses = _statuses(place, singular, directions, known, noise)
     scale = _physical(problem, theta)
-    physical = covariance * np.outer(scale, scale)
+    physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
     uncertainty = Uncertainty(
         names=tuple(p.name for p in problem.space),
         covariance=physical,
@@ -103,9 +80,17 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
         singular_values=singular,
         noise_sd=noise,
     )
+    jumps = {p.name for p, one in zip(problem.space, one_sided, strict=True) if one}
     blind = np.any(directions[~known] ** 2 > _NULL_MEMBER, axis=0) if not known.all() else None
     estimates = _estimates(problem, theta, statuses, np.sqrt(np.diag(physical)), blind, n - d)
+    estimates = tuple(_on_one_side(e) if e.name in jumps else e for e in estimates)
     return Analysis(estimates, uncertainty, min(gain, 1.0), count)
+
+
+def _on_one_side(estimate: Estimate) -> Estimate:
+    """An estimate whose slope is not known because the output jumps on one side of it only."""
+    reason = "the output changes with it in jumps, and here on one side only"
+    return replace(estimate, stderr=None, interval95=None, reason=reason)
 
 
 def _influence(error: FloatArray, scale: float) -> FloatArray:

@@ -175,7 +175,7 @@ def test_options_that_cannot_be_used_are_refused() -> None:
         Problem.build(model, data, skip=-1)
     with pytest.raises(InvalidSettings, match="/weights/z: the model has no output"):
         Problem.build(model, data, weights={"z": 1.0})
-    with pytest.raises(InvalidSettings, match="not a positive number"):
+    with pytest.raises(InvalidSettings, match="is not a weight"):
         Problem.build(model, data, weights={"y": 0.0})
     with pytest.raises(InvalidSettings, match="no parameter 'q'"):
         Problem.build(model, data, parameters={"q": {"fixed": 1.0}})
@@ -195,3 +195,17 @@ def test_a_state_that_nothing_measures_cannot_start_measured() -> None:
     ).model.initial
     with pytest.raises(InvalidRecord, match="state 'x' is to start at its measured value"):
         Problem.build(replace(model, initial=measured), [record()])
+
+
+@pytest.mark.parametrize("loss", [Loss(), Loss("soft-l1", 0.1)])
+def test_the_weight_of_a_single_output_changes_nothing(loss: Loss) -> None:
+    plain = Problem.build(duffing(), [record()], loss=loss)
+    weighted = Problem.build(duffing(), [record()], loss=loss, weights={"y": 100.0})
+    theta = individuals(plain, 3)
+    np.testing.assert_array_equal(weighted.fitness(theta), plain.fitness(theta))
+
+
+@pytest.mark.parametrize("weight", [1e-300, 1e308, np.inf, np.nan, -1.0])
+def test_weights_that_no_number_can_square_are_refused(weight: float) -> None:
+    with pytest.raises(InvalidSettings, match="/weights/y: .*need a number from"):
+        Problem.build(duffing(), [record()], weights={"y": weight})

@@ -1,13 +1,16 @@
 """Least squares from the champions: never worse, inside the bounds, counted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sysid.models.library import load_model
 from sysid.problem import Problem
+from sysid.records import Channel, Record
 from sysid.refinement import refine
 from sysid.settings import Loss
-from tests.searching import example, noisy, record
+from tests.searching import example, force, noisy, record
 
 NEAR = np.array([0.22, 0.52, 5.1, 1.1])
 
@@ -59,3 +62,21 @@ def test_robust_refinement_withstands_outliers() -> None:
     end = refine(robust, [NEAR])[0]
     assert end is not None
     assert end.theta[1] == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
+def test_refinement_does_not_depend_on_the_unit_of_the_data(unit: float) -> None:
+    document = {
+        "name": "test", "form": "difference", "inputs": {"q": "N"}, "states": {"x": "m"},
+        "parameters": {"g": {"lower": 0, "upper": 10}, "p": {"lower": 0, "upper": 0.9}},
+        "equations": {"x": "g*q(k-1) + p*x(k-1)"}, "outputs": {"y": "x"}, "initial": {"x": 0},
+    }  # fmt: skip
+    source = force(100)
+    source = replace(source, values=unit * source.values)
+    y = np.zeros(100)
+    for k in range(1, 100):
+        y[k] = 2.0 * source.values[k - 1] + 0.5 * y[k - 1]
+    data = Record((source,), (Channel("y", source.times, y, "m"),))
+    end = refine(Problem.build(load_model(document), [data]), [np.array([7.0, 0.2])])[0]
+    assert end is not None
+    assert end.theta == pytest.approx([2.0, 0.5], rel=1e-9)

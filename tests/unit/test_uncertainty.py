@@ -148,3 +148,40 @@ def test_outliers_widen_robust_standard_errors_little() -> None:
     plain, robust = errors(y, Loss()), errors(outliers, loss)
     assert np.all(robust < 2 * plain)
     assert np.all(errors(outliers, Loss()) > 5 * plain)
+
+
+def rounded(n: int = 300) -> Problem:
+    """Example 1 where the model's lag is rounded to whole samples of 20 ms."""
+    model = load_model("duffing-eq16").document
+    solver = {"history": "constant", "interpolation": "nearest"}
+    return Problem.build(load_model({**model, "solver": solver}), [record(noisy(n=n))])
+
+
+def test_a_rounded_lag_is_no_surer_than_its_plateau() -> None:
+    problem = rounded()
+    errors = []
+    for lag in (0.4912, 0.4951, 0.5, 0.5049, 0.5088, 0.5099, 0.50999):  # all the same samples
+        analysis = analyse(problem, np.array([0.2, lag, 5.0, 1.0]))
+        found = by_name(analysis.estimates)["L"]
+        assert found.status == "identified"
+        assert found.stderr is not None
+        errors.append(found.stderr)
+    expected = np.hypot(0.02 / np.sqrt(12), BOUND["L"])
+    assert errors == pytest.approx([expected] * len(errors), rel=0.1)
+
+
+def test_a_rounded_lag_leaves_the_other_standard_errors_alone() -> None:
+    found = by_name(analyse(rounded(), np.array([0.2, 0.5, 5.0, 1.0])).estimates)
+    for name in ("c", "b", "a"):
+        assert found[name].stderr == pytest.approx(BOUND[name], rel=0.25)
+
+
+def test_a_rounded_lag_at_its_bound_has_no_standard_error_and_says_why() -> None:
+    changes = {"L": {"lower": 0.5, "upper": 1.0}}
+    model = load_model({**load_model("duffing-eq16").document,
+                        "solver": {"history": "constant", "interpolation": "nearest"}})  # fmt: skip
+    problem = Problem.build(model, [record(noisy())], parameters=changes)
+    found = by_name(analyse(problem, np.array([0.2, 0.5, 5.0, 1.0])).estimates)["L"]
+    assert found.stderr is None
+    assert found.interval95 is None
+    assert "jumps" in found.reason

@@ -1,0 +1,121 @@
+"""How the simulated output moves with each free parameter, also where it moves in jumps only.
+
+A lag that is rounded to whole samples (nearest interpolation) leaves the output unchanged on a
+*plateau* and changes it at the plateau's ends. A small difference says nothing there: it is zero,
+or as large as the step is small. So each side is searched for the nearest jump, and the slope is
+taken from the middle of the plateau below to the middle of the plateau above.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.ga.chromosome import located, placed
+from sysid.problem import Problem
+from sysid.types import BoolArray, FloatArray, IntArray
+
+_DIFFERENCE = 1e-5  # of the range
+_GROWTH, _LARGEST = 4.0, 0.7  # of the step of the search for a jump; the largest, of the range
+_HALVINGS = 6  # a jump's place is then known to about 1 % of its distance
+
+
+class Sensitivities(NamedTuple):
+    """Weighted residuals and their slopes at an estimate, over the places in [0, 1].
+
+    Attributes
+    ----------
+    error : FloatArray, shape (n,)
+    columns : FloatArray, shape (n, D)
+        ∂ŷ/∂p, weighted; zero where none is known.
+    plateau : FloatArray, shape (D,)
+        Width on which the output does not change with that parameter; 0: it changes at once.
+    one_sided : BoolArray, shape (D,)
+        The output changes on one side of the estimate only, and not at once: no slope.
+    evaluations : int
+    """
+
+    error: FloatArray
+    columns: FloatArray
+    plateau: FloatArray
+    one_sided: BoolArray
+    evaluations: int
+
+
+def sensitivities(problem: Problem, theta: FloatArray) -> Sensitivities:
+    """Central differences at an estimate (D,); beside a bound one-sided."""
+    probe = _Probe(problem, theta)
+    d = probe.place.size
+    columns, plateau = np.zeros((probe.weight.size, d)), np.zeros(d)
+    one_sided = np.zeros(d, dtype=np.bool_)
+    everything = np.arange(d)
+    low, below = probe.at(everything, np.full(d, -_DIFFERENCE))
+    high, above = probe.at(everything, np.full(d, _DIFFERENCE))
+    here = probe.predicted[:, None]
+    moves = (np.any(below != here, axis=0) | (low == 0.0)) & (
+        np.any(above != here, axis=0) | (high == 0.0)
+    )
+    with np.errstate(invalid="ignore", over="ignore"):
+        columns[:, moves] = ((above - below) / (high - low))[:, moves]
+        jumping = np.flatnonzero(~moves)
+        if jumping.size:
+            down, below = probe.jumps(jumping, -1.0)
+            up, above = probe.jumps(jumping, 1.0)
+            both = np.isfinite(down) & np.isfinite(up)
+            width = np.where(both, up + down, 0.0)
+            plateau[jumping], one_sided[jumping] = width, np.isfinite(down) != np.isfinite(up)
+            steps = np.where(both, 2.0 * width, np.inf)
+            columns[:, jumping] = np.where(both, (above - below) / steps, 0.0)
+        columns = probe.weight[:, None] * np.where(np.isfinite(columns), columns, 0.0)
+        error = probe.weight * (probe.predicted - probe.measured)
+    return Sensitivities(error, columns, plateau, one_sided, probe.evaluations)
+
+
+class _Probe:
+    """The scored output beside an estimate, one parameter moved at a time."""
+
+    def __init__(self, problem: Problem, theta: FloatArray) -> None:
+        self._problem = problem
+        self._scored = problem.evaluator.weight > 0
+        self.weight = problem.evaluator.weight[self._scored]
+        self.measured = problem.evaluator.measured[self._scored]
+        self.place = placed(problem.evaluator, theta[None])[0]
+        self.predicted = problem.predictions(theta[None])[0][self._scored]
+        self.evaluations = 1
+
+    def at(self, which: IntArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Steps taken, cut off at the bounds, and the outputs there: (n, number of `which`)."""
+        moved = np.clip(self.place[which] + steps, 0.0, 1.0)
+        around = np.repeat(self.place[None], which.size, axis=0)
+        around[np.arange(which.size), which] = moved
+        predicted = self._problem.predictions(located(self._problem.evaluator, around))
+        self.evaluations += which.size
+        return moved - self.place[which], np.ascontiguousarray(predicted[:, self._scored].T)
+
+    def jumps(self, which: IntArray, side: float) -> tuple[FloatArray, FloatArray]:
+        """Distance of each parameter's nearest jump on one side, and the outputs beyond it.
+
+        The distance is infinite where there is none.
+        """
+        near, far = np.zeros(which.size), np.full(which.size, np.inf)
+        beyond = np.repeat(self.predicted[:, None], which.size, axis=1)
+        step = _DIFFERENCE
+        while step < _LARGEST and np.any(np.isinf(far)):
+            self._try(which, side, np.full(which.size, step), near, far, beyond)
+            step *= _GROWTH
+        for _ in range(_HALVINGS):
+            self._try(which, side, 0.5 * (near + far), near, far, beyond)
+        return far, beyond
+
+    def _try(
+        self, which: IntArray, side: float, steps: FloatArray,
+        near: FloatArray, far: FloatArray, beyond: FloatArray,
+    ) -> None:  # fmt: skip
+        """Narrow down each jump, in place, by the output at one more step of each parameter."""
+        open_ = np.flatnonzero((near < steps) & (steps < far))
+        if open_.size == 0:
+            return
+        taken, predicted = self.at(which[open_], side * steps[open_])
+        moved = np.any(predicted != self.predicted[:, None], axis=0)
+        far[open_[moved]] = np.abs(taken[moved])
+        beyond[:, open_[moved]] = predicted[:, moved]
+        near[open_[~moved]] = steps[open_[~moved]]
