@@ -120,13 +120,23 @@ def _sweep_faults(
         yield from found
 
 
+def _of_another_type(step: Step, whole: dict[str, Any]) -> Iterator[FieldError]:
+    """Values that a body would take for others, as '3' for 3: workers take a cell's as they are."""
+    for path, value in step.cell.values.items():
+        if not isinstance(value, str | bool | float):
+            continue
+        taken = value_at(whole, path)
+        if not isinstance(taken, type(value) | list):
+            yield FieldError(step.pointer, f"{path}: found {value!r}; write {taken!r}")
+
+
 def _is_good_alone(cell: Cell) -> bool:
     return all(path in ALONE and _fits(ALONE[path], value) for path, value in cell.values.items())
 
 
 def _fits(kind: TypeAdapter[Any], value: Any) -> bool:
     try:
-        kind.validate_python(value)
+        kind.validate_python(value, strict=True)
     except ValidationError:
         return False
     return True
@@ -138,7 +148,9 @@ def _step_faults(checker: JobChecker, document: dict[str, Any], step: Step) -> I
     yield from wrong
     if wrong:
         return
-    for fault in checker.errors(JobIn.model_validate(body).normal_form()):
+    whole = JobIn.model_validate(body).normal_form()
+    yield from _of_another_type(step, whole)
+    for fault in checker.errors(whole):
         yield FieldError(step.pointer, str(fault), fault.column)
 
 

@@ -109,7 +109,12 @@ def values_of(axis: Axis) -> list[Any]:
     assert axis.log is not None
     start, stop, points = axis.log
     ratio = log(stop / start) / max(points - 1, 1)
-    return [start * exp(ratio * i) for i in range(points - 1)] + [stop]
+    return [_plain(start * exp(ratio * i)) for i in range(points - 1)] + [_plain(stop)]
+
+
+def _plain(value: float) -> float | int:
+    """A whole number as such, so that fields of whole numbers take it."""
+    return int(value) if value.is_integer() and value < 2**53 else value
 
 
 def _child(here: dict[str, Any], part: str) -> Any:

@@ -86,6 +86,8 @@ AXES: list[tuple[dict[str, Any], str, str]] = [
     ({"path": "/noise/sigma", "log": [0, 1, 3]}, "log", "start > 0"),
     ({"path": "/seed", "log": [1, 10, 5]}, "log", "found 1.778"),
     ({"path": "/noise/seed", "log": [1, 10, 3]}, "log", "found 3.16"),
+    ({"path": "/seed", "values": [1, "3"]}, "values/1", "found '3'; write 3"),
+    ({"path": "/algorithm/population", "values": [50.0]}, "values/0", "found 50.0; write 50"),
     ({"path": "/seed", "range": [-3, 5]}, "range", "found -3"),
     ({"path": "/algorithm/population", "log": [16, 64, 4]}, "log", "found 25.3"),
     ({"path": "/noise/sigma", "values": [0.1, "x"]}, "values/1", "found 'x'"),
