@@ -12,6 +12,7 @@ from sysid.problem import Problem, metrics_of
 from sysid.refinement import Refined, refine
 from sysid.result import Estimate, Identification, Improvement, IslandSummary
 from sysid.settings import GeneticAlgorithm
+from sysid.threads import one_thread
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis, analyse
 from sysid.warnings import warnings_of
@@ -35,6 +36,13 @@ def conclude(
     """
     if not np.isfinite(state.rms):
         raise DivergedEverywhere(state.evaluations)
+    with one_thread():  # so that the last bit does not depend on the number of cores
+        return _concluded(problem, algorithm, state, validation)
+
+
+def _concluded(
+    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, validation: Problem | None
+) -> Identification:
     champions = [_champion(problem, island.history) for island in state.islands]
     refined = _polished(problem, algorithm, state, champions)
     ends = [
@@ -46,7 +54,7 @@ def conclude(
     analysis = analyse(problem, theta)
     simulated = problem.predictions(theta[None])[0]
     metrics = metrics_of(problem, simulated)
-    kept = None if validation is None else _validated(validation, analysis.estimates)
+    kept = None if validation is None else _validated(validation, problem, analysis.estimates)
     limit = algorithm.safe_limit
     return Identification(
         estimates=analysis.estimates,
@@ -131,19 +139,22 @@ class _Validated(NamedTuple):
     simulated: tuple[tuple[FloatArray, ...], ...]
 
 
-def _validated(validation: Problem, estimates: tuple[Estimate, ...]) -> _Validated:
+def _validated(
+    validation: Problem, estimation: Problem, estimates: tuple[Estimate, ...]
+) -> _Validated:
     """Agreement and simulation on data that were not used.
 
-    The model's parameters are those of the estimate. An initial state belongs to its record, so
-    those of the validation records are found on them, alone.
+    The model's parameters are those of the estimate, and so are the weights, so that both RMS
+    are in the same measure. An initial state belongs to its record: where the last part of the
+    same records is judged it is the estimated one, on other records it is found on them, alone.
     """
-    model, records, changes, prediction, loss, weights, skip = validation.arguments
-    own = {p.name for p in model.parameters}
+    model, records, changes, prediction, loss, _, skip, since = validation.arguments
+    own = {p.name for p in (model.parameters if since is None else validation.all_parameters)}
     fixed = {e.name: {"fixed": e.value} for e in estimates if e.name in own}
     kept = {name: fields for name, fields in changes.items() if name not in own}
     known = Problem.build(
         model, records, parameters={**kept, **fixed}, prediction=prediction, loss=loss,
-        weights=weights, skip=skip,
+        weights=estimation.output_weights, skip=skip, scored_from=since,
     )  # fmt: skip
     theta = np.zeros(0)
     if known.space:
@@ -151,4 +162,19 @@ def _validated(validation: Problem, estimates: tuple[Estimate, ...]) -> _Validat
         start = refine(known, [middle])[0]
         theta = middle if start is None else start.theta
     simulated = known.predictions(theta[None])[0]
-    return _Validated(metrics_of(known, simulated), _split(known, simulated))
+    return _Validated(metrics_of(known, simulated), _judged(known, _split(known, simulated)))
+
+
+def _judged(
+    known: Problem, simulated: tuple[tuple[FloatArray, ...], ...]
+) -> tuple[tuple[FloatArray, ...], ...]:
+    """The part from the time on at which the records are scored, at its measured times."""
+    if known.scored_from is None:
+        return simulated
+    names = [output.name for output in known.model.outputs]
+    kept = []
+    for record, since, outputs in zip(known.records, known.scored_from, simulated, strict=True):
+        times = {channel.name: channel.times for channel in record.outputs}
+        late = [times[name] >= since for name in names]
+        kept.append(tuple(part[mask] for part, mask in zip(outputs, late, strict=True)))
+    return tuple(kept)

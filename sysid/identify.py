@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+from sysid.errors import InvalidSettings
 from sysid.models.model import Model
 from sysid.noise import Noise, with_noise
 from sysid.problem import Problem
-from sysid.records import Record
+from sysid.records import Record, split_record, start_of_validation
 from sysid.result import Identification
 from sysid.run import RunState, advance, begin, conclude, is_finished
 from sysid.settings import GeneticAlgorithm, Loss, Prediction
@@ -27,6 +28,7 @@ def identify(
     weights: Mapping[str, float] | None = None,
     skip: int = 0,
     validation: Record | Sequence[Record] | None = None,
+    validation_fraction: float | None = None,
     noise: Noise | None = None,
     warm: Mapping[str, float] | None = None,
     progress: Callable[[RunState], None] | None = None,
@@ -45,6 +47,8 @@ def identify(
         See `Problem.build`.
     validation : Record or sequence of Record
         Data that are not used for the estimate.
+    validation_fraction : float
+        Instead of `validation`: the last part of each record, simulated with all before it.
     noise : Noise
         Added to the outputs of `records` before fitting.
     warm : mapping of str to float
@@ -60,21 +64,40 @@ def identify(
         If an argument cannot be used.
     """
     algorithm = settings or GeneticAlgorithm()
-    problem = partial(
-        Problem.build, model, parameters=parameters, prediction=prediction, loss=loss,
-        weights=weights, skip=skip,
-    )  # fmt: skip
-    estimation = _several(records)
-    if noise is not None:
-        estimation = tuple(with_noise(record, noise, e) for e, record in enumerate(estimation))
-    posed = problem(estimation)
-    kept = None if validation is None else problem(_several(validation))
+    pose = partial(
+        Problem.build, model, parameters=parameters, prediction=prediction, loss=loss, skip=skip
+    )
+    posed = pose(_estimation(_several(records), validation_fraction, noise), weights=weights)
+    kept, since = _kept(_several(records), validation, validation_fraction)
+    judged = None if kept is None else pose(kept, weights=posed.output_weights, scored_from=since)
     state = begin(posed, algorithm, seed, warm)
     while not is_finished(algorithm, state):
         state = advance(posed, algorithm, state, _PROGRESS_SECONDS)
         if progress is not None:
             progress(state)
-    return conclude(posed, algorithm, state, kept)
+    return conclude(posed, algorithm, state, judged)
+
+
+def _estimation(
+    records: tuple[Record, ...], fraction: float | None, noise: Noise | None
+) -> tuple[Record, ...]:
+    """Records that the model is fitted to."""
+    if fraction is not None:
+        records = tuple(split_record(record, fraction)[0] for record in records)
+    if noise is None:
+        return records
+    return tuple(with_noise(record, noise, e) for e, record in enumerate(records))
+
+
+def _kept(
+    whole: tuple[Record, ...], validation: Record | Sequence[Record] | None, fraction: float | None
+) -> tuple[tuple[Record, ...] | None, list[float] | None]:
+    """Records for validation, and from when on they are scored where only their last part is."""
+    if fraction is None:
+        return None if validation is None else _several(validation), None
+    if validation is not None:
+        raise InvalidSettings("/validation", "give either records or a fraction")
+    return whole, [start_of_validation(record, fraction) for record in whole]
 
 
 def _several(records: Record | Sequence[Record]) -> tuple[Record, ...]:

@@ -43,6 +43,10 @@ class Problem:
     evaluator : Evaluator
         The problem as compiled code sees it.
     experiments : tuple of Experiment
+    output_weights : mapping of str to float
+        Weight of each output, as given or found from the records.
+    scored_from : tuple of float or None
+        For each experiment the time (s) before which no sample is scored; None: all are.
     """
 
     model: Model
@@ -51,6 +55,8 @@ class Problem:
     space: tuple[Parameter, ...]
     evaluator: Evaluator
     experiments: tuple[Experiment, ...]
+    output_weights: Mapping[str, float]
+    scored_from: tuple[float, ...] | None
     arguments: tuple[Any, ...]
 
     @classmethod
@@ -64,6 +70,7 @@ class Problem:
         loss: Loss | None = None,
         weights: Mapping[str, float] | None = None,
         skip: int = 0,
+        scored_from: Sequence[float] | None = None,
     ) -> "Problem":
         """Lay the records out for the model and compile it.
 
@@ -78,6 +85,9 @@ class Problem:
             Weight of each output; by default 1 for one output, else 1 / its standard deviation.
         skip : int
             First samples of each output that are not scored.
+        scored_from : sequence of float
+            For each record the time (s) from which on samples are scored: a part that is kept
+            for validation is simulated with all that went before it.
 
         Raises
         ------
@@ -87,7 +97,8 @@ class Problem:
             If an option cannot be used.
         """
         arguments = (model, tuple(records), dict(parameters or {}), prediction, loss or Loss(),
-                     None if weights is None else dict(weights), skip)  # fmt: skip
+                     None if weights is None else dict(weights), skip,
+                     None if scored_from is None else tuple(scored_from))  # fmt: skip
         return _built(*arguments)
 
     def __reduce__(self) -> _Rebuild:
@@ -180,6 +191,7 @@ def _channel_metrics(problem: Problem, simulated: FloatArray) -> list[ChannelMet
 def _built(
     model: Model, records: tuple[Record, ...], parameters: Mapping[str, Mapping[str, Any]],
     prediction: Prediction, loss: Loss, weights: Mapping[str, float] | None, skip: int,
+    scored_from: tuple[float, ...] | None,
 ) -> Problem:  # fmt: skip
     if not records:
         raise InvalidRecord("there is no record to compare the model with; need one or more")
@@ -187,15 +199,23 @@ def _built(
         raise InvalidSettings("/prediction", f"{prediction!r} is not 'simulation' or 'one-step'")
     if skip < 0:
         raise InvalidSettings("/skip", f"{skip!r} is not a number of samples, 0 or more")
-    arguments = (model, records, parameters, prediction, loss, weights, skip)
+    since = (-np.inf,) * len(records) if scored_from is None else scored_from
+    if len(since) != len(records):
+        raise InvalidSettings(
+            "/scored_from", f"found {len(since)} times for {len(records)} records; need one each"
+        )
+    arguments = (model, records, parameters, prediction, loss, weights, skip, scored_from)
     everything = override((*model.parameters, *initial_parameters(model, len(records))), parameters)
     per_output = output_weights(model, records, weights, skip)
     experiments = tuple(
-        lay_out(model, record, e, everything, per_output, skip) for e, record in enumerate(records)
+        lay_out(model, record, e, everything, per_output, skip, scored_from=since[e])
+        for e, record in enumerate(records)
     )
     free = tuple(parameter for parameter in everything if parameter.is_free)
     evaluator = _evaluator(model, experiments, everything, prediction == "one-step", loss)
-    return Problem(model, records, everything, free, evaluator, experiments, arguments)
+    return Problem(
+        model, records, everything, free, evaluator, experiments, per_output, scored_from, arguments
+    )
 
 
 def simulation_problem(model: Model, record: Record) -> Problem:
@@ -204,7 +224,9 @@ def simulation_problem(model: Model, record: Record) -> Problem:
     weights = {output.name: 1.0 for output in model.outputs}
     experiment = lay_out(model, record, 0, model.parameters, weights, 0, simulates_only=True)
     evaluator = _evaluator(model, (experiment,), model.parameters, False, Loss())
-    return Problem(model, (record,), model.parameters, (), evaluator, (experiment,), arguments)
+    return Problem(
+        model, (record,), model.parameters, (), evaluator, (experiment,), weights, None, arguments
+    )
 
 
 def _evaluator(

@@ -271,7 +271,7 @@ def split_record(record: Record, fraction: float) -> tuple[Record, Record]:
     InvalidSettings
         If the fraction is not between 0 and 1, or leaves a channel of a part without samples.
     """
-    cut = time_of_cut(max((one.times for one in record.outputs), key=len), fraction)
+    cut = start_of_validation(record, fraction)
     parts = []
     for start, stop in ((-np.inf, np.nextafter(cut, -np.inf)), (cut, np.inf)):
         try:
@@ -285,6 +285,17 @@ def split_record(record: Record, fraction: float) -> tuple[Record, Record]:
         except InvalidRecord as error:
             raise InvalidSettings("/validation/fraction", f"found {fraction!r}: {error}") from None
     return parts[0], parts[1]
+
+
+def start_of_validation(record: Record, fraction: float) -> float:
+    """Time (s) at which the last `fraction` of a record begins, a sample of the longest output.
+
+    Raises
+    ------
+    InvalidSettings
+        If the fraction is not between 0 and 1, or one part would be empty.
+    """
+    return time_of_cut(max((one.times for one in record.outputs), key=len), fraction)
 
 
 def time_of_cut(times: FloatArray, fraction: float, pointer: str = "/validation/fraction") -> float:

@@ -7,7 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from service.cli.common import err, estimate, fail, out, print_json, print_table, usage
+from service.cli.common import (
+    SampleTime,
+    Segments,
+    err,
+    estimate,
+    fail,
+    out,
+    print_json,
+    print_table,
+    read_file,
+    usage,
+)
 from service.documents import read_yaml
 
 if TYPE_CHECKING:
@@ -16,6 +27,13 @@ if TYPE_CHECKING:
     from sysid.records import Record, Recording
     from sysid.result import Identification
 
+# Fields of a job body that mean nothing in one process, and what does their work here.
+ELSEWHERE = {
+    "sweep": "a sweep needs a server: lagid submit job.yaml",
+    "datasets": "name the recording as DATA",
+    "model": "use --model",
+    "validation.datasets": "use --validation FILE",
+}
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 
 
@@ -40,12 +58,8 @@ def identify(
     validation: Annotated[
         Path | None, typer.Option(help="Recording that is kept for validation.")
     ] = None,
-    segments: Annotated[
-        str | None, typer.Option(help="CSV columns of labels that part the rows: col,col.")
-    ] = None,
-    sample_time: Annotated[
-        float | None, typer.Option(help="Sampling period in s, for a CSV without times.")
-    ] = None,
+    segments: Segments = None,
+    sample_time: SampleTime = None,
     json_file: Annotated[
         str | None, typer.Option("--json", metavar="FILE", help="Write the result; - for stdout.")
     ] = None,
@@ -53,11 +67,10 @@ def identify(
     """Identify a model's parameters and lags from a recording, in this process."""
     body = job_body(data, model, changes or [], _pairs(channels))
     loaded = _model(model)
+    _refuse_same(data, validation)
     reading = Reading(sample_time, _names(segments))
     records = _records(data, reading, loaded, body)
     kept = [] if validation is None else _records(validation, reading, loaded, body)
-    if body.validation is not None and body.validation.fraction is not None:
-        records, kept = _split(records, body.validation.fraction)
     begun = time.perf_counter()
     found = _identified(loaded, records, kept, body, quiet=json_file == "-")
     tell(loaded, found, time.perf_counter() - begun, json_file)
@@ -76,6 +89,7 @@ def job_body(data: Path, model: str, changes: list[str], channels: dict[str, str
         if not equals:
             usage(f"--set {change}: need path=value, as algorithm.population=100")
         parts = [part for part in path.replace("/", ".").split(".") if part]
+        _refuse_elsewhere(change, parts)
         here = body
         for part in parts[:-1]:
             here = here.setdefault(part, {})
@@ -83,10 +97,26 @@ def job_body(data: Path, model: str, changes: list[str], channels: dict[str, str
                 usage(f"--set {change}: {part} has no fields")
         here[parts[-1] if parts else ""] = read_yaml(value.encode())
     try:
-        return JobIn.model_validate(body)
+        job = JobIn.model_validate(body)
     except ValidationError as error:
-        faults = explained(error.errors(), body, JobIn)
-        usage("; ".join(f"{one.pointer}: {one.detail}" for one in faults))
+        usage("; ".join(map(str, explained(error.errors(), body, JobIn))))
+    if job.validation is not None and job.validation.datasets is not None:
+        usage(f"--set validation: {ELSEWHERE['validation.datasets']}")
+    return job
+
+
+def _refuse_elsewhere(change: str, parts: list[str]) -> None:
+    for place, instead in ELSEWHERE.items():
+        if ".".join([*parts, ""]).startswith(f"{place}."):
+            usage(f"--set {change}: {instead}")
+
+
+def _refuse_same(data: Path, validation: Path | None) -> None:
+    if validation is None or not (data.is_file() and validation.is_file()):
+        return
+    if read_file(data) == read_file(validation):
+        usage(f"--validation {validation}: this is the recording that is fitted; name another, "
+              "or use --set validation.fraction=0.3")  # fmt: skip
 
 
 def read(path: Path, reading: Reading) -> "Recording":
@@ -167,6 +197,7 @@ def _identified(
             model, records, algorithm, seed=body.seed, parameters=document["parameters"],
             prediction=body.prediction, loss=loss_of(document["loss"]), weights=body.weights,
             skip=body.skip, validation=kept or None,
+            validation_fraction=None if body.validation is None else body.validation.fraction,
             noise=Noise(body.noise.sigma, body.noise.seed) if body.noise.sigma else None,
             progress=show,
         )  # fmt: skip
@@ -187,13 +218,6 @@ def _records(path: Path, reading: Reading, model: "Model", body: "JobIn") -> "li
     chosen = {signal: body.channels.get(signal, signal) for signal in (*inputs, *outputs)}
     roles = ({one: chosen[one] for one in inputs}, {one: chosen[one] for one in outputs})
     return list(read(path, reading).records(*roles, path.stem))
-
-
-def _split(records: "list[Record]", fraction: float) -> "tuple[list[Record], list[Record]]":
-    from sysid.records import split_record
-
-    parts = [split_record(record, fraction) for record in records]
-    return [first for first, _ in parts], [second for _, second in parts]
 
 
 def _pairs(text: str | None) -> dict[str, str]:

@@ -1,0 +1,54 @@
+"""A result does not depend on how many threads the linear algebra may use."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sysid.threads import _libraries, one_thread
+
+CONCLUDED = """
+import hashlib
+import numpy as np
+from sysid.identify import identify
+from sysid.models.library import load_model
+from sysid.records import Channel, Record
+from sysid.settings import GeneticAlgorithm
+
+times = 0.01 * np.arange(20_000)
+random = np.random.default_rng(1)
+u = np.repeat(random.standard_normal(200), 100)
+y = 2.0 * np.convolve(u, np.exp(-times[:600]) * 0.01)[:20_000]
+y += 0.01 * random.standard_normal(20_000)
+record = Record((Channel("u", times, u),), (Channel("y", times, y),))
+settings = GeneticAlgorithm(population=16, generations=4)
+found = identify(load_model("fopdt"), record, settings, validation_fraction=0.2)
+text = repr((found.estimates, found.rms, found.fit_percent, found.rms_validation, found.agreement,
+             found.history, found.uncertainty.covariance.tobytes()))
+print(hashlib.sha256(text.encode()).hexdigest())
+"""
+
+
+def concluded(threads: int) -> str:
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": str(threads)}
+    done = subprocess.run(
+        [sys.executable, "-c", CONCLUDED], env=environment, capture_output=True, text=True,
+        check=True, cwd=Path(__file__).parents[2],
+    )  # fmt: skip
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_a_long_record_gives_the_same_bits_with_one_and_two_threads() -> None:
+    assert concluded(1) == concluded(2)
+
+
+def test_the_number_of_threads_comes_back_when_the_last_caller_is_done() -> None:
+    before = [library.threads() for library in _libraries()]
+    with one_thread():
+        with one_thread():
+            pass
+        assert all(library.threads() == 1 for library in _libraries())
+    assert [library.threads() for library in _libraries()] == before

@@ -1,0 +1,136 @@
+"""The last part of each record, kept for validation: judged with all that went before it."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid.errors import InvalidSettings
+from sysid.identify import identify
+from sysid.models.library import load_model
+from sysid.models.spec import parse_model
+from sysid.noise import Noise, with_noise
+from sysid.problem import Problem
+from sysid.records import Channel, Record, split_record
+from sysid.result import Identification
+from sysid.settings import GeneticAlgorithm
+from tests.searching import DUFFING, force
+from workers.ports import ProblemSpec
+from workers.tasks import build, prepared
+
+BRIEF = GeneticAlgorithm(population=16, generations=2)
+TRUE = {name: {"fixed": value} for name, value in DUFFING.items() if name != "c"}
+NEAR = {**TRUE, "c": {"lower": 0.19, "upper": 0.21}}
+FRACTION = 0.3
+
+DECAY = {
+    "name": "decay",
+    "form": "differential",
+    "states": {"x": "1", "z": "1"},
+    "parameters": {"a": {"lower": 0.1, "upper": 1.0}},
+    "equations": {"x": "-a*x", "z": "-2*a*z"},
+    "outputs": {"y": "x", "w": "z"},
+    "initial": {"x": {"lower": 0.5, "upper": 5.0}, "z": 2},
+    "solver": {"method": "rk4", "step": "sample"},
+}
+
+
+def free_run(model: str, values: Mapping[str, float], n: int = 600) -> Record:
+    blank = Record((force(n),), (Channel("y", 0.02 * np.arange(n), np.zeros(n), "m"),))
+    problem = Problem.build(load_model(model), [blank])
+    theta = np.array([[values[p.name] for p in problem.space]])
+    return replace(
+        blank, outputs=(replace(blank.outputs[0], values=problem.predictions(theta)[0]),)
+    )
+
+
+def decay(sd: float = 0.0) -> Record:
+    times = 0.05 * np.arange(100)
+    noise = sd * np.random.default_rng(3).standard_normal((2, 100))
+    y, w = 3.0 * np.exp(-0.5 * times) + noise[0], 2.0 * np.exp(-times) + noise[1]
+    return Record((), (Channel("y", times, y), Channel("w", times, w)))
+
+
+def standard_deviation(found: Identification, record: Record) -> list[float]:
+    estimation = split_record(record, FRACTION)[0]
+    return [float(np.std(channel.values)) for channel in estimation.outputs]
+
+
+@pytest.mark.parametrize("model", ["duffing-eq16", "duffing-delay"])
+def test_the_true_model_fits_both_parts_alike(model: str) -> None:
+    record = with_noise(free_run(model, DUFFING), Noise(0.01, 1), 0)
+    found = identify(load_model(model), record, BRIEF, parameters=NEAR, validation_fraction=0.3)
+    assert found.fit_percent > 97
+    assert found.fit_percent_validation == pytest.approx(found.fit_percent, abs=1.0)
+    assert found.rms_validation == pytest.approx(found.rms, rel=0.2)
+    assert [part[0].size for part in (*found.simulated, *found.simulated_validation)] == [420, 180]
+    assert [one.samples for one in found.agreement_validation] == [180]
+
+
+def test_an_estimated_initial_state_goes_on_into_the_part_kept() -> None:
+    found = identify(parse_model(DECAY), [decay(), decay()], BRIEF, validation_fraction=FRACTION)
+    for experiment in found.simulated_validation:
+        for simulated, channel in zip(experiment, decay().outputs, strict=True):
+            np.testing.assert_allclose(simulated, channel.values[70:], atol=1e-6)
+
+
+def test_the_rms_of_both_parts_are_in_the_same_measure() -> None:
+    record = decay(sd=0.02)
+    found = identify(parse_model(DECAY), record, BRIEF, validation_fraction=FRACTION)
+    split = split_record(record, FRACTION)
+    for part, simulated, value in zip(
+        split, (found.simulated, found.simulated_validation),
+        (found.rms, found.rms_validation), strict=True,
+    ):  # fmt: skip
+        weighted = [
+            (channel.values - model) / deviation
+            for channel, model, deviation in zip(
+                part.outputs, simulated[0], standard_deviation(found, record), strict=True
+            )
+        ]
+        assert value == pytest.approx(np.sqrt(np.mean(np.square(weighted))), rel=1e-9)
+
+
+def test_other_records_are_judged_with_the_weights_of_the_estimate() -> None:
+    record = decay(sd=0.02)
+    small = Record((), tuple(replace(c, values=0.1 * c.values) for c in record.outputs))
+    found = identify(parse_model(DECAY), record, BRIEF, validation=small)
+    weighted = [
+        (kept.values - simulated) / np.std(channel.values)
+        for channel, kept, simulated in zip(
+            record.outputs, small.outputs, found.simulated_validation[0], strict=True
+        )
+    ]
+    expected = np.sqrt(np.mean(np.square(weighted)))
+    assert found.rms_validation == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_worker_builds_the_part_kept_on_the_whole_record_without_noise() -> None:
+    record = free_run("duffing-eq16", DUFFING)
+    spec = ProblemSpec(
+        model=dict(load_model("duffing-eq16").document), records="r", validation=None,
+        validation_fraction=FRACTION, noise=Noise(0.05, 1),
+    )  # fmt: skip
+    posed, judged = build(spec, {"r": (record,)})
+    estimation, kept = prepared(spec, {"r": (record,)})
+    assert judged is not None
+    assert kept is not None
+    assert posed.records[0].outputs[0].values.tobytes() == estimation[0].outputs[0].values.tobytes()
+    assert judged.records == (record,)
+    assert judged.n_scored == kept[0].outputs[0].values.size == 180
+    theta = np.array([[DUFFING[p.name] for p in judged.space]])
+    assert judged.metrics(theta[0]).rms < 1e-12
+
+
+def test_records_and_a_fraction_together_are_refused() -> None:
+    record = free_run("duffing-eq16", DUFFING)
+    model = load_model("duffing-eq16")
+    with pytest.raises(InvalidSettings, match="either records or a fraction"):
+        identify(model, record, BRIEF, validation=record, validation_fraction=0.3)
+
+
+def test_times_to_score_from_are_one_for_each_record() -> None:
+    record = free_run("duffing-eq16", DUFFING)
+    with pytest.raises(InvalidSettings, match="2 times for 1 records"):
+        Problem.build(load_model("duffing-eq16"), [record], scored_from=[1.0, 2.0])
