@@ -48,7 +48,7 @@ def tally(session: Session, lease: Lease, n_reasons: int) -> Tally:
         int(evaluations),
         int(generations),
         tuple(str(reason) for reason in session.scalars(first)),
-        dict(session.execute(kept).tuples().all()),
+        dict(session.execute(kept).all()),
     )
 
 

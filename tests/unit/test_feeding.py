@@ -6,11 +6,22 @@ from typing import Any
 import pytest
 
 from sysid.errors import InvalidSettings
-from tests.runs import ListedRuns, Notebook, spec
+from sysid.run import begin
+from tests.runs import RECORDS, ListedRuns, Notebook, spec
 from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
 from workers.feeding import Feeder
 from workers.packing import PACKS_PER_CPU
-from workers.ports import Done, Failure, Item, QueuedRun, Records, RefusedRun
+from workers.ports import (
+    Advance,
+    Advanced,
+    Done,
+    Failure,
+    Item,
+    QueuedRun,
+    Records,
+    RefusedRun,
+)  # fmt: skip
+from workers.tasks import build
 
 Answer = Callable[[Item], Done | PackLost]
 
@@ -212,3 +223,24 @@ def test_a_job_ends_when_nothing_of_it_is_left(n_runs: int) -> None:
     feeder = Feeder(ScriptedCrew(fails))
     jobs(feeder, a=n_runs)
     assert finish(feeder) == ["a"]
+
+
+def test_a_pack_of_no_job_is_let_go(caplog: pytest.LogCaptureFixture) -> None:
+    crew = ScriptedCrew(fails)
+    feeder = Feeder(crew)
+    notebook = jobs(feeder, a=1)["a"]
+    crew.submit([Advance("stray", spec(), None, 1.0)], (), ())
+    assert finish(feeder) == ["a"]
+    assert (crew.packs, list(notebook.failures)) == ({}, ["a0"])
+    assert "a pack of no job came back" in caplog.messages
+
+
+def test_a_run_is_told_to_begin_once_also_when_it_goes_on_from_a_checkpoint() -> None:
+    problem, _ = build(spec().problem, RECORDS)
+    kept = begin(problem, spec().algorithm, 1)
+    answers = iter([Advanced(kept), Advanced(kept), Failure("as told")])
+    feeder = Feeder(ScriptedCrew(lambda item: Done(item.run, next(answers), 0.01)))
+    notebook = Notebook()
+    feeder.add("a", ListedRuns([QueuedRun("a0", spec(), kept)]), notebook)
+    finish(feeder)
+    assert notebook.begun == ["a0"]

@@ -1,0 +1,154 @@
+"""A dispatcher's leases and what it does when one is late or lost; the clock is the test's."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.dispatch.claiming import Leases
+from service.dispatcher import Dispatcher
+from service.storage.tables import State
+from tests.dispatching import Place
+from tests.stored import Clock, claim, job_of, state_of, submit
+from tests.unit.test_feeding import ScriptedCrew, fails
+
+SECONDS = 30.0
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def leases_of(database, clock: Clock) -> Leases:
+    return Leases(database, SECONDS, clock=clock, stopwatch=lambda: clock.now.timestamp())
+
+
+def test_a_lease_renewed_in_time_is_kept(database, clock: Clock) -> None:
+    job, leases = submit(database), leases_of(database, clock)
+    lease = leases.claim().lease
+    for _ in range(5):
+        clock.advance(20)
+        leases.renew()
+        assert not leases.is_lost(lease)
+    assert state_of(database, job) is State.RUNNING
+
+
+def test_a_lease_that_is_late_is_lost_though_nobody_has_reaped_it(database, clock: Clock) -> None:
+    submit(database)
+    leases = leases_of(database, clock)
+    lease = leases.claim().lease
+    clock.advance(31)
+    assert leases.is_lost(lease)
+
+
+def test_a_late_heartbeat_of_other_leases_does_not_make_a_new_one_late(
+    database, clock: Clock
+) -> None:
+    submit(database), submit(database)
+    leases = leases_of(database, clock)
+    old = leases.claim().lease
+    clock.advance(31)
+    young = leases.claim().lease
+    assert (leases.is_lost(old), leases.is_lost(young)) == (True, False)
+
+
+def test_a_forgotten_lease_expires_while_the_others_of_its_owner_live(
+    database, clock: Clock
+) -> None:
+    submit(database), submit(database)
+    leases = leases_of(database, clock)
+    dropped, kept = leases.claim().lease, leases.claim().lease
+    leases.forget(dropped)
+    for _ in range(2):
+        clock.advance(20)
+        leases.renew()
+    assert state_of(database, dropped.job_id) is State.QUEUED
+    assert state_of(database, kept.job_id) is State.RUNNING
+
+
+def test_a_lease_that_a_rival_took_is_lost_and_the_rivals_is_not_renewed(
+    database, clock: Clock
+) -> None:
+    submit(database)
+    leases, rival = leases_of(database, clock), leases_of(database, clock)
+    lease = leases.claim().lease
+    clock.advance(31)
+    rival.renew()
+    assert claim(database, "d2", clock).lease.attempt == 2
+    leases.renew()
+    assert leases.is_lost(lease)
+    clock.advance(31)
+    leases.renew()
+    assert (state_of(database, lease.job_id), job_of(database, lease.job_id).lost_leases) == (
+        State.QUEUED, 2,
+    )  # fmt: skip
+
+
+class Stand:
+    """A dispatcher in this process, with a crew and a clock that the test moves."""
+
+    def __init__(self, folder: Path, clock: Clock) -> None:
+        self.place, self.clock = Place(folder), clock
+        self.crew = ScriptedCrew(fails)
+        self.crew.is_slow = True
+        self.leases = leases_of(self.place.database, clock)
+        self.dispatcher = Dispatcher(
+            self.place.database, self.place.store, self.crew, self.leases
+        )  # fmt: skip
+
+    def turn_until(self, job: str, state: State, attempt: int) -> None:
+        for _ in range(200_000):
+            row = self.place.job(job)
+            if (row.state, row.attempt) == (state, attempt):
+                return
+            self.dispatcher.turn()
+        raise AssertionError(f"{job} is {row.state} in attempt {row.attempt}")
+
+    def turn_until_sent(self, n_packs: int) -> None:
+        for _ in range(200_000):
+            if len(self.crew.sent) == n_packs:
+                return
+            self.dispatcher.turn()
+        raise AssertionError(f"{len(self.crew.sent)} packs were sent")
+
+
+@pytest.fixture
+def stand(tmp_path: Path, clock: Clock) -> Iterator[Stand]:
+    made = Stand(tmp_path / "data", clock)
+    yield made
+    made.place.database.dispose()
+
+
+def test_a_job_dropped_because_the_heartbeat_was_late_is_taken_up_again(stand: Stand) -> None:
+    job = stand.place.submit()
+    stand.turn_until_sent(1)
+    stand.clock.advance(31)  # the process slept
+    for _ in range(200_000):
+        stand.dispatcher.turn()
+        if stand.crew.cancelled:
+            break
+    assert stand.crew.cancelled
+    for _ in range(2):
+        stand.clock.advance(20)
+        stand.leases.renew()
+    assert (stand.place.job(job).state, stand.place.job(job).lost_leases) == (State.QUEUED, 1)
+    stand.turn_until(job, State.RUNNING, attempt=2)
+
+
+def test_a_job_claimed_back_while_its_old_packs_fly_ends_once_under_its_new_attempt(
+    stand: Stand,
+) -> None:
+    job = stand.place.submit()
+    stand.turn_until_sent(1)
+    stand.clock.advance(31)
+    leases_of(stand.place.database, stand.clock).renew()  # another reaps it
+    stand.turn_until_sent(2)
+    assert len(stand.crew.packs) == 2
+    stand.crew.is_slow = False
+    stand.turn_until(job, State.FAILED, attempt=2)
+    (run,) = stand.place.runs(job)
+    assert (run.state, run.attempt, run.error) == (State.FAILED, 2, "as told")
+    for _ in range(3):
+        stand.dispatcher.turn()
+    assert stand.crew.packs == {}

@@ -1,0 +1,98 @@
+"""A job that is claimed again goes on where it was: its progress, reasons and history."""
+
+import pytest
+
+from service.dispatch.checkpoints import packed, unpacked
+from service.dispatch.preparing import JobRuns
+from service.dispatch.recording import Recorder
+from service.storage.events import EventRepository
+from service.storage.ledger import HistoryPoint, RunLedger, RunOutcome
+from service.storage.queue import Queue
+from service.storage.runs import RunRepository
+from service.storage.tables import Checkpoint, State
+from sysid.run import begin
+from tests.dispatching import Place
+from tests.runs import RECORDS, spec
+from workers.ports import Failure, QueuedRun
+from workers.tasks import build
+
+SWEEP = {"axes": [{"path": "/seed", "values": [1, 2, 3, 4]}]}
+
+
+@pytest.fixture(scope="module")
+def state():
+    return begin(build(spec().problem, RECORDS)[0], spec().algorithm, 1)
+
+
+@pytest.fixture
+def place(tmp_path):
+    made = Place(tmp_path / "data")
+    yield made
+    made.database.dispose()
+
+
+def claim(place):
+    with place.database.write() as session:
+        return Queue(session).claim("d1")
+
+
+def claim_again(place, lease):
+    with place.database.write() as session:
+        Queue(session).release(lease)
+    return claim(place)
+
+
+def recorder(place, claim):
+    return Recorder(place.database, claim, lambda run, found: None)
+
+
+def point(run, number):
+    return HistoryPoint(run, 0, number, 10 * number, 50, 1.0 / (number + 1), "genetic", [1.5])
+
+
+def test_progress_and_reasons_go_on_from_the_attempt_before(place, state) -> None:
+    job = place.submit(sweep=SWEEP)
+    first, runs = claim(place), [run.id for run in place.runs(job)]
+    with place.database.write() as session:
+        ledger = RunLedger(session, first.lease)
+        ledger.record([
+            RunOutcome(run_id=runs[0], state=State.SUCCEEDED, evaluations=700, generations=40),
+            RunOutcome(run_id=runs[1], state=State.FAILED, error="as told", evaluations=30),
+        ])  # fmt: skip
+        ledger.save([(runs[2], 200, packed(state))])
+    again = recorder(place, claim_again(place, first.lease))
+    again.failure(runs[3], Failure("otherwise"))
+    again.keep()
+    assert (place.job(job).evaluations, place.job(job).generation) == (930, 40)
+    again.progress(runs[2], state, 1.0)
+    again.keep()
+    assert place.job(job).evaluations == 730 + state.evaluations
+    again.failure(runs[2], Failure("as told"))
+    again.finish()
+    assert place.job(job).error == "3 of 4 runs failed: as told; otherwise"
+    assert place.job(job).evaluations == 730 + state.evaluations
+    with place.database.read() as session:
+        told = [one.data for one in EventRepository(session).after(job) if one.kind == "log"]
+    assert told == [{"message": f"{runs[3]} failed: otherwise"}]
+
+
+def test_a_run_whose_checkpoint_is_refused_loses_its_history_and_only_that_run(
+    place, state
+) -> None:
+    job = place.submit(sweep=SWEEP)
+    first, runs = claim(place), [run.id for run in place.runs(job)]
+    with place.database.write() as session:
+        ledger = RunLedger(session, first.lease)
+        ledger.append([point(run, number) for run in runs for number in range(2)])
+        ledger.record([RunOutcome(run_id=runs[0], state=State.SUCCEEDED)])
+        ledger.save([(runs[1], 9, packed(state)), (runs[2], 9, b"lagid 0.0 run state 1\n...")])
+    source = JobRuns(place.database, claim_again(place, first.lease), place.store)
+    queued = [one for one in source.runs() if isinstance(one, QueuedRun)]
+    assert [(one.run, one.state is None) for one in queued] == [
+        (runs[1], False), (runs[2], True), (runs[3], True),
+    ]  # fmt: skip
+    with place.database.read() as session:
+        lengths = [len(RunRepository(session).history(run)) for run in runs]
+        kept = [(one.run_id, unpacked(one.state) is None) for one in session.query(Checkpoint)]
+    assert lengths == [2, 2, 0, 0]
+    assert kept == [(runs[1], False)]

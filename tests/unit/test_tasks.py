@@ -1,0 +1,28 @@
+"""A pack of work as a worker sees it."""
+
+import pytest
+
+import workers.tasks
+from tests.runs import RECORDS, spec
+from workers.ports import Advance, Concluded, Failure
+
+FAULTY_SEED = 13
+
+
+def test_a_programming_error_in_one_run_fails_it_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    sound = workers.tasks.begin
+
+    def begin(problem, algorithm, seed, warm):
+        if seed == FAULTY_SEED:
+            raise OverflowError("too large")
+        return sound(problem, algorithm, seed, warm)
+
+    monkeypatch.setattr(workers.tasks, "begin", begin)
+    monkeypatch.setattr(workers.tasks, "PACK_LIMIT_SECONDS", 1000.0)
+    pack = [Advance(f"r{seed}", spec(seed, generations=5), None, 100.0) for seed in (1, 13, 2)]
+    first, faulty, last = workers.tasks.advance(pack, ["short"], RECORDS["short"])
+    assert isinstance(first.outcome, Concluded)
+    assert isinstance(last.outcome, Concluded)
+    assert faulty.outcome == Failure(
+        "internal error: OverflowError: too large", "InternalError"
+    )  # fmt: skip
