@@ -165,6 +165,7 @@ class Queue:
             {"state": state, "error": error, "finished_at": self._clock(), "lease_until": None,
              "lease_owner": None, "seconds_left": None},
         )  # fmt: skip
+        self._settle_best(job)
         if state is State.SUCCEEDED:
             self._require_finished_runs(job.id)
         else:
@@ -203,6 +204,12 @@ class Queue:
         if job is None:
             raise LeaseLost(lease.job_id, lease.attempt)
         return job
+
+    def _settle_best(self, job: Job) -> None:
+        """Take the best RMS from the results: while a run goes on it tells its fitness only."""
+        best = self._session.scalar(select(func.min(Run.best_rms)).where(Run.job_id == job.id))
+        if best is not None:
+            job.best_rms = best
 
     def _require_finished_runs(self, job_id: str) -> None:
         left = select(func.count()).where(Run.job_id == job_id, Run.state.in_(OPEN))

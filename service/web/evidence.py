@@ -75,6 +75,8 @@ class RunEvidence:
     ----------
     unit : str
         Unit of the RMS.
+    fitness : str
+        What the search minimised: RMS, or with a robust loss that loss as an RMS.
     history : sequence of sequence of Improvement
         One sequence per island, in the order of the generations.
     epoch : int
@@ -89,6 +91,7 @@ class RunEvidence:
 
     id: str
     unit: str
+    fitness: str = "RMS"
     generations: int = 0
     evaluations: int = 0
     parameters: Sequence[SoughtParameter] = ()

@@ -52,7 +52,7 @@ def in_theme(figure: Figure, paper: theme.Theme) -> Figure:
 
 
 def history(run: RunEvidence, abscissa: Abscissa = "generations") -> Figure:
-    """RMS of every island's champion over generations or evaluations, phases marked."""
+    """Fitness of every island's champion over generations or evaluations, phases marked."""
     end = _end(run, abscissa)
     lines = [
         _island_line(number, points, abscissa, end)
@@ -65,7 +65,7 @@ def history(run: RunEvidence, abscissa: Abscissa = "generations") -> Figure:
         "layout": layout(
             360,
             xaxis={"title": {"text": abscissa}, "rangemode": "tozero"},
-            yaxis={"title": {"text": f"RMS [{run.unit}]"}, "type": "log", "exponentformat": "e"},
+            yaxis=_fitness_axis(run),
             shapes=[_upright(epoch * run.epoch) for epoch in _some(epochs)],
             uirevision=abscissa,
         ),
@@ -131,7 +131,7 @@ def correlation(run: RunEvidence) -> Figure:
 
 
 def waterfall(run: RunEvidence) -> Figure:
-    """RMS that each island found, best first, before and after refinement."""
+    """Fitness that each island found, best first, before and after refinement."""
     order = sorted(range(len(run.islands)), key=lambda i: _last(run.islands[i]))
     rank = list(range(1, len(order) + 1))
     islands = [f"island {i + 1}" for i in order]
@@ -154,7 +154,7 @@ def waterfall(run: RunEvidence) -> Figure:
             WATERFALL_HEIGHT,
             xaxis={"title": {"text": "islands, best first"}, "dtick": max(1, len(order) // 12),
                    "range": [0.5, len(order) + 0.5]},
-            yaxis={"title": {"text": f"RMS [{run.unit}]"}, "type": "log", "exponentformat": "e"},
+            yaxis=_fitness_axis(run),
         ),
     }  # fmt: skip
 
@@ -239,6 +239,11 @@ def _phase_markers(run: RunEvidence, abscissa: Abscissa) -> list[dict[str, Any]]
 def _some(epochs: Sequence[int]) -> list[int]:
     distinct = sorted(set(epochs))
     return distinct if len(distinct) <= _EPOCHS_MARKED else []
+
+
+def _fitness_axis(run: RunEvidence) -> dict[str, Any]:
+    title = {"text": f"{run.fitness} [{run.unit}]"}
+    return {"title": title, "type": "log", "exponentformat": "e"}
 
 
 def _upright(x: float) -> dict[str, Any]:

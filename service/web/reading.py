@@ -65,6 +65,12 @@ def _recorded_unit(session: Session, body: Body, channel: str) -> str:
     return next((str(one["unit"]) for one in channels if one["name"] == channel), "1")
 
 
+def fitness_of(body: Body) -> str:
+    """What the search minimises, as figures of it call it: with soft-l1 it is not J."""
+    robust = (body.get("loss") or {}).get("kind") == "soft-l1"
+    return "soft-l1 loss, as RMS" if robust else "RMS"
+
+
 def sought_parameters(run: Run, body: Body) -> list[SoughtParameter]:
     """The free parameters in the order of the history's columns.
 
@@ -90,7 +96,7 @@ def evidence_of(session: Session, job: Job, run: Run) -> RunEvidence:
     algorithm = body.get("algorithm", {})
     result = run.result or {}
     return RunEvidence(
-        id=run.id, unit=unit_of(session, body),
+        id=run.id, unit=unit_of(session, body), fitness=fitness_of(body),
         generations=run.generations or (job.generation if job.n_runs == 1 else 0),
         evaluations=run.evaluations, history=history,
         parameters=_covering(sought_parameters(run, body), history),

@@ -60,7 +60,7 @@ def _figures(
 ) -> list[tuple[str, int, Markup]]:
     """Title, height (px) and Plotly JSON of a run's figures, those with something to show."""
     evidence = evidence_of(session, job, run)
-    made = [("RMS of every island", figures.history(evidence))]
+    made = [("Progress of every island", figures.history(evidence))]
     for experiment in experiments_of(session, store, job, run)[:EXPERIMENTS_SHOWN]:
         title = f"Measured against identified: {experiment.name}"
         made.append((title, figures_signals.response(experiment)))

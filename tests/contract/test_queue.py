@@ -303,3 +303,14 @@ def test_progress_is_kept_and_told_and_the_best_never_rises(database):
         events = EventRepository(session).after(got.job.id)
     told = [event.data["best_rms"] for event in events if event.kind == "progress"]
     assert told == [0.5, 0.5, 0.2, 0.2]
+
+
+def test_the_best_of_an_ended_job_is_that_of_its_results(database):
+    got, runs = claimed(database)
+    with database.write() as session:
+        Queue(session).report(got.lease, Progress(100, 7, 0.2, 3.5))  # fitness, as of soft-l1
+        RunLedger(session, got.lease).record(
+            [RunOutcome(run_id=runs[0], state=State.SUCCEEDED, best_rms=0.9)]
+        )
+    finish(database, got.lease)
+    assert job_of(database, got.job.id).best_rms == 0.9

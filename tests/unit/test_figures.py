@@ -14,6 +14,7 @@ from service.web.evidence import (
     SoughtParameter,
     Trace,
 )
+from service.web.reading import fitness_of
 from service.web.theme import DASHES, SERIES, series_style
 
 
@@ -228,3 +229,11 @@ def test_a_window_has_one_sample_more_at_each_side() -> None:
     assert window(times, 3.0, 5.0) == slice(2, 7)
     assert window(times, None, None) == slice(0, 10)
     assert window(times, -5.0, 50.0) == slice(0, 10)
+
+
+@pytest.mark.parametrize("draw", [figures.history, figures.waterfall])
+def test_a_robust_loss_is_not_called_the_rms(draw):
+    robust = fitness_of({"loss": {"kind": "soft-l1", "scale": 0.1}})
+    shown = draw(run(fitness=robust))["layout"]["yaxis"]["title"]["text"]
+    assert shown == "soft-l1 loss, as RMS [kPa]"
+    assert draw(run(fitness=fitness_of({})))["layout"]["yaxis"]["title"]["text"] == "RMS [kPa]"

@@ -207,5 +207,5 @@ def test_the_weight_of_a_single_output_changes_nothing(loss: Loss) -> None:
 
 @pytest.mark.parametrize("weight", [1e-300, 1e308, np.inf, np.nan, -1.0])
 def test_weights_that_no_number_can_square_are_refused(weight: float) -> None:
-    with pytest.raises(InvalidSettings, match="/weights/y: .*need a number from"):
+    with pytest.raises(InvalidSettings, match=r"/weights/y: .*need a number from"):
         Problem.build(duffing(), [record()], weights={"y": weight})
