@@ -100,6 +100,34 @@ def test_a_command_that_is_called_wrongly_exits_with_2(data: Path) -> None:
     assert "did you mean 'bits'?" in line
 
 
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--set", "sweep.axes=[{path: /seed, values: [1, 2]}]"], "lagid submit"),
+        (["--set", "validation.datasets=[other]"], "--validation FILE"),
+        (["--set", "validation={datasets: [other]}"], "--validation FILE"),
+        (["--set", "datasets=[other]"], "DATA"),
+        (["--set", "model=tube"], "--model"),
+        (["--set", f"algorithm.stagnation={10**30}"], "/algorithm/stagnation"),
+        (["--set", f"algorithm.stagnation={'9' * 5000}"], "lagid: "),
+        (["--validation", "{data}"], "the recording that is fitted"),
+    ],
+)
+def test_what_identify_cannot_do_in_this_process_is_refused(
+    data: Path, words: list[str], expected: str
+) -> None:
+    words = [word if word != "{data}" else str(data) for word in words]
+    done = lagid("identify", data, "--model", "fopdt", *words)
+    assert expected in refused(done, done.returncode)
+    assert done.returncode in (1, 2)
+
+
+def test_a_file_that_is_not_utf8_is_said_without_an_empty_place(tmp_path: Path) -> None:
+    job = tmp_path / "job.yaml"
+    job.write_bytes(b"model: \xff")
+    assert refused(lagid("submit", job)).startswith("lagid: not UTF-8")
+
+
 def test_no_server_is_said_with_what_to_do() -> None:
     assert "lagid serve" in refused(lagid("jobs"))
 
