@@ -19,8 +19,9 @@ from service.storage.tables import Dataset
 from sysid.errors import RecordTooShort, SysidError, nearest
 from sysid.language.intervals import bounds
 from sysid.language.lags import past_values
+from sysid.models.initial import initial_parameters
 from sysid.models.lags import check_lags
-from sysid.models.model import EstimatedInitial, Model
+from sysid.models.model import Model
 from sysid.parameters import Parameter, override
 
 Body = dict[str, Any]
@@ -126,11 +127,6 @@ class JobChecker:
 
     def _all_parameters(self, body: Body, model: Model) -> tuple[Parameter, ...]:
         """The model's parameters, and the initial states to be estimated in each experiment."""
-        if not any(isinstance(start, EstimatedInitial) for start in model.initial):
-            return model.parameters
-        # Only such models pay for this import, which brings all of SciPy's signal processing.
-        from sysid.experiments import initial_parameters
-
         found = [self.dataset(reference) for reference in body["datasets"]]
         pieces = sum(
             max(1, len(one.details.get("segments") or ())) for one in found

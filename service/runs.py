@@ -22,6 +22,7 @@ from service.storage.lookups import Reached, reached
 from service.storage.runs import RunOrder, RunRepository
 from service.storage.tables import Job, Run, State
 from service.sweeps import body_of
+from sysid.models.initial import initial_parameters
 from sysid.parameters import override
 
 ALMOST = 0.99  # what a run that is not over shows at most: refinement is still to come
@@ -120,7 +121,8 @@ def _free_names(session: Session, run: Run) -> list[str]:
         return [one["name"] for one in run.result["parameters"] if one["status"] != "fixed"]
     body = body_of_run(run, JobRepository(session).get(run.job_id))
     model, _ = resolve(session, body["model"])
-    return [p.name for p in override(model.parameters, body["parameters"]) if p.is_free]
+    everything = (*model.parameters, *initial_parameters(model, len(body["datasets"])))
+    return [p.name for p in override(everything, body["parameters"]) if p.is_free]
 
 
 def _progress(run: Run, job: Job, known: Reached | None) -> float:

@@ -12,6 +12,7 @@ from sysid.kernels.grid import Grid, grid_of, sample_places
 from sysid.kernels.inputs import FineInput
 from sysid.kernels.plan import Samples, Start, fine_inputs, largest_lags
 from sysid.language.tree import Past
+from sysid.models.initial import initial_name
 from sysid.models.model import EstimatedInitial, FixedInitial, Model
 from sysid.parameters import Parameter
 from sysid.records import Channel, Record
@@ -39,21 +40,6 @@ class Experiment:
     outputs: tuple[Samples, ...]
     starts: tuple[Start, ...]
     lag: float
-
-
-def initial_name(state: str, experiment: int) -> str:
-    """Name of an estimated initial state: ``x(0)``, in the second experiment ``x(0)[2]``."""
-    return f"{state}(0)" if experiment == 0 else f"{state}(0)[{experiment + 1}]"
-
-
-def initial_parameters(model: Model, experiments: int) -> tuple[Parameter, ...]:
-    """The initial states to be estimated, for each experiment on its own."""
-    return tuple(
-        Parameter(initial_name(state.name, e), start.lower, start.upper, state.unit)
-        for e in range(experiments)
-        for state, start in zip(model.states, model.initial, strict=True)
-        if isinstance(start, EstimatedInitial)
-    )
 
 
 def output_weights(

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from sysid.errors import InvalidRecord, InvalidSettings
-from sysid.experiments import Experiment, initial_parameters, lay_out, output_weights
+from sysid.experiments import Experiment, lay_out, output_weights
 from sysid.kernels.compiler import kernel_address
 from sysid.kernels.evaluation import population_fitness, population_predictions
 from sysid.kernels.evaluator import Evaluator
 from sysid.kernels.layout import Variant
 from sysid.kernels.plan import Numbers, fits_grid, has_weights, numbers
 from sysid.metrics import ChannelMetrics, Metrics, fit_percent, rms
+from sysid.models.initial import initial_parameters
 from sysid.models.model import Model
 from sysid.parameters import Parameter, override
 from sysid.records import Record

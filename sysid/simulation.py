@@ -7,7 +7,7 @@ from math import isfinite
 import numpy as np
 
 from sysid.errors import InvalidRecord, InvalidSettings, nearest
-from sysid.experiments import initial_name
+from sysid.models.initial import initial_name
 from sysid.models.model import FixedInitial, Initial, Model
 from sysid.parameters import Parameter
 from sysid.problem import simulation_problem

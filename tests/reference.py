@@ -9,9 +9,10 @@ from math import floor
 
 import numpy as np
 
-from sysid.experiments import Experiment, initial_name
+from sysid.experiments import Experiment
 from sysid.kernels.inputs import FineInput
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.models.initial import initial_name
 from sysid.models.model import EstimatedInitial, MeasuredInitial, Model
 from sysid.problem import Problem
 from sysid.types import FloatArray

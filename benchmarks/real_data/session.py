@@ -7,9 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from service.client import Client
-
 from benchmarks.table import Row
+from service.client import Client
 from service.embedded import embedded_service
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -16,8 +16,9 @@ from service.storage.tables import Job, Run
 from service.sweeps import body_of
 from service.web.evidence import Improvement, RunEvidence, SoughtParameter
 from sysid.errors import SysidError
+from sysid.models.initial import initial_parameters
 from sysid.models.library import load_model
-from sysid.models.model import EstimatedInitial, Model
+from sysid.models.model import Model
 from sysid.parameters import Parameter, Scale, override
 
 Body = Mapping[str, Any]
@@ -77,15 +78,15 @@ def sought_parameters(run: Run, body: Body) -> list[SoughtParameter]:
     The result names them once the run has ended; until then the model and the request do.
     """
     model = model_of(body)
-    known = override(model.parameters, body.get("parameters", {})) if model else ()
+    everything = (
+        (*model.parameters, *initial_parameters(model, len(body["datasets"]))) if model else ()
+    )
+    known = override(everything, body.get("parameters", {}))
     result = (run.result or {}).get("parameters")
     if result:
         scales = {one.name: one.scale for one in known}
         return [_estimated(one, scales) for one in result if one.get("status") != "fixed"]
-    if model is None:
-        return []
-    free = [_sought(one) for one in known if one.is_free]
-    return [*free, *_initial_states(model, len(body["datasets"]))]
+    return [_sought(one) for one in known if one.is_free]
 
 
 def evidence_of(session: Session, job: Job, run: Run) -> RunEvidence:
@@ -161,14 +162,3 @@ def _sought(parameter: Parameter) -> SoughtParameter:
     return SoughtParameter(
         parameter.name, parameter.unit, parameter.lower, parameter.upper, parameter.scale
     )
-
-
-def _initial_states(model: Model, n_experiments: int) -> list[SoughtParameter]:
-    found = []
-    for experiment in range(n_experiments):
-        for state, start in zip(model.states, model.initial, strict=True):
-            if isinstance(start, EstimatedInitial):
-                place = f"[{experiment + 1}]" if n_experiments > 1 else ""
-                name = f"{state.name}(0){place}"
-                found.append(SoughtParameter(name, state.unit, start.lower, start.upper))
-    return found
