@@ -230,6 +230,10 @@ def _signal_faults(body: Body, model: Model) -> Iterator[FieldError]:
             yield FieldError(
                 f"/channels/{name}", f"model {model.name!r} has no signal {name!r}{hint}"
             )
+    for name in body["hold"]:
+        if name not in inputs:
+            hint = nearest(name, inputs)
+            yield FieldError(f"/hold/{name}", f"model {model.name!r} has no input {name!r}{hint}")
     for name, weight in (body["weights"] or {}).items():
         if name not in outputs:
             hint = nearest(name, outputs)

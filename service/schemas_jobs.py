@@ -159,6 +159,7 @@ class JobIn(Body):
     model: Annotated[Any, AfterValidator(_model_reference)]
     datasets: list[str] = Field(min_length=1, max_length=1000)
     channels: dict[str, str] = Field(default={})
+    hold: dict[str, Literal["zero", "first", "band-limited"]] = Field(default={})
     validation: ValidationIn | None = None
     parameters: dict[str, ParameterIn] = Field(default={})
     prediction: Literal["simulation", "one-step"] = "simulation"

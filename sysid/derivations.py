@@ -157,15 +157,7 @@ def subtract_offset(recording: Recording, given: Arguments) -> Recording:
 
 def set_hold(recording: Recording, given: Arguments) -> Recording:
     """Say what named channels do between their samples, when they are inputs."""
-    holds = {name: _HOLDS[given.choice(name, HOLDS)] for name, _ in given.items()}
-    for name in holds:
-        recording.channel(name)
-    return replace(
-        recording,
-        channels=tuple(
-            replace(one, hold=holds.get(one.name, one.hold)) for one in recording.channels
-        ),
-    )
+    return recording.held({name: _HOLDS[given.choice(name, HOLDS)] for name, _ in given.items()})
 
 
 def rename(recording: Recording, given: Arguments) -> Recording:

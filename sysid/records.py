@@ -166,6 +166,23 @@ class Recording:
         """How the longest channel was sampled."""
         return max(self.channels, key=lambda channel: channel.times.size).sampling
 
+    def held(self, holds: Mapping[str, Hold]) -> "Recording":
+        """Return the recording with other intersample behaviour of some channels.
+
+        Raises
+        ------
+        InvalidRecord
+            If there is no channel of that name.
+        """
+        for name in holds:
+            self.channel(name)
+        return replace(
+            self,
+            channels=tuple(
+                replace(one, hold=holds.get(one.name, one.hold)) for one in self.channels
+            ),
+        )
+
     def record(
         self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
     ) -> "Record":

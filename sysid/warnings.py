@@ -3,6 +3,7 @@
 import numpy as np
 
 from sysid.islands.archipelago import of_island
+from sysid.kernels.demand import is_difference
 from sysid.problem import Problem
 from sysid.result import Estimate, Uncertainty
 from sysid.settings import GeneticAlgorithm
@@ -10,6 +11,7 @@ from sysid.types import FloatArray
 from sysid.uncertainty import Analysis
 
 _STRONG = 0.9
+_HELD = 0.5  # of an input's neighbouring samples are equal, where it is taken for one of steps
 _NOTABLE_GAIN = 0.01
 _ROUNDING = 1e-9  # of the output: below, the residual is rounding and has no optimum
 
@@ -27,12 +29,34 @@ def warnings_of(
     if limit is not None and rms > limit:
         found.append(f"the RMS error {rms:.4g} is above the safe limit {limit:g}: not valid")
     found += _worse_than_a_line(problem, simulated)
+    found += _steps_read_as_ramps(problem)
     found += [text for e in analysis.estimates if (text := _of_estimate(e))]
     if analysis.uncertainty is not None:
         found += _correlated(analysis.uncertainty)
     if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING * problem.output_scale:
         found.append(_not_an_optimum(algorithm, analysis.possible_gain))
     return tuple(found)
+
+
+def _steps_read_as_ramps(problem: Problem) -> list[str]:
+    """Inputs that look held between samples, but are read as straight lines.
+
+    A jump read as a ramp over one sample moves the estimate of a lag by half a sample.
+    """
+    if is_difference(problem.model):
+        return []  # a recursion reads inputs at the samples only
+    channels = [one for record in problem.arguments[1] for one in record.inputs]
+    names = {
+        one.name
+        for one in channels
+        if one.hold == "first" and _HELD <= np.mean(np.diff(one.values) == 0) < 1
+    }
+    return [
+        f"input {name!r} stays constant between jumps, but is read as straight between its "
+        f"samples, which moves a lag by about half a sample; if it was held, set hold: "
+        f"{{{name}: zero}}"
+        for name in sorted(names)
+    ]
 
 
 def _worse_than_a_line(problem: Problem, simulated: FloatArray) -> list[str]:

@@ -216,8 +216,12 @@ def _records(path: Path, reading: Reading, model: "Model", body: "JobIn") -> "li
             known = ", ".join((*inputs, *outputs))
             fail(f"model {model.name!r} has no signal {signal!r}; it has {known}")
     chosen = {signal: body.channels.get(signal, signal) for signal in (*inputs, *outputs)}
+    for signal in body.hold:
+        if signal not in inputs:
+            fail(f"model {model.name!r} has no input {signal!r}; it has {', '.join(inputs)}")
     roles = ({one: chosen[one] for one in inputs}, {one: chosen[one] for one in outputs})
-    return list(read(path, reading).records(*roles, path.stem))
+    held = read(path, reading).held({chosen[one]: hold for one, hold in body.hold.items()})
+    return list(held.records(*roles, path.stem))
 
 
 def _pairs(text: str | None) -> dict[str, str]:

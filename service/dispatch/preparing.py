@@ -23,6 +23,7 @@ from sysid.errors import SysidError
 from sysid.islands.run_state import RunState
 from sysid.models.model import Model
 from sysid.noise import Noise
+from sysid.records import Hold
 from sysid.result import Identification
 from workers.errors import RecordsUnavailable
 from workers.ports import Failure, ProblemSpec, QueuedRun, Records, RefusedRun, RunSpec
@@ -34,11 +35,12 @@ READ_AHEAD = 200
 
 
 class DataKey(NamedTuple):
-    """Which datasets, and which of their channels is which signal of which model."""
+    """Which datasets, which of their channels is which signal of the model, and how it is held."""
 
     datasets: tuple[str, ...]
     inputs: tuple[tuple[str, str], ...]
     outputs: tuple[tuple[str, str], ...]
+    holds: tuple[tuple[str, Hold], ...]
 
 
 class JobRuns:
@@ -84,8 +86,8 @@ class JobRuns:
         kept = validation.get("datasets")
         problem = ProblemSpec(
             model=dict(model.document),
-            records=self._key(body["datasets"], body["channels"], model),
-            validation=None if kept is None else self._key(kept, body["channels"], model),
+            records=self._key(body["datasets"], body, model),
+            validation=None if kept is None else self._key(kept, body, model),
             validation_fraction=validation.get("fraction"),
             parameters=body["parameters"],
             prediction=body["prediction"],
@@ -104,7 +106,7 @@ class JobRuns:
         RecordsUnavailable
             If a dataset or a channel is not there, or cannot be used.
         """
-        datasets, inputs, outputs = self._data[key]
+        datasets, inputs, outputs, holds = self._data[key]
         try:
             with self._database.read() as session:
                 project = self._job.project_id
@@ -112,9 +114,9 @@ class JobRuns:
             return tuple(
                 record
                 for row in rows
-                for record in recording_of(self._store, row.sha256).records(
-                    dict(inputs), dict(outputs), row.name
-                )
+                for record in recording_of(self._store, row.sha256)
+                .held(dict(holds))
+                .records(dict(inputs), dict(outputs), row.name)
             )
         except (SysidError, ServiceError, StorageError) as error:
             raise RecordsUnavailable(str(error)) from error
@@ -163,11 +165,13 @@ class JobRuns:
                 self._models[name] = models.resolve(session, reference)[0]
         return self._models[name]
 
-    def _key(self, datasets: list[str], channels: Mapping[str, str], model: Model) -> str:
+    def _key(self, datasets: list[str], body: Mapping[str, Any], model: Model) -> str:
+        channels = body["channels"]
         data = DataKey(
             tuple(datasets),
             tuple((one.name, channels.get(one.name, one.name)) for one in model.inputs),
             tuple((one.name, channels.get(one.name, one.name)) for one in model.outputs),
+            tuple((channels.get(name, name), hold) for name, hold in body["hold"].items()),
         )
         key = repr(data)
         self._data[key] = data

@@ -38,6 +38,7 @@ JOBS: list[tuple[dict[str, Any], str, str]] = [
     ({"parameters": {"L": {"uper": 1}}}, "/parameters/L/uper", "did you mean 'upper'?"),
     ({"parameters": {"L": {"upper": 100}}}, "/datasets/0", "lasts 29.9 s"),
     ({"loss": {"kind": "cubes"}}, "/loss/kind", "found 'cubes'"),
+    ({"hold": {"y": "zero"}}, "/hold/y", "has no input 'y'"),
     ({"weights": {"z": 1}}, "/weights/z", "no output 'z'"),
     ({"weights": {"y": -1}}, "/weights/y", "found -1"),
     ({"skip": 300}, "/datasets/0", "300 samples"),
