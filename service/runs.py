@@ -23,7 +23,7 @@ from service.storage.runs import RunOrder, RunRepository
 from service.storage.tables import Job, Run, State
 from service.sweeps import body_of
 from sysid.models.initial import initial_parameters
-from sysid.parameters import override
+from sysid.parameters import Parameter, override
 
 ALMOST = 0.99  # what a run that is not over shows at most: refinement is still to come
 
@@ -49,7 +49,7 @@ def page(
         cell=_wanted("cell", choice.cell), labels=_wanted("label", choice.labels),
         order=choice.order, descending=choice.descending,
     )  # fmt: skip
-    known = reached(session, [run.id for run in found.items if run.state is State.RUNNING])
+    known = reached(session, [run.id for run in found.items if run.result is None])
     items = [told(run, job, known.get(run.id)) for run in found.items]
     return Page(items=items, next=found.next)
 
@@ -58,9 +58,11 @@ def one(session: Session, run_id: str) -> RunOut:
     """One run with its result document."""
     run = RunRepository(session).get(run_id)
     job = JobRepository(session).get(run.job_id)
-    is_running = run.state is State.RUNNING
-    known = reached(session, [run.id]) if is_running else {}
-    return told(run, job, known.get(run.id))
+    known = reached(session, [run.id]) if run.result is None else {}
+    answer = told(run, job, known.get(run.id))
+    if run.result is not None or not run.state.is_terminal:
+        return answer
+    return answer.model_copy(update={"parameters": _best_so_far(session, run, job)})
 
 
 def told(run: Run, job: Job, known: Reached | None = None) -> RunOut:
@@ -116,13 +118,35 @@ def migrations(session: Session, run_id: str) -> MigrationsOut:
     return MigrationsOut(id=run_id, migrants=migrants)
 
 
+def _best_so_far(session: Session, run: Run, job: Job) -> list[dict[str, Any]]:
+    """What a run that ended without a result had found, without standard errors."""
+    points = RunRepository(session).history(run.id)
+    if not points:
+        return []
+    best = min(points, key=lambda point: point.rms)
+    reason = f"the run was {run.state.value} before its standard errors were computed"
+    return [
+        {
+            "name": one.name, "unit": one.unit, "value": value, "lower": one.lower,
+            "upper": one.upper, "stderr": None, "interval95": None, "status": "unfinished",
+            "reason": reason,
+        }
+        for one, value in zip(_sought(session, run, job), best.parameters, strict=False)
+    ]  # fmt: skip
+
+
 def _free_names(session: Session, run: Run) -> list[str]:
     if run.result is not None:
         return [one["name"] for one in run.result["parameters"] if one["status"] != "fixed"]
-    body = body_of_run(run, JobRepository(session).get(run.job_id))
+    return [one.name for one in _sought(session, run, JobRepository(session).get(run.job_id))]
+
+
+def _sought(session: Session, run: Run, job: Job) -> list[Parameter]:
+    """The free parameters of a run, in the order of its history's columns."""
+    body = body_of_run(run, job)
     model, _ = resolve(session, body["model"])
     everything = (*model.parameters, *initial_parameters(model, len(body["datasets"])))
-    return [p.name for p in override(everything, body["parameters"]) if p.is_free]
+    return [one for one in override(everything, body["parameters"]) if one.is_free]
 
 
 def _progress(run: Run, job: Job, known: Reached | None) -> float:

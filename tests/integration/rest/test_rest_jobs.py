@@ -5,9 +5,10 @@ from typing import Any
 from starlette.testclient import TestClient
 
 from service.api.deps import Parts
+from service.storage.ledger import HistoryPoint, RunLedger
 from service.storage.queue import Queue
 from service.storage.tables import State
-from tests.rest import refused
+from tests.rest import CSV, recording, refused
 
 
 def submit(server: TestClient, dataset: str, **changes: Any) -> dict[str, Any]:
@@ -162,3 +163,29 @@ def test_an_axis_over_an_object_gives_each_run_the_whole_object(
     assert [(one["method"], one["bits"]) for one in found] == [("simple", 24), ("improved", 12)]
     axis = {"path": "/parameters/L", "values": [{"upper": 1}, {"upper": 2}]}
     assert submit(server, dataset, sweep={"axes": [axis]})["progress"]["runs"] == 2
+
+
+def test_a_cancelled_run_keeps_the_best_it_had_found(own: TestClient) -> None:
+    stored = own.post("/v1/datasets", content=recording(), headers=CSV).json()
+    job = submit(own, stored["id"], parameters={"L": {"upper": 1.0}})["id"]
+    parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
+    (run,) = own.get(f"/v1/jobs/{job}/runs").json()["items"]
+    names = own.get(f"/v1/runs/{run['id']}/history").json()["names"]
+    assert names == ["K", "T", "L", "y0", "x(0)"]
+    with parts.database.write() as session:
+        lease = Queue(session).claim("d1").lease
+        ledger = RunLedger(session, lease)
+        ledger.start([run["id"]])
+        for number, rms in enumerate((0.5, 0.25)):
+            values = [2.0 + number, 1.0, 0.5, 0.0, 0.0]
+            point = HistoryPoint(run["id"], 0, number, number, 50 * number, rms, "genetic", values)
+            ledger.append([point])
+        Queue(session).finish(lease, State.CANCELLED)
+    told = own.get(f"/v1/runs/{run['id']}").json()
+    assert told["state"] == "cancelled"
+    assert told["rms"] == 0.25
+    assert told["evaluations"] == 50
+    best = {one["name"]: one for one in told["parameters"]}
+    assert best["K"]["value"] == 3.0
+    assert best["K"]["stderr"] is None
+    assert "cancelled" in best["K"]["reason"]
