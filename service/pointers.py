@@ -11,6 +11,7 @@ from sysid.errors import nearest
 
 Location = Sequence[str | int]
 SHOWN = 80
+NOT_AN_OBJECT = ("model_type", "model_attributes_type", "dict_type")
 
 
 def explained(entries: Iterable[Mapping[str, Any]], body: Any, kind: Any) -> Iterator[FieldError]:
@@ -29,7 +30,8 @@ def explained(entries: Iterable[Mapping[str, Any]], body: Any, kind: Any) -> Ite
         # A union gives one entry per member; the first is about the member most often meant.
         if pointer not in seen:
             seen.add(pointer)
-            yield FieldError(pointer, detail_of(entry, known_fields(kind, entry["loc"][:-1])))
+            at = entry["loc"] if entry["type"] in NOT_AN_OBJECT else entry["loc"][:-1]
+            yield FieldError(pointer, detail_of(entry, known_fields(kind, at)))
 
 
 def detail_of(entry: Mapping[str, Any], known: Sequence[str]) -> str:
@@ -39,7 +41,14 @@ def detail_of(entry: Mapping[str, Any], known: Sequence[str]) -> str:
     if entry["type"] == "missing":
         return "this field is required"
     found = repr(entry.get("input"))
-    return f"{entry['msg']}; found {found if len(found) <= SHOWN else found[:SHOWN] + '…'}"
+    found = found if len(found) <= SHOWN else found[:SHOWN] + "…"
+    if entry["type"] in NOT_AN_OBJECT:
+        return f"found {found}; need an object with fields such as {', '.join(known)}"
+    if entry["type"] == "list_type":
+        return f"found {found}; need a list, such as [{entry.get('input')}]"
+    if entry["type"] == "string_pattern_mismatch" and entry["loc"][-1] == "path":
+        return f"found {found}; need a JSON pointer, such as /noise/sigma"
+    return f"{entry['msg']}; found {found}"
 
 
 def pointer_into(body: Any, loc: Location, *, is_missing: bool = False) -> str:

@@ -56,6 +56,9 @@ def add(
     with connected(url, key) as client:
         stored = client.add_dataset(file, name, segments=segments, sample_time=sample_time)
     _tell(stored, as_json)
+    if name and stored["name"] != name and not as_json:
+        out.print(f"note: these bytes were stored before, as {stored['name']!r}; that name stays",
+                  markup=False, soft_wrap=True)  # fmt: skip
 
 
 @app.command()

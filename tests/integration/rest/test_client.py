@@ -1,6 +1,7 @@
 """The light client against the application, without a socket."""
 
 import asyncio
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -107,4 +108,6 @@ def test_the_asynchronous_client_does_the_same(server: TestClient, dataset: str)
             with pytest.raises(ProblemError, match="no run"):
                 await client.run("run_0")
 
-    asyncio.run(work())
+    # A thread of its own: a browser test before may have left a loop running in this one.
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(lambda: asyncio.run(work())).result()
