@@ -1,5 +1,7 @@
 """A pack of work as a worker sees it."""
 
+from dataclasses import replace
+
 import pytest
 
 import workers.tasks
@@ -26,3 +28,23 @@ def test_a_programming_error_in_one_run_fails_it_alone(monkeypatch: pytest.Monke
     assert faulty.outcome == Failure(
         "internal error: OverflowError: too large", "InternalError"
     )  # fmt: skip
+
+
+def test_a_run_whose_model_diverges_everywhere_fails_with_that_message() -> None:
+    whole = spec(1, generations=5)
+    wild = {
+        "name": "wild",
+        "form": "difference",
+        "inputs": {"u": "1"},
+        "states": {"x": "1"},
+        "parameters": {"a": {"lower": 1e6, "upper": 1e7}},
+        "equations": {"x": "a*x(k-1) + u(k-1)"},
+        "outputs": {"y": "x"},
+        "initial": {"x": 1},
+    }
+    problem = replace(whole.problem, model=wild, parameters={})
+    item = Advance("r1", replace(whole, problem=problem), None, 100.0)
+    (done,) = workers.tasks.advance([item], ["short"], RECORDS["short"])
+    assert isinstance(done.outcome, Failure)
+    assert "the model diverged for every one of" in done.outcome.reason
+    assert "narrow the bounds" in done.outcome.reason
