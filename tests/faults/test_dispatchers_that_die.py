@@ -14,6 +14,8 @@ from service.storage.sessions import Database
 from service.storage.tables import State
 from tests.stored import job_of, runs_of, submit
 
+pytestmark = pytest.mark.slow  # processes of their own
+
 LEASE = timedelta(seconds=0.4)
 N_JOBS, N_RUNS = 24, 2
 

@@ -18,6 +18,8 @@ import pytest
 from service.embedded import free_port
 from tests.rest import recording
 
+pytestmark = pytest.mark.slow  # processes of their own
+
 OWN = """
 name: own
 form: differential
