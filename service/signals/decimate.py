@@ -23,16 +23,27 @@ def decimate(
     times, values : FloatArray, shape (at most max_points,)
         A subset of the samples, in their order; all of them if they are few enough.
     """
-    if max_points < 2:
-        raise ValueError(f"max_points is {max_points}; need 2 or more")
     if values.size <= max_points:
         return times, values
+    kept = extremes(values, max_points)
+    return times[kept], values[kept]
+
+
+def extremes(values: FloatArray, max_points: int) -> IntArray:
+    """Indices of the least and the greatest sample of each of ``max_points // 2`` buckets.
+
+    Raises
+    ------
+    ValueError
+        If `max_points` is below 2.
+    """
+    if max_points < 2:
+        raise ValueError(f"max_points is {max_points}; need 2 or more")
     edges = np.linspace(0, values.size, max_points // 2 + 1).astype(np.int64)[:-1]
     known = np.isfinite(values)
     least = _first_extreme(np.where(known, values, np.inf), edges, np.minimum)
     greatest = _first_extreme(np.where(known, values, -np.inf), edges, np.maximum)
-    kept = np.unique(np.concatenate([least, greatest]))
-    return times[kept], values[kept]
+    return np.unique(np.concatenate([least, greatest]))
 
 
 def _first_extreme(values: FloatArray, edges: IntArray, extreme: np.ufunc) -> IntArray:

@@ -1,31 +1,23 @@
 """Thinning of lines to what a screen can show, without losing what the eye looks for."""
 
-from itertools import pairwise
-
 import numpy as np
 from numpy.typing import NDArray
 
+from service.signals.decimate import extremes
 from service.web.evidence import Floats
 
 MAX_POINTS = 1000
 
 
-def extremes(values: Floats, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
+def thinned(values: Floats, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
     """Indices of at most `max_points` samples: the ends, and each bin's least and greatest.
 
-    A spike of one sample therefore stays visible at any zoom. Missing values are passed over.
+    A spike of one sample therefore stays visible at any zoom. Several arrays may share them.
     """
     if values.size <= max_points:
         return np.arange(values.size)
-    edges = np.linspace(0, values.size, (max_points - 2) // 2 + 1).astype(np.intp)
-    kept = [0, values.size - 1]
-    for start, stop in pairwise(edges):
-        part = values[start:stop]
-        known = np.flatnonzero(np.isfinite(part))
-        if known.size:
-            kept.append(start + known[np.argmin(part[known])])
-            kept.append(start + known[np.argmax(part[known])])
-    return np.unique(np.array(kept, dtype=np.intp))
+    inner = extremes(values, max_points - 2)
+    return np.unique(np.concatenate([[0, values.size - 1], inner])).astype(np.intp)
 
 
 def window(times: Floats, start: float | None, stop: float | None) -> slice:

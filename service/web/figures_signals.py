@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from service.web import theme
-from service.web.decimation import MAX_POINTS, extremes, window
+from service.web.decimation import MAX_POINTS, thinned, window
 from service.web.evidence import Experiment, Floats, OutputTraces, Trace
 from service.web.figures import MARGIN, Figure, finite, layout
 
@@ -115,9 +115,9 @@ def _output_traces(
     output: OutputTraces, span: slice, axis: str, in_legend: bool
 ) -> list[dict[str, Any]]:
     times, values = output.measured.times[span], output.measured.values[span]
-    kept = extremes(values, MAX_POINTS)
+    kept = thinned(values, MAX_POINTS)
     identified = output.identified[span]
-    also = extremes(identified, MAX_POINTS)
+    also = thinned(identified, MAX_POINTS)
     shared = {"type": "scatter", "yaxis": _axis(axis), "showlegend": in_legend}
     return [
         {
@@ -145,7 +145,7 @@ def _measured_look(times: Floats, drawn: int) -> dict[str, Any]:
 def _residual(output: OutputTraces, span: slice, axis: str, in_legend: bool) -> dict[str, Any]:
     times = output.measured.times[span]
     values = output.measured.values[span] - output.identified[span]
-    kept = extremes(values, MAX_POINTS)
+    kept = thinned(values, MAX_POINTS)
     return {
         "type": "scatter", "mode": "lines", "name": "residual", "yaxis": _axis(axis),
         "showlegend": in_legend, "x": finite(times[kept]), "y": finite(values[kept]),
@@ -156,7 +156,7 @@ def _residual(output: OutputTraces, span: slice, axis: str, in_legend: bool) -> 
 
 def _line(signal: Trace, span: slice, axis: str, colour: str, *, legend: bool) -> dict[str, Any]:
     times, values = signal.times[span], signal.values[span]
-    kept = extremes(values, MAX_POINTS)
+    kept = thinned(values, MAX_POINTS)
     return {
         "type": "scatter", "mode": "lines", "name": signal.name, "yaxis": _axis(axis),
         "showlegend": legend, "x": finite(times[kept]), "y": finite(values[kept]),
