@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 from llvmlite import ir
 
 from sysid.kernels.calls import LANES
+from sysid.kernels.vectormath import vector_functions
 
 DOUBLE, INT, BOOL = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 VECTOR, INTS, BOOLS = (ir.VectorType(kind, LANES) for kind in (DOUBLE, INT, BOOL))
@@ -111,12 +112,34 @@ class Lanes:
         return self.add(start, self.mul(fraction, self.sub(stop, start)))
 
     def intrinsic(self, name: str, *arguments: Value) -> Value:
-        """A function LLVM knows, lane by lane; those without instructions become libm calls."""
+        """A function LLVM knows, lane by lane; vectors may go to the machine's vector library."""
         values = self.same_shape(*arguments)
         kind = values[0].type
+        offered = vector_functions()
+        if name in offered.symbols and isinstance(kind, ir.VectorType):
+            return self._in_parts(offered.symbols[name], offered.lanes, values)
         suffix = f"v{LANES}f64" if isinstance(kind, ir.VectorType) else "f64"
         signature = ir.FunctionType(kind, [v.type for v in values])
         return self.builder.call(self._declared(f"llvm.{name}.{suffix}", signature), values)
+
+    def _in_parts(self, symbol: str, width: int, values: list[Value]) -> Value:
+        """A vector function of `width` lanes, called on the parts of wider vectors."""
+        part = ir.VectorType(DOUBLE, width)
+        function = self._declared(symbol, ir.FunctionType(part, [part] * len(values)))
+        nothing = ir.Constant(VECTOR, ir.Undefined)
+        parts = []
+        for first in range(0, LANES, width):
+            chosen = _positions(range(first, first + width))
+            pieces = [self.builder.shuffle_vector(one, nothing, chosen) for one in values]
+            parts.append(self.builder.call(function, pieces))
+        while len(parts) > 1:  # neighbours join until one vector is left
+            width = parts[0].type.count
+            order = _positions(range(2 * width))
+            parts = [
+                self.builder.shuffle_vector(low, high, order)
+                for low, high in zip(parts[::2], parts[1::2], strict=True)
+            ]
+        return parts[0]
 
     def whole_and_fraction(self, value: Value) -> tuple[Value, Value]:
         """Floor as whole numbers, and what remains."""
@@ -199,6 +222,11 @@ class Lanes:
         module = self.function.module
         known = module.globals.get(name)
         return known if known is not None else ir.Function(module, signature, name)
+
+
+def _positions(places: Sequence[int]) -> Value:
+    """Which lanes a shuffle takes."""
+    return ir.Constant(ir.VectorType(_INT32, len(places)), list(places))
 
 
 class Loop:

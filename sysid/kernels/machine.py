@@ -15,6 +15,8 @@ from typing import Any
 import llvmlite
 import llvmlite.binding as llvm
 
+from sysid.kernels.vectormath import vector_functions
+
 _MAGIC = b"lagid-kernel-1\n"
 _LEVEL = 3
 _engines: list[Any] = []  # an engine owns the memory of its code: it lives as long as the process
@@ -36,9 +38,9 @@ def _features() -> str:
 
 @cache
 def machine_name() -> str:
-    """What object code depends on besides its source: compiler, processor and its features."""
+    """What object code depends on besides its source: compiler, processor, vector library."""
     words = (llvmlite.__version__, str(llvm.llvm_version_info), llvm.get_host_cpu_name())
-    return "\n".join((*words, _features()))
+    return "\n".join((*words, _features(), *vector_functions().symbols.values()))
 
 
 def object_code(assembly: str) -> bytes:
@@ -55,6 +57,7 @@ def object_code(assembly: str) -> bytes:
 def loaded(code: bytes, function: str) -> int:
     """Address of a function of some object code, which stays loaded."""
     _target()
+    vector_functions()  # the code may call them
     empty = llvm.parse_assembly("")
     # each engine owns its target machine, so the one that compiles cannot be shared with it
     machine = llvm.Target.from_default_triple().create_target_machine(jit=True)

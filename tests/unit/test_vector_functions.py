@@ -1,0 +1,77 @@
+"""Functions of the vector library give what NumPy gives, in every lane, and hide no divergence."""
+
+import numpy as np
+import pytest
+
+from sysid import load_model
+from sysid.kernels import lanes, machine
+from sysid.kernels.vectormath import VectorFunctions, vector_functions
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+from sysid.types import FloatArray
+
+FUNCTIONS = {
+    "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh,
+    "atan": np.arctan,
+}  # fmt: skip
+PLACES = np.array([-800.0, -3.0, -0.5, -1e-9, 0.0, 1e-300, 0.7, 1.0, 30.0, 709.0, 710.0, 1e5])
+
+
+def values_of(expression: str, candidates: FloatArray) -> FloatArray:
+    """The second sample of a recursion that gives an expression of its parameters p and q."""
+    bounds = {"lower": -1e6, "upper": 1e6}
+    model = load_model(
+        {
+            "name": "function", "form": "difference", "states": {"x": "1"},
+            "parameters": {"p": bounds, "q": bounds}, "equations": {"x": expression},
+            "outputs": {"y": "x"}, "initial": {"x": 0},
+        }
+    )  # fmt: skip
+    times = np.arange(2.0)
+    record = Record((), (Channel("y", times, times, "1"),))
+    return np.asarray(Problem.build(model, [record]).predictions(candidates)[:, 1])
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_function_is_that_of_numpy_also_where_it_overflows_or_is_undefined(name: str) -> None:
+    candidates = np.column_stack([PLACES, PLACES])
+    with np.errstate(all="ignore"):
+        expected = FUNCTIONS[name](PLACES)
+    np.testing.assert_allclose(
+        values_of(f"{name}(p) + 0*x(k-1)", candidates), expected, rtol=1e-14, atol=1e-300
+    )
+
+
+def test_a_power_is_that_of_numpy_for_any_base_and_exponent() -> None:
+    bases, exponents = np.array([-2.0, -2.0, 0.0, 0.3, 5.0]), np.array([3.0, 0.5, 2.0, -1.7, 400.0])
+    candidates = np.array([(a, b) for a in bases for b in exponents])
+    with np.errstate(all="ignore"):
+        expected = np.power(candidates[:, 0], candidates[:, 1])
+    found = values_of("p**q + 0*x(k-1)", candidates)
+    np.testing.assert_allclose(found, expected, rtol=1e-13)
+
+
+def test_a_lane_does_not_depend_on_its_neighbours() -> None:
+    candidates = np.column_stack([PLACES, PLACES])
+    alone = np.array([values_of("exp(p) + 0*x(k-1)", one[None])[0] for one in candidates])
+    np.testing.assert_array_equal(values_of("exp(p) + 0*x(k-1)", candidates), alone)
+
+
+def test_a_machine_without_the_library_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    candidates = np.column_stack([PLACES, PLACES])
+    with_library = values_of("tanh(p) + sin(q) + 0*x(k-1)", candidates)
+    monkeypatch.setattr(lanes, "vector_functions", lambda: VectorFunctions(1, {}))
+    monkeypatch.setattr(machine, "vector_functions", lambda: VectorFunctions(1, {}))
+    machine.machine_name.cache_clear()
+    try:
+        without = values_of("tanh(p) + sin(q) + 0*x(k-1)", candidates)
+    finally:
+        machine.machine_name.cache_clear()
+    np.testing.assert_allclose(without, with_library, rtol=1e-13)
+
+
+def test_each_symbol_names_its_lanes_and_arguments() -> None:
+    offered = vector_functions()
+    for name, symbol in offered.symbols.items():
+        arguments = "vv" if name == "pow" else "v"
+        assert symbol[5:] == f"N{offered.lanes}{arguments}_{name}"
