@@ -1,7 +1,7 @@
-"""Speed of the compiled kernels, beside a reference in C where one is at hand.
+"""Speed of the compiled kernels beside C, and of what surrounds them.
 
-The reference is the folder ``bench`` beside the measured data (`LAGID_DATA`): the paper's
-recursion in C, compiled here with the machine's own compiler.
+The reference of the paper's recursion lies in the folder ``bench`` beside the measured data
+(`LAGID_DATA`); C of other models is in ``benchmarks/c``. Both are compiled here.
 """
 
 import importlib.util
@@ -14,6 +14,16 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks.equivalents import (
+    EXAMPLES,
+    Compiled,
+    operations_a_step,
+    operations_of_peak,
+    problem_of,
+)
+from benchmarks.equivalents import (
+    individuals as candidates,
+)
 from benchmarks.table import Row, Skipped, parser, report
 from sysid.kernels.compiler import kernel_key
 from sysid.kernels.emission import kernel_code
@@ -105,6 +115,50 @@ def against_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
     return rows, skipped
 
 
+def against_own_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
+    """Models that users write, 48 × 300, beside C written by hand; both the least of several."""
+    if shutil.which("cc") is None:
+        return [], [Skipped("models beside C", "no C compiler (cc)")]
+    compiled, rows = Compiled(), []
+    turns = 10_000
+    peak = operations_of_peak(turns) / microseconds(compiled.peak(turns), 5) / 1000
+    for name, example in EXAMPLES.items():
+        built, theta = problem_of(example, 300), candidates(example, 48)
+        call, fitness = compiled.call(example, built, theta)
+        call()
+        if not np.allclose(fitness, built.fitness(theta), rtol=1e-9):
+            raise SystemExit(f"{name}: the C code does not compute what the kernel computes")
+        ours = c = np.inf
+        for _ in range(3):
+            ours = min(ours, microseconds(lambda e=built, t=theta: e.fitness(t), repeats))
+            c = min(c, microseconds(call, repeats))
+        steps = 2 * 300 if "2 steps" in name else 300
+        share = operations_a_step(built) * 48 * steps / ours / 1000 / peak
+        rows += [
+            Row(f"{name}: time ÷ C by hand", ours / c, "", 1.5),
+            Row(f"{name}: per individual, sample and stage", ours * 1000 / 48 / 300
+                / example.stages, "ns"),
+            Row(f"{name}: share of the peak of {peak:.0f} GFLOP/s", 100 * share, "%"),
+        ]  # fmt: skip
+    return rows, []
+
+
+def growth(repeats: int) -> list[Row]:
+    """Whether the time is linear: the largest departure from a straight line through it."""
+    rows = []
+    sizes = {"samples": (300, 1000, 3000, 10_000), "individuals": (48, 96, 480, 960)}
+    for what, counts in sizes.items():
+        times = []
+        for count in counts:
+            samples, many = (count, 48) if what == "samples" else (300, count)
+            example, theta = problem(duffing("difference"), samples), individuals(many)
+            times.append(microseconds(lambda e=example, t=theta: e.fitness(t), repeats))
+        each = np.array(times) / np.array(counts)
+        rows.append(Row(f"time for each of {counts[0]} to {counts[-1]} {what}: largest ÷ least",
+                        float(each.max() / each.min()), "", 1.5))  # fmt: skip
+    return rows
+
+
 def others(repeats: int) -> list[Row]:
     """The differential form, a long record, and what a new model costs."""
     model = duffing("differential")
@@ -138,7 +192,9 @@ def main() -> None:
     options = parser(__doc__ or "").parse_args()
     repeats = 10 if options.quick else 50
     rows, skipped = against_c(repeats)
-    report("Kernels", [*rows, *others(repeats)], skipped, options)
+    own, absent = against_own_c(repeats)
+    rows += [*own, *growth(repeats), *others(repeats)]
+    report("Kernels", rows, [*skipped, *absent], options)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,205 @@
+/* Hand-written C of models that users write: J (Eq. 10) of a population, free run, to time generated kernels against.
+ * As a careful programmer would: individuals side by side in lanes of W, state in lane arrays, what one step has read
+ * kept for the next, no trajectory stored where no lag needs one.
+ * Build: cc -O3 -march=native -ffast-math -fopenmp-simd -DW=16 -shared -fPIC equivalents.c -lm
+ * theta: K rows (parameters, in the model's order) of P values, P a multiple of W; u: the input on its fine grid, `zero`
+ * the index at t = 0, `points` fine points in an integration step; y: N measured values; work: zeroed history; J: P. */
+#include <math.h>
+#ifndef W
+#define W 16
+#endif
+#define LANES _Pragma("omp simd") for (int j = 0; j < W; j++)
+#define ARGUMENTS                                                                                                        \
+  const double *restrict theta, long P, const double *restrict u, long zero, long points, const double *restrict y,     \
+      long N, double h, double *restrict work, double *restrict J
+#define ROW(i) theta[(i) * P + p0 + j]
+
+/* dy/dt = (K u(t - L) - y)/T, RK4; y(0) measured. */
+void tube(ARGUMENTS) {
+  (void)work;
+  for (long p0 = 0; p0 < P; p0 += W) {
+    double gain[W], rate[W], part[W], sum[W], x[W], before[W], start[W];
+    long offset[W];
+    LANES {
+      double d = ROW(2) / h * points;
+      long whole = (long)d;
+      rate[j] = 1 / ROW(1), gain[j] = ROW(0) * rate[j], part[j] = d - whole;
+      offset[j] = zero - whole;
+      before[j] = u[offset[j] - 1], start[j] = u[offset[j]];
+      sum[j] = 0, x[j] = y[0];
+    }
+    for (long k = 0; k < N - 1; k++) {
+      const double *at = u + k * points;
+      LANES {
+        double middle = at[offset[j] + 1], end = at[offset[j] + 2];
+        double f0 = gain[j] * (start[j] + part[j] * (before[j] - start[j]));
+        double f1 = gain[j] * (middle + part[j] * (start[j] - middle));
+        double f2 = gain[j] * (end + part[j] * (middle - end));
+        double k1 = f0 - rate[j] * x[j];
+        double k2 = f1 - rate[j] * (x[j] + 0.5 * h * k1);
+        double k3 = f1 - rate[j] * (x[j] + 0.5 * h * k2);
+        double k4 = f2 - rate[j] * (x[j] + h * k3);
+        x[j] += h / 6 * (k1 + k4 + 2 * (k2 + k3));
+        before[j] = middle, start[j] = end;
+        double e = y[k + 1] - x[j];
+        sum[j] += e * e;
+      }
+    }
+    LANES J[p0 + j] = sqrt(sum[j] / N);
+  }
+}
+
+/* y'' = b u(t - L) - d y' - k1 y - k2 y^2 - k3 y^3 - c, RK4 with two steps a sample; y(0) and its first difference. */
+void silverbox(ARGUMENTS) {
+  (void)work;
+  double step = h / 2;
+  for (long p0 = 0; p0 < P; p0 += W) {
+    double b[W], d[W], k1[W], k2[W], k3[W], c[W], part[W], sum[W], x[W], v[W], before[W], start[W];
+    long offset[W];
+    LANES {
+      double lag = ROW(6) / step * points;
+      long whole = (long)lag;
+      b[j] = ROW(0), d[j] = ROW(1), k1[j] = ROW(2), k2[j] = ROW(3), k3[j] = ROW(4), c[j] = ROW(5);
+      part[j] = lag - whole, offset[j] = zero - whole;
+      before[j] = u[offset[j] - 1], start[j] = u[offset[j]];
+      sum[j] = 0, x[j] = y[0], v[j] = (y[1] - y[0]) / h;
+    }
+    for (long k = 0; k < 2 * (N - 1); k++) {
+      const double *at = u + k * points;
+      LANES {
+        const double *here = at + offset[j];
+        double middle = here[points / 2], middle_before = here[points / 2 - 1];
+        double end = here[points], end_before = here[points - 1];
+        double f0 = b[j] * (start[j] + part[j] * (before[j] - start[j])) - c[j];
+        double f1 = b[j] * (middle + part[j] * (middle_before - middle)) - c[j];
+        double f2 = b[j] * (end + part[j] * (end_before - end)) - c[j];
+#define FORCE(f, x, v) ((f) - d[j] * (v) - (x) * (k1[j] + (x) * (k2[j] + k3[j] * (x))))
+        double xs, vs, a1, a2, a3, a4, v2, v3, v4;
+        a1 = FORCE(f0, x[j], v[j]);
+        xs = x[j] + 0.5 * step * v[j], v2 = v[j] + 0.5 * step * a1, a2 = FORCE(f1, xs, v2);
+        xs = x[j] + 0.5 * step * v2, v3 = v[j] + 0.5 * step * a2, a3 = FORCE(f1, xs, v3);
+        xs = x[j] + step * v3, v4 = v[j] + step * a3, a4 = FORCE(f2, xs, v4);
+        vs = v[j];
+        x[j] += step / 6 * (vs + v4 + 2 * (v2 + v3));
+        v[j] += step / 6 * (a1 + a4 + 2 * (a2 + a3));
+        before[j] = end_before, start[j] = end;
+      }
+      if (k & 1) LANES {
+        double e = y[(k + 1) / 2] - x[j];
+        sum[j] += e * e;
+      }
+    }
+    LANES J[p0 + j] = sqrt(sum[j] / N);
+  }
+}
+
+/* Eq. 16 with the force of Eq. 17-18: Coulomb friction by the sign of the last step; lags up to the history's front. */
+void coulomb(ARGUMENTS) {
+  (void)points;
+  for (long p0 = 0; p0 < P; p0 += W) {
+    double damping[W], spring[W], friction[W], part[W], sum[W], tap[W], delayed[W], x0[W], x1[W];
+    long offset[W], pad = 64;
+    LANES {
+      double d = ROW(1) / h;
+      long whole = (long)d;
+      part[j] = d - whole, offset[j] = (1 - whole) * W + j;
+      damping[j] = ROW(0) * h, spring[j] = 1 + h * h * ROW(2), friction[j] = h * h * ROW(3);
+      sum[j] = y[0] * y[0] + y[1] * y[1], tap[j] = delayed[j] = x0[j] = x1[j] = 0;
+    }
+    for (long k = 0; k < pad * W + 2 * W; k++) work[k] = 0;
+    for (long k = 0; k < N - 2; k++) {
+      double *row = work + (k + pad) * W;
+      double force = h * h * u[zero + k * points];
+#pragma GCC ivdep
+      for (int j = 0; j < W; j++) {
+        double newest = row[offset[j]];
+        double now = newest + part[j] * (tap[j] - newest);
+        double change = now - delayed[j], moved = x1[j] - x0[j];
+        double sign = (moved > 0) - (moved < 0);
+        tap[j] = newest, delayed[j] = now;
+        double next = 2 * x1[j] - damping[j] * change - spring[j] * x0[j] - friction[j] * sign + force;
+        row[2 * W + j] = next;
+        x0[j] = x1[j], x1[j] = next;
+        double e = y[k + 2] - next;
+        sum[j] += e * e;
+      }
+    }
+    LANES J[p0 + j] = sqrt(sum[j] / N);
+  }
+}
+
+/* 13 terms of a cubic NARX: 1 u u1 y1 y2 y1^2 y1 y2 y1^3 y1^2 y2 y1 y2^2 y2^3 y1 u y1^2 u; the first two samples measured. */
+void narx(ARGUMENTS) {
+  (void)work, (void)points, (void)h;
+  for (long p0 = 0; p0 < P; p0 += W) {
+    double a[13][W], sum[W], y1[W], y2[W];
+    for (int i = 0; i < 13; i++) LANES a[i][j] = ROW(i);
+    LANES sum[j] = 0, y1[j] = y[1], y2[j] = y[0];
+    for (long k = 2; k < N; k++) {
+      double u0 = u[zero + k * points], u1 = u[zero + (k - 1) * points];
+      LANES {
+        double p = y1[j], q = y2[j], s = p * p, t = q * q;
+        double next = a[0][j] * p + a[1][j] * q + a[2][j] * u0 + a[3][j] * u1 + a[4][j] * s + a[5][j] * p * q +
+                      a[6][j] * s * p + a[7][j] * s * q + a[8][j] * p * t + a[9][j] * q * t + a[10][j] * p * u0 +
+                      a[11][j] * s * u0 + a[12][j] * t;
+        y2[j] = p, y1[j] = next;
+        double e = y[k] - next;
+        sum[j] += e * e;
+      }
+    }
+    LANES J[p0 + j] = sqrt(sum[j] / N);
+  }
+}
+
+/* dx/dt = beta x(t - L)/(1 + x(t - L)^n) - gamma x, RK4; lags from one step up to the history's front; x(0) measured. */
+void mackey(ARGUMENTS) {
+  (void)u, (void)zero, (void)points;
+  long pad = 128;
+  for (long p0 = 0; p0 < P; p0 += W) {
+    double beta[W], gamma[W], n[W], part[W], sum[W], x[W], older[W], old[W], first[W];
+    long offset[W];
+    LANES {
+      double d = ROW(3) / h;
+      long whole = (long)d;
+      beta[j] = ROW(0), gamma[j] = ROW(1), n[j] = ROW(2);
+      part[j] = d - whole, offset[j] = (1 - whole) * W + j;
+      sum[j] = 0, x[j] = older[j] = old[j] = y[0];
+      first[j] = beta[j] * y[0] / (1 + pow(y[0], n[j]));
+    }
+    for (long k = 0; k <= pad; k++) LANES work[k * W + j] = y[0];
+    for (long k = 0; k < N - 1; k++) {
+      double *row = work + (k + pad) * W, half[W], whole[W], powers[2][W], ahead[W];
+#pragma GCC ivdep
+      for (int j = 0; j < W; j++) {
+        double next = row[offset[j]], f = part[j];
+        double later = next + (f + 0.5) * (old[j] - next), earlier = old[j] + (f - 0.5) * (older[j] - old[j]);
+        half[j] = f < 0.5 ? later : earlier, whole[j] = next + f * (old[j] - next), ahead[j] = next;
+      }
+      LANES powers[0][j] = pow(half[j], n[j]);
+      LANES powers[1][j] = pow(whole[j], n[j]);
+      LANES {
+        double f1 = beta[j] * half[j] / (1 + powers[0][j]), f2 = beta[j] * whole[j] / (1 + powers[1][j]);
+        double k1 = first[j] - gamma[j] * x[j];
+        double k2 = f1 - gamma[j] * (x[j] + 0.5 * h * k1);
+        double k3 = f1 - gamma[j] * (x[j] + 0.5 * h * k2);
+        double k4 = f2 - gamma[j] * (x[j] + h * k3);
+        x[j] += h / 6 * (k1 + k4 + 2 * (k2 + k3));
+        older[j] = old[j], old[j] = ahead[j], first[j] = f2;
+        row[W + j] = x[j];
+        double e = y[k + 1] - x[j];
+        sum[j] += e * e;
+      }
+    }
+    LANES J[p0 + j] = sqrt(sum[j] / N);
+  }
+}
+
+/* Multiply-adds a call, for the machine's peak: 2 * W * 8 * turns operations in independent chains. */
+double peak(long turns) {
+  double x[8][W], total = 0;
+  for (int i = 0; i < 8; i++) LANES x[i][j] = 1e-9 * (i * W + j);
+  for (long k = 0; k < turns; k++)
+    for (int i = 0; i < 8; i++) LANES x[i][j] = x[i][j] * 0.999999 + 1e-7;
+  for (int i = 0; i < 8; i++) LANES total += x[i][j];
+  return total;
+}
