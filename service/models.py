@@ -11,11 +11,13 @@ from service.schemas import FieldProblem, Page
 from service.schemas_models import CheckOut, ModelOut
 from service.storage import errors as storage_errors
 from service.storage.models import ModelRepository
+from service.storage.tables import Job, Run
 from service.storage.tables import Model as StoredModel
+from service.sweeps import body_of
 from sysid.errors import SysidError, UnknownModel, nearest
 from sysid.models import library
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
+from sysid.models.spec import parse_model, with_terms
 
 
 def page(session: Session, cursor: str | None, limit: int) -> Page[ModelOut]:
@@ -94,6 +96,27 @@ def resolve(session: Session, reference: Any) -> tuple[Model, Any]:
     except NotFound:
         raise UnknownModel(reference, _names(session)) from None
     return parse_model(row.document), row.document
+
+
+def model_of_run(session: Session, run: Run, job: Job) -> Model:
+    """The model of one run, its terms as they were selected on the run's data.
+
+    Until a run with a term selection has its result, the model has all candidates, and a `rule`.
+
+    Raises
+    ------
+    InvalidModel, UnknownModel
+        If the stored model cannot be read any more.
+    """
+    model, _ = resolve(session, body_of(job.spec, run.cell)["model"])
+    return resolved(model, run.result)
+
+
+def resolved(model: Model, result: Mapping[str, Any] | None) -> Model:
+    """A model with the terms that a run's result document says were selected, if it does."""
+    if model.rule is None or not (result or {}).get("selection"):
+        return model
+    return with_terms(model, [one["term"] for one in (result or {})["selection"]])
 
 
 def _own(session: Session, reference: str) -> StoredModel:

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.errors import InvalidRequest
-from service.models import resolve
+from service.models import model_of_run
 from service.schemas import Page
 from service.schemas_runs import (
     HistoryOut,
@@ -144,7 +144,9 @@ def _free_names(session: Session, run: Run) -> list[str]:
 def _sought(session: Session, run: Run, job: Job) -> list[Parameter]:
     """The free parameters of a run, in the order of its history's columns."""
     body = body_of_run(run, job)
-    model, _ = resolve(session, body["model"])
+    model = model_of_run(session, run, job)
+    if model.rule is not None:  # which of its candidates are sought is told with the result
+        return []
     everything = (*model.parameters, *initial_parameters(model, len(body["datasets"])))
     return [one for one in override(everything, body["parameters"]) if one.is_free]
 

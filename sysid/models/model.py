@@ -1,10 +1,11 @@
 """A checked model: equations as trees, parameters with bounds, how to start and how to solve."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from sysid.language.tree import Expression
+from sysid.models.terms import Selection, Term, TermRule
 from sysid.parameters import Parameter
 
 Form = Literal["difference", "differential", "polynomial"]
@@ -92,6 +93,10 @@ class Model:
     be computed is `order` (indices into `states`). `memory` is the largest fixed offset of any
     past value (difference form): the first `memory` samples are given, not computed.
     `document` is the normal form, from which the model can be built again.
+
+    Of a polynomial, `terms` are its terms, in the order of their coefficients. With a `rule` they
+    are candidates only: `sysid.selection.selected` resolves it on records, and what it has found
+    is the resolved model's `selection`.
     """
 
     name: str
@@ -107,3 +112,6 @@ class Model:
     memory: int
     solver: Solver
     document: Mapping[str, Any]
+    terms: tuple[Term, ...] = ()
+    rule: TermRule | None = None
+    selection: Selection | None = field(default=None, compare=False)

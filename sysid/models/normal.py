@@ -59,9 +59,19 @@ def _polynomial(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
         body["lags"] = {k: [_text(one) for one in v] for k, v in fields["lags"].items()}
     body["coefficients"] = {k: _value(v) for k, v in fields["coefficients"].items()}
     body["constant"] = bool(fields.get("constant", False))
-    terms = fields.get("terms", "all")
-    body["terms"] = terms if isinstance(terms, str) else [_text(one) for one in terms]
+    body["terms"] = _terms(fields.get("terms", "all"), model)
     return body
+
+
+def _terms(written: Any, model: Model) -> object:
+    if model.rule is None:
+        return written if isinstance(written, str) else [_text(one) for one in written]
+    rule: dict[str, Any] = {"select": written["select"], "keep": model.rule.keep}
+    if model.rule.err is not None:
+        rule["err"] = model.rule.err
+    candidates = written.get("candidates", "all")
+    listed = candidates if isinstance(candidates, str) else [_text(one) for one in candidates]
+    return {**rule, "criterion": model.rule.criterion, "candidates": listed}
 
 
 def _text(written: object) -> str:

@@ -19,48 +19,88 @@ from sysid.language.tree import Binary, Expression, Number, Past, Symbol
 from sysid.models.equations import note
 from sysid.models.reader import Reader, pointer, shown
 from sysid.models.sections import MAX_PARAMETERS
+from sysid.models.terms import Criterion, Term, TermRule
 from sysid.parameters import Parameter, Scale
 
 FIELDS = ("output", "degree", "lags", "coefficients", "constant", "terms")
 
+MAX_CANDIDATES = 512
+"""Terms that a selection may choose from."""
+
 _MAX_DEGREE = 9
-_NO_SELECTION = "term selection is not available yet; write 'all' or a list of terms"
+_SELECTORS = ("frols",)
+_CRITERIA = ("none", "bic")
+_RULE_FIELDS = ("select", "keep", "err", "criterion", "candidates")
 
 
-class Term(NamedTuple):
-    """A product of past values; the empty one is the constant 1."""
+class Polynomial(NamedTuple):
+    """The right-hand side of y(k) = …, its coefficients and terms.
 
-    factors: tuple[Past, ...]
+    With a rule the terms are candidates, and so are the coefficients.
+    """
 
-    @property
-    def label(self) -> str:
-        """Text of the product, such as ``y(k-1)**2*u(k-1-dk)``."""
-        if not self.factors:
-            return "1"
-        powers = {text(factor).replace(" ", ""): 0 for factor in self.factors}
-        for factor in self.factors:
-            powers[text(factor).replace(" ", "")] += 1
-        return "*".join(f"{name}**{n}" if n > 1 else name for name, n in powers.items())
-
-    @property
-    def coefficient(self) -> str:
-        """Name of the term's coefficient: ``a[y(k-1)*u(k-1)]``."""
-        return f"a[{self.label}]"
+    tree: Expression
+    coefficients: tuple[Parameter, ...]
+    terms: tuple[Term, ...]
+    rule: TermRule | None
 
 
-def expand(
-    reader: Reader, fields: Mapping[str, Any], scope: Scope
-) -> tuple[Expression, tuple[Parameter, ...]]:
-    """The right-hand side of y(k) = …, and its coefficients."""
-    terms = _terms(reader, fields, scope)
+def expand(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> Polynomial:
+    """What a document's lags, degree and terms say."""
+    written = fields.get("terms", "all")
+    selects = isinstance(written, Mapping)
+    terms = _candidates(reader, fields, scope) if selects else _terms(reader, fields, scope)
     if _wants_constant(reader, fields):
         terms = (*terms, Term(()))
-    if len(terms) > MAX_PARAMETERS:
+    if not selects and len(terms) > MAX_PARAMETERS:
         detail = f"gives {len(terms)} coefficients; at most {MAX_PARAMETERS} are allowed"
         reader.fault("/terms", detail)
         terms = ()
+    rule = _rule(reader, written, len(terms)) if selects else None
     coefficients = _coefficients(reader, fields.get("coefficients"), terms)
-    return _sum([_product(term) for term in terms]), coefficients
+    return Polynomial(_sum([_product(term) for term in terms]), coefficients, terms, rule)
+
+
+def _rule(reader: Reader, written: Mapping[str, Any], candidates: int) -> TermRule:
+    fields = reader.section(written, "/terms", _RULE_FIELDS)
+    if reader.required(fields, "select", "/terms", "name the selector: frols") is not None:
+        reader.choice(fields["select"], _SELECTORS, "/terms/select")
+    criterion = reader.choice(fields.get("criterion", "none"), _CRITERIA, "/terms/criterion")
+    err = fields.get("err")
+    if err is not None:
+        err = reader.number(err, "/terms/err", 0.5)
+        if not 0 < err < 1:
+            need = "need a share between 0 and 1 that may stay unexplained, such as 1e-4"
+            reader.fault("/terms/err", f"found {err:g}; {need}")
+    ends_by_itself = err is not None or criterion != "none"
+    most = min(candidates, MAX_PARAMETERS)
+    keep = fields.get("keep")
+    if keep is None and not ends_by_itself:
+        reader.fault("/terms/keep", "is missing; say how many terms to keep, such as 8")
+    if keep is None or most == 0:  # without candidates, that is the fault to tell
+        return TermRule(max(most, 1), err, cast(Criterion, criterion))
+    keep = _kept(reader, keep, candidates, most)
+    return TermRule(keep, err, cast(Criterion, criterion))
+
+
+def _kept(reader: Reader, keep: object, candidates: int, most: int) -> int:
+    is_whole = isinstance(keep, int) and not isinstance(keep, bool)
+    if is_whole and cast(int, keep) > most:
+        few = f"the document has {candidates} candidate terms" if most == candidates else (
+            f"a model may have {most} coefficients")  # fmt: skip
+        reader.fault("/terms/keep", f"found {keep}, but {few}; need 1 to {most}")
+        return most
+    return reader.whole(keep, "/terms/keep", 1, most)
+
+
+def _candidates(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> tuple[Term, ...]:
+    written = fields["terms"].get("candidates", "all")
+    if isinstance(written, list | tuple):
+        return _listed(reader, written, scope, "/terms/candidates", MAX_CANDIDATES)
+    if written != "all":
+        detail = f"{shown(written)} is not 'all' or a list of terms"
+        reader.fault("/terms/candidates", detail)
+    return _all_terms(reader, fields, scope, MAX_CANDIDATES)
 
 
 def _wants_constant(reader: Reader, fields: Mapping[str, Any]) -> bool:
@@ -73,23 +113,27 @@ def _wants_constant(reader: Reader, fields: Mapping[str, Any]) -> bool:
 def _terms(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> tuple[Term, ...]:
     written = fields.get("terms", "all")
     if isinstance(written, list | tuple):
-        return _listed(reader, written, scope)
-    if isinstance(written, Mapping):
-        reader.fault("/terms/select" if "select" in written else "/terms", _NO_SELECTION)
-    elif written != "all":
-        reader.fault("/terms", f"{shown(written)} is not 'all' or a list of terms")
-    return _all_terms(reader, fields, scope)
+        if not written and fields.get("constant") is True:
+            return ()  # the constant alone
+        return _listed(reader, written, scope, "/terms", MAX_PARAMETERS)
+    if written != "all":
+        need = "'all', a list of terms, or {select: frols, keep: 8}"
+        reader.fault("/terms", f"{shown(written)} is not {need}")
+    return _all_terms(reader, fields, scope, MAX_PARAMETERS)
 
 
-def _all_terms(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> tuple[Term, ...]:
+def _all_terms(
+    reader: Reader, fields: Mapping[str, Any], scope: Scope, most: int
+) -> tuple[Term, ...]:
     highest = reader.required(fields, "degree", "", "it is the largest number of factors in a term")
     degree = 1 if highest is None else reader.whole(highest, "/degree", 1, _MAX_DEGREE)
     values = _regressors(reader, fields, scope)
     count = comb(len(values) + degree, degree) - 1
-    if count > MAX_PARAMETERS:
+    if count > most:
+        what = "coefficients" if most == MAX_PARAMETERS else "candidates"
         detail = (
-            f"degree {degree} of {len(values)} past values gives {count} coefficients; at most "
-            f"{MAX_PARAMETERS} are allowed: lower it, or list the terms"
+            f"degree {degree} of {len(values)} past values gives {count} {what}; at most "
+            f"{most} are allowed: lower it, or list the terms"
         )
         reader.fault("/degree", detail)
         return ()
@@ -145,12 +189,16 @@ def _not_present(reader: Reader, value: Past, place: str) -> Past | None:
     return value
 
 
-def _listed(reader: Reader, written: Sequence[object], scope: Scope) -> tuple[Term, ...]:
+def _listed(
+    reader: Reader, written: Sequence[object], scope: Scope, where: str, most: int
+) -> tuple[Term, ...]:
     terms: list[Term] = []
     if not written:
-        reader.fault("/terms", "the list is empty; name at least one term, such as y(k-1)")
-    for number, one in enumerate(written[: MAX_PARAMETERS + 1]):
-        place, known = f"/terms/{number}", reader.count()
+        reader.fault(where, "the list is empty; name at least one term, such as y(k-1)")
+    if len(written) > most:
+        reader.fault(where, f"has {len(written)} terms; at most {most} are allowed")
+    for number, one in enumerate(written[:most]):
+        place, known = f"{where}/{number}", reader.count()
         checked = check(reader.expression(one, place), scope)
         note(reader, checked, place)
         if checked.tree is None or reader.count() > known:

@@ -1,7 +1,7 @@
 """Model documents: from YAML or JSON data to a checked `Model`, every fault at once."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
@@ -60,6 +60,13 @@ def parse_model(document: object) -> Model:
     model = _polynomial(reader, fields) if form == "polynomial" else _equations(reader, fields)
     reader.finish()
     return replace(model, document=normal_form(fields, model))
+
+
+def with_terms(model: Model, labels: Sequence[str]) -> Model:
+    """The polynomial with only these of its terms (``"1"``: the constant), in this order."""
+    listed = [label for label in labels if label != "1"]
+    document = {**model.document, "terms": listed, "constant": "1" in labels}
+    return parse_model(document)
 
 
 def _form(reader: Reader, document: Mapping[str, Any]) -> Form:
@@ -194,7 +201,7 @@ def _polynomial(reader: Reader, fields: Mapping[str, Any]) -> Model:
             "constants": tuple(known),
         },
     )
-    tree, coefficients = expand(reader, fields, scope)
+    found_terms = expand(reader, fields, scope)
     starts = initial(reader, fields.get("initial"), scope.states, MeasuredInitial())
     settings = solver(reader, fields.get("solver"), "difference")
     reader.finish()
@@ -205,13 +212,15 @@ def _polynomial(reader: Reader, fields: Mapping[str, Any]) -> Model:
         inputs=inputs,
         states=(output,),
         outputs=(Output(output.name, Past(output.name, "state"), output.unit),),
-        parameters=(*coefficients, *found),
-        equations=(tree,),
+        parameters=(*found_terms.coefficients, *found),
+        equations=(found_terms.tree,),
         initial=starts,
         order=(0,),
-        memory=eq.memory((tree,)),
+        memory=eq.memory((found_terms.tree,)),
         solver=settings,
         document={},
+        terms=found_terms.terms,
+        rule=found_terms.rule,
     )
 
 

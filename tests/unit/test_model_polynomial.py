@@ -90,7 +90,16 @@ def test_an_unknown_lag_is_the_same_in_every_term_that_has_it() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"terms": ["y(k-1)", "u(k-1-dk)"]}, {"constant": True}, {"output": {"y": "m"}}]
+    "changes",
+    [
+        {},
+        {"terms": ["y(k-1)", "u(k-1-dk)"]},
+        {"constant": True},
+        {"output": {"y": "m"}},
+        {"terms": {"select": "frols", "keep": 3}},
+        {"terms": {"select": "frols", "err": 0.001, "criterion": "bic"}, "constant": True},
+        {"terms": {"select": "frols", "keep": 1, "candidates": ["y(k-1)", "u(k-1)*y(k-1)"]}},
+    ],
 )
 def test_the_normal_form_gives_the_same_model(changes: dict[str, Any]) -> None:
     model = parse_model(NARX | changes)
@@ -110,7 +119,27 @@ def _depth(tree: object) -> int:
 @pytest.mark.parametrize(
     ("changes", "pointer", "part"),
     [
-        ({"terms": {"select": "frols", "keep": 8}}, "/terms/select", "not available yet"),
+        ({"terms": {"keep": 8}}, "/terms/select", "is missing"),
+        ({"terms": {"select": "lasso", "keep": 8}}, "/terms/select", "'lasso'"),
+        ({"terms": {"select": "frols"}}, "/terms/keep", "is missing"),
+        ({"terms": {"select": "frols", "keep": 0}}, "/terms/keep", "whole number from 1 to 14"),
+        ({"terms": {"select": "frols", "keep": True}}, "/terms/keep", "whole number from 1 to 14"),
+        ({"terms": {"select": "frols", "keep": 15}}, "/terms/keep", "has 14 candidate terms"),
+        ({"terms": {"select": "frols", "keep": 2, "err": 1}}, "/terms/err", "share between 0 and"),
+        ({"terms": {"select": "frols", "keep": 2, "criterion": "aic"}}, "/terms/criterion", "aic"),
+        ({"terms": {"select": "frols", "keep": 2, "kept": 2}}, "/terms/kept", "unknown field"),
+        ({"terms": {"select": "frols", "keep": 2}, "lags": None}, "/lags", "is missing"),
+        ({"terms": {"select": "frols", "keep": 2}, "degree": None}, "/degree", "is missing"),
+        (
+            {"terms": {"select": "frols", "keep": 1, "candidates": ["y(k-1) +"]}},
+            "/terms/candidates/0",
+            "",
+        ),
+        (
+            {"terms": {"select": "frols", "keep": 1, "candidates": []}},
+            "/terms/candidates",
+            "list is empty",
+        ),
         ({"terms": "some"}, "/terms", "is not 'all' or a list"),
         ({"terms": []}, "/terms", "the list is empty"),
         ({"terms": ["y(k-1)", "y(k-1)"]}, "/terms/1", "listed twice"),
