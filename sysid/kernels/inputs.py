@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from math import ceil
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.signal import upfirdn
 
 from sysid.errors import InvalidRecord
 from sysid.records import Channel
@@ -119,6 +117,10 @@ def _band_limited(channel: Channel, times: FloatArray) -> FloatArray:
 
     The record is continued at both ends by its point reflection, which keeps value and slope.
     """
+    # Here, as they take most of a second to import and few inputs need them.
+    from scipy.interpolate import CubicSpline
+    from scipy.signal import upfirdn
+
     period = (channel.times[-1] - channel.times[0]) / (channel.times.size - 1)
     if not _is_regular(channel.times, period):
         raise InvalidRecord(
