@@ -1,0 +1,98 @@
+"""Time of whole searches on the paper's Example 1: what is added to the simulations.
+
+Where the C reference is at hand (see `benchmarks/kernels.py`) figures are ratios to it, measured
+in the same run.
+"""
+
+import time
+
+import numpy as np
+
+from benchmarks import paper_example
+from benchmarks.kernels import microseconds, reference
+from benchmarks.table import Row, Skipped, parser, report
+from sysid.problem import Problem
+from sysid.refinement import refine
+from sysid.run import advance, begin
+from sysid.settings import GeneticAlgorithm
+from sysid.types import FloatArray
+from sysid.uncertainty import analyse
+
+GENERATIONS, POPULATION = 400, 50
+C_SHARE = 2.0 / 3.5
+"""Of the C reference's evaluations in a CPU-second: the bar, free of the machine's own speed."""
+
+
+def search_milliseconds(problem: Problem, algorithm: GeneticAlgorithm) -> tuple[float, int]:
+    """CPU time and evaluations of one search, without its refinement."""
+    state = begin(problem, algorithm, 1)
+    start = time.process_time()
+    state = advance(problem, algorithm, state)
+    return 1e3 * (time.process_time() - start), state.evaluations
+
+
+def drawn(problem: Problem, count: int) -> FloatArray:
+    """Candidates anywhere in the bounds."""
+    lower, upper = problem.evaluator.lower, problem.evaluator.upper
+    return lower + np.random.default_rng(0).random((count, lower.size)) * (upper - lower)
+
+
+def searches(problem: Problem, repeats: int) -> tuple[list[Row], list[Skipped]]:
+    """Each method's search beside its own simulations and beside C."""
+    rows: list[Row] = []
+    timed_c = reference()
+    children = drawn(problem, POPULATION // 2)
+    for method in ("simple", "improved-paper", "improved"):
+        algorithm = GeneticAlgorithm(
+            method=method, population=POPULATION, generations=GENERATIONS, refine=False
+        )
+        spent = kernel = c = np.inf
+        for _ in range(repeats):
+            once, evaluations = search_milliseconds(problem, algorithm)
+            spent = min(spent, once)
+            kernel = min(kernel, microseconds(lambda: problem.fitness(children), 3) / 1e3)
+            if timed_c is not None:
+                c = min(c, timed_c(48, paper_example.SAMPLES) / 1e3)
+        rows.append(Row(f"{method}: whole search, {evaluations} simulations", spent, "ms"))
+        rate = evaluations / spent / 1e3
+        rows.append(Row(f"{method}: simulations a CPU-second", rate, "M"))
+        if timed_c is not None:
+            share = rate / (48 / c / 1e3)
+            rows.append(Row(f"{method}: the same ÷ C reference", share, "", C_SHARE, ">="))
+        if method == "simple":
+            own = GENERATIONS * kernel
+            rows.append(Row("simple: time ÷ its simulations alone", spent / own, "", 1.25))
+            if timed_c is not None:
+                rows.append(
+                    Row("simple: time ÷ 400 populations of 48 in C", spent / (400 * c), "", 2.0)
+                )
+    skipped = [] if timed_c else [Skipped("beside C", "no C reference beside LAGID_DATA, or no cc")]
+    return rows, skipped
+
+
+def refinement(problem: Problem, repeats: int) -> Row:
+    """Least squares from 2 % beside the estimate, and its standard errors."""
+    start = 1.02 * np.array(list(paper_example.TRUTH.values()))
+
+    def work() -> object:
+        found = refine(problem, [start])[0]
+        return analyse(problem, start if found is None else found.theta)
+
+    return Row(
+        "refinement with standard errors, 4 parameters × 300 samples",
+        microseconds(work, repeats) / 1e3, "ms", 2.0,
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Measure and print."""
+    options = parser(__doc__ or "").parse_args()
+    repeats = 3 if options.quick else 10
+    problem = paper_example.problem(seed=1)
+    rows, skipped = searches(problem, repeats)
+    rows.append(refinement(problem, repeats))
+    report("Searches", rows, skipped, options)
+
+
+if __name__ == "__main__":
+    main()
