@@ -1,6 +1,7 @@
 """From a job's rows to specifications that workers can carry out."""
 
 import logging
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -32,6 +33,8 @@ from workers.tasks import prepared
 _log = logging.getLogger(__name__)
 
 READ_AHEAD = 200
+KEPT_SAMPLES = 1_000_000
+"""Of records that a job keeps in memory, 16 bytes each, besides those last asked for."""
 
 
 class DataKey(NamedTuple):
@@ -57,6 +60,7 @@ class JobRuns:
         self._problems: dict[str, ProblemSpec] = {}
         self._models: dict[str, Model] = {}
         self._data: dict[str, DataKey] = {}
+        self._read: OrderedDict[str, Records] = OrderedDict()
 
     def runs(self) -> Iterator[QueuedRun | RefusedRun]:
         """The unfinished runs in order, each from its checkpoint if it has one."""
@@ -106,6 +110,23 @@ class JobRuns:
         RecordsUnavailable
             If a dataset or a channel is not there, or cannot be used.
         """
+        if key not in self._read:  # every run of a sweep asks, to store its signals
+            self._read[key] = self._from_store(key)
+            while len(self._read) > 1 and self._n_samples() > KEPT_SAMPLES:
+                self._read.popitem(last=False)
+        self._read.move_to_end(key)
+        return self._read[key]
+
+    def _n_samples(self) -> int:
+        channels = (
+            channel
+            for records in self._read.values()
+            for record in records
+            for channel in (*record.inputs, *record.outputs)
+        )
+        return sum(channel.times.size for channel in channels)
+
+    def _from_store(self, key: str) -> Records:
         datasets, inputs, outputs, holds = self._data[key]
         try:
             with self._database.read() as session:
