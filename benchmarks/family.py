@@ -32,6 +32,25 @@ def cpu_seconds() -> dict[str, float]:
     return spent
 
 
+def memory_megabytes() -> dict[str, float]:
+    """Proportional set size by what each process is; of several the largest."""
+    sizes: dict[str, float] = {}
+    for process in members():
+        name = kind(process)
+        sizes[name] = max(sizes.get(name, 0.0), pss_bytes(process) / 1e6)
+    return sizes
+
+
+def pss_bytes(process: int) -> float:
+    """Proportional set size of one process; 0 if it has ended."""
+    try:
+        text = Path(f"/proc/{process}/smaps_rollup").read_text()
+    except OSError:
+        return 0.0
+    lines = (line.split() for line in text.splitlines())
+    return sum(1024.0 * float(line[1]) for line in lines if line[0] == "Pss:")
+
+
 def kind(process: int) -> str:
     """What a process of the service is, by its command line."""
     try:
