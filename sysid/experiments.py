@@ -104,8 +104,9 @@ def lay_out(
         for channel in outputs:
             _check_scored(channel, skip, scored_from)
     grid = grid_of(model, inputs, outputs)
-    if is_difference(model) and grid.points <= model.memory:
-        raise RecordTooShort(grid.duration, model.memory * grid.step, "the model's memory")
+    if is_difference(model) and grid.last < model.memory:
+        needed = model.memory * grid.integration_step
+        raise RecordTooShort(grid.duration, needed, "the model's memory")
     spans = {
         p.name: (p.lower, p.upper) if p.fixed is None else (p.fixed, p.fixed) for p in parameters
     }
@@ -162,11 +163,16 @@ def _samples(
 
 
 def _on_grid(grid: Grid, channel: Channel) -> FloatArray:
-    """The measurement at the grid points, on a line between its samples."""
+    """The measurement at the grid points."""
+    return _measured_at(grid.times, channel)
+
+
+def _measured_at(times: FloatArray, channel: Channel) -> FloatArray:
+    """The measurement at any times, on a line between its samples; 0 if it has none."""
     known = np.isfinite(channel.values)
     if not np.any(known):
-        return np.zeros(grid.points)
-    return np.interp(grid.times, channel.times[known], channel.values[known])
+        return np.zeros(times.size)
+    return np.interp(times, channel.times[known], channel.values[known])
 
 
 def _starts(
@@ -197,7 +203,8 @@ def _measured_start(model: Model, state: int, grid: Grid, outputs: Sequence[Chan
     name = model.states[state].name
     count = max(model.memory, 1) if is_difference(model) else 1
     if name in measured:
-        return _on_grid(grid, measured[name])[:count]
+        times = grid.start + grid.integration_step * np.arange(count, dtype=np.float64)
+        return _measured_at(times, measured[name])
     for other, equation in zip(model.states, model.equations, strict=True):
         if equation == Past(name, "state") and other.name in measured:
             return _first_slope(measured[other.name])

@@ -7,11 +7,13 @@ from math import isfinite
 import numpy as np
 
 from sysid.errors import InvalidRecord, InvalidSettings, nearest
+from sysid.language.evaluation import value as value_of
 from sysid.models.initial import initial_name
 from sysid.models.model import FixedInitial, Initial, Model
 from sysid.parameters import Parameter
 from sysid.problem import simulation_problem
 from sysid.records import Channel, Record, Recording
+from sysid.ties import ties_of
 from sysid.types import FloatArray
 
 
@@ -27,7 +29,8 @@ def simulate(
         One for each input of the model, of the same name; others are ignored.
     values : mapping of str to float
         Every parameter, inside or outside its bounds, and initial values such as ``x(0)`` where
-        the model does not fix them (where it does, they replace its own).
+        the model does not fix them (where it does, they replace its own). One that is tied to
+        others may be left out.
     times : FloatArray, shape (N,)
         Seconds, not decreasing; regular for a difference equation, whose period they give.
 
@@ -44,6 +47,7 @@ def simulate(
         If an input is missing or the times are too short for the model's lags.
     """
     _check(model, values)
+    values = _with_ties(model, values)
     known = tuple(_known(parameter, values[parameter.name]) for parameter in model.parameters)
     initial = tuple(
         _start(start, state.name, values)
@@ -60,8 +64,16 @@ def simulate(
     return Recording(tuple(replace(c, values=found[c.name].copy()) for c in outputs))
 
 
+def _with_ties(model: Model, values: Mapping[str, float]) -> dict[str, float]:
+    """The values, and those of tied parameters that are not among them."""
+    free = [replace(p, tied=None) if p.name in values else p for p in model.parameters]
+    ties = {name: value_of(tie, values) for name, tie in ties_of(model, free).items()}
+    return {**ties, **values}
+
+
 def _check(model: Model, values: Mapping[str, float]) -> None:
     names = [parameter.name for parameter in model.parameters]
+    tied = [parameter.name for parameter in model.parameters if parameter.tied is not None]
     starts = [initial_name(state.name, 0) for state in model.states]
     for name, value in values.items():
         if name not in names and name not in starts:
@@ -72,7 +84,7 @@ def _check(model: Model, values: Mapping[str, float]) -> None:
         if not isfinite(value):
             raise InvalidSettings(f"/parameters/{name}", f"{value!r} is not a finite number")
     for name in names:
-        if name not in values:
+        if name not in values and name not in tied:
             raise InvalidSettings(f"/parameters/{name}", "a value is missing")
 
 
@@ -80,7 +92,7 @@ def _known(parameter: Parameter, value: float) -> Parameter:
     """The parameter fixed at a value, which may lie outside its bounds."""
     value = float(value)
     lower, upper = min(parameter.lower, value), max(parameter.upper, value)
-    return replace(parameter, lower=lower, upper=upper, fixed=value, scale="linear")
+    return replace(parameter, lower=lower, upper=upper, fixed=value, scale="linear", tied=None)
 
 
 def _start(start: Initial, state: str, values: Mapping[str, float]) -> FixedInitial:

@@ -73,7 +73,7 @@ class Comparison:
 
     @property
     def _substeps(self) -> int:
-        return self._model.solver.substeps if self._model.form == "differential" else 1
+        return self._model.solver.substeps
 
     def _at_grid(self, grid: Value, states: States, at: Placing) -> None:
         lanes = self._lanes

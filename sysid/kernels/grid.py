@@ -32,7 +32,7 @@ class Grid:
 
     @property
     def integration_step(self) -> float:
-        """Step of the integration in s; of a recursion, the sampling period h."""
+        """Step of the integration in s; of a recursion, h."""
         return self.step / self.substeps
 
     @property
@@ -69,7 +69,7 @@ def grid_of(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel])
         If the grid would be too long.
     """
     if is_difference(model):
-        return _sample_grid(outputs)
+        return _sample_grid(outputs, model.solver.substeps)
     step = model.solver.step or _simulation_step(outputs)
     first = min(float(channel.times[0]) for channel in outputs)
     begin = min([first, *(float(channel.times[0]) for channel in inputs)])
@@ -107,12 +107,12 @@ def is_on_grid(places: FloatArray) -> bool:
     return bool(np.all(places == np.round(places)) and np.all(np.diff(places) > 0))
 
 
-def _sample_grid(outputs: Sequence[Channel]) -> Grid:
+def _sample_grid(outputs: Sequence[Channel], substeps: int) -> Grid:
     period = _output_period(outputs)
     start = min(float(channel.times[0]) for channel in outputs)
     end = max(float(channel.times[-1]) for channel in outputs)
-    _check_length((end - start) / period)
-    return Grid(start, period, round((end - start) / period) + 1, 1)
+    _check_length((end - start) / period * substeps)
+    return Grid(start, period, round((end - start) / period) + 1, substeps)
 
 
 def _simulation_step(outputs: Sequence[Channel]) -> float:

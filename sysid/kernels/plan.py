@@ -59,14 +59,15 @@ def largest_lags(
         If a lag may be as long as the record.
     """
     largest: dict[str, float] = {}
+    step = grid.integration_step
     for past in lags(model, kind):
         if past.lag is None:
             continue
-        upper = bounds(past.lag, parameters, grid.step)[1]
-        seconds = (upper + past.offset) * grid.step if is_difference(model) else upper
+        upper = bounds(past.lag, parameters, step)[1]
+        seconds = (upper + past.offset) * step if is_difference(model) else upper
         if not seconds < grid.duration:
             raise RecordTooShort(grid.duration, seconds, f"the lag of {past.name!r}")
-        steps = upper if is_difference(model) else upper / grid.integration_step
+        steps = upper if is_difference(model) else upper / step
         largest[past.name] = max(steps, largest.get(past.name, 0.0))
     return largest
 

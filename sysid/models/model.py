@@ -69,7 +69,8 @@ class Solver:
     step : float or None
         Grid of the simulation in s; None: the sampling period of the outputs.
     substeps : int
-        Integration steps in one grid step.
+        Integration steps in one grid step. In the difference form `k` counts these and `h` is
+        their length, so that a stiff recursion may be finer than the sampling.
     history : {"constant", "zero"}
         States before the start: their initial value, or zero.
     interpolation : {"linear", "cubic", "nearest"}

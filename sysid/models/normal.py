@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sysid.models.model import EstimatedInitial, FixedInitial, Initial, Model, Output, Solver
+from sysid.models.model import EstimatedInitial, FixedInitial, Initial, Model, Output
 from sysid.parameters import Parameter
 
 _TEXTS = ("description", "source")
@@ -38,7 +38,7 @@ def normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
             state.name: _initial(start)
             for state, start in zip(model.states, model.initial, strict=True)
         },
-        "solver": _solver(model.solver, model.form == "differential"),
+        "solver": _solver(model),
     }
 
 
@@ -71,7 +71,8 @@ def _terms(written: Any, model: Model) -> object:
         rule["err"] = model.rule.err
     candidates = written.get("candidates", "all")
     listed = candidates if isinstance(candidates, str) else [_text(one) for one in candidates]
-    return {**rule, "criterion": model.rule.criterion, "candidates": listed}
+    rule |= {"criterion": model.rule.criterion, "exchange": model.rule.exchange}
+    return {**rule, "candidates": listed}
 
 
 def _text(written: object) -> str:
@@ -97,6 +98,8 @@ def _parameter(parameter: Parameter, declared: Mapping[str, Any]) -> dict[str, A
     }
     if parameter.fixed is not None:
         entry["fixed"] = parameter.fixed
+    if parameter.tied is not None:
+        entry["tied"] = _text(parameter.tied)
     if description := declared[parameter.name].get("description"):
         entry["description"] = " ".join(description.split())
     return entry
@@ -110,9 +113,12 @@ def _initial(start: Initial) -> object:
     return "measured"
 
 
-def _solver(solver: Solver, continuous: bool) -> dict[str, Any]:
+def _solver(model: Model) -> dict[str, Any]:
+    solver = model.solver
     past = {"history": solver.history, "interpolation": solver.interpolation}
-    if not continuous:
+    if model.form == "polynomial":
         return past
+    if model.form == "difference":
+        return {"substeps": solver.substeps, **past}
     step = "sample" if solver.step is None else solver.step
     return {"method": solver.method, "step": step, "substeps": solver.substeps, **past}

@@ -9,6 +9,7 @@ from sysid.language.scope import Timing, reserved
 from sysid.models.model import (
     EstimatedInitial,
     FixedInitial,
+    Form,
     Initial,
     MeasuredInitial,
     Quantity,
@@ -21,9 +22,9 @@ MAX_EQUATIONS = 64
 MAX_PARAMETERS = 256
 
 _NAME = re.compile(r"[^\W\d]\w{0,63}")
-_PARAMETER_FIELDS = ("lower", "upper", "unit", "scale", "fixed", "description")
+_PARAMETER_FIELDS = ("lower", "upper", "unit", "scale", "fixed", "tied", "description")
 _SOLVER_FIELDS = ("method", "step", "substeps", "history", "interpolation")
-_GRID_FIELDS = ("method", "step", "substeps")
+_DIFFERENTIAL_FIELDS = ("method", "step")
 
 
 def check_names(reader: Reader, form: Timing, sections: Mapping[str, Sequence[str]]) -> None:
@@ -76,10 +77,13 @@ def _parameter(reader: Reader, name: str, entry: object) -> Parameter | None:
     unit = reader.unit(fields.get("unit"), place + "/unit")
     scale = reader.choice(fields.get("scale", "linear"), ("linear", "log"), place + "/scale")
     reader.text(fields.get("description"), place + "/description")
+    tied = reader.text(fields.get("tied"), place + "/tied") or None
+    if tied is not None and "fixed" in numbers:
+        reader.fault(place + "/tied", "a parameter is either fixed or tied; leave one of them out")
     if reader.count() > known:
         return None
     try:
-        return Parameter(name, unit=unit, scale=cast(Scale, scale), **numbers)
+        return Parameter(name, unit=unit, scale=cast(Scale, scale), tied=tied, **numbers)
     except InvalidBounds as error:
         reader.fault(place, str(error))
         return None
@@ -124,13 +128,18 @@ def _initial(reader: Reader, value: object, place: str) -> Initial:
     return FixedInitial(reader.number(value, place))
 
 
-def solver(reader: Reader, value: object, form: Timing) -> Solver:
-    """How the model is integrated and how past values are read."""
+def solver(reader: Reader, value: object, form: Form) -> Solver:
+    """How the model is integrated and how past values are read.
+
+    A difference equation may take several steps in a sampling period (`substeps`); the terms of
+    a polynomial are samples, so it may not.
+    """
     fields = reader.section(value, "/solver", _SOLVER_FIELDS)
-    if form == "difference":
-        for name in (name for name in _GRID_FIELDS if name in fields):
-            detail = "belongs to the differential form; a difference equation steps by samples"
-            reader.fault(pointer("solver", name), detail)
+    for name in (name for name in _foreign(form) if name in fields):
+        detail = "belongs to the differential form; a difference equation steps by samples"
+        if name == "substeps":
+            detail = "is of no use to a polynomial, whose terms are samples"
+        reader.fault(pointer("solver", name), detail)
     plain = Solver()
     choices: dict[str, Any] = {
         name: reader.choice(fields.get(name, getattr(plain, name)), options, "/solver/" + name)
@@ -143,6 +152,12 @@ def solver(reader: Reader, value: object, form: Timing) -> Solver:
     substeps = reader.whole(fields.get("substeps", 1), "/solver/substeps", 1, 1000)
     step = _step(reader, fields.get("step", "sample"))
     return Solver(step=step, substeps=substeps, **choices)
+
+
+def _foreign(form: Form) -> tuple[str, ...]:
+    """Fields of a solver that mean nothing in this form."""
+    fields = {"difference": _DIFFERENTIAL_FIELDS, "polynomial": (*_DIFFERENTIAL_FIELDS, "substeps")}
+    return fields.get(form, ())
 
 
 def _step(reader: Reader, value: object) -> float | None:

@@ -44,6 +44,20 @@ def test_a_recursion_equals_its_twin(interpolation: str, history: str) -> None:
     assert_equal(Problem.build(model, [record(26)]))
 
 
+@pytest.mark.parametrize("hold", ["first", "zero"])
+def test_a_recursion_finer_than_its_samples_equals_its_twin(hold: Any) -> None:
+    start = {"x": "measured", "w": 0}
+    guessed = {"x": {"lower": -1, "upper": 1}, "w": 0.1}
+    model = difference(RECURSION, "x + 0.1*x(k - L/h)", solver={"substeps": 3}, initial=guessed)
+    assert_equal(Problem.build(model, [record(14, hold=hold)]))
+    model = difference(RECURSION, "x", solver={"substeps": 3}, initial=start)
+    problem = Problem.build(model, [record(14, hold=hold)])
+    assert_equal(problem)
+    found = problem.predictions(individuals(problem, 3))[:, : model.memory // 3]
+    given = np.tile(record(14).outputs[0].values[:4], (3, 1))
+    np.testing.assert_allclose(found, given, rtol=1e-14)
+
+
 @pytest.mark.parametrize("method", ["rk4", "euler", "semi-implicit"])
 @pytest.mark.parametrize(
     ("interpolation", "substeps", "irregular", "hold"),

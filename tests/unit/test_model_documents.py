@@ -14,7 +14,7 @@ from sysid.models.model import (
     Solver,
 )
 from sysid.models.spec import parse_model
-from sysid.parameters import Parameter
+from sysid.parameters import Parameter, override
 
 CONTINUOUS: dict[str, Any] = {
     "name": "delayed-duffing",
@@ -176,6 +176,7 @@ def test_a_fault_of_a_parameter_does_not_make_its_name_unknown(
         ({"equations": {"x": "w(k - 1 + d/4)", "w": "x"}}, "/equations", "depend on each other"),
         ({"equations": {"x": "x(k - (d-1)/4)", "w": "1"}}, "/equations/x", "may reach the present"),
         ({"solver": {"method": "rk4"}}, "/solver/method", "belongs to the differential form"),
+        ({"solver": {"substeps": 0}}, "/solver/substeps", "whole number from 1"),
         ({"states": {"x": "1", "w": "1", "h": "m"}}, "/states/h", "word of the language"),
     ],
 )
@@ -186,6 +187,34 @@ def test_a_fault_of_a_difference_document_is_told_where_it_is(
     found = faults(DISCRETE | free, **changes)
     assert pointer in found
     assert part in found[pointer]
+
+
+@pytest.mark.parametrize(
+    ("entry", "pointer", "part"),
+    [
+        ({"tied": "2*q"}, "/parameters/L/tied", "'q' is not declared"),
+        ({"tied": "L + 1"}, "/parameters/L/tied", "circle"),
+        ({"tied": 3}, "/parameters/L/tied", "3 is not a text"),
+        ({"tied": "c", "fixed": 0.5}, "/parameters/L/tied", "either fixed or tied"),
+    ],
+)
+def test_a_tie_that_cannot_be_is_told_where_it_is(
+    entry: dict[str, Any], pointer: str, part: str
+) -> None:
+    both = {"lower": 0, "upper": 1}
+    found = faults(CONTINUOUS, parameters={"c": both, "L": both | entry})
+    assert part in found[pointer]
+
+
+def test_a_parameter_tied_in_its_document_is_not_free_until_something_else_is_said_of_it() -> None:
+    both = {"lower": 0, "upper": 1}
+    model = parse_model(CONTINUOUS | {"parameters": {"c": both, "L": both | {"tied": "c / 2"}}})
+    assert [p.name for p in model.parameters if p.is_free] == ["c"]
+    assert parse_model(model.document) == model
+    for change in ({"upper": 0.5}, {"fixed": 0.25}):
+        _, lag = override(model.parameters, {"L": change})
+        assert lag.tied is None
+        assert lag.is_free == ("upper" in change)
 
 
 def test_all_faults_of_a_document_are_told_together_with_their_columns() -> None:

@@ -16,7 +16,7 @@ from sysid.parameters import override
 from tests.meaning import simulate
 
 BUILT_IN = (
-    "coulomb-delay", "coulomb-eq16", "delayed-logistic", "delayed-van-der-pol", "duffing-delay",
+    "actuator", "coulomb-delay", "coulomb-eq16", "delayed-logistic", "delayed-van-der-pol", "duffing-delay",
     "duffing-eq16", "emps", "exponential", "fopdt", "mackey-glass", "narx", "silverbox", "sopdt",
     "tube", "tube-second-order",
 )  # fmt: skip

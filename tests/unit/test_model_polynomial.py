@@ -167,6 +167,7 @@ def _depth(tree: object) -> int:
         ({"output": {"y": "1", "z": "1"}}, "/output", "name of the one output"),
         ({"output": "u"}, "/inputs/u", "already declared"),
         ({"states": {"x": "m"}}, "/states", "unknown field"),
+        ({"solver": {"substeps": 2}}, "/solver/substeps", "whose terms are samples"),
     ],
 )
 def test_a_fault_of_a_polynomial_document_is_told_where_it_is(
