@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
-from sysid.errors import Fault, InvalidModel
+from sysid.errors import Fault, InvalidModel, InvalidSettings
 from sysid.language.scope import Scope, Timing
 from sysid.language.tree import Expression, Past
 from sysid.models import equations as eq
@@ -24,6 +24,7 @@ from sysid.models.sections import (
     solver,
 )
 from sysid.parameters import Parameter
+from sysid.ties import ties_of
 
 _COMMON = (
     "name", "title", "description", "source", "form", "inputs", "parameters", "constants",
@@ -59,7 +60,12 @@ def parse_model(document: object) -> Model:
     _head(reader, fields)
     model = _polynomial(reader, fields) if form == "polynomial" else _equations(reader, fields)
     reader.finish()
-    return replace(model, document=normal_form(fields, model))
+    model = replace(model, document=normal_form(fields, model))
+    try:
+        ties_of(model, model.parameters)
+    except InvalidSettings as error:
+        raise InvalidModel([Fault(error.pointer, error.detail)]) from None
+    return model
 
 
 def with_terms(model: Model, labels: Sequence[str]) -> Model:
@@ -203,7 +209,7 @@ def _polynomial(reader: Reader, fields: Mapping[str, Any]) -> Model:
     )
     found_terms = expand(reader, fields, scope)
     starts = initial(reader, fields.get("initial"), scope.states, MeasuredInitial())
-    settings = solver(reader, fields.get("solver"), "difference")
+    settings = solver(reader, fields.get("solver"), "polynomial")
     reader.finish()
     return Model(
         name=fields["name"],
