@@ -211,7 +211,7 @@ def test_a_parameter_tied_in_its_document_is_not_free_until_something_else_is_sa
     model = parse_model(CONTINUOUS | {"parameters": {"c": both, "L": both | {"tied": "c / 2"}}})
     assert [p.name for p in model.parameters if p.is_free] == ["c"]
     assert parse_model(model.document) == model
-    for change in ({"upper": 0.5}, {"fixed": 0.25}):
+    for change in ({"lower": 0, "upper": 0.5}, {"fixed": 0.25}):
         _, lag = override(model.parameters, {"L": change})
         assert lag.tied is None
         assert lag.is_free == ("upper" in change)
