@@ -1,0 +1,232 @@
+"""Onset delay: how long after an input begins to move its output begins to move.
+
+An *event* is the input leaving a rest. A rest is a stretch in which it stays within a tolerance,
+the larger of 1 % of its range and four standard deviations of its noise. From there on, up to the
+next event, the excursion of a signal is its largest distance from its level at rest, and its onset
+is the time from which on it stays further from that level than 2 % of the excursion (or four
+standard deviations of its noise, if that is more). The onset delay is the output's onset less the
+input's, the median over all clear events of a record.
+
+An event is clear if the input moves by 10 % of its range or more, if the output was at rest before
+it (going on as it went there, it would not have come half way to its threshold), if its threshold
+is not above 5 % of its excursion, and if no other input moves in between.
+The input's own onset is taken the same way, so that a ramp is not counted as delay; an input that
+is held moves at its samples. Both read the measurement: no model enters.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.models.model import Model
+from sysid.records import Channel, Record
+from sysid.types import BoolArray, FloatArray
+
+SHARE = 0.02
+"""Part of the excursion at which a signal has left its level."""
+
+_NOISE = 4.0  # standard deviations that noise may reach without being an onset
+_LARGEST_SHARE = 0.05  # a threshold above this part of the excursion tells no onset
+_TOLERANCE = 0.01  # of the range: a signal at rest stays within it
+_NOTABLE = 0.1  # of the input's range: a step that counts
+_REST = 10  # samples at least
+_CREEP = 0.5  # of the threshold: what still moves so far by itself is not at rest
+_STAYS = 3  # samples beyond the threshold that make an onset
+
+
+@dataclass(frozen=True, slots=True)
+class OnsetDelay:
+    """Onset delay of one output behind one input in one experiment.
+
+    Attributes
+    ----------
+    experiment : int
+        From 0.
+    delay : float or None
+        Median over the events, s; None: see `reason`.
+    spread : float or None
+        Standard deviation over the events, s; None with fewer than two.
+    events : int
+        How many were clear.
+    threshold : float or None
+        Part of the excursion at which the output counted as having left, the largest of them.
+    """
+
+    experiment: int
+    input: str
+    output: str
+    delay: float | None
+    spread: float | None = None
+    events: int = 0
+    threshold: float | None = None
+    reason: str = ""
+
+
+class _Event(NamedTuple):
+    """The input rests from `rest` to `leaves` and may move until `until` (s)."""
+
+    rest: float
+    leaves: float
+    until: float
+
+
+class _Onset(NamedTuple):
+    time: float
+    excursion: float
+    share: float
+
+
+def onset_delays(model: Model, records: Sequence[Record]) -> tuple[OnsetDelay, ...]:
+    """Onset delay of every output behind every input, record by record."""
+    inputs = {one.name for one in model.inputs}
+    outputs = {one.name for one in model.outputs}
+    return tuple(
+        _pair(number, first, then, [one for one in moving if one is not first])
+        for number, record in enumerate(records)
+        for moving in [[one for one in record.inputs if one.name in inputs]]
+        for first in moving
+        for then in record.outputs
+        if then.name in outputs
+    )
+
+
+def _pair(number: int, first: Channel, then: Channel, others: Sequence[Channel]) -> OnsetDelay:
+    known = np.isfinite(then.values)
+    times, values = then.times[known], then.values[known]
+    if np.any(np.diff(times) <= 0):
+        return OnsetDelay(number, first.name, then.name, None,
+                          reason="several samples share a time: repeats were pooled")  # fmt: skip
+    events = list(_events(first))
+    if not events:
+        reason = "the input does not rest before it moves"
+        return OnsetDelay(number, first.name, then.name, None, reason=reason)
+    noise = (_noise(first.values), _noise(values))
+    found: list[tuple[float, float]] = []
+    for event in events:
+        pair = _at_event(event, first, (times, values), noise)
+        if pair is not None and not any(_moves(o, event.rest, pair[1].time) for o in others):
+            found.append((pair[1].time - pair[0].time, pair[1].share))
+    if not found:
+        reason = "the output does not rest before any step of the input, or its step is not clear"
+        return OnsetDelay(number, first.name, then.name, None, reason=reason)
+    delays = np.array([delay for delay, _ in found])
+    spread = float(np.std(delays, ddof=1)) if delays.size > 1 else None
+    share = max(share for _, share in found)
+    return OnsetDelay(
+        number, first.name, then.name, float(np.median(delays)), spread, len(found), share
+    )
+
+
+def _at_event(
+    event: _Event, first: Channel, output: tuple[FloatArray, FloatArray],
+    noise: tuple[float, float],
+) -> tuple[_Onset, _Onset] | None:  # fmt: skip
+    """Onsets of input and output at one event; None if one is not clear."""
+    held = first.hold == "zero"
+    moved = _onset(first.times, first.values, event, noise[0], held=held)
+    if moved is None or moved.excursion < _NOTABLE * float(np.ptp(first.values)):
+        return None
+    answered = _onset(*output, event, noise[1], held=False)
+    # What moves before its input does is not moved by it.
+    return None if answered is None or answered.time < moved.time else (moved, answered)
+
+
+def _onset(
+    times: FloatArray, values: FloatArray, event: _Event, noise: float, *, held: bool
+) -> _Onset | None:
+    """When a signal leaves the level at which it rests before an event; None if not clear."""
+    before = _span(times, max(event.rest, 0.5 * (event.rest + event.leaves)), event.leaves)
+    after = _span(times, event.leaves, event.until)
+    if before.stop - before.start < _REST // 2 or after.stop - after.start < _STAYS:
+        return None
+    rest = values[before]
+    level = float(np.mean(rest))
+    distance = np.abs(values[after] - level)
+    excursion = float(np.max(distance))
+    threshold = max(SHARE * excursion, _NOISE * noise)
+    if not 0 < threshold <= _LARGEST_SHARE * excursion:
+        return None
+    found = _crossing(times[after], distance, threshold, excursion, held=held)
+    if found is None or _creep(times[before], rest, found.time) > _CREEP * threshold:
+        return None
+    return found
+
+
+def _creep(times: FloatArray, rest: FloatArray, until: float) -> float:
+    """How far a signal would have gone from its mean at rest had it gone on as it did there."""
+    centre = float(np.mean(times))
+    ahead = times - centre
+    slope = float(ahead @ (rest - np.mean(rest))) / float(ahead @ ahead)
+    return abs(slope * (until - centre))
+
+
+def _crossing(
+    times: FloatArray, distance: FloatArray, threshold: float, excursion: float, *, held: bool
+) -> _Onset | None:
+    """The first time at which a distance passes a threshold and stays beyond for a few samples."""
+    beyond: BoolArray = distance > threshold
+    stays = np.flatnonzero(np.lib.stride_tricks.sliding_window_view(beyond, _STAYS).all(axis=1))
+    if stays.size == 0:
+        return None
+    k = int(stays[0])
+    time = float(times[k])
+    if k > 0 and not held:
+        low, high = float(distance[k - 1]), float(distance[k])
+        time -= (high - threshold) / (high - low) * float(times[k] - times[k - 1])
+    return _Onset(time, excursion, threshold / excursion)
+
+
+def _events(channel: Channel) -> Iterator[_Event]:
+    """The ends of the rests of an input, each with the time up to which its response is read."""
+    rests = _rests(channel.values)
+    times = channel.times
+    for number, (start, stop) in enumerate(rests):
+        if stop >= times.size:
+            break
+        following = rests[number + 1][1] if number + 1 < len(rests) else times.size
+        # Its last value at rest, for an onset may lie between that and the next sample.
+        end = float(times[following - 1])
+        yield _Event(float(times[start]), float(times[stop - 1]), end)
+
+
+def _rests(values: FloatArray) -> list[tuple[int, int]]:
+    """Stretches (first, beyond the last) of ten samples or more within the tolerance."""
+    if values.size <= _REST:
+        return []
+    tolerance = max(_TOLERANCE * float(np.ptp(values)), 2.0 * _NOISE * _noise(values))
+    windows = np.lib.stride_tricks.sliding_window_view(values, _REST)
+    still = np.max(windows, axis=1) - np.min(windows, axis=1) <= tolerance
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    return [(int(a), int(b) - 1 + _REST) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _moves(channel: Channel, start: float, stop: float) -> bool:
+    """Whether an input leaves its tolerance between two times."""
+    span = _span(channel.times, start, stop)
+    part = channel.values[max(span.start - 1, 0) : span.stop]
+    if part.size == 0:
+        return False
+    tolerance = max(
+        _TOLERANCE * float(np.ptp(channel.values)), 2.0 * _NOISE * _noise(channel.values)
+    )
+    return bool(np.ptp(part) > tolerance)
+
+
+def _span(times: FloatArray, start: float, stop: float) -> slice:
+    return slice(
+        int(np.searchsorted(times, start, "left")), int(np.searchsorted(times, stop, "right"))
+    )
+
+
+def _noise(values: FloatArray) -> float:
+    """Standard deviation of white noise on a signal, from its second differences.
+
+    Their median is not moved by the few samples at which the signal itself bends.
+    """
+    if values.size < _REST:
+        return 0.0
+    bend = np.diff(values, 2)
+    return float(1.4826 * np.median(np.abs(bend)) / sqrt(6.0))

@@ -1,0 +1,377 @@
+"""Tests of the residuals: whether they are white, and whether they are independent of the inputs.
+
+What MATLAB's ``resid`` shows (Ljung, System Identification, 2nd ed., ch. 16.6), with e = y - ŷ:
+
+whiteness
+    r(k) = Σ e(t) e(t+k) / Σ e², k = 1 … 25. For white e its variance is n_k/n², n_k pairs of n
+    samples. Q = Σ r(k)² n²/n_k is χ² with as many degrees of freedom as lags (Ljung and Box 1978,
+    for n_k = n - k). The mean is not removed: an offset of the model is a fault too.
+independence
+    c(k) = Σ e(t) u(t - kτ) / √(Σ e² Σ u²), both without their means. e may be coloured: given u,
+    the covariance of two such sums is Σ R(i - j) u(i) u(j), R the autocovariance of e, from a
+    Parzen window as wide as the colour of e asks for (Andrews 1991). The sum of squares over the
+    lags k ≥ 0, each against its variance, is compared with a χ² of the same mean and variance
+    (Satterthwaite), for neighbouring lags are not independent. Lags k < 0 are shown and not
+    tested: there feedback from the output to the input would show.
+
+Only scored samples count. Missing samples leave their pairs out. Where samples are not regular
+the lags of whiteness count samples; u is read between its samples as it was held, so τ is a time
+all the same, and nothing is resampled. With soft-l1 the residuals are those that the loss sees,
+ψ(e) = e/√(1 + (e/s)²), so that an outlier counts as what it counted for the estimate.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.special import gammaincc
+
+from sysid.problem import Problem
+from sysid.records import Channel, sampling_of
+from sysid.types import BoolArray, FloatArray
+
+MAX_LAG = 25
+LEVEL = 0.05
+"""Chance that a true model with white noise fails one of its tests, all of them together."""
+
+_BAND95, _BAND99 = 1.959963984540054, 2.5758293035489004
+_FEWEST = 20  # samples: below, no test says anything
+_MOST = 50_000  # consecutive samples that are enough for any test; bounds the time it takes
+_ROUNDING = 1e-9  # of the output: below, the residual is rounding
+_GRID = 0.05  # of a period: so far from its place a sample may lie
+_GAPS = 0.5  # of the places of a grid are filled at least, else it is none
+
+Kind = Literal["whiteness", "independence"]
+Outcome = Literal["passed", "failed", "not tested"]
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualTest:
+    """One test of one output's residuals.
+
+    Attributes
+    ----------
+    experiment : int
+        From 0.
+    input : str or None
+        None for whiteness.
+    outcome : {"passed", "failed", "not tested"}
+        With `reason` if not tested.
+    samples, lags : int
+        Scored samples; lags tested.
+    inside95, inside99 : float or None
+        Part of the tested lags inside the bands.
+    statistic, degrees, p : float or None
+        Of the χ² distribution; `p` is the chance of a larger statistic if the model is true.
+    """
+
+    experiment: int
+    output: str
+    kind: Kind
+    input: str | None
+    outcome: Outcome
+    samples: int
+    lags: int = 0
+    inside95: float | None = None
+    inside99: float | None = None
+    statistic: float | None = None
+    degrees: float | None = None
+    p: float | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ResidualTests:
+    """All tests of a result. `passed` is None where nothing could be tested."""
+
+    data: Literal["estimation", "validation"]
+    passed: bool | None
+    tests: tuple[ResidualTest, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correlation:
+    """A correlation function with its bands, and the test made of it.
+
+    Attributes
+    ----------
+    lags : FloatArray, shape (n,)
+        In periods, `period` (s) each; None where they count samples of irregular times.
+    values, band95, band99 : FloatArray, shape (n,)
+        Empty if not tested.
+    """
+
+    test: ResidualTest
+    period: float | None
+    lags: FloatArray
+    values: FloatArray
+    band95: FloatArray
+    band99: FloatArray
+
+
+class Series(NamedTuple):
+    """The residuals (N,) of one output in one experiment, as the loss sees them.
+
+    `scored` tells which of them count; `size` is the largest measured value among those.
+    """
+
+    experiment: int
+    output: str
+    times: FloatArray
+    residual: FloatArray
+    scored: BoolArray
+    size: float
+    inputs: tuple[Channel, ...]
+
+
+def residual_tests(
+    problem: Problem, simulated: FloatArray, data: Literal["estimation", "validation"]
+) -> ResidualTests:
+    """Test the residuals of simulated values (M,) on the records of a problem."""
+    return verdict(correlations(series_of(problem, simulated)), data)
+
+
+def verdict(
+    found: Sequence[Correlation], data: Literal["estimation", "validation"]
+) -> ResidualTests:
+    """The tests of some correlation functions, and whether all of them passed."""
+    tests = tuple(one.test for one in found)
+    tested = [one for one in tests if one.outcome != "not tested"]
+    passed = all(one.outcome == "passed" for one in tested) if tested else None
+    return ResidualTests(data, passed, tests)
+
+
+def series_of(problem: Problem, simulated: FloatArray) -> list[Series]:
+    """The residuals of every output of every experiment, from simulated values (M,)."""
+    loss = problem.arguments[4]
+    scale = loss.scale if loss.kind == "soft-l1" else 0.0
+    parts = zip(
+        problem.records, problem.split(simulated), problem.split(problem.evaluator.measured),
+        problem.split(problem.evaluator.weight), strict=True,
+    )  # fmt: skip
+    names = {one.name for one in problem.model.inputs}
+    found = []
+    for number, (record, model, measured, weight) in enumerate(parts):
+        inputs = tuple(one for one in record.inputs if one.name in names)
+        times = {channel.name: channel.times for channel in record.outputs}
+        for output in (one.name for one in problem.model.outputs):
+            factor = problem.output_weights[output]
+            found.append(
+                series(number, output, times[output], factor * measured[output],
+                       factor * model[output], weight[output] > 0, inputs, scale)
+            )  # fmt: skip
+    return found
+
+
+def series(
+    experiment: int, output: str, times: FloatArray, measured: FloatArray, simulated: FloatArray,
+    scored: BoolArray, inputs: tuple[Channel, ...], loss_scale: float = 0.0,
+) -> Series:  # fmt: skip
+    """Residuals from weighted outputs (N,); of a long record the last 50 000 scored samples.
+
+    `loss_scale` is that of a soft-l1 loss, 0 with squares.
+    """
+    with np.errstate(all="ignore"):  # a missing measurement, or a simulation that diverged
+        error = measured - simulated
+        seen = error / np.sqrt(1.0 + np.square(error / loss_scale)) if loss_scale > 0 else error
+    where = np.flatnonzero(scored & np.isfinite(seen))[-_MOST:]
+    usable = np.zeros(times.size, dtype=np.bool_)
+    usable[where] = True
+    kept = slice(int(where[0]), int(where[-1]) + 1) if where.size else slice(0, 0)
+    size = float(np.max(np.abs(measured[where]), initial=0.0))
+    return Series(experiment, output, times[kept], seen[kept], usable[kept], size, inputs)
+
+
+def correlations(found: Sequence[Series], level: float = LEVEL) -> list[Correlation]:
+    """Autocorrelation of each series and its correlation with each input, all tested together.
+
+    `level` is shared out (Bonferroni): of n tests each is one at `level` / n.
+    """
+    count = sum(1 + len(one.inputs) for one in found if not _untestable(one))
+    each = level / max(count, 1)
+    return [curve for one in found for curve in _of_series(one, each)]
+
+
+def _of_series(one: Series, level: float) -> Iterator[Correlation]:
+    reason = _untestable(one)
+    if reason:
+        yield _not_tested(one, "whiteness", None, reason)
+        for channel in one.inputs:
+            yield _not_tested(one, "independence", channel.name, reason)
+        return
+    laid = _laid(one)
+    yield _whiteness(one, laid, level)
+    for channel in one.inputs:
+        yield _independence(one, laid, channel, level)
+
+
+def _untestable(one: Series) -> str:
+    n = int(np.count_nonzero(one.scored))
+    if n < _FEWEST:
+        return f"{n} samples are too few; need {_FEWEST} or more"
+    if float(np.sqrt(np.mean(np.square(one.residual[one.scored])))) <= _ROUNDING * one.size:
+        return "the residuals are rounding: the model reproduces the data exactly"
+    return ""
+
+
+class _Laid(NamedTuple):
+    """Residuals one beside the other, zero where one is missing, with their times."""
+
+    times: FloatArray
+    values: FloatArray
+    present: BoolArray
+    period: float
+    is_regular: bool
+
+    @property
+    def lags(self) -> int:
+        return min(MAX_LAG, int(np.count_nonzero(self.present)) // 4)
+
+
+def _laid(one: Series) -> _Laid:
+    """The scored residuals in places a period apart; irregular ones in their order."""
+    times, values = one.times[one.scored], one.residual[one.scored]
+    steps = np.diff(times)
+    period = float(np.median(steps)) if steps.size else 0.0
+    if period > 0:
+        rounded = np.cumsum(np.maximum(np.rint(steps / period), 0.0))
+        period = float((times[-1] - times[0]) / rounded[-1])  # not off by the rounding of one step
+        exact = np.concatenate([[0.0], steps / period])
+        places = np.concatenate([[0.0], rounded])
+        far = np.abs(exact - np.rint(exact))
+        is_regular = bool(np.all(far <= _GRID) and np.all(np.rint(exact[1:]) >= 1))
+        n = int(places[-1]) + 1
+        if is_regular and values.size >= _GAPS * n:
+            index = places.astype(np.intp)
+            filled, present = np.zeros(n), np.zeros(n, dtype=np.bool_)
+            filled[index], present[index] = values, True
+            laid = times[0] + period * np.arange(n)
+            laid[index] = times
+            return _Laid(laid, filled, present, period, is_regular=True)
+    distinct = max(np.unique(times).size - 1, 1)
+    spacing = float(times[-1] - times[0]) / distinct
+    return _Laid(times, values, np.ones(values.size, dtype=np.bool_), spacing, is_regular=False)
+
+
+def _whiteness(one: Series, laid: _Laid, level: float) -> Correlation:
+    n = np.count_nonzero(laid.present)
+    power = float(laid.values @ laid.values)
+    lags = range(1, laid.lags + 1)
+    values = np.array([laid.values[k:] @ laid.values[:-k] for k in lags]) / power
+    pairs = np.array([np.count_nonzero(laid.present[k:] & laid.present[:-k]) for k in lags])
+    deviation = np.sqrt(np.maximum(pairs, 1)) / n
+    statistic = float(np.sum(np.square(values / deviation)))
+    test = _test(one, "whiteness", None, values / deviation, statistic, float(len(lags)), level)
+    band = np.concatenate([[0.0], deviation])
+    return Correlation(
+        test, laid.period if laid.is_regular else None, np.arange(0.0, len(lags) + 1),
+        np.concatenate([[1.0], values]), _BAND95 * band, _BAND99 * band,
+    )  # fmt: skip
+
+
+def _independence(one: Series, laid: _Laid, channel: Channel, level: float) -> Correlation:
+    m = laid.lags
+    if not np.ptp(channel.values) > 0:
+        return _not_tested(one, "independence", channel.name, "the input is constant")
+    residual = np.where(laid.present, laid.values - np.mean(laid.values[laid.present]), 0.0)
+    shifted = [_shifted(laid, channel, k * laid.period) for k in range(-m, m + 1)]
+    # Of every lag the same samples, so that no lag is judged by more than another.
+    known = laid.present & np.all(np.isfinite(shifted), axis=0)
+    if np.count_nonzero(known) < _FEWEST:
+        return _not_tested(one, "independence", channel.name, "it overlaps the output too little")
+    columns = np.where(known, shifted, 0.0)
+    columns -= np.where(known, columns.sum(axis=1, keepdims=True) / known.sum(), 0.0)
+    sizes = np.sqrt(np.sum(np.square(columns), axis=1))
+    if not np.min(sizes[m:]) > _ROUNDING * np.max(np.abs(channel.values)):
+        return _not_tested(one, "independence", channel.name, "the input is constant there")
+    covariance = _covariance(residual, laid.present, columns)
+    sums, deviation = columns @ residual, np.sqrt(np.diag(covariance))
+    norm = sizes * np.sqrt(float(residual[known] @ residual[known]))
+    norm, deviation = np.maximum(norm, np.finfo(float).tiny), np.maximum(deviation, 1e-300)
+    past = slice(m, 2 * m + 1)
+    scaled = sums[past] / deviation[past]
+    spread = covariance[past, past] / np.outer(deviation[past], deviation[past])
+    count, squares = m + 1, float(np.sum(np.square(spread)))
+    # A sum of squares with mean `count` and variance 2·`squares` is a χ² times squares/count.
+    statistic = float(scaled @ scaled) * count / squares
+    test = _test(
+        one, "independence", channel.name, scaled, statistic, count * count / squares, level
+    )
+    band = deviation / norm
+    return Correlation(
+        test, laid.period, np.arange(-float(m), m + 1), sums / norm, _BAND95 * band, _BAND99 * band
+    )
+
+
+def _shifted(laid: _Laid, channel: Channel, lag: float) -> FloatArray:
+    """The input at the residuals' times less a lag (s); nan where it was not recorded."""
+    # A jump and the sample it is seen at may be a rounding apart: nearer than this, they are one.
+    slack = 1e-6 * laid.period
+    wanted = laid.times - lag
+    if channel.hold == "zero":
+        place = np.searchsorted(channel.times, wanted + slack, side="right") - 1
+        values = channel.values[np.clip(place, 0, channel.times.size - 1)]
+        period = sampling_of(channel.times).period
+        slack += period if np.isfinite(period) else 0.0  # the last value holds for a period
+    else:
+        values = np.interp(wanted, channel.times, channel.values)
+    first, last = channel.times[0], channel.times[-1]
+    inside = (wanted >= first - 1e-6 * laid.period) & (wanted <= last + slack)
+    return np.asarray(np.where(inside, values, np.nan))
+
+
+def _covariance(residual: FloatArray, present: BoolArray, columns: FloatArray) -> FloatArray:
+    """Covariance of Σ e(i) u_a(i) over the noise e, given the columns u_a (n, N)."""
+    n = residual.size
+    length = next_fast_len(2 * n, real=True)
+    raw = irfft(np.square(np.abs(rfft(residual, length))), length)[:n]
+    pairs = np.rint(irfft(np.square(np.abs(rfft(present.astype(float), length))), length)[:n])
+    autocovariance = raw / np.count_nonzero(present)
+    complete = np.where(pairs > 0, np.arange(n, 0.0, -1.0) / np.maximum(pairs, 1.0), 0.0)
+    autocovariance *= complete * np.count_nonzero(present) / n  # as if none were missing
+    taper = _parzen(n, _width(autocovariance, n))
+    kernel = np.zeros(length)
+    kernel[:n] = autocovariance * taper
+    kernel[length - n + 1 :] = kernel[1:n][::-1]
+    spectrum = np.maximum(rfft(kernel).real, 0.0)
+    weight = np.full(spectrum.size, 2.0)  # each frequency stands for its negative too
+    weight[0] = 1.0
+    if length % 2 == 0:
+        weight[-1] = 1.0
+    seen_by = rfft(columns, length, axis=1) * np.sqrt(spectrum * weight / length)
+    return np.asarray((seen_by @ seen_by.conj().T).real)
+
+
+def _width(autocovariance: FloatArray, n: int) -> float:
+    """Width of a Parzen window, by the rule of Andrews (1991) for first-order colour."""
+    rho = float(np.clip(autocovariance[1] / autocovariance[0], -0.99, 0.99))
+    curvature = 4.0 * rho**2 / (1.0 - rho) ** 4
+    return float(np.clip(2.66 * (curvature * n) ** 0.2, n ** (1 / 3), 0.25 * n))
+
+
+def _parzen(n: int, width: float) -> FloatArray:
+    x = np.minimum(np.arange(n) / width, 1.0)
+    return np.asarray(np.where(x <= 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3))
+
+
+def _test(
+    one: Series, kind: Kind, channel: str | None, scaled: FloatArray, statistic: float,
+    degrees: float, level: float,
+) -> ResidualTest:  # fmt: skip
+    p = float(gammaincc(degrees / 2, statistic / 2))
+    size = np.abs(scaled)
+    return ResidualTest(
+        one.experiment, one.output, kind, channel, "passed" if p >= level else "failed",
+        int(np.count_nonzero(one.scored)), scaled.size, float(np.mean(size <= _BAND95)),
+        float(np.mean(size <= _BAND99)), statistic, degrees, p,
+    )  # fmt: skip
+
+
+def _not_tested(one: Series, kind: Kind, channel: str | None, reason: str) -> Correlation:
+    samples = int(np.count_nonzero(one.scored))
+    test = ResidualTest(one.experiment, one.output, kind, channel, "not tested", samples,
+                        reason=reason)  # fmt: skip
+    none = np.zeros(0)
+    return Correlation(test, None, none, none, none, none)
