@@ -137,7 +137,8 @@ def _best_so_far(session: Session, run: Run, job: Job) -> list[dict[str, Any]]:
 
 def _free_names(session: Session, run: Run) -> list[str]:
     if run.result is not None:
-        return [one["name"] for one in run.result["parameters"] if one["status"] != "fixed"]
+        known = ("fixed", "tied")
+        return [one["name"] for one in run.result["parameters"] if one["status"] not in known]
     return [one.name for one in _sought(session, run, JobRepository(session).get(run.job_id))]
 
 

@@ -11,6 +11,7 @@ from sysid.problem import Problem
 from sysid.records import Record, split_record, start_of_validation
 from sysid.result import Identification
 from sysid.run import RunState, advance, begin, conclude, is_finished
+from sysid.selection import selected
 from sysid.settings import GeneticAlgorithm, Loss, Prediction
 
 _PROGRESS_SECONDS = 0.25
@@ -34,6 +35,8 @@ def identify(
     progress: Callable[[RunState], None] | None = None,
 ) -> Identification:
     """Find the free parameters of a model, its unknown lags among them.
+
+    A polynomial whose terms are to be selected first has them selected on the records.
 
     Parameters
     ----------
@@ -64,10 +67,12 @@ def identify(
         If an argument cannot be used.
     """
     algorithm = settings or GeneticAlgorithm()
+    estimation = _estimation(_several(records), validation_fraction, noise)
+    model, parameters = selected(model, estimation, parameters, skip)
     pose = partial(
         Problem.build, model, parameters=parameters, prediction=prediction, loss=loss, skip=skip
     )
-    posed = pose(_estimation(_several(records), validation_fraction, noise), weights=weights)
+    posed = pose(estimation, weights=weights)
     kept, since = _kept(_several(records), validation, validation_fraction)
     judged = None if kept is None else pose(kept, weights=posed.output_weights, scored_from=since)
     state = begin(posed, algorithm, seed, warm)

@@ -4,9 +4,12 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from sysid.metrics import ChannelMetrics
+from sysid.onset import OnsetDelay
+from sysid.residuals import ResidualTests
+from sysid.models.terms import SelectedTerm
 from sysid.types import FloatArray
 
-EstimateStatus = Literal["identified", "group", "at bound", "unidentifiable", "fixed"]
+EstimateStatus = Literal["identified", "group", "at bound", "unidentifiable", "fixed", "tied"]
 Phase = Literal["start", "genetic", "sequence", "migration", "refinement"]
 
 
@@ -68,6 +71,53 @@ class IslandSummary:
     evaluations: int
 
 
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A combination of parameters that the data tell, though not what each of them is.
+
+    Attributes
+    ----------
+    members : tuple of str
+        The parameters in it.
+    expression : str
+        A product of powers, such as ``A_m*k_b/J``, or else a sum, such as ``T + L``.
+    value : float
+    stderr : float or None
+        Standard error of `value`.
+    """
+
+    members: tuple[str, ...]
+    expression: str
+    value: float
+    stderr: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Criteria:
+    """Information criteria, smaller is better: only models fitted to the same samples compare.
+
+    The log-likelihood is that of independent Gaussian residuals whose one variance is estimated
+    with the parameters: ln ℓ = -n/2 (ln(2π Σe²/n) + 1), e weighted. With κ = D + 1 (the variance
+    counts): AIC = 2κ - 2 ln ℓ, AICc = AIC + 2κ(κ + 1)/(n - κ - 1), BIC = κ ln n - 2 ln ℓ
+    (Akaike 1974; Hurvich and Tsai 1989; Schwarz 1978).
+
+    Attributes
+    ----------
+    aic, bic : float
+        Minus infinity where the residuals vanish.
+    aicc : float or None
+        None where there are not more samples than κ + 1.
+    samples, parameters : int
+        n scored samples and D free parameters.
+    """
+
+    aic: float
+    aicc: float | None
+    bic: float
+    samples: int
+    parameters: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
     """Local analysis at the estimate; rows and columns are the free parameters `names`."""
@@ -78,6 +128,7 @@ class Uncertainty:
     condition: float
     singular_values: FloatArray
     noise_sd: float
+    groups: tuple[Group, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +140,7 @@ class Identification:
     per island. `simulated` has per experiment, per output, the model's output at the measured
     times. `fit_percent_validation` and `rms_validation` are None without validation data.
     `agreement` and `agreement_validation` tell each output of each experiment on its own.
+    `selection` has the terms that were selected, if the model asked for it.
     """
 
     estimates: tuple[Estimate, ...]
@@ -108,3 +160,7 @@ class Identification:
     agreement: tuple[ChannelMetrics, ...]
     agreement_validation: tuple[ChannelMetrics, ...]
     warnings: tuple[str, ...]
+    selection: tuple[SelectedTerm, ...] = ()
+    criteria: Criteria | None = None
+    residual_tests: ResidualTests | None = None
+    onset_delays: tuple[OnsetDelay, ...] = ()

@@ -17,6 +17,7 @@ from sysid.islands.archipelago import found, of_island, plans
 from sysid.islands.migration import migrate
 from sysid.islands.run_state import RunState
 from sysid.problem import Problem
+from sysid.selection import equation_error_starts
 from sysid.settings import GeneticAlgorithm
 
 __all__ = [
@@ -36,9 +37,13 @@ def begin(
     seed: int,
     warm: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
 ) -> RunState:
-    """A run before its first generation; `warm`: parameter values that seed a quarter of it."""
+    """A run before its first generation; `warm`: parameter values that seed a quarter of it.
+
+    The improved search of a polynomial is seeded by least squares one step ahead, too.
+    """
     given = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
-    return RunState(seed, found(problem, algorithm, seed, given))
+    starts = equation_error_starts(problem, algorithm)
+    return RunState(seed, found(problem, algorithm, seed, given, starts.values, starts.evaluations))
 
 
 def border(algorithm: GeneticAlgorithm, state: RunState) -> int:

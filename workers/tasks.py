@@ -14,6 +14,7 @@ from sysid.problem import Problem
 from sysid.records import split_record, start_of_validation
 from sysid.run import CALL_SECONDS, advance_island, begin, conclude, is_finished
 from sysid.run import advance as advance_run
+from sysid.selection import selected
 from workers.ports import (
     Advance,
     Advanced,
@@ -124,9 +125,10 @@ def build(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Problem, P
     """
     model = parse_model(spec.model)
     estimation, validation = prepared(spec, records)
+    model, parameters = selected(model, estimation, spec.parameters, spec.skip)
 
     problem = partial(
-        Problem.build, model, parameters=spec.parameters, prediction=spec.prediction,
+        Problem.build, model, parameters=parameters, prediction=spec.prediction,
         loss=spec.loss, skip=spec.skip,
     )  # fmt: skip
     posed = problem(estimation, weights=spec.weights)

@@ -9,7 +9,15 @@ import numpy as np
 from service.storage.ledger import HistoryPoint, MigrantPoint, RunOutcome
 from service.storage.tables import State
 from sysid.metrics import ChannelMetrics
-from sysid.result import Estimate, Identification, Improvement, Migrant, Uncertainty
+from sysid.result import (
+    Criteria,
+    Estimate,
+    Group,
+    Identification,
+    Improvement,
+    Migrant,
+    Uncertainty,
+)
 
 
 def outcome_of(run: str, found: Identification, seconds: float, signals: str | None) -> RunOutcome:
@@ -56,11 +64,13 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
             }
             for island in found.islands
         ],
-        "identifiability": _identifiability(found.uncertainty, found.estimates),
+        "identifiability": _identifiability(found.uncertainty),
+        "criteria": _criteria(found.criteria),
         "correlation": _correlation(found.uncertainty),
         "noise_sd": None if found.uncertainty is None else _finite(found.uncertainty.noise_sd),
         "residual_tests": {},
         "warnings": list(found.warnings),
+        "selection": [one._asdict() for one in found.selection],
     }
 
 
@@ -113,17 +123,34 @@ def _agreement(one: ChannelMetrics) -> dict[str, Any]:
     }
 
 
-def _identifiability(
-    uncertainty: Uncertainty | None, estimates: tuple[Estimate, ...]
-) -> dict[str, Any]:
-    grouped = [one.name for one in estimates if one.status == "group"]
-    groups = [grouped] if grouped else []
+def _identifiability(uncertainty: Uncertainty | None) -> dict[str, Any]:
     if uncertainty is None:
-        return {"condition": None, "groups": groups, "singular_values": []}
+        return {"condition": None, "groups": [], "singular_values": []}
     return {
         "condition": _finite(uncertainty.condition),
-        "groups": groups,
+        "groups": [_group(one) for one in uncertainty.groups],
         "singular_values": [_finite(value) for value in uncertainty.singular_values],
+    }
+
+
+def _group(one: Group) -> dict[str, Any]:
+    return {
+        "members": list(one.members),
+        "expression": one.expression,
+        "value": _finite(one.value),
+        "stderr": _finite(one.stderr),
+    }
+
+
+def _criteria(one: Criteria | None) -> dict[str, Any] | None:
+    if one is None:
+        return None
+    return {
+        "aic": _finite(one.aic),
+        "aicc": _finite(one.aicc),
+        "bic": _finite(one.bic),
+        "samples": one.samples,
+        "parameters": one.parameters,
     }
 
 

@@ -10,7 +10,16 @@ from sysid.ga.chromosome import coded, placed
 from sysid.ga.evolution import initial_places
 from sysid.ga.island import Island
 from sysid.ga.random import WARM, draws, unit
-from sysid.ga.state import IMPROVED, IMPROVED_PAPER_STEPS, N_COUNTERS, PAPER, POINT, SIMPLE, Plan
+from sysid.ga.state import (
+    EVALUATIONS,
+    IMPROVED,
+    IMPROVED_PAPER_STEPS,
+    N_COUNTERS,
+    PAPER,
+    POINT,
+    SIMPLE,
+    Plan,
+)  # fmt: skip
 from sysid.problem import Problem
 from sysid.settings import GeneticAlgorithm, Loss
 from sysid.types import FloatArray
@@ -115,29 +124,37 @@ def found(
     algorithm: GeneticAlgorithm,
     seed: int,
     warm: Sequence[Mapping[str, float]] = (),
+    starts: Sequence[Mapping[str, float]] = (),
+    spent: int = 0,
 ) -> tuple[Island, ...]:
     """The islands before their first generation; no individual is evaluated yet.
 
     A quarter of every island comes from the `warm` parameter values (in turn: the values
-    themselves, then neighbours), the rest is drawn.
+    themselves, then neighbours), the rest is drawn. Those that search by the improved method
+    also share the `starts`, best first, whose finding took `spent` simulations.
     """
     if not 0 <= seed < 2**63:
         raise InvalidSettings("/seed", f"found {seed!r}; need a whole number 0 to 2^63 - 1")
     n = len(problem.space)
     if n == 0:
         raise InvalidSettings("/parameters", "every parameter is fixed; leave at least one free")
-    islands = []
+    islands, n_islands = [], algorithm.n_islands
     for plan, size in zip(plans(problem, algorithm, seed), sizes(algorithm), strict=True):
         places = initial_places(plan, size, n)
-        for p in range(max(1, size // _WARM_SHARE) if warm else 0):
-            _warm(problem, plan, warm[p % len(warm)], p, places, p >= len(warm))
+        improves = plan.method in (IMPROVED, IMPROVED_PAPER_STEPS)
+        mine = starts[plan.island % max(len(starts), 1) :: n_islands] if improves else ()
+        given = (*warm, *mine)
+        for p in range(max(1, size // _WARM_SHARE) if given else 0):
+            _warm(problem, plan, given[p % len(given)], p, places, p >= len(given))
+        counters = np.zeros(N_COUNTERS, dtype=np.int64)
+        counters[EVALUATIONS] = spent if plan.island == 0 else 0
         islands.append(
             Island(
                 plan.island,
                 seed,
                 coded(places, plan.bits),
                 np.full(size, np.nan),
-                np.zeros(N_COUNTERS, dtype=np.int64),
+                counters,
                 np.zeros(POINT + n),
             )
         )

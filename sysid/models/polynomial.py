@@ -30,7 +30,7 @@ MAX_CANDIDATES = 512
 _MAX_DEGREE = 9
 _SELECTORS = ("frols",)
 _CRITERIA = ("none", "bic")
-_RULE_FIELDS = ("select", "keep", "err", "criterion", "candidates")
+_RULE_FIELDS = ("select", "keep", "err", "criterion", "exchange", "candidates")
 
 
 class Polynomial(NamedTuple):
@@ -66,21 +66,24 @@ def _rule(reader: Reader, written: Mapping[str, Any], candidates: int) -> TermRu
     if reader.required(fields, "select", "/terms", "name the selector: frols") is not None:
         reader.choice(fields["select"], _SELECTORS, "/terms/select")
     criterion = reader.choice(fields.get("criterion", "none"), _CRITERIA, "/terms/criterion")
-    err = fields.get("err")
-    if err is not None:
-        err = reader.number(err, "/terms/err", 0.5)
-        if not 0 < err < 1:
-            need = "need a share between 0 and 1 that may stay unexplained, such as 1e-4"
-            reader.fault("/terms/err", f"found {err:g}; {need}")
-    ends_by_itself = err is not None or criterion != "none"
-    most = min(candidates, MAX_PARAMETERS)
-    keep = fields.get("keep")
-    if keep is None and not ends_by_itself:
+    exchange = _truth(reader, fields.get("exchange", True), "/terms/exchange")
+    err = None if fields.get("err") is None else _share(reader, fields["err"])
+    most, keep = min(candidates, MAX_PARAMETERS), fields.get("keep")
+    if keep is None and err is None and criterion == "none":
         reader.fault("/terms/keep", "is missing; say how many terms to keep, such as 8")
     if keep is None or most == 0:  # without candidates, that is the fault to tell
-        return TermRule(max(most, 1), err, cast(Criterion, criterion))
-    keep = _kept(reader, keep, candidates, most)
-    return TermRule(keep, err, cast(Criterion, criterion))
+        number = max(most, 1)
+    else:
+        number = _kept(reader, keep, candidates, most)
+    return TermRule(number, err, cast(Criterion, criterion), exchange)
+
+
+def _share(reader: Reader, written: object) -> float:
+    err = reader.number(written, "/terms/err", 0.5)
+    if not 0 < err < 1:
+        need = "need a share between 0 and 1 that may stay unexplained, such as 1e-4"
+        reader.fault("/terms/err", f"found {err:g}; {need}")
+    return err
 
 
 def _kept(reader: Reader, keep: object, candidates: int, most: int) -> int:
@@ -104,9 +107,12 @@ def _candidates(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> tupl
 
 
 def _wants_constant(reader: Reader, fields: Mapping[str, Any]) -> bool:
-    found = fields.get("constant", False)
+    return _truth(reader, fields.get("constant", False), "/constant")
+
+
+def _truth(reader: Reader, found: object, place: str) -> bool:
     if not isinstance(found, bool):
-        reader.fault("/constant", f"{shown(found)} is not true or false")
+        reader.fault(place, f"{shown(found)} is not true or false")
     return found is True
 
 
@@ -117,8 +123,8 @@ def _terms(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> tuple[Ter
             return ()  # the constant alone
         return _listed(reader, written, scope, "/terms", MAX_PARAMETERS)
     if written != "all":
-        need = "'all', a list of terms, or {select: frols, keep: 8}"
-        reader.fault("/terms", f"{shown(written)} is not {need}")
+        need = "is not 'all' or a list of terms, nor asks for a selection"
+        reader.fault("/terms", f"{shown(written)} {need}")
     return _all_terms(reader, fields, scope, MAX_PARAMETERS)
 
 
@@ -243,7 +249,7 @@ def _coefficients(reader: Reader, entry: object, terms: Sequence[Term]) -> tuple
         return ()
     try:
         return tuple(
-            Parameter(term.coefficient, unit=unit, scale=cast(Scale, scale), **ends)
+            Parameter(term.coefficient, ends["lower"], ends["upper"], unit, cast(Scale, scale))
             for term in terms
         )
     except InvalidBounds as error:

@@ -43,11 +43,14 @@ class TermRule:
         Stop when the share of the output's squares that is not explained falls below this.
     criterion : {"none", "bic"}
         ``bic``: the number of terms with the least Bayesian information criterion.
+    exchange : bool
+        Whether a taken term may give way to a better one afterwards.
     """
 
     keep: int
     err: float | None = None
     criterion: Criterion = "none"
+    exchange: bool = True
 
 
 class SelectedTerm(NamedTuple):

@@ -1,0 +1,176 @@
+"""Forward regression by orthogonal least squares, on a triangle of inner products.
+
+The selection is that of Chen, Billings and Luo (1989): each step takes the term whose part
+orthogonal to those already taken explains most of what is left of the output, and its
+error-reduction ratio is that share. A forward choice cannot be taken back, and past values of a
+smooth signal look alike, so that an early choice may stand for several true terms. So by
+exchange: each taken term in turn gives way to the one that explains most in its stead, until
+none does better.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.models.terms import TermRule
+from sysid.types import FloatArray
+
+_DEPENDENT = 1e-20  # of a column's squares: less is rounding, the column depends on the others
+_EXPLAINED = 1e-24  # of the output's squares: less is rounding, nothing is left to explain
+_GAIN = 1e-6  # of what is unexplained: an exchange that gains less is not made
+_ROUNDS = 20
+
+
+class Forward(NamedTuple):
+    """Terms in the order of selection.
+
+    Attributes
+    ----------
+    order : tuple of int
+    ratios : tuple of float
+        Share of the output's squares that each explains beyond those before it.
+    left : tuple of float
+        Share that is left with it: not from 1 less a sum, which has no digits where little is.
+    """
+
+    order: tuple[int, ...] = ()
+    ratios: tuple[float, ...] = ()
+    left: tuple[float, ...] = ()
+
+    @property
+    def unexplained(self) -> float:
+        """Share of the output's squares that all of them leave."""
+        return self.left[-1] if self.left else 1.0
+
+    def first(self, keep: int) -> "Forward":
+        """Only the first terms."""
+        return Forward(self.order[:keep], self.ratios[:keep], self.left[:keep])
+
+
+def forward(
+    triangle: FloatArray, keep: int, err: float | None = None, among: Sequence[int] | None = None
+) -> Forward:
+    """Take terms until `keep` are taken, the unexplained share is below `err`, or none helps.
+
+    Parameters
+    ----------
+    triangle : FloatArray, shape (M + 1, M + 1)
+        R of the QR decomposition of [terms, output].
+    keep : int
+    err : float or None
+    among : sequence of int or None
+        Candidates; None: all.
+    """
+    left, target = triangle[:, :-1].copy(), triangle[:, -1].copy()
+    whole, squares = float(target @ target), np.sum(np.square(left), axis=0)
+    free = np.zeros(squares.size, dtype=np.bool_)
+    free[list(range(squares.size) if among is None else among)] = True
+    found = Forward()
+    stop = max(_EXPLAINED, err or 0.0)
+    while len(found.order) < keep and whole > 0 and not (found.left and found.unexplained < stop):
+        chosen = _best(left, target, free, squares)
+        if chosen is None:
+            break
+        direction = left[:, chosen] / np.linalg.norm(left[:, chosen])
+        part = float(direction @ target)
+        target = target - part * direction
+        found = Forward(
+            (*found.order, chosen),
+            (*found.ratios, part * part / whole),
+            (*found.left, float(target @ target) / whole),
+        )
+        free[chosen] = False
+        for _ in range(2):  # twice is enough: the second pass takes out what rounding left
+            left -= np.outer(direction, direction @ left)
+    return found
+
+
+def _best(
+    left: FloatArray, target: FloatArray, free: FloatArray, squares: FloatArray
+) -> int | None:
+    """The free column that explains most of the target; None if all depend on those taken."""
+    norms = np.sum(np.square(left), axis=0)
+    usable = free & (norms > _DEPENDENT * squares) & (norms > 0)
+    if not np.any(usable):
+        return None
+    gains = np.where(usable, np.square(left.T @ target) / np.where(usable, norms, 1.0), -1.0)
+    return int(np.argmax(gains))
+
+
+def exchanged(triangle: FloatArray, order: Sequence[int]) -> tuple[int, ...]:
+    """The terms after exchanges, each of which explains more than the term it replaces."""
+    chosen = list(order)
+    least = _left_over(triangle, chosen)
+    squares = np.sum(np.square(triangle[:, :-1]), axis=0)
+    floor = _EXPLAINED * float(triangle[:, -1] @ triangle[:, -1])
+    for _ in range(_ROUNDS):
+        before = least
+        for place in range(len(chosen)):
+            others = chosen[:place] + chosen[place + 1 :]
+            left = _orthogonal(triangle, others)
+            free = np.ones(squares.size, dtype=np.bool_)
+            free[others] = False
+            better = _best(left[:, :-1], left[:, -1], free, squares)
+            if better is None or better == chosen[place] or least <= floor:
+                continue
+            value = _left_over(triangle, [*others, better])
+            if value < (1.0 - _GAIN) * least:
+                chosen[place], least = better, value
+        if least == before:
+            break
+    return tuple(chosen)
+
+
+def _orthogonal(triangle: FloatArray, taken: Sequence[int]) -> FloatArray:
+    """All columns less their parts in the span of those taken."""
+    if not taken:
+        return triangle
+    basis = np.linalg.qr(triangle[:, list(taken)])[0]
+    left = triangle - basis @ (basis.T @ triangle)
+    found: FloatArray = left - basis @ (basis.T @ left)
+    return found
+
+
+def _left_over(triangle: FloatArray, taken: Sequence[int]) -> float:
+    left = _orthogonal(triangle, taken)[:, -1]
+    return float(left @ left)
+
+
+def solved(triangle: FloatArray, taken: Sequence[int], ridge: float = 0.0) -> FloatArray:
+    """Least-squares coefficients (M,) with the taken terms, zero for the others.
+
+    Columns are scaled to length 1; `ridge` is added to their squares. Of terms that depend on
+    each other the shortest solution is given.
+    """
+    found = np.zeros(triangle.shape[1] - 1)
+    if not taken:
+        return found
+    matrix, target = triangle[:, list(taken)], triangle[:, -1]
+    lengths = np.linalg.norm(matrix, axis=0)
+    lengths = np.where(lengths > 0, lengths, 1.0)
+    matrix = matrix / lengths
+    if ridge > 0:
+        matrix = np.vstack([matrix, np.sqrt(ridge) * np.eye(len(taken))])
+        target = np.concatenate([target, np.zeros(len(taken))])
+    found[list(taken)] = np.linalg.lstsq(matrix, target, rcond=1e-12)[0] / lengths
+    return found
+
+
+def count_by_bic(found: Forward, samples: int) -> int:
+    """Number of terms with the least n ln(S / n) + k ln n, S the squares left with k terms."""
+    counts = np.arange(1, len(found.left) + 1)
+    shares = np.maximum(np.array(found.left), _EXPLAINED)
+    values = samples * np.log(shares) + counts * np.log(max(samples, 1))
+    return int(np.argmin(values)) + 1 if counts.size else 0
+
+
+def select(triangle: FloatArray, rule: TermRule, samples: int) -> Forward:
+    """The terms by a rule, in the order in which they explain most."""
+    found = forward(triangle, rule.keep, rule.err)
+    if rule.criterion == "bic":
+        found = found.first(count_by_bic(found, samples))
+    if not rule.exchange:
+        return found
+    chosen = exchanged(triangle, found.order)
+    return forward(triangle, len(chosen), among=chosen)

@@ -1,0 +1,112 @@
+"""Resolving a model whose terms are to be selected on the estimation records."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from math import prod
+from typing import Any
+
+from sysid.errors import InvalidSettings
+from sysid.models.model import Model
+from sysid.models.spec import with_terms
+from sysid.models.terms import SelectedTerm, Selection, TermRule
+from sysid.parameters import Parameter, override
+from sysid.records import Record
+from sysid.selection.frols import Forward, forward, select, solved
+from sysid.selection.lagsearch import affordable_rows, lag_values, search
+from sysid.selection.regression import Regression
+from sysid.threads import one_thread
+
+Changes = Mapping[str, Mapping[str, Any]]
+
+
+def selected(
+    model: Model, records: Sequence[Record], changes: Changes | None = None, skip: int = 0
+) -> tuple[Model, dict[str, Mapping[str, Any]]]:
+    """The model with the terms that its rule selects on the records; another as it is.
+
+    Without records the model stays as it is, too. Unknown lags are tried at whole samples inside their bounds; the terms are those at the lags
+    where they explain most. The lags stay unknown: their values are in the `selection` of the
+    model, for the search to begin with.
+
+    Parameters
+    ----------
+    model : Model
+    records : sequence of Record
+        Those for the estimate.
+    changes : mapping of str to mapping
+        Changed bounds, scales or fixed values, also of candidates' coefficients.
+    skip : int
+        First samples of each output that are not scored.
+
+    Returns
+    -------
+    Model
+    dict
+        The changes, without those of coefficients that the model no longer has.
+
+    Raises
+    ------
+    InvalidSettings
+        If the records have fewer samples than there are candidates.
+    InvalidRecord, RecordTooShort, InvalidBounds
+        If a record does not have what the model needs, or a change cannot be used.
+    """
+    given = dict(changes or {})
+    if model.rule is None or not records:
+        return model, given
+    own = {parameter.name for parameter in model.parameters}
+    parameters = override(
+        model.parameters, {name: fields for name, fields in given.items() if name in own}
+    )
+    with one_thread():  # so that the last bit does not depend on the number of cores
+        found, lags, coefficients, samples = _found(model, model.rule, records, parameters, skip)
+    resolved = with_terms(model, [model.terms[i].label for i in found.order])
+    dropped = frozenset(own - {parameter.name for parameter in resolved.parameters})
+    selection = Selection(_told(model, found, coefficients), lags, samples, dropped)
+    kept = {name: fields for name, fields in given.items() if name not in dropped}
+    return replace(resolved, selection=selection), kept
+
+
+def enough_samples(model: Model, samples: int) -> None:
+    """Raise if a selection has more candidates than samples to tell them apart by.
+
+    Raises
+    ------
+    InvalidSettings
+    """
+    if model.rule is not None and samples < len(model.terms):
+        raise InvalidSettings(
+            "/model/terms",
+            f"{len(model.terms)} candidates cannot be told apart by {samples} samples; give "
+            "longer records, a lower degree or fewer lags",
+        )
+
+
+def _found(
+    model: Model, rule: TermRule, records: Sequence[Record],
+    parameters: Sequence[Parameter], skip: int,
+) -> tuple[Forward, dict[str, float], list[float], int]:  # fmt: skip
+    regression = Regression.of(model, records, parameters, skip)
+    enough_samples(model, regression.samples)
+    values = lag_values(model, parameters, regression.pieces[0].period)
+    lags: dict[str, float] = {}
+    if values:
+        combinations = prod(len(axis) for axis in values.values())
+        few = regression.thinned(affordable_rows(combinations, len(model.terms)))
+
+        def unexplained(tried: Mapping[str, float]) -> float:
+            triangle, _ = few.triangle(model.terms, tried)
+            return forward(triangle, rule.keep, rule.err).unexplained
+
+        lags = search(values, unexplained)[0].lags
+    triangle, samples = regression.triangle(model.terms, lags)
+    enough_samples(model, samples)
+    found = select(triangle, rule, samples)
+    return found, lags, solved(triangle, found.order).tolist(), samples
+
+
+def _told(model: Model, found: Forward, coefficients: Sequence[float]) -> tuple[SelectedTerm, ...]:
+    return tuple(
+        SelectedTerm(model.terms[i].label, ratio, 1.0 - left, coefficients[i])
+        for i, ratio, left in zip(found.order, found.ratios, found.left, strict=True)
+    )
