@@ -5,7 +5,7 @@ All methods take and return plain documents with the names of the REST interface
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypedDict
@@ -224,6 +224,10 @@ class Client:
     def runs(self, job: str, **filters: Any) -> list[Document]:
         """All runs of a job."""
         return self._all("jobs", job, "runs", **filters)
+
+    def summary(self, job: str, by: Sequence[str] | None = None) -> Document:
+        """Quantiles over the values of axes or labels; by default over all axes but seeds."""
+        return self._json(calls.read("jobs", job, "summary", by=None if by is None else list(by)))
 
     def run(self, name: str) -> Document:
         """One run's result."""

@@ -4,11 +4,12 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Response, status
 
-from service import jobs, runs
+from service import jobs, runs, summaries
 from service.api.deps import Cursor, Limit, PartsDep, ReadSession, WriteSession
 from service.schemas import Page
 from service.schemas_jobs import JobIn, JobOut
 from service.schemas_runs import RunOut
+from service.schemas_summaries import SummaryOut
 from service.storage.jobs import JobRepository
 from service.storage.runs import RunOrder
 from service.storage.tables import Job, State
@@ -83,6 +84,19 @@ def runs_of(
     """Runs of a job; filter by axis values, labels or state."""
     choice = runs.Choice(state or [], cell or [], label or [], order, descending)
     return runs.page(session, job_id, cursor, limit, choice)
+
+
+@router.get("/{job_id}/summary")
+def summary(
+    job_id: str,
+    session: ReadSession,
+    by: Annotated[
+        list[str] | None,
+        Query(description="axis (`/noise/sigma`) or label; may be repeated; default: no seeds"),
+    ] = None,
+) -> SummaryOut:
+    """Quantiles, success rate and mean evaluations for each value of the chosen axes."""
+    return summaries.summary(session, job_id, by)
 
 
 def _accepted(job: Job, response: Response) -> JobOut:

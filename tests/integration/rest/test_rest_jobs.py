@@ -189,3 +189,25 @@ def test_a_cancelled_run_keeps_the_best_it_had_found(own: TestClient) -> None:
     assert best["K"]["value"] == 3.0
     assert best["K"]["stderr"] is None
     assert "cancelled" in best["K"]["reason"]
+
+
+def test_a_summary_goes_over_the_axes_that_are_no_seeds(server: TestClient, dataset: str) -> None:
+    axes = [{"path": "/noise/sigma", "values": [0, 0.1]}, {"path": "/seed", "range": [0, 3]}]
+    job = submit(server, dataset, sweep={"axes": axes})["id"]
+    told = server.get(f"/v1/jobs/{job}/summary").json()
+    assert told["by"] == ["/noise/sigma"]
+    assert [(one["key"], one["runs"], one["succeeded"]) for one in told["groups"]] == [
+        ({"/noise/sigma": 0}, 3, 0), ({"/noise/sigma": 0.1}, 3, 0),
+    ]  # fmt: skip
+    by_seed = server.get(f"/v1/jobs/{job}/summary", params={"by": "/seed"}).json()
+    assert [one["key"] for one in by_seed["groups"]] == [{"/seed": i} for i in range(3)]
+
+
+def test_a_summary_over_an_axis_that_is_not_there_names_those_that_are(
+    server: TestClient, dataset: str
+) -> None:
+    job = submit(server, dataset, sweep={"axes": [{"path": "/seed", "range": [0, 3]}]})["id"]
+    (fault,) = refused(server.get(f"/v1/jobs/{job}/summary", params={"by": "/sed"}), 422, "invalid")
+    assert fault["pointer"] == "?by"
+    assert "no axis or label '/sed'" in fault["detail"]
+    assert "/seed" in fault["detail"]

@@ -1,0 +1,135 @@
+"""Aggregates over the runs of a job, computed by the database: no run is loaded to be counted."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from sqlalchemy import ColumnElement, Integer, case, cast, func, or_, select
+from sqlalchemy.orm import Session
+
+from service.storage.columns import to_json
+from service.storage.tables import DEFAULT_PROJECT, Run, State
+
+QUANTILES = (50, 250, 500, 750, 950)
+"""In thousandths: the database counts places with whole numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class GroupKey:
+    """What runs are grouped by: an axis of the sweep, or a label."""
+
+    kind: Literal["axis", "label"]
+    name: str
+
+    @property
+    def column(self) -> ColumnElement[Any]:
+        """The value in a run's row."""
+        column = Run.cell if self.kind == "axis" else Run.labels
+        found: ColumnElement[Any] = column.expression[self.name]
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A number of each run that quantiles are wanted of."""
+
+    kind: Literal["rms", "fit_estimation", "fit_validation", "evaluations", "estimate", "stderr"]
+    parameter: str = ""
+
+    @property
+    def column(self) -> ColumnElement[Any]:
+        """The value in a run's row; NULL where it has none."""
+        match self.kind:
+            case "rms":
+                return Run.best_rms.expression
+            case "estimate" | "stderr":
+                entry = "value" if self.kind == "estimate" else "stderr"
+                number: ColumnElement[Any] = Run.estimates[(self.parameter, entry)].as_float()
+                return number
+            case _:
+                found: ColumnElement[Any] = getattr(Run, self.kind)
+                return found
+
+
+@dataclass(slots=True)
+class Group:
+    """The runs that share the values of the grouping keys."""
+
+    key: tuple[Any, ...]
+    first: int
+    states: dict[State, int]
+    n_valid: int
+    mean_evaluations: float | None
+    mean_seconds: float | None
+    quantiles: dict[Quantity, tuple[float, ...]] = field(default_factory=dict)
+
+
+def groups(
+    session: Session, job_id: str, keys: Sequence[GroupKey], quantities: Sequence[Quantity],
+    limit: int, project_id: str = DEFAULT_PROJECT,
+) -> list[Group]:  # fmt: skip
+    """Groups of a job's runs in the order of the sweep, at most `limit` + 1 of them.
+
+    Quantiles are those of runs that succeeded, linearly interpolated between neighbours.
+    """
+    columns = [key.column.label(f"key{i}") for i, key in enumerate(keys)]
+    mine = (Run.job_id == job_id, Run.project_id == project_id)
+    counts = [func.sum(case((Run.state == state, 1), else_=0)) for state in State]
+    query = (
+        select(
+            func.min(Run.number), func.sum(case((Run.valid.is_(True), 1), else_=0)),
+            func.avg(_when_succeeded(Run.evaluations)), func.avg(_when_succeeded(Run.seconds)),
+            *counts, *columns,
+        )
+        .where(*mine).group_by(*columns).order_by(func.min(Run.number)).limit(limit + 1)
+    )  # fmt: skip
+    found: dict[str, Group] = {}
+    for first, valid, evaluations, seconds, *rest in session.execute(query):
+        key = tuple(rest[len(counts) :])
+        states = {state: int(n) for state, n in zip(State, rest, strict=False)}
+        mean = None if evaluations is None else float(evaluations)
+        found[to_json(key)] = Group(key, int(first), states, int(valid), mean, seconds)
+    for quantity in quantities:
+        for key, values in _quantiles(session, mine, columns, quantity):
+            if to_json(key) in found:  # not beyond the limit
+                found[to_json(key)].quantiles[quantity] = values
+    return list(found.values())
+
+
+def _when_succeeded(column: Any) -> ColumnElement[Any]:
+    return case((Run.state == State.SUCCEEDED, column))
+
+
+def _quantiles(
+    session: Session, mine: Sequence[ColumnElement[bool]], keys: Sequence[Any], quantity: Quantity
+) -> Iterator[tuple[tuple[Any, ...], tuple[float, ...]]]:
+    """Each group's quantiles of one number: only the values beside each of them are read."""
+    value = quantity.column.label("value")
+    # A number for all rows where there is no key: a window needs something to part by.
+    parts = list(keys) or [Run.job_id]
+    ranked = (
+        select(
+            *keys, value,
+            func.row_number().over(partition_by=parts, order_by=value).label("place"),
+            func.count().over(partition_by=parts).label("n"),
+        )
+        .where(*mine, Run.state == State.SUCCEEDED, value.element.is_not(None))
+        .subquery()
+    )  # fmt: skip
+    place, n = ranked.c.place, cast(ranked.c.n, Integer)
+    lower = [1 + (q * (n - 1)) // 1000 for q in QUANTILES]
+    wanted = or_(*(place.in_((at, at + 1)) for at in lower))
+    rows = session.execute(select(ranked).where(wanted))
+    values: dict[str, tuple[tuple[Any, ...], int, dict[int, float]]] = {}
+    for row in rows:
+        *key, number, at, count = row
+        entry = values.setdefault(to_json(key), (tuple(key), int(count), {}))
+        entry[2][int(at)] = float(number)
+    for found, count, places in values.values():
+        yield found, tuple(_interpolated(places, count, q) for q in QUANTILES)
+
+
+def _interpolated(places: dict[int, float], count: int, thousandths: int) -> float:
+    whole, rest = divmod(thousandths * (count - 1), 1000)
+    low = places[1 + whole]
+    return low if rest == 0 else low + (places[2 + whole] - low) * rest / 1000

@@ -1,0 +1,104 @@
+"""Summaries of many runs, on SQLite and on PostgreSQL alike."""
+
+import numpy as np
+import pytest
+
+from service.storage.ledger import Cell, RunLedger, RunOutcome
+from service.storage.queue import Queue
+from service.storage.summaries import QUANTILES, GroupKey, Quantity, groups
+from service.storage.tables import State
+from tests.stored import runs_of, submit
+
+SIGMA = GroupKey("axis", "/noise/sigma")
+METHOD = GroupKey("axis", "/algorithm/method")
+
+
+def filled(database, cells, values):
+    """A job with these cells, whose runs gave these values; None: the run failed."""
+    submit(database, n_runs=len(cells))
+    with database.write() as session:
+        got = Queue(session).claim("d1")
+        ledger = RunLedger(session, got.lease)
+        ledger.create(
+            Cell(number=i, cell=cell, labels={"length_m": 5.0 * (i % 2)})
+            for i, cell in enumerate(cells)
+        )
+    outcomes = [
+        RunOutcome(run_id=run.id, state=State.FAILED, error="diverged")
+        if value is None
+        else RunOutcome(
+            run_id=run.id,
+            state=State.SUCCEEDED,
+            valid=True,
+            best_rms=value,
+            evaluations=100 + i,
+            result={"parameters": [{"name": "L", "value": 2 * value, "stderr": None}]},
+        )
+        for i, (run, value) in enumerate(zip(runs_of(database, got.job.id), values, strict=True))
+    ]
+    with database.write() as session:
+        RunLedger(session, got.lease).record(outcomes)
+    return got.job.id
+
+
+def summary(database, job, keys, *quantities, limit=100):
+    with database.read() as session:
+        return groups(session, job, keys, quantities, limit)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100])
+def test_quantiles_are_those_of_the_values(database, count):
+    values = np.random.default_rng(count).random(count).tolist()
+    job = filled(database, [{"/seed": i} for i in range(count)], values)
+    (whole,) = summary(database, job, [], Quantity("rms"), Quantity("estimate", "L"))
+    expected = np.quantile(values, np.array(QUANTILES) / 1000)
+    np.testing.assert_allclose(whole.quantiles[Quantity("rms")], expected, rtol=1e-12)
+    np.testing.assert_allclose(whole.quantiles[Quantity("estimate", "L")], 2 * expected, rtol=1e-12)
+    assert whole.mean_evaluations == pytest.approx(100 + (count - 1) / 2)
+
+
+def test_groups_come_in_the_order_of_the_sweep_each_with_its_own_runs(database):
+    cells = [
+        {"/noise/sigma": sigma, "/algorithm/method": method, "/seed": seed}
+        for sigma in (0.2, 0, 0.1)
+        for method in ("simple", "improved")
+        for seed in range(3)
+    ]
+    values = [float(i) for i in range(len(cells))]
+    job = filled(database, cells, values)
+    found = summary(database, job, [SIGMA, METHOD], Quantity("rms"))
+    assert [one.key for one in found] == [
+        (0.2, "simple"), (0.2, "improved"), (0, "simple"), (0, "improved"), (0.1, "simple"),
+        (0.1, "improved"),
+    ]  # fmt: skip
+    medians = [one.quantiles[Quantity("rms")][2] for one in found]
+    assert medians == [1.0, 4.0, 7.0, 10.0, 13.0, 16.0]
+
+
+def test_failed_runs_are_counted_and_enter_no_quantile(database):
+    job = filled(database, [{"/seed": i} for i in range(4)], [1.0, None, 3.0, None])
+    (whole,) = summary(database, job, [], Quantity("rms"))
+    assert whole.states[State.SUCCEEDED] == 2
+    assert whole.states[State.FAILED] == 2
+    assert whole.n_valid == 2
+    assert whole.quantiles[Quantity("rms")][2] == 2.0
+
+
+def test_runs_may_be_grouped_by_a_label_and_by_values_that_are_no_numbers(database):
+    model = {"name": "own", "form": "difference"}
+    job = filled(database, [{"/model": model}, {"/model": "tube"}], [1.0, 2.0])
+    by_model = summary(database, job, [GroupKey("axis", "/model")])
+    assert [one.key for one in by_model] == [(model,), ("tube",)]
+    by_label = summary(database, job, [GroupKey("label", "length_m")])
+    assert [one.key for one in by_label] == [(0.0,), (5.0,)]
+
+
+def test_a_quantity_that_no_run_has_gives_no_quantiles(database):
+    job = filled(database, [{"/seed": 0}], [1.0])
+    (whole,) = summary(database, job, [], Quantity("stderr", "L"), Quantity("estimate", "x"))
+    assert whole.quantiles == {}
+
+
+def test_at_most_one_group_more_than_the_limit_is_read(database):
+    job = filled(database, [{"/noise/sigma": i} for i in range(9)], [1.0] * 9)
+    assert len(summary(database, job, [SIGMA], Quantity("rms"), limit=4)) == 5
