@@ -1,0 +1,88 @@
+"""What every exported text says of its model: facts, values with standard errors, origin."""
+
+import json
+import re
+import textwrap
+from collections.abc import Iterator, Mapping
+
+from sysid.export.identifiers import one_line
+from sysid.export.identified import Identified, Value
+from sysid.models.initial import initial_name
+from sysid.models.model import MeasuredInitial
+
+
+_JOINED = "\N{NO-BREAK SPACE}"
+
+
+def wrapped(source: str, width: int) -> list[str]:
+    """Source text on lines that end before an operator or behind a comma."""
+    tied = re.sub(r"(?<=[-+<>=*/]) ", _JOINED, source)
+    lines = textwrap.wrap(tied, width, break_long_words=False, break_on_hyphens=False)
+    return [line.replace(_JOINED, " ") for line in lines]
+
+
+def unit_text(unit: str) -> str:
+    """A unit as told in a sentence."""
+    return "without unit" if unit == "1" else unit
+
+
+def facts(identified: Identified) -> list[str]:
+    """Title, source, sampling, hold and provenance, one line each."""
+    model = identified.model
+    lines = [model.title or model.name, f"Model {model.name!r}, {model.form} form."]
+    for key in ("source", "description"):
+        if model.document.get(key):
+            lines.append(f"{key.capitalize()}: {model.document[key]}")
+    if identified.sample_time is not None:
+        lines.append(f"The data had a sampling period of {identified.sample_time:.10g} s.")
+    if model.form == "polynomial":
+        lines.append("The coefficients hold for that sampling period only.")
+    lines += [_hold(identified, one.name) for one in model.inputs]
+    if identified.version:
+        lines.append(f"Identified by lagid {identified.version}.")
+    for key, value in identified.provenance.items():
+        told = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        lines.append(f"{key}: {told}")
+    return [part for line in lines for part in textwrap.wrap(one_line(line), 94) or [""]]
+
+
+def _hold(identified: Identified, name: str) -> str:
+    hold = identified.hold(name)
+    if hold == "zero":
+        return f"Input {name} is held from each sample to the next."
+    if hold == "first":
+        return f"Input {name} goes on a straight line from each sample to the next."
+    return (
+        f"Input {name} was band-limited between its samples; here it goes on a straight line, "
+        "so give it resampled to a period short enough for that."
+    )
+
+
+def value_lines(
+    identified: Identified, parameters: Mapping[str, str], starts: Mapping[str, str]
+) -> Iterator[tuple[str, str]]:
+    """Identifier and description of every parameter and start."""
+    model = identified.model
+    texts = model.document.get("parameters") or {}
+    for one in model.parameters:
+        value = identified.find(one.name)
+        about = (texts.get(one.name) or {}).get("description", "")
+        name = f"{one.name}: " if parameters[one.name] != one.name else ""
+        head = name + (f"{about}, " if about else "")
+        yield parameters[one.name], head + _told(value or Value(one.name, 0.0, one.unit))
+    for state, initial in zip(model.states, model.initial, strict=True):
+        name = initial_name(state.name, 0)
+        value = identified.find(name)
+        head = f"{name}: start of {state.name}, "
+        if value is not None:
+            yield starts[state.name], head + _told(value)
+        elif isinstance(initial, MeasuredInitial):
+            yield starts[state.name], f"{head}{unit_text(state.unit)}; measured: give its first value."
+        else:
+            yield starts[state.name], f"{head}{unit_text(state.unit)}."
+
+
+def _told(value: Value) -> str:
+    error = "" if value.stderr is None else f"; standard error {value.stderr:.3g}"
+    status = f"; {value.status}" if value.status and value.status != "identified" else ""
+    return f"{unit_text(value.unit)}{error}{status}."

@@ -1,0 +1,129 @@
+"""Expression trees as source text of a programming language."""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+
+_LEVEL = {
+    "or": 1, "and": 2, "<": 4, "<=": 4, ">": 4, ">=": 4, "==": 4, "!=": 4,
+    "+": 5, "-": 5, "*": 6, "/": 6,
+}  # fmt: skip
+_SIGN = 7
+ATOM = 9
+
+
+class Language(Protocol):
+    """What two programming languages write differently."""
+
+    words: Mapping[str, str]
+    """``and`` and ``or``."""
+
+    def negation(self, condition: str) -> str:
+        """``not (…)``, to stand anywhere."""
+
+    def function(self, name: str, arguments: list[str]) -> str:
+        """A call of a function of the model language."""
+
+    def power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
+        """A power and its level; `base` may be followed by ``**``, `whole` is a small exponent."""
+
+    def choice(self, condition: str, first: str, second: str) -> str:
+        """``where``, to stand anywhere."""
+
+    def quotient(self, above: str) -> str:
+        """A dividend of numbers only, so that division by zero gives ``inf``."""
+
+    def element(self, array: str, index: str, divisor: int) -> str:
+        """Array at the whole part of index / divisor."""
+
+    def read(self, helper: str, signal: str, place: str) -> str:
+        """A call of ``between`` or ``held``."""
+
+    def limited(self, value: str, least: int, most: int) -> str:
+        """A number held between two others."""
+
+    def real(self, index: str) -> str:
+        """A whole number as floating-point number."""
+
+
+class Scope(Protocol):
+    """What names stand for at one place of the program; the texts are to stand anywhere."""
+
+    def symbol(self, symbol: Symbol) -> str:
+        """A parameter or a reserved name."""
+
+    def past(self, past: Past) -> str:
+        """A state or an input, now or in the past."""
+
+
+def source(expression: Expression, language: Language, scope: Scope, floor: int = 0) -> str:
+    """Text of an expression; in parentheses if it binds less than `floor`."""
+    written, level = _written(expression, language, scope)
+    return written if level >= floor else f"({written})"
+
+
+def number(value: float) -> str:
+    """Shortest text that gives the number back, and is one of floating point."""
+    return repr(float(value))
+
+
+def _written(expression: Expression, language: Language, scope: Scope) -> tuple[str, int]:
+    match expression:
+        case Number(value):
+            return number(value), ATOM if value >= 0 else _SIGN
+        case Symbol():
+            return scope.symbol(expression), ATOM
+        case Past():
+            return scope.past(expression), ATOM
+        case Unary("-", operand):
+            return f"-{source(operand, language, scope, _SIGN + 1)}", _SIGN
+        case Unary(_, operand):
+            return language.negation(source(operand, language, scope)), ATOM
+        case Binary("**", base, exponent):
+            return language.power(
+                source(base, language, scope, ATOM), source(exponent, language, scope),
+                _whole(base, exponent),
+            )  # fmt: skip
+        case Binary():
+            return _infix(expression, language, scope), _LEVEL[expression.operator]
+        case Call("where", (condition, first, second)):
+            parts = (source(one, language, scope) for one in (condition, first, second))
+            return language.choice(*parts), ATOM
+        case Call(function, arguments):
+            return language.function(function, [source(a, language, scope) for a in arguments]), ATOM
+
+
+def _infix(tree: Binary, language: Language, scope: Scope) -> str:
+    level = _LEVEL[tree.operator]
+    logical = level <= _LEVEL["<"]
+    before = source(tree.left, language, scope, 4 + (level == 4) if logical else level)
+    after = source(tree.right, language, scope, 4 + (level == 4) if logical else level + 1)
+    if tree.operator == "/" and is_number(tree):
+        before = language.quotient(before)
+    operator = language.words.get(tree.operator, tree.operator)
+    space = " " if level <= _LEVEL["+"] else ""
+    return f"{before}{space}{operator}{space}{after}"
+
+
+def is_number(expression: Expression) -> bool:
+    """Whether an expression has no names in it."""
+    match expression:
+        case Number():
+            return True
+        case Unary(_, operand):
+            return is_number(operand)
+        case Binary(_, left, right):
+            return is_number(left) and is_number(right)
+        case Call(_, arguments):
+            return all(is_number(one) for one in arguments)
+        case _:
+            return False
+
+
+def _whole(base: Expression, exponent: Expression) -> int | None:
+    match exponent:
+        case Number(value) if value.is_integer() and abs(value) <= 64 and not is_number(base):
+            return int(value)
+        case _:
+            return None

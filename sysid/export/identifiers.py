@@ -1,0 +1,53 @@
+"""Names of a model as identifiers of a program, and its texts as harmless comments."""
+
+import re
+import unicodedata
+from collections.abc import Iterable
+
+_GREEK = {
+    "α": "alpha", "β": "beta", "γ": "gamma", "δ": "delta", "ε": "epsilon", "ζ": "zeta",
+    "η": "eta", "θ": "theta", "ι": "iota", "κ": "kappa", "λ": "lambda", "μ": "mu", "ν": "nu",
+    "ξ": "xi", "ο": "omicron", "π": "pi", "ρ": "rho", "σ": "sigma", "ς": "sigma", "τ": "tau",
+    "υ": "upsilon", "φ": "phi", "χ": "chi", "ψ": "psi", "ω": "omega",
+}  # fmt: skip
+
+
+class Identifiers:
+    """Gives every name an identifier of its own: ASCII letters, digits and ``_``."""
+
+    def __init__(self, taken: Iterable[str]) -> None:
+        self._taken = set(taken)
+
+    def of(self, name: str) -> str:
+        """An identifier like the name, that no one else has."""
+        stem = _ascii(name)
+        found, number = stem, 1
+        while found in self._taken:
+            number += 1
+            found = f"{stem}_{number}"
+        self._taken.add(found)
+        return found
+
+
+def _ascii(name: str) -> str:
+    spelled = "".join(_GREEK.get(c, _GREEK.get(c.lower(), c).capitalize() if c.lower() in _GREEK
+                                 else c) for c in unicodedata.normalize("NFKC", name))  # fmt: skip
+    plain = unicodedata.normalize("NFKD", spelled).encode("ascii", "ignore").decode()
+    stem = re.sub(r"[^A-Za-z0-9]+", "_", plain).strip("_")[:60]
+    return stem if stem and not stem[0].isdigit() else f"p_{stem}".rstrip("_")
+
+
+def one_line(text: str) -> str:
+    """The text on one line, without characters that cannot be seen or that turn the direction."""
+    visible = "".join(c if c.isprintable() else " " for c in text)
+    return " ".join(visible.split())
+
+
+def in_docstring(text: str) -> str:
+    """A line of a docstring: backslashes and quotes cannot end it."""
+    return one_line(text).replace("\\", "\\\\").replace('"', '\\"')
+
+
+def in_c_comment(text: str) -> str:
+    """A line inside ``/* … */``: it opens and closes none, and holds no trigraph."""
+    return one_line(text).replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
