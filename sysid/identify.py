@@ -75,12 +75,21 @@ def identify(
     posed = pose(estimation, weights=weights)
     kept, since = _kept(_several(records), validation, validation_fraction)
     judged = None if kept is None else pose(kept, weights=posed.output_weights, scored_from=since)
-    state = begin(posed, algorithm, seed, warm)
+    state = _searched(posed, algorithm, begin(posed, algorithm, seed, warm), progress)
+    return conclude(posed, algorithm, state, judged)
+
+
+def _searched(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    progress: Callable[[RunState], None] | None,
+) -> RunState:
     while not is_finished(algorithm, state):
-        state = advance(posed, algorithm, state, _PROGRESS_SECONDS)
+        state = advance(problem, algorithm, state, _PROGRESS_SECONDS)
         if progress is not None:
             progress(state)
-    return conclude(posed, algorithm, state, judged)
+    return state
 
 
 def _estimation(

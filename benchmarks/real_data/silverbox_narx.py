@@ -1,0 +1,78 @@
+"""Silverbox (measured): a NARX polynomial of 13 selected terms, free run on three tests."""
+
+from typing import Any
+
+from benchmarks.real_data.session import (
+    data_folder,
+    identify,
+    peak_memory_row,
+    print_estimates,
+    service,
+)
+from benchmarks.real_data.silverbox import PUBLISHED, TESTS
+from benchmarks.table import Row, Skipped, parser, report
+
+ESTIMATION = [40650, 105712]  # the first 75 % of rows 40650:127400
+BARS_MV = {"multisine": 0.28, "arrow": 0.41, "arrow, first 32,000": 0.28}
+SECONDS = 120.0
+MODEL: dict[str, Any] = {
+    "name": "silverbox-narx",
+    "title": "Cubic NARX of 13 terms out of 84",
+    "form": "polynomial",
+    "output": {"y": "V"},
+    "inputs": {"u": "V"},
+    "degree": 3,
+    "constant": True,
+    "lags": {"y": [1, 2, 3], "u": [0, 1, 2]},
+    "coefficients": {"lower": -10, "upper": 10},
+    "terms": {"select": "frols", "keep": 13},
+}
+
+
+def main() -> None:
+    """Upload, derive, identify over REST, print."""
+    options = parser(__doc__ or "").parse_args()
+    folder = data_folder()
+    if folder is None:
+        report("Silverbox, NARX", [], [Skipped("silverbox", "LAGID_DATA is absent")], options)
+        return
+    with service() as (client, _):
+        raw = client.add_dataset(folder / "silverbox" / "silverbox_snls80mv.csv", name="silverbox")
+
+        def part(name: str, rows: list[int]) -> str:
+            return str(client.derive(raw["id"], [{"trim": {"rows": rows}}], name=name)["id"])
+
+        tests = {name: part(f"silverbox {name}", rows) for name, rows in TESTS.items()}
+        run = identify(
+            client,
+            {
+                "name": "silverbox-narx",
+                "model": MODEL,
+                "datasets": [part("silverbox estimation", ESTIMATION)],
+                "validation": {"datasets": list(tests.values())},
+                "skip": 50,
+            },
+        )
+    _print_selection(run)
+    print_estimates("Silverbox, NARX, 65,062 samples", run)
+    print(f"\n{PUBLISHED}")
+    rms = [1e3 * one["rms"] for one in run["agreement"]["validation"]]
+    rows = [
+        Row(f"RMS, {name}", value, "mV", BARS_MV[name])
+        for name, value in zip(tests, rms, strict=True)
+    ]
+    rows += [Row("terms", len(run["selection"]), "1", 13), Row("run", run["seconds"], "s", SECONDS)]
+    rows.append(peak_memory_row())
+    report("Silverbox, NARX, free run on the test parts", rows, [], options)
+
+
+def _print_selection(run: dict[str, Any]) -> None:
+    print("\n| term | error-reduction ratio | left unexplained | one-step coefficient |")
+    print("|---|--:|--:|--:|")
+    for one in run["selection"]:
+        left = 1.0 - one["cumulated"]
+        print(f"| {one['term']} | {one['err']:.3g} | {left:.3g} | {one['coefficient']:.6g} |")
+
+
+if __name__ == "__main__":
+    main()
