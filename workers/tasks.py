@@ -1,13 +1,15 @@
 """The one kind of task: advance a pack of work. Stateless but for a cache of built problems."""
 
+import json
 import logging
 import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 
 from sysid.errors import SysidError
 from sysid.ga.island import Island
+from sysid.models.model import Model
 from sysid.models.spec import parse_model
 from sysid.noise import with_noise
 from sysid.problem import Problem
@@ -34,7 +36,7 @@ _log = logging.getLogger(__name__)
 PACK_LIMIT_SECONDS = 1.0
 """No further item is begun after that; what is left goes back unchanged."""
 
-CACHED_PROBLEMS = 8
+CACHED_PROBLEMS, CACHED_MODELS = 8, 32
 
 _problems: OrderedDict[str, tuple[Problem, Problem | None]] = OrderedDict()
 
@@ -115,6 +117,12 @@ def _problem(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Problem
     return built
 
 
+@lru_cache(maxsize=CACHED_MODELS)
+def _model(document: str) -> Model:
+    """The model of a document as JSON: the runs of a sweep share it, whatever else they vary."""
+    return parse_model(json.loads(document))
+
+
 def build(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Problem, Problem | None]:
     """The problem and that of its validation data, if there are any.
 
@@ -123,7 +131,7 @@ def build(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Problem, P
     SysidError
         If model, records or settings cannot be used.
     """
-    model = parse_model(spec.model)
+    model = _model(json.dumps(spec.model))
     estimation, validation = prepared(spec, records)
     model, parameters = selected(model, estimation, spec.parameters, spec.skip)
 
