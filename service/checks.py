@@ -23,6 +23,7 @@ from sysid.models.initial import initial_parameters
 from sysid.models.lags import check_lags
 from sysid.models.model import Model
 from sysid.parameters import Parameter, override
+from sysid.ties import tied_model, ties_of
 
 Body = dict[str, Any]
 MOST_GENES = 10_000_000  # individuals times parameters: 80 MB for each copy of a population
@@ -70,9 +71,11 @@ class JobChecker:
         )
         found += _freedom_faults(parameters, body["algorithm"]["population"])
         own = (parameters or model[0].parameters)[: len(model[0].parameters)]
-        _tried(check_lags, found, model[0], own)
+        ties = _tried(ties_of, found, model[0], parameters or model[0].parameters)
+        tied = tied_model(model[0], ties or {})
+        _tried(check_lags, found, tied, own)
         found += self._repeated(body)
-        found += self._data(body, model[0], own)
+        found += self._data(body, tied, own)
         return found + list(_signal_faults(body, model[0]))
 
     def resolved(self, body: Body) -> Body:
@@ -272,12 +275,13 @@ def _length_faults(
     pointer: str, model: Model, parameters: tuple[Parameter, ...], piece: _Piece, skip: int
 ) -> Iterator[FieldError]:
     period = model.solver.step or piece.period or piece.duration / max(piece.samples - 1, 1)
-    needed, signal = longest_delay(model, parameters, period)
+    substeps = model.solver.substeps
+    needed, signal = longest_delay(model, parameters, period / substeps)
     what = f"the largest lag of {signal!r}" if needed else "a simulation"
     if piece.duration <= needed:
         error = RecordTooShort(piece.duration, needed, what)
         yield FieldError(pointer, f"{piece.words}{error}")
-    if piece.samples <= model.memory + skip:
+    if (piece.samples - 1 - skip) * substeps < model.memory:
         yield FieldError(
             pointer,
             f"{piece.words}the record has {piece.samples} samples; the model's memory "

@@ -29,6 +29,7 @@ class ParameterIn(Body):
     upper: float | None = None
     scale: Literal["linear", "log"] | None = None
     fixed: float | None = None
+    tied: str | None = Field(default=None, max_length=1000)
 
 
 class ValidationIn(Body):

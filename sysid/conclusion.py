@@ -8,8 +8,10 @@ from sysid.errors import DivergedEverywhere
 from sysid.islands.archipelago import of_island
 from sysid.islands.run_state import RunState
 from sysid.metrics import Metrics
+from sysid.onset import onset_delays
 from sysid.problem import Problem, metrics_of
 from sysid.refinement import Refined, refine
+from sysid.residuals import ResidualTests, residual_tests
 from sysid.result import Estimate, Identification, Improvement, IslandSummary
 from sysid.settings import GeneticAlgorithm
 from sysid.threads import one_thread
@@ -74,6 +76,10 @@ def _concluded(
         agreement=metrics.channels,
         agreement_validation=() if kept is None else kept.metrics.channels,
         warnings=warnings_of(problem, algorithm, analysis, simulated, metrics.rms),
+        selection=() if problem.model.selection is None else problem.model.selection.terms,
+        criteria=analysis.criteria,
+        residual_tests=_tests(problem, simulated, kept),
+        onset_delays=onset_delays(problem.model, problem.records),
     )
 
 
@@ -137,6 +143,12 @@ def _split(problem: Problem, values: FloatArray) -> tuple[tuple[FloatArray, ...]
 class _Validated(NamedTuple):
     metrics: Metrics
     simulated: tuple[tuple[FloatArray, ...], ...]
+    tests: ResidualTests
+
+
+def _tests(problem: Problem, simulated: FloatArray, kept: "_Validated | None") -> ResidualTests:
+    """Of residuals that the parameters were not fitted to, where there are any."""
+    return residual_tests(problem, simulated, "estimation") if kept is None else kept.tests
 
 
 def _validated(
@@ -150,7 +162,7 @@ def _validated(
     """
     model, records, changes, prediction, loss, _, skip, since = validation.arguments
     own = {p.name for p in (model.parameters if since is None else validation.all_parameters)}
-    fixed = {e.name: {"fixed": e.value} for e in estimates if e.name in own}
+    fixed = {e.name: _known(e) for e in estimates if e.name in own}
     kept = {name: fields for name, fields in changes.items() if name not in own}
     known = Problem.build(
         model, records, parameters={**kept, **fixed}, prediction=prediction, loss=loss,
@@ -162,7 +174,17 @@ def _validated(
         start = refine(known, [middle])[0]
         theta = middle if start is None else start.theta
     simulated = known.predictions(theta[None])[0]
-    return _Validated(metrics_of(known, simulated), _judged(known, _split(known, simulated)))
+    return _Validated(
+        metrics_of(known, simulated), _judged(known, _split(known, simulated)),
+        residual_tests(known, simulated, "validation"),
+    )  # fmt: skip
+
+
+def _known(estimate: Estimate) -> dict[str, float]:
+    """An estimate as a fixed value; that of a tie may lie outside its parameter's bounds."""
+    value = estimate.value
+    bounds = {"lower": min(estimate.lower, value), "upper": max(estimate.upper, value)}
+    return {"fixed": value, "scale": "linear", **bounds}
 
 
 def _judged(

@@ -26,6 +26,9 @@ class Parameter:
         How the interval is divided by the chromosome; ``"log"`` where it spans decades.
     fixed : float or None
         A known value; the parameter is then not searched.
+    tied : str or None
+        What it is in terms of other parameters, such as ``"2*a"``; it is then not searched, and
+        its bounds say nothing.
 
     Raises
     ------
@@ -40,6 +43,7 @@ class Parameter:
     unit: str = "1"
     scale: Scale = "linear"
     fixed: float | None = None
+    tied: str | None = None
 
     def __post_init__(self) -> None:
         if not (isfinite(self.lower) and isfinite(self.upper) and self.lower < self.upper):
@@ -53,21 +57,24 @@ class Parameter:
     @property
     def is_free(self) -> bool:
         """Whether the parameter is searched."""
-        return self.fixed is None
+        return self.fixed is None and self.tied is None
 
 
-_FIELDS = ("lower", "upper", "scale", "fixed")
+_FIELDS = ("lower", "upper", "scale", "fixed", "tied")
 
 
 def override(
     parameters: tuple[Parameter, ...], changes: Mapping[str, Mapping[str, Any]]
 ) -> tuple[Parameter, ...]:
-    """Parameters with some bounds, scales or fixed values replaced.
+    """Parameters with some bounds, scales, fixed values or ties replaced.
+
+    Both bounds make a parameter free that its model fixes or ties.
 
     Raises
     ------
     InvalidSettings
-        If a name or a field is unknown, or a value is not a number.
+        If a name or a field is unknown, a value is not a number, a parameter is fixed outside its
+        bounds, or it is tied and something else as well.
     InvalidBounds
         If the result is not a usable interval.
     """
@@ -78,23 +85,42 @@ def override(
                 f"/parameters/{name}", f"the model has no parameter {name!r}{nearest(name, known)}"
             )
         for field, value in fields.items():
-            if field not in _FIELDS:
-                raise InvalidSettings(
-                    f"/parameters/{name}/{field}", f"unknown field{nearest(field, _FIELDS)}"
-                )
-            if field != "scale" and (isinstance(value, bool) or not isinstance(value, int | float)):
-                raise InvalidSettings(f"/parameters/{name}/{field}", f"{value!r} is not a number")
-            if field == "scale" and value not in ("linear", "log"):
-                raise InvalidSettings(
-                    f"/parameters/{name}/scale", f"{value!r} is not 'linear' or 'log'"
-                )
+            _check_field(f"/parameters/{name}/{field}", field, value)
+        if "tied" in fields and len(fields) > 1:
+            others = ", ".join(repr(field) for field in fields if field != "tied")
+            raise InvalidSettings(
+                f"/parameters/{name}", f"a tied parameter is not searched; leave out {others}"
+            )
     return tuple(_changed(p, changes.get(p.name, {})) for p in parameters)
 
 
+def _check_field(pointer: str, field: str, value: object) -> None:
+    if field not in _FIELDS:
+        raise InvalidSettings(pointer, f"unknown field{nearest(field, _FIELDS)}")
+    if field == "tied":
+        if not isinstance(value, str):
+            raise InvalidSettings(pointer, f"{value!r} is not an expression, such as '2*a'")
+    elif field == "scale":
+        if value not in ("linear", "log"):
+            raise InvalidSettings(pointer, f"{value!r} is not 'linear' or 'log'")
+    elif isinstance(value, bool) or not isinstance(value, int | float):
+        raise InvalidSettings(pointer, f"{value!r} is not a number")
+
+
 def _changed(parameter: Parameter, fields: Mapping[str, Any]) -> Parameter:
+    if "tied" in fields:
+        return replace(parameter, tied=fields["tied"], fixed=None)
     values: dict[str, Any] = {k: v if k == "scale" else float(v) for k, v in fields.items()}
+    if {"lower", "upper"} <= values.keys() and "fixed" not in values:
+        values |= {"fixed": None, "tied": None}  # an interval to search frees what the model gives
     fixed = values.get("fixed")
-    if fixed is not None:  # a value fixed by the user may lie outside the catalogue's bounds
-        values.setdefault("lower", min(parameter.lower, fixed))
-        values.setdefault("upper", max(parameter.upper, fixed))
+    if fixed is not None:
+        values["tied"] = None
+    lower, upper = (values.get(k, getattr(parameter, k)) for k in ("lower", "upper"))
+    if fixed is not None and not lower <= fixed <= upper:
+        raise InvalidSettings(
+            f"/parameters/{parameter.name}/fixed",
+            f"{fixed:g} lies outside the bounds [{lower:g}, {upper:g}] of {parameter.name!r}; give "
+            "a value inside them, or give 'lower' and 'upper' that hold it",
+        )
     return replace(parameter, **values)

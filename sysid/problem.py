@@ -16,10 +16,12 @@ from sysid.kernels.layout import Variant
 from sysid.kernels.plan import Numbers, fits_grid, has_weights, numbers
 from sysid.metrics import ChannelMetrics, Metrics, fit_percent, rms
 from sysid.models.initial import initial_parameters
+from sysid.models.lags import check_lags
 from sysid.models.model import Model
 from sysid.parameters import Parameter, override
 from sysid.records import Record
 from sysid.settings import Loss, Prediction
+from sysid.ties import Ties, tied_model, ties_of
 from sysid.types import FloatArray
 
 _Rebuild = tuple[Callable[..., "Problem"], tuple[Any, ...]]
@@ -35,12 +37,15 @@ class Problem:
     Attributes
     ----------
     model : Model
+        With tied parameters replaced by what they are tied to.
     records : tuple of Record
     all_parameters : tuple of Parameter
         K: the model's, then the estimated initial states, named ``x(0)`` in the first experiment
         and ``x(0)[2]`` in the second.
     space : tuple of Parameter
         D: those of them that are free.
+    ties : mapping of str to Expression
+        What each tied parameter is, in terms of free and fixed ones.
     evaluator : Evaluator
         The problem as compiled code sees it.
     experiments : tuple of Experiment
@@ -59,6 +64,7 @@ class Problem:
     output_weights: Mapping[str, float]
     scored_from: tuple[float, ...] | None
     arguments: tuple[Any, ...]
+    ties: Ties
 
     @classmethod
     def build(
@@ -78,7 +84,7 @@ class Problem:
         Parameters
         ----------
         parameters : mapping of str to mapping
-            Changed bounds, scales or fixed values.
+            Changed bounds, scales or fixed values, or what a parameter is tied to.
         prediction : {"simulation", "one-step"}
         loss : Loss
             Squares if not given.
@@ -194,6 +200,8 @@ def _built(
     prediction: Prediction, loss: Loss, weights: Mapping[str, float] | None, skip: int,
     scored_from: tuple[float, ...] | None,
 ) -> Problem:  # fmt: skip
+    if model.rule is not None:
+        raise InvalidSettings("/model/terms", "the terms are not selected yet; see `selected`")
     if not records:
         raise InvalidRecord("there is no record to compare the model with; need one or more")
     if prediction not in ("simulation", "one-step"):
@@ -207,6 +215,9 @@ def _built(
         )
     arguments = (model, records, parameters, prediction, loss, weights, skip, scored_from)
     everything = override((*model.parameters, *initial_parameters(model, len(records))), parameters)
+    ties = ties_of(model, everything)
+    model = tied_model(model, ties)
+    check_lags(model, everything)
     per_output = output_weights(model, records, weights, skip)
     experiments = tuple(
         lay_out(model, record, e, everything, per_output, skip, scored_from=since[e])
@@ -215,8 +226,9 @@ def _built(
     free = tuple(parameter for parameter in everything if parameter.is_free)
     evaluator = _evaluator(model, experiments, everything, prediction == "one-step", loss)
     return Problem(
-        model, records, everything, free, evaluator, experiments, per_output, scored_from, arguments
-    )
+        model, records, everything, free, evaluator, experiments, per_output, scored_from,
+        arguments, ties,
+    )  # fmt: skip
 
 
 def simulation_problem(model: Model, record: Record) -> Problem:
@@ -226,8 +238,9 @@ def simulation_problem(model: Model, record: Record) -> Problem:
     experiment = lay_out(model, record, 0, model.parameters, weights, 0, simulates_only=True)
     evaluator = _evaluator(model, (experiment,), model.parameters, False, Loss())
     return Problem(
-        model, (record,), model.parameters, (), evaluator, (experiment,), weights, None, arguments
-    )
+        model, (record,), model.parameters, (), evaluator, (experiment,), weights, None, arguments,
+        {},
+    )  # fmt: skip
 
 
 def _evaluator(

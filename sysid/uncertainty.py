@@ -10,6 +10,9 @@ K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals u
 
 Where the output does not change on a plateau of width w (a lag that is rounded to whole samples),
 nothing tells where in it the parameter lies: w²/12 is added to its variance.
+
+What no data tell follows from the form of the equations (`sysid.symmetries`) and is taken out of S
+exactly; what these data do not tell, from its singular values. Both give groups (`sysid.groups`).
 """
 
 from dataclasses import dataclass, replace
@@ -17,13 +20,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
+from sysid.estimates import Known, estimates_of
 from sysid.ga.chromosome import placed
+from sysid.groups import Block, blocks, written
 from sysid.islands.archipelago import loss_scale
-from sysid.parameters import Parameter
 from sysid.problem import Problem
-from sysid.result import Estimate, EstimateStatus, Uncertainty
+from sysid.result import Criteria, Estimate, EstimateStatus, Uncertainty
 from sysid.sensitivities import sensitivities
-from sysid.types import FloatArray
+from sysid.symmetries import scalings
+from sysid.types import BoolArray, FloatArray
 
 _RANK = 1e-7  # of the largest singular value: below, the differences are rounding
 _SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
@@ -40,51 +45,116 @@ class Analysis:
     Attributes
     ----------
     estimates : tuple of Estimate
-        All parameters, fixed ones too.
+        All parameters, fixed and tied ones too.
     uncertainty : Uncertainty or None
         None when there are no more samples than parameters.
     possible_gain : float
         Part of the loss that one least-squares step promises to remove; near 0 at an optimum.
     evaluations : int
+    criteria : Criteria
     """
 
     estimates: tuple[Estimate, ...]
     uncertainty: Uncertainty | None
     possible_gain: float
     evaluations: int
+    criteria: Criteria
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Directions:
+    """Singular values and directions of the sensitivities, over the places.
+
+    `null` are those along which the output does not change, `weak` those of which the data say
+    little; `member` marks the parameters that `null` moves.
+    """
+
+    singular: FloatArray
+    rows: FloatArray
+    null: BoolArray
+    weak: BoolArray
+    member: BoolArray
 
 
 def analyse(problem: Problem, theta: FloatArray) -> Analysis:
     """Standard errors, correlations and identifiability at an estimate (D,)."""
     error, columns, plateau, one_sided, count = sensitivities(problem, theta)
     n, d = columns.shape
+    criteria = criteria_of(error, d)
     if n <= d:
         reason = f"{n} samples are not more than {d} parameters"
-        return Analysis(_without(problem, theta, reason), None, 0.0, count)
-    singular, directions = np.linalg.svd(columns, full_matrices=False)[1:]
-    known = singular > _RANK * max(singular[0], np.finfo(float).tiny)
-    inverse = (directions[known].T / singular[known] ** 2) @ directions[known]
-    covariance, noise = _covariance(error, columns, inverse, loss_scale(problem))
+        return Analysis(_without(problem, theta, reason), None, 0.0, count, criteria)
     place = placed(problem.evaluator, theta[None])[0]
     # No step of least squares gains from a parameter on a plateau: there the loss is flat.
     sloping = np.where(plateau > 0, 0.0, columns)
     gain = _possible_gain(_influence(error, loss_scale(problem)), sloping, place)
-    statuses = _statuses(place, singular, directions, known, noise)
     scale = _physical(problem, theta)
+    powers = scalings(problem.model, problem.all_parameters)
+    columns, known = _without_symmetries(columns, powers * theta / scale)
+    singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
+    kept = singular > _RANK * max(singular[0], np.finfo(float).tiny)
+    kept[d - known :] = False
+    inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
+    covariance, noise = _covariance(error, columns, inverse, loss_scale(problem))
+    member = np.any(rows[~kept] ** 2 > _NULL_MEMBER, axis=0) | np.any(powers != 0.0, axis=0)
+    weak = kept & (noise >= _SAYS_NOTHING * singular)
+    directions = _Directions(singular, rows, ~kept, weak, member)
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
+    found = _blocks(directions)
+    names = tuple(p.name for p in problem.space)
     uncertainty = Uncertainty(
-        names=tuple(p.name for p in problem.space),
+        names=names,
         covariance=physical,
         correlation=_correlation(physical),
-        condition=float(singular[0] / singular[-1]) if singular[-1] > 0 else float("inf"),
+        condition=float(singular[0] / singular[-1]) if kept.all() else float("inf"),
         singular_values=singular,
         noise_sd=noise,
+        groups=tuple(g for one in found for g in written(one, names, theta, scale, physical)),
     )
+    told = Known(
+        theta, _statuses(place, found), physical, float(stdtrit(n - d, 0.975)), member,
+        uncertainty.groups, rows[~kept], scale,
+    )  # fmt: skip
+    estimates = estimates_of(problem, told)
     jumps = {p.name for p, one in zip(problem.space, one_sided, strict=True) if one}
-    blind = np.any(directions[~known] ** 2 > _NULL_MEMBER, axis=0) if not known.all() else None
-    estimates = _estimates(problem, theta, statuses, np.sqrt(np.diag(physical)), blind, n - d)
     estimates = tuple(_on_one_side(e) if e.name in jumps else e for e in estimates)
-    return Analysis(estimates, uncertainty, min(gain, 1.0), count)
+    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria)
+
+
+def criteria_of(error: FloatArray, parameters: int) -> Criteria:
+    """Information criteria from the weighted residuals (n,); see `Criteria` for the formulae."""
+    n, counted = error.size, parameters + 1
+    mean = float(error @ error) / n
+    twice = -n * (np.log(2.0 * np.pi * mean) + 1.0) if mean > 0 else np.inf  # 2 ln ℓ
+    aic = 2.0 * counted - twice
+    left = n - counted - 1
+    aicc = aic + 2.0 * counted * (counted + 1) / left if left > 0 else None
+    bic = counted * float(np.log(n)) - twice
+    return Criteria(float(aic), None if aicc is None else float(aicc), float(bic), n, parameters)
+
+
+def _without_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[FloatArray, int]:
+    """Sensitivities that do not change at all along the directions (k, D), and their number.
+
+    By differences they would change a little, and where friction breaks away more than that.
+    """
+    if not directions.size:
+        return columns, 0
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    size, rows = np.linalg.svd(directions / np.where(lengths > 0, lengths, 1.0),
+                               full_matrices=False)[1:]  # fmt: skip
+    rows = rows[size > _RANK]
+    return columns - (columns @ rows.T) @ rows, rows.shape[0]
+
+
+def _blocks(directions: _Directions) -> tuple[Block, ...]:
+    """Parameters that have no effect of their own, then those of which the data say little."""
+    found = blocks(directions.rows[directions.null], directions.member)
+    if not directions.weak.any():
+        return found
+    weak = directions.rows[directions.weak]
+    member = np.any(weak**2 > _WEAK_MEMBER, axis=0) & ~directions.member
+    return found + tuple(one for one in blocks(weak, member) if one.basis.size)
 
 
 def _on_one_side(estimate: Estimate) -> Estimate:
@@ -130,21 +200,14 @@ def _covariance(
     return n / (n - d) * bread @ filling @ bread, noise
 
 
-def _statuses(
-    place: FloatArray, singular: FloatArray, directions: FloatArray,
-    known: FloatArray, noise: float,
-) -> tuple[EstimateStatus, ...]:  # fmt: skip
+def _statuses(place: FloatArray, found: tuple[Block, ...]) -> tuple[EstimateStatus, ...]:
     """What the data say of each parameter: see `EstimateStatus`."""
     statuses: list[EstimateStatus] = ["identified"] * place.size
     for d in np.flatnonzero((place < _AT_BOUND) | (place > 1.0 - _AT_BOUND)):
         statuses[d] = "at bound"
-    for value, direction, seen in zip(singular, directions, known, strict=True):
-        if seen and noise < _SAYS_NOTHING * value:
-            continue
-        members = np.flatnonzero(direction**2 > (_WEAK_MEMBER if seen else _NULL_MEMBER))
-        for d in members:
-            if statuses[d] != "unidentifiable":
-                statuses[d] = "unidentifiable" if members.size == 1 else "group"
+    for block in found:
+        for d in block.members:
+            statuses[d] = "unidentifiable" if block.tells_nothing else "group"
     return tuple(statuses)
 
 
@@ -163,57 +226,10 @@ def _correlation(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.clip(correlation, -1.0, 1.0))
 
 
-def _estimates(
-    problem: Problem, theta: FloatArray, statuses: tuple[EstimateStatus, ...],
-    errors: FloatArray, blind: FloatArray | None, freedom: int,
-) -> tuple[Estimate, ...]:  # fmt: skip
-    quantile = float(stdtrit(freedom, 0.975))
-    free = {}
-    for d, parameter in enumerate(problem.space):
-        value, error = float(theta[d]), float(errors[d])
-        reason = _reason(statuses[d], blind is not None and bool(blind[d]))
-        if blind is not None and blind[d]:
-            free[parameter.name] = _estimate(parameter, value, None, None, statuses[d], reason)
-            continue
-        interval = (value - quantile * error, value + quantile * error)
-        free[parameter.name] = _estimate(parameter, value, error, interval, statuses[d], reason)
-    return _all(problem, free)
-
-
-def _reason(status: EstimateStatus, blind: bool) -> str:
-    """Why there is no standard error, or what to think of it."""
-    if blind and status == "group":
-        return "only a combination with other parameters has an effect on the output"
-    if blind:
-        return "the output does not change with it"
-    return {
-        "group": "the data say little of it apart from a combination with other parameters",
-        "unidentifiable": "the data say little of it: its standard error is as large as its range",
-        "at bound": "it lies at its bound; the standard error is that of the linear model",
-    }.get(status, "")
-
-
-def _estimate(
-    parameter: Parameter, value: float, stderr: float | None,
-    interval: tuple[float, float] | None, status: EstimateStatus, reason: str,
-) -> Estimate:  # fmt: skip
-    return Estimate(
-        parameter.name, parameter.unit, value, parameter.lower, parameter.upper, stderr, interval,
-        status, reason,
-    )  # fmt: skip
-
-
-def _all(problem: Problem, free: dict[str, Estimate]) -> tuple[Estimate, ...]:
-    """The free estimates and the fixed parameters, in the problem's order."""
-    return tuple(
-        free.get(p.name) or _estimate(p, p.fixed or 0.0, None, None, "fixed", "its value was given")
-        for p in problem.all_parameters
-    )
-
-
 def _without(problem: Problem, theta: FloatArray, reason: str) -> tuple[Estimate, ...]:
-    free = {
-        p.name: _estimate(p, float(value), None, None, "unidentifiable", reason)
-        for p, value in zip(problem.space, theta, strict=True)
-    }
-    return _all(problem, free)
+    """Estimates of which nothing more is known than their values."""
+    d = theta.size
+    statuses: list[EstimateStatus] = ["unidentifiable"] * d
+    blind = np.ones(d, dtype=np.bool_)
+    known = Known(theta, tuple(statuses), np.zeros((d, d)), 0.0, blind, (), np.eye(d), np.ones(d), reason)
+    return estimates_of(problem, known)

@@ -33,7 +33,7 @@ def predictions(problem: Problem, theta: FloatArray, one_step: bool = False) -> 
     """Simulated values (M,) of one individual (D,)."""
     free = iter(theta)
     values = {
-        p.name: float(next(free)) if p.fixed is None else p.fixed for p in problem.all_parameters
+        p.name: float(next(free)) if p.is_free else p.fixed or 0.0 for p in problem.all_parameters
     }
     parts: list[FloatArray] = []
     with np.errstate(all="ignore"):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from service.evidence import onset_document, residual_document
 from service.storage.ledger import HistoryPoint, MigrantPoint, RunOutcome
 from service.storage.tables import State
 from sysid.metrics import ChannelMetrics
@@ -68,7 +69,8 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
         "criteria": _criteria(found.criteria),
         "correlation": _correlation(found.uncertainty),
         "noise_sd": None if found.uncertainty is None else _finite(found.uncertainty.noise_sd),
-        "residual_tests": {},
+        "residual_tests": residual_document(found.residual_tests),
+        "onset_delays": onset_document(found.onset_delays),
         "warnings": list(found.warnings),
         "selection": [one._asdict() for one in found.selection],
     }

@@ -139,7 +139,7 @@ def test_bounds_of_a_request_that_let_a_lag_be_negative_are_refused() -> None:
     with pytest.raises(InvalidSettings, match=r"lag of u\(t - L\) can be as small as -0.5 s"):
         check_lags(tube, override(tube.parameters, {"L": {"lower": -0.5}}))
     with pytest.raises(InvalidSettings, match=r"-0\.2 s"):
-        check_lags(tube, override(tube.parameters, {"L": {"fixed": -0.2}}))
+        check_lags(tube, override(tube.parameters, {"L": {"fixed": -0.2, "lower": -1}}))
 
 
 def test_lags_in_samples_are_checked_from_the_whole_delay() -> None:

@@ -1,0 +1,188 @@
+"""What the data tell of parameters that they do not tell apart: groups, written out.
+
+The rows of `null` (m, D) span the directions along which the output does not change. They fall
+into blocks that have no parameter in common. In a block of M parameters and m directions there are
+M - m combinations that do not change along any of them. They are read off the reduced echelon form
+R of the directions with the pivots i: for every other parameter j
+
+    e_j - Σ_i R_ij e_i        is orthogonal to all directions.
+
+Taken of ln θ with rational entries this is a product of powers (``A_m*k_b/J``), taken of θ a sum
+(``T + L``); where neither is rational it is the sum that holds near the estimate.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import sqrt
+
+import numpy as np
+
+from sysid.result import Group
+from sysid.types import BoolArray, FloatArray, IntArray
+
+_LINK = 1e-4  # of two parameters that no direction moves together, this is rounding
+_PIVOT = 1e-3  # of the largest entry of its column
+_RATIONAL, _DENOMINATOR, _LARGEST = 1e-3, 4, 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """Parameters that some directions move together.
+
+    Attributes
+    ----------
+    members : IntArray, shape (M,)
+    basis : FloatArray, shape (m, M)
+        The directions, over the members' places in [0, 1].
+    """
+
+    members: IntArray
+    basis: FloatArray
+
+    @property
+    def tells_nothing(self) -> bool:
+        """Whether there are as many directions as parameters, so that no combination is left."""
+        return bool(self.basis.shape[0] >= self.members.size)
+
+
+def blocks(null: FloatArray, member: BoolArray) -> tuple[Block, ...]:
+    """The blocks of some orthonormal directions (m, D) over the parameters marked in `member`."""
+    together = np.abs(null.T @ null)
+    own = np.sqrt(np.maximum(np.diag(together), np.finfo(float).tiny))
+    linked = together > _LINK * np.outer(own, own)
+    found, left = [], list(np.flatnonzero(member))
+    while left:
+        block = [left.pop(0)]
+        for d in block:  # grows while it is walked
+            near = [other for other in left if linked[d, other]]
+            block += near
+            left = [other for other in left if other not in near]
+        members = np.array(sorted(block), dtype=np.int64)
+        _, size, rows = np.linalg.svd(null[:, members], full_matrices=False)
+        # A direction of this block lies in it whole, one of another block not at all.
+        found.append(Block(members, rows[size > 0.5]))
+    return tuple(found)
+
+
+def written(
+    block: Block, names: Sequence[str], theta: FloatArray, scale: FloatArray, covariance: FloatArray
+) -> tuple[Group, ...]:
+    """The combinations of a block that the data tell.
+
+    Parameters
+    ----------
+    names : sequence of str, length D
+    theta, scale : FloatArray, shape (D,)
+        Estimate, and ∂θ/∂p of the places p.
+    covariance : FloatArray, shape (D, D)
+        Of θ, in its units; without what it would be along the directions.
+    """
+    if block.tells_nothing:
+        return ()
+    value, unit = theta[block.members], scale[block.members]
+    has_logarithm = bool(np.all(value != 0.0))
+    rows = block.basis * (unit / value if has_logarithm else 1.0)
+    entries = np.array(list(_orthogonal(rows)))
+    sums = entries / (value if has_logarithm else unit)
+    sums = sums / _leading(sums)
+    powers = _rational(entries) if has_logarithm else None
+    terms = _rational(sums)
+    if powers is not None and (terms is None or powers[1] <= terms[1]):
+        texts = [(e, _product([names[d] for d in block.members], e)) for e in powers[0]]
+        found = [(text, float(np.prod(value**e)), e / value) for e, text in texts]
+        told = [(text, total, total * slope) for text, total, slope in found]
+    else:
+        kept = sums if terms is None else terms[0]
+        told = [(_sum([names[d] for d in block.members], c), float(c @ value), c) for c in kept]
+    return tuple(_group(block, names, covariance, *one) for one in told)
+
+
+def _group(
+    block: Block, names: Sequence[str], covariance: FloatArray, text: str, value: float,
+    slope: FloatArray,
+) -> Group:  # fmt: skip
+    inside = covariance[np.ix_(block.members, block.members)]
+    stderr = sqrt(max(float(slope @ inside @ slope), 0.0))
+    members = tuple(names[d] for d, s in zip(block.members, slope, strict=True) if s != 0.0)
+    return Group(members, text, value, stderr)
+
+
+def _orthogonal(rows: FloatArray) -> Iterator[FloatArray]:
+    """Combinations that are orthogonal to all rows, each with one parameter that is no pivot.
+
+    Pivots are the parameters that most directions move, in the order of the model.
+    """
+    simple = _reduced(rows, range(rows.shape[1]))[0]
+    counts = np.count_nonzero(np.abs(simple) > _PIVOT, axis=0)
+    reduced, pivots = _reduced(rows, np.argsort(-counts, kind="stable").tolist())
+    for j in range(rows.shape[1]):
+        if j not in pivots:
+            entry = np.zeros(rows.shape[1])
+            entry[j], entry[pivots] = 1.0, -reduced[:, j]
+            yield _upright(entry)
+
+
+def _reduced(rows: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, list[int]]:
+    """Reduced echelon form, with the columns taken as pivots in the given order."""
+    rows = rows / np.max(np.abs(rows), axis=1, keepdims=True)
+    pivots: list[int] = []
+    for column in columns:
+        done = len(pivots)
+        if done == rows.shape[0]:
+            break
+        best = done + int(np.argmax(np.abs(rows[done:, column])))
+        size = float(np.max(np.abs(rows[done:])))
+        if abs(float(rows[best, column])) <= _PIVOT * size:
+            continue
+        rows[[done, best]] = rows[[best, done]]
+        rows[done] /= rows[done, column]
+        others = np.arange(rows.shape[0]) != done
+        rows[others] -= np.outer(rows[others, column], rows[done])
+        pivots.append(column)
+    return rows[: len(pivots)], pivots
+
+
+def _upright(entry: FloatArray) -> FloatArray:
+    """The combination or its inverse, whichever has fewer negative entries."""
+    large = np.abs(entry) > _PIVOT
+    return -entry if np.sum(entry[large] < 0) > np.sum(entry[large] > 0) else entry
+
+
+def _leading(sums: FloatArray) -> FloatArray:
+    """For each row its first entry that is not small, so that sums begin with a plain name."""
+    large = np.abs(sums) > _PIVOT * np.max(np.abs(sums), axis=1, keepdims=True)
+    return np.take_along_axis(sums, np.argmax(large, axis=1)[:, None], axis=1)
+
+
+def _rational(entries: FloatArray) -> tuple[FloatArray, float] | None:
+    """The entries as small fractions, and how far off they are; None where they are not."""
+    nearest = np.array(
+        [[float(Fraction(v).limit_denominator(_DENOMINATOR)) for v in row] for row in entries]
+    )
+    off = float(np.max(np.abs(nearest - entries)))
+    return (nearest, off) if off < _RATIONAL and np.max(np.abs(nearest)) <= _LARGEST else None
+
+
+def _product(names: Sequence[str], powers: FloatArray) -> str:
+    above = [_power(name, p) for name, p in zip(names, powers, strict=True) if p > 0]
+    below = [_power(name, -p) for name, p in zip(names, powers, strict=True) if p < 0]
+    top = "*".join(above) or "1"
+    if not below:
+        return top
+    return f"{top}/{below[0]}" if len(below) == 1 else f"{top}/({'*'.join(below)})"
+
+
+def _power(name: str, power: float) -> str:
+    return name if power == 1.0 else f"{name}**{power:g}"
+
+
+def _sum(names: Sequence[str], factors: FloatArray) -> str:
+    text = ""
+    for name, factor in zip(names, factors, strict=True):
+        if factor == 0.0:
+            continue
+        size = name if abs(factor) == 1.0 else f"{abs(factor):.4g}*{name}"
+        sign = ("-" if factor < 0 else "") if not text else (" - " if factor < 0 else " + ")
+        text += sign + size
+    return text

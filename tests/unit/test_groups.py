@@ -1,0 +1,214 @@
+"""Identifiability: what the form of a model hides, what the data hide, and how it is written."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.models.library import load_model
+from sysid.models.spec import parse_model
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+from sysid.result import Group
+from sysid.symmetries import scalings
+from sysid.types import FloatArray
+from sysid.uncertainty import Analysis, analyse
+
+STEP = 0.05
+
+
+def document(
+    equations: dict[str, str], parameters: tuple[str, ...], form: str = "differential",
+    **fields: Any,
+) -> dict[str, Any]:  # fmt: skip
+    written = {
+        "name": "test", "form": form, "inputs": {"u": "V"},
+        "states": dict.fromkeys(equations, "m"),
+        "parameters": {name: {"lower": 0.01, "upper": 20} for name in parameters},
+        "equations": equations, "outputs": {"y": next(iter(equations))},
+        "initial": dict.fromkeys(equations, 0),
+    }  # fmt: skip
+    return written | fields
+
+
+def posed(written: dict[str, Any], truth: dict[str, float], sd: float = 0.01, n: int = 200,
+          **options: Any) -> tuple[Problem, FloatArray]:  # fmt: skip
+    """A problem whose data are the model's at the truth, with noise."""
+    times = STEP * np.arange(n)
+    rng = np.random.default_rng(3)
+    u = Channel("u", times, np.repeat(rng.standard_normal(n // 10), 10), "V", hold="zero")
+    blank = Record((u,), (Channel("y", times, np.zeros(n), "m"),))
+    model = parse_model(written)
+    problem = Problem.build(model, [blank], **options)
+    theta = np.array([truth[p.name] for p in problem.space])
+    y = problem.predictions(theta[None])[0] + sd * rng.standard_normal(n)
+    data = Record((u,), (Channel("y", times, y, "m"),))
+    return Problem.build(model, [data], **options), theta
+
+
+def told(analysis: Analysis) -> dict[str, Group]:
+    assert analysis.uncertainty is not None
+    return {group.expression: group for group in analysis.uncertainty.groups}
+
+
+def statuses(analysis: Analysis) -> dict[str, str]:
+    return {estimate.name: estimate.status for estimate in analysis.estimates}
+
+
+ARM = document({"x": "v", "v": "(A*k*u - B*v - c*x)/J"}, ("J", "A", "k", "B", "c"))
+TRUTH = {"J": 2.0, "A": 3.0, "k": 1.5, "B": 4.0, "c": 5.0}
+
+
+def test_products_of_powers_are_written_out_with_value_and_standard_error() -> None:
+    problem, theta = posed(ARM, TRUTH)
+    analysis = analyse(problem, theta)
+    groups = told(analysis)
+    assert set(groups) == {"A*k/J", "B/J", "c/J"}
+    assert groups["A*k/J"].members == ("J", "A", "k")
+    assert groups["A*k/J"].value == pytest.approx(2.25)
+    assert set(statuses(analysis).values()) == {"group"}
+    assert all(e.stderr is None and "B/J" in e.reason for e in analysis.estimates if e.name == "B")
+
+
+def test_the_standard_error_of_a_group_is_that_of_the_parameter_in_its_place() -> None:
+    problem, theta = posed(ARM, TRUTH)
+    groups = told(analyse(problem, theta))
+    given = {"J": {"fixed": 2.0}, "k": {"fixed": 1.5}}
+    known, part = posed(ARM, TRUTH, parameters=given)
+    alone = {e.name: e for e in analyse(known, part).estimates}
+    for name, expression, factor in (("A", "A*k/J", 1.5 / 2), ("B", "B/J", 0.5), ("c", "c/J", 0.5)):
+        assert alone[name].status == "identified"
+        assert alone[name].stderr is not None
+        # One free parameter less and one direction less: the same degrees of freedom but for 2.
+        expected = alone[name].stderr * factor
+        assert groups[expression].stderr == pytest.approx(expected, rel=0.01)
+
+
+def test_a_sum_is_written_as_a_sum() -> None:
+    written = document({"x": "(a + b)*u - 2*c*x"}, ("a", "b", "c"))
+    problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1})
+    analysis = analyse(problem, theta)
+    assert statuses(analysis) == {"a": "group", "b": "group", "c": "identified"}
+    assert [(g, v.value) for g, v in told(analysis).items()] == [("a + b", pytest.approx(3.0))]
+
+
+def test_a_combination_that_is_neither_is_told_with_numbers() -> None:
+    written = document({"x": "(a + sin(b))*u - c*x"}, ("a", "b", "c"))
+    problem, theta = posed(written, {"a": 0.7, "b": 0.3, "c": 1.1})
+    (text,) = told(analyse(problem, theta))
+    assert text == "a + 0.9553*b"  # cos(0.3)
+
+
+def test_groups_that_have_no_parameter_in_common_are_told_apart() -> None:
+    written = document({"x": "a*b*u - c*d*x"}, ("a", "b", "c", "d"))
+    problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1, "d": 0.9})
+    assert set(told(analyse(problem, theta))) == {"a*b", "c*d"}
+
+
+def test_powers_other_than_one_are_written() -> None:
+    written = document({"x": "a*sqrt(b)*u - c*x"}, ("a", "b", "c"))
+    problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1})
+    assert set(told(analyse(problem, theta))) == {"a**2*b"}
+
+
+def test_a_parameter_without_effect_belongs_to_no_group() -> None:
+    written = document({"x": "a*u - c*x + 0*d"}, ("a", "c", "d"))
+    problem, theta = posed(written, {"a": 0.7, "c": 1.1, "d": 2.0})
+    analysis = analyse(problem, theta)
+    assert statuses(analysis)["d"] == "unidentifiable"
+    assert told(analysis) == {}
+
+
+def test_what_the_data_tell_little_of_is_a_group_with_a_standard_error() -> None:
+    written = document({"x": "(a + b)*u + 0.0001*b - c*x"}, ("a", "b", "c"))
+    problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1})
+    analysis = analyse(problem, theta)
+    assert statuses(analysis) == {"a": "group", "b": "group", "c": "identified"}
+    (group,) = told(analysis).values()
+    assert group.value == pytest.approx(3.0, rel=0.01)
+    assert group.stderr is not None
+    assert group.stderr < 0.05
+    assert all(e.stderr is not None and e.stderr > 5 for e in analysis.estimates[:2])
+
+
+@pytest.mark.parametrize(
+    ("equation", "names", "rank"),
+    [
+        ("a*u - b*x", "ab", 2),
+        ("a*b*u - x", "ab", 1),
+        ("a*(u - b*x)", "ab", 2),
+        ("(a*u - b*x)/c", "abc", 2),
+        ("sin(a*u)*b - x", "ab", 2),
+        ("where(a*x > b, u, 0) - x", "ab", 1),
+        ("where(a*x > 0, u, 0) - x", "a", 0),
+        ("u*max(a*b, c) - x", "abc", 2),
+        ("a**2*u/b**2 - x", "ab", 1),
+        ("a*u + 1 - x", "a", 1),
+        ("u(t - a*b/40) - x", "ab", 1),
+        ("a*sign(b*u) - x", "ab", 1),
+    ],
+)
+def test_the_rank_follows_from_the_form_of_the_equation(
+    equation: str, names: str, rank: int
+) -> None:
+    written = document({"x": equation}, tuple(names))
+    written["parameters"] = {name: {"lower": 0.1, "upper": 3} for name in names}
+    model = parse_model(written)
+    assert len(names) - scalings(model, model.parameters).shape[0] == rank
+
+
+def test_a_scaling_leaves_the_output_as_it_is() -> None:
+    problem, theta = posed(ARM, TRUTH)
+    for powers in scalings(problem.model, problem.all_parameters):
+        scaled = theta * 1.3**powers
+        np.testing.assert_allclose(
+            problem.predictions(scaled[None]), problem.predictions(theta[None]), rtol=1e-10
+        )
+
+
+def test_a_state_that_starts_elsewhere_than_at_zero_has_its_scale() -> None:
+    equations = {"y": "a*z - y", "z": "b*u - z"}
+    free = parse_model(document(equations, ("a", "b")))
+    bound = parse_model(document(equations, ("a", "b"), initial={"y": 0, "z": 1}))
+    assert scalings(free, free.parameters).tolist() == [[1.0, -1.0]]
+    assert scalings(bound, bound.parameters).size == 0
+
+
+def test_a_fixed_parameter_is_no_part_of_a_scaling() -> None:
+    problem, _ = posed(ARM, TRUTH, parameters={"J": {"fixed": 2.0}})
+    assert scalings(problem.model, problem.all_parameters).tolist() == [[1.0, -1.0, 0.0, 0.0]]
+
+
+ACTUATOR = {"J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_b": 83.089,
+            "k_c": 456.99e3, "A_m": 5.0e-6, "B": 1.0e-3}  # fmt: skip
+FREE = {"k_b": {"lower": 5, "upper": 500}, "A_m": {"lower": 1e-7, "upper": 1e-3},
+        "B": {"lower": 1e-5, "upper": 0.1, "scale": "log"},
+        "theta(0)": {"fixed": 0.0}}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_of_the_eight_parameters_of_the_actuator_six_combinations_can_be_found() -> None:
+    times = 0.005 * np.arange(800)
+    rng = np.random.default_rng(1)
+    levels = np.repeat(rng.uniform(-3e4, 3e4, 40), 20)
+    supply = Channel("P_a", times, levels, "Pa", hold="zero")
+    model = load_model("actuator")
+    blank = Record((supply,), (Channel("theta", times, np.zeros(800), "rad"),))
+    problem = Problem.build(model, [blank], parameters=FREE)
+    theta = np.array([ACTUATOR[p.name] for p in problem.space])
+    y = problem.predictions(theta[None])[0] + 1e-3 * rng.standard_normal(800)
+    measured = replace_output(blank, np.concatenate([[0.0], y[1:]]))
+    analysis = analyse(Problem.build(model, [measured], parameters=FREE), theta)
+    groups = told(analysis)
+    assert set(groups) == {"B/J", "F_c/J", "F_max/J", "k_b*A_m/J", "k_c*A_m/J"}
+    assert statuses(analysis)["k_a"] == "identified"
+    assert analysis.uncertainty is not None
+    assert np.sum(analysis.uncertainty.singular_values > 1e-10) == 6
+    relative = {name: (g.stderr or 0.0) / g.value for name, g in groups.items()}
+    assert relative["B/J"] > 0.2  # next to nothing, where the others are told to 1 %
+    assert max(share for name, share in relative.items() if name != "B/J") < 0.02
+
+
+def replace_output(record: Record, values: FloatArray) -> Record:
+    old = record.outputs[0]
+    return Record(record.inputs, (Channel(old.name, old.times, values, old.unit),))
