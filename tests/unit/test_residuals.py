@@ -1,0 +1,256 @@
+"""Residual tests: how often they pass what is white, and what they do not let pass."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.models.library import load_model
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+from sysid.residuals import (
+    Correlation,
+    ResidualTests,
+    correlations,
+    residual_tests,
+    series,
+    verdict,
+)
+from sysid.settings import Loss
+from sysid.types import FloatArray
+
+N, STEP = 400, 0.1
+TIMES = np.arange(N) * STEP
+TRUE = {"K": 2.0, "T": 0.8, "L": 0.5, "y0": 0.0, "x(0)": 0.0}
+
+
+def draws(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def held(draw: np.random.Generator, n: int = N) -> FloatArray:
+    return np.repeat(draw.choice([-1.0, 1.0], n // 5), 5)
+
+
+def coloured(draw: np.random.Generator, pole: float, n: int = N) -> FloatArray:
+    values = draw.normal(size=n + 200)
+    for k in range(1, values.size):
+        values[k] += pole * values[k - 1]
+    return values[200:]
+
+
+def found(
+    residual: FloatArray, u: FloatArray, *, times: FloatArray = TIMES, **more: Any
+) -> list[Correlation]:
+    n = residual.size
+    scored = more.pop("scored", np.ones(n, dtype=bool))
+    channel = Channel("u", TIMES[: u.size], u, hold=more.pop("hold", "zero"))
+    one = series(0, "y", times, residual, np.zeros(n), scored, (channel,), **more)
+    return correlations([one])
+
+
+def outcomes(residual: FloatArray, u: FloatArray, **more: Any) -> list[str]:
+    return [one.test.outcome for one in found(residual, u, **more)]
+
+
+def share_passed(passed: list[bool]) -> float:
+    return sum(passed) / len(passed)
+
+
+def test_white_noise_passes_both_tests_together_in_about_95_of_100_draws() -> None:
+    passed = []
+    for seed in range(200):
+        draw = draws(seed)
+        u = held(draw)
+        whole = verdict(found(draw.normal(size=N), u), "validation")
+        passed.append(whole.passed is True)
+    assert 0.91 <= share_passed(passed) <= 0.99
+
+
+def test_white_noise_has_95_and_99_of_100_lags_inside_the_bands() -> None:
+    inside = []
+    for seed in range(100):
+        draw = draws(seed)
+        inside.append([(c.test.inside95, c.test.inside99)
+                       for c in found(draw.normal(size=N), held(draw))])  # fmt: skip
+    white, crossed = np.mean(np.array(inside, dtype=float), axis=0)
+    assert white == pytest.approx([0.95, 0.99], abs=0.012)
+    assert crossed == pytest.approx([0.95, 0.99], abs=0.025)
+
+
+def test_noise_of_first_order_is_not_white() -> None:
+    for seed in range(20):
+        draw = draws(seed)
+        assert outcomes(coloured(draw, 0.5), held(draw))[0] == "failed"
+
+
+def test_coloured_noise_that_is_independent_of_a_coloured_input_passes_that_test() -> None:
+    passed = []
+    for seed in range(150):
+        draw = draws(seed)
+        residual, u = coloured(draw, 0.9), coloured(draw, 0.9)
+        passed.append(outcomes(residual, u)[1] == "passed")
+    assert share_passed(passed) >= 0.92  # with bands of white noise it would be one in ten
+
+
+def test_a_response_that_the_model_missed_fails_the_test_against_its_input() -> None:
+    for seed in range(20):
+        draw = draws(seed)
+        u = held(draw)
+        missed = np.concatenate([np.zeros(7), u[:-7]])
+        assert outcomes(draw.normal(size=N) + 0.5 * missed, u)[1] == "failed"
+
+
+def test_the_cross_correlation_is_largest_at_the_lag_that_was_missed() -> None:
+    draw = draws(5)
+    u = draw.normal(size=N)
+    residual = 0.2 * draw.normal(size=N) + np.concatenate([np.zeros(7), u[:-7]])
+    crossed = found(residual, u)[1]
+    assert crossed.lags[np.argmax(np.abs(crossed.values))] == 7
+    assert crossed.period == pytest.approx(STEP)
+    assert crossed.lags[0] == -25
+    assert crossed.lags[-1] == 25
+
+
+def test_an_offset_of_the_model_is_a_fault_too() -> None:
+    draw = draws(2)
+    residual = draw.normal(size=N)
+    assert outcomes(residual, held(draw))[0] == "passed"
+    assert outcomes(residual + 1.0, held(draw))[0] == "failed"
+
+
+def test_neither_test_depends_on_the_units_of_time_residual_and_input() -> None:
+    draw = draws(3)
+    residual, u = draw.normal(size=N), held(draw)
+    first = found(residual, u)
+    one = series(0, "y", 60 * TIMES, 1e-3 * residual, np.zeros(N), np.ones(N, dtype=bool),
+                 (Channel("u", 60 * TIMES, 1e5 * u + 3e5, hold="zero"),))  # fmt: skip
+    for here, there in zip(first, correlations([one]), strict=True):
+        np.testing.assert_allclose(here.values, there.values, rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(here.band95, there.band95, rtol=1e-7)
+
+
+def test_missing_and_skipped_samples_take_no_part() -> None:
+    draw = draws(4)
+    residual, u = draw.normal(size=N), held(draw)
+    scored = draw.random(N) > 0.2
+    scored[:30] = False
+    spoilt = np.where(scored, residual, 1e6)
+    for here, there in zip(
+        found(residual, u, scored=scored), found(spoilt, u, scored=scored), strict=True
+    ):
+        assert here.test == there.test
+        np.testing.assert_array_equal(here.values, there.values)
+    assert here.test.samples == np.count_nonzero(scored)
+
+
+def test_white_noise_with_gaps_or_at_irregular_times_passes_as_often() -> None:
+    gaps, irregular = [], []
+    for seed in range(120):
+        draw = draws(seed)
+        residual, u = draw.normal(size=N), held(draw)
+        gaps.append(verdict(found(residual, u, scored=draw.random(N) > 0.3), "validation").passed)
+        times = np.sort(draw.uniform(0, TIMES[-1], N // 2))
+        curves = found(residual[: N // 2], u, times=times)
+        assert curves[0].period is None
+        irregular.append(verdict(curves, "validation").passed)
+    assert share_passed([one is True for one in gaps]) >= 0.9
+    assert share_passed([one is True for one in irregular]) >= 0.9
+
+
+def test_a_missed_response_is_found_at_irregular_times_too() -> None:
+    draw = draws(6)
+    u = held(draw)
+    times = np.sort(draw.uniform(3, TIMES[-1], N // 2))
+    missed = u[np.floor((times - 0.7) / STEP).astype(int)]
+    assert outcomes(draw.normal(size=N // 2) + 0.7 * missed, u, times=times)[1] == "failed"
+
+
+def test_residuals_that_are_rounding_are_not_tested() -> None:
+    measured = 1e5 + 1e4 * np.sin(TIMES)
+    rounding = 1e-11 * draws(1).normal(size=N) * measured
+    one = series(0, "y", TIMES, measured, measured - rounding, np.ones(N, dtype=bool),
+                 (Channel("u", TIMES, held(draws(1))),))  # fmt: skip
+    curves = correlations([one])
+    assert {curve.test.outcome for curve in curves} == {"not tested"}
+    assert all("rounding" in curve.test.reason for curve in curves)
+    assert verdict(curves, "estimation").passed is None
+
+
+@pytest.mark.parametrize(
+    ("residual", "u", "outcome", "reason"),
+    [
+        (np.ones(10), np.ones(10), ["not tested", "not tested"], "10 samples are too few"),
+        (draws(0).normal(size=N), np.ones(N), ["passed", "not tested"], "the input is constant"),
+        (draws(0).normal(size=N), held(draws(0), 100)[:3], ["passed", "not tested"], "input"),
+    ],
+)
+def test_what_cannot_be_tested_says_why(
+    residual: FloatArray, u: FloatArray, outcome: list[str], reason: str
+) -> None:
+    curves = found(residual, u, times=TIMES[: residual.size])
+    assert [one.test.outcome for one in curves] == outcome
+    assert reason in curves[-1].test.reason
+    assert curves[-1].values.size == 0
+
+
+def test_with_a_robust_loss_outliers_do_not_decide() -> None:
+    draw = draws(8)
+    residual, u = draw.normal(size=N), held(draw)
+    residual[100:102] = 300.0  # two neighbours: with squares nothing but these would be seen
+    assert outcomes(residual, u)[0] == "failed"
+    assert outcomes(residual, u, loss_scale=1.0)[0] == "passed"
+
+
+def test_the_share_of_each_test_is_the_level_by_their_number() -> None:
+    draw = draws(9)
+    one = series(0, "y", TIMES, draw.normal(size=N), np.zeros(N), np.ones(N, dtype=bool), ())
+    p = correlations([one])[0].test.p
+    assert p is not None
+    many = [replace_experiment(one, k) for k in range(10)]
+    assert correlations([one], level=1.01 * p)[0].test.outcome == "failed"
+    assert correlations(many, level=1.01 * p)[0].test.outcome == "passed"
+
+
+def replace_experiment(one: Any, number: int) -> Any:
+    return one._replace(experiment=number)
+
+
+def problem(draw: np.random.Generator, noise: float, **more: Any) -> tuple[Problem, FloatArray]:
+    """First order plus dead time with its true parameters, and what it gives."""
+    u = held(draw)
+    record = Record((Channel("u", TIMES, u, hold="zero"),), (Channel("y", TIMES, np.zeros(N)),))
+    true = {name: {"fixed": value} for name, value in TRUE.items()}
+    bare = Problem.build(load_model("fopdt"), (record,), parameters=true, **more)
+    clean = bare.predictions(np.zeros((1, 0)))[0]
+    measured = clean + noise * draw.normal(size=N)
+    noisy = replace(record, outputs=(replace(record.outputs[0], values=measured),))
+    return Problem.build(load_model("fopdt"), (noisy,), parameters=true, **more), clean
+
+
+def test_the_true_model_passes_and_one_with_another_lag_fails() -> None:
+    true, clean = problem(draws(11), 0.05)
+    whole = residual_tests(true, clean, "estimation")
+    assert isinstance(whole, ResidualTests)
+    assert whole.passed is True
+    assert [(one.kind, one.input) for one in whole.tests] == [
+        ("whiteness", None), ("independence", "u"),
+    ]  # fmt: skip
+    late = np.concatenate([np.zeros(4), clean[:-4]])
+    assert residual_tests(true, late, "estimation").passed is False
+
+
+def test_a_problem_hands_its_skipped_samples_and_its_loss_on() -> None:
+    true, clean = problem(draws(12), 0.05, skip=40, loss=Loss("soft-l1", 0.05))
+    clean = clean.copy()
+    clean[:40] = 1e3
+    clean[200:202] += 30.0
+    whole = residual_tests(true, clean, "validation")
+    assert whole.passed is True
+    assert whole.tests[0].samples == N - 40
+
+
+def test_a_true_model_without_noise_is_not_tested() -> None:
+    true, clean = problem(draws(13), 0.0)
+    assert residual_tests(true, clean, "estimation").passed is None
