@@ -1,0 +1,341 @@
+"""Closing the loop: a model whose input is proportional control of one of its outputs.
+
+The result is a model like any other, whose input is the reference; `sysid.simulation.simulate`
+runs it. The plant's input becomes
+
+    u = ± limit at most of gain · (reference - output),
+
+and may pass a transport element G e^(-Ls)/(Ts + 1), such as the long tube of section 5.2, before
+it enters the plant (Asakura and Guo, Figure 21).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from math import isfinite
+from typing import Any
+
+from sysid.errors import InvalidSettings, nearest
+from sysid.language.intervals import bounds
+from sysid.language.lags import past_values
+from sysid.language.printer import number, text
+from sysid.language.substitution import substitute
+from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol
+from sysid.models.model import EstimatedInitial, FixedInitial, Initial, Model
+from sysid.models.sections import interval
+from sysid.models.spec import parse_model
+from sysid.parameters import Parameter
+
+_PERIOD = Symbol("h", "period")
+
+
+@dataclass(frozen=True, slots=True)
+class Transport:
+    """What lies between controller and plant: gain · e^(-delay s) / (time_constant s + 1).
+
+    Attributes
+    ----------
+    gain : float
+    time_constant, delay : float
+        In s, 0 or more. Without time constant it is a pure delay.
+    """
+
+    gain: float = 1.0
+    time_constant: float = 0.0
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "time_constant", "delay"):
+            value = getattr(self, name)
+            if not isfinite(value) or (name != "gain" and value < 0):
+                raise InvalidSettings(f"/transport/{name}", f"{value!r} is not a number 0 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class ProportionalControl:
+    """Proportional control of one output by one input.
+
+    Attributes
+    ----------
+    input, output : str
+        Signals of the model.
+    gain : float
+        Unit of the input per unit of the output.
+    limit : float or None
+        Largest absolute value that the controller gives, in the unit of the input.
+    transport : Transport or None
+        What its signal passes before it enters the plant.
+    """
+
+    input: str
+    output: str
+    gain: float
+    limit: float | None = None
+    transport: Transport | None = None
+
+    def __post_init__(self) -> None:
+        if not isfinite(self.gain):
+            raise InvalidSettings("/gain", f"{self.gain!r} is not a finite number")
+        if self.limit is not None and not (isfinite(self.limit) and self.limit > 0):
+            raise InvalidSettings("/limit", f"{self.limit!r} is not a number above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class ClosedLoop:
+    """A closed loop as a model.
+
+    Attributes
+    ----------
+    model : Model
+        Its outputs are those of the plant, then `input` and `command`.
+    reference : str
+        The model's input that stands for the reference, in the unit of the controlled output.
+    input : str
+        The output that tells what enters the plant.
+    command : str
+        The output that tells what the controller gives, before the transport.
+    steps_late : int
+        In the difference form, steps by which the controller acts late where without them its
+        present value would depend on itself: as a sampled controller does. Else 0.
+    renamed : mapping of str to str
+        Coefficients of a polynomial, which are no names of the language, and what they are called.
+    """
+
+    model: Model
+    reference: str
+    input: str
+    command: str
+    steps_late: int
+    renamed: Mapping[str, str]
+
+    def values(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Values of the plant's parameters as those of the closed loop."""
+        return {self.renamed.get(name, name): value for name, value in values.items()}
+
+
+def close_loop(model: Model, control: ProportionalControl) -> ClosedLoop:
+    """The model under proportional control.
+
+    Behind a transport with a time constant the plant's input becomes a state. It starts at 0, or
+    at the value that is given for ``u(0)`` if the input is called u.
+
+    Raises
+    ------
+    InvalidSettings
+        If the model has no such input or output, or if the output contains the input itself with
+        nothing between them that takes time (an algebraic loop).
+    InvalidModel
+        If the closed loop is too long to be a model.
+    """
+    renamed = _renamed(model)
+    loop = _Loop(_called(model, renamed), control)
+    document = loop.differential() if model.form == "differential" else loop.difference()
+    closed = parse_model(document)
+    return ClosedLoop(closed, loop.reference, control.input, loop.command, loop.steps_late, renamed)
+
+
+class _Loop:
+    """A model and its controller, on the way to the document of the closed loop."""
+
+    def __init__(self, model: Model, control: ProportionalControl) -> None:
+        self.model, self.control = model, control
+        self.transport = control.transport or Transport()
+        self.clock = "t" if model.form == "differential" else "k"
+        self.output = _named(model.outputs, control.output, "output")
+        self.input = _named(model.inputs, control.input, "input")
+        taken = {q.name for group in (model.inputs, model.states, model.outputs) for q in group}
+        taken |= {p.name for p in model.parameters}
+        self.reference = _free("reference", taken)
+        self.command = _free("command", taken)
+        self.steps_late = 0
+
+    def differential(self) -> dict[str, Any]:
+        """Document of a closed loop in the differential form."""
+        delayed = self._given(0, Number(self.transport.delay))
+        if self.transport.time_constant > 0:
+            entered = f"{text(delayed, self.clock)} - {self.input.name}"
+            return self._document(f"({entered})/{number(self.transport.time_constant)}", None)
+        if any(past.name == self.input.name for past in past_values(self.output.expression)):
+            raise InvalidSettings(
+                "/output",
+                f"output {self.output.name!r} contains the input {self.input.name!r} itself, so "
+                "the controller would depend on its own present value (an algebraic loop); "
+                "control another output, or give a transport with a time constant",
+            )
+        return self._document(None, self._fed_back)
+
+    def difference(self) -> dict[str, Any]:
+        """Document of a closed loop in the difference form (a polynomial becomes one)."""
+        if self.transport.time_constant > 0:
+            lag = Binary("/", Number(self.transport.delay), _PERIOD)
+            kept = f"exp(-h/{number(self.transport.time_constant)})"
+            drive = text(self._given(1, lag))
+            before = f"{self.input.name}(k-1)"
+            return self._document(f"{drive} + {kept}*({before} - ({drive}))", None)
+        self.steps_late = int(self._is_circular())
+        return self._document(None, self._fed_back)
+
+    def _given(self, steps: int, lag: Expression | None) -> Expression:
+        """What leaves the transport but for its time constant, some steps and a lag ago."""
+        gain = self.transport.gain
+        command = self._command(steps, None if lag is None or _is_zero(lag) else lag)
+        return command if gain == 1.0 else Binary("*", Number(gain), command)
+
+    def _command(self, steps: int, lag: Expression | None) -> Expression:
+        """Gain times (reference - output), limited, some steps and a lag ago."""
+        reference = Past(self.reference, "input", steps, lag)
+        output = _shifted(self.output.expression, steps, lag, self.clock == "k")
+        error = Binary("-", reference, output)
+        command: Expression = Binary("*", Number(self.control.gain), error)
+        if self.control.limit is not None:
+            limit = self.control.limit
+            least = Call("min", (Number(limit), command))
+            command = Call("max", (Number(-limit), least))
+        return command
+
+    def _fed_back(self, node: Expression) -> Expression | None:
+        """The controller's signal where the plant reads its input."""
+        match node:
+            case Past(self.input.name, "input", offset, own):
+                delay: Expression = Number(self.transport.delay)
+                if self.clock == "k":
+                    delay = Binary("/", delay, _PERIOD)
+                lag = own if _is_zero(delay) else delay if own is None else Binary("+", delay, own)
+                return self._given(offset + self.steps_late, lag)
+            case _:
+                return None
+
+    def _is_circular(self) -> bool:
+        """Whether the controlled output at a sample depends on the plant's input at that sample."""
+        spans = {p.name: interval(p) for p in self.model.parameters}
+        trees = dict(zip((s.name for s in self.model.states), self.model.equations, strict=True))
+        reached: set[str] = set()
+        waiting = [self.output.expression]
+        while waiting:
+            for past in past_values(waiting.pop()):
+                lag = past.lag
+                is_now = past.offset == 0 and (lag is None or bounds(lag, spans)[0] < 1)
+                if is_now and past.name == self.input.name:
+                    return True
+                if is_now and past.kind == "state" and past.name not in reached:
+                    reached.add(past.name)
+                    waiting.append(trees[past.name])
+        return False
+
+    def _document(
+        self, equation: str | None, change: Callable[[Expression], Expression | None] | None
+    ) -> dict[str, Any]:
+        """The closed loop, with an equation of the plant's input or with its reads replaced."""
+        model, name = self.model, self.input.name
+
+        def written(tree: Expression) -> str:
+            return text(tree if change is None else substitute(tree, change), self.clock)
+
+        states = {state.name: state.unit for state in model.states}
+        equations = {
+            state.name: written(tree)
+            for state, tree in zip(model.states, model.equations, strict=True)
+        }
+        initial = {s.name: _start(one) for s, one in zip(model.states, model.initial, strict=True)}
+        if equation is not None:
+            states[name], equations[name], initial[name] = self.input.unit, equation, 0.0
+        inputs = {q.name: q.unit for q in model.inputs if q.name != name}
+        command = text(self._command(0, None), self.clock)
+        entering = name if equation is not None else written(Past(name, "input"))
+        outputs = {o.name: (written(o.expression), o.unit) for o in model.outputs}
+        outputs |= {name: (entering, self.input.unit), self.command: (command, self.input.unit)}
+        return {
+            "name": f"{model.name[:50]}-closed-loop",
+            "form": "differential" if model.form == "differential" else "difference",
+            "inputs": {self.reference: self.output.unit, **inputs},
+            "states": states,
+            "parameters": {p.name: _declared(p) for p in model.parameters},
+            "equations": equations,
+            "outputs": {k: {"expression": e, "unit": unit} for k, (e, unit) in outputs.items()},
+            "initial": initial,
+            "solver": dict(model.document["solver"]),
+        }
+
+
+def _renamed(model: Model) -> dict[str, str]:
+    """Names for parameters whose own are none in the language, such as ``a[y(k-1)]``."""
+    taken = {q.name for group in (model.inputs, model.states, model.outputs) for q in group}
+    taken |= {p.name for p in model.parameters}
+    odd = [p.name for p in model.parameters if not p.name.isidentifier()]
+    return {name: _free(f"a_{i}", taken) for i, name in enumerate(odd, 1)}
+
+
+def _called(model: Model, renamed: Mapping[str, str]) -> Model:
+    """The model with parameters of other names."""
+
+    def other(node: Expression) -> Expression | None:
+        match node:
+            case Symbol(name, "parameter") if name in renamed:
+                return Symbol(renamed[name], "parameter")
+            case _:
+                return None
+
+    if not renamed:
+        return model
+    parameters = tuple(replace(p, name=renamed.get(p.name, p.name)) for p in model.parameters)
+    trees = tuple(substitute(tree, other) for tree in model.equations)
+    return replace(model, parameters=parameters, equations=trees)
+
+
+def _is_zero(lag: Expression) -> bool:
+    """Whether a lag is the number 0, or that many seconds in samples."""
+    match lag:
+        case Number(0.0) | Binary("/", Number(0.0), _):
+            return True
+        case _:
+            return False
+
+
+def _shifted(tree: Expression, steps: int, lag: Expression | None, counts: bool) -> Expression:
+    """An expression as it was some whole steps and a lag ago; `counts`: lags are in samples."""
+
+    def earlier(node: Expression) -> Expression | None:
+        match node:
+            case Past(name, kind, offset, own):
+                both = own if lag is None else lag if own is None else Binary("+", own, lag)
+                return Past(name, kind, offset + steps, both)
+            case Symbol(_, "index"):
+                return Binary("-", node, back)
+            case Symbol(_, "time"):
+                return Binary("-", node, Binary("*", back, _PERIOD) if counts else back)
+            case _:
+                return None
+
+    back = Binary("+", Number(float(steps)), lag or Number(0.0))
+    return tree if steps == 0 and lag is None else substitute(tree, earlier)
+
+
+def _named(signals: Any, name: str, role: str) -> Any:
+    for signal in signals:
+        if signal.name == name:
+            return signal
+    known = [signal.name for signal in signals]
+    raise InvalidSettings(f"/{role}", f"the model has no {role} {name!r}{nearest(name, known)}")
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """The name, or with underscores behind it until nothing else has it."""
+    while name in taken:
+        name += "_"
+    return name
+
+
+def _declared(parameter: Parameter) -> dict[str, Any]:
+    fields = {
+        name: getattr(parameter, name)
+        for name in ("lower", "upper", "unit", "scale", "fixed", "tied")
+    }
+    return {name: value for name, value in fields.items() if value is not None}
+
+
+def _start(initial: Initial) -> Mapping[str, float] | float:
+    """A start that needs no measurement: what is estimated or measured is given as a value."""
+    if isinstance(initial, FixedInitial):
+        return initial.value
+    if isinstance(initial, EstimatedInitial):
+        return {"lower": initial.lower, "upper": initial.upper}
+    return {"lower": -1.0, "upper": 1.0}

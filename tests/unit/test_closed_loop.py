@@ -1,0 +1,197 @@
+"""A model under proportional control: against loops written by hand, and the paper's Figure 21."""
+
+from math import degrees, pi
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.closed_loop import ProportionalControl, Transport, close_loop
+from sysid.errors import InvalidRecord, InvalidSettings
+from sysid.models.library import load_model
+from sysid.models.model import Model
+from sysid.models.spec import parse_model
+from sysid.records import Channel
+from sysid.simulation import simulate
+from sysid.step_response import StepMetrics, step_metrics
+from sysid.types import FloatArray
+
+ACTUATOR = {
+    "J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3,
+    "A_m": 5.0e-6, "B": 1.0e-3, "theta_s": 0.75 * pi, "theta(0)": 0.0,
+}  # fmt: skip
+TUBE = Transport(1.0, 0.35, 0.127)
+TIMES = 0.01 * np.arange(601)
+
+
+def stepped(height: float, unit: str = "rad") -> Channel:
+    """A reference that is 0 before t = 0 and `height` from then on."""
+    times = np.array([-0.01, 0.0, TIMES[-1]])
+    return Channel("reference", times, np.array([0.0, height, height]), unit, hold="zero")
+
+
+def arm(gain: float, transport: Transport | None = TUBE) -> tuple[FloatArray, StepMetrics]:
+    """Angle of the arm after a step of 90°, and what it is judged by."""
+    control = ProportionalControl("P_a", "theta", gain, 0.25e6, transport)
+    loop = close_loop(load_model("actuator"), control)
+    angle = simulate(loop.model, [stepped(pi / 2)], ACTUATOR, times=TIMES).channel("theta").values
+    return angle, step_metrics(TIMES, angle, at=0.0, before=0.0, after=pi / 2)
+
+
+def lag(output: str = "y", **fields: Any) -> Model:
+    """First-order lag behind a dead time."""
+    document = {
+        "name": "lag", "form": "differential", "inputs": {"u": "V"}, "states": {"y": "m"},
+        "parameters": {"T": {"lower": 0.1, "upper": 2}, "L": {"lower": 0, "upper": 1}},
+        "equations": {"y": "(u(t-L) - y)/T"}, "outputs": {"y": output}, "initial": {"y": 0},
+    }  # fmt: skip
+    return parse_model(document | fields)
+
+
+def test_a_gain_of_10_kpa_per_radian_settles_in_a_second_and_a_half_with_1_percent_overshoot() -> (
+    None
+):
+    _, found = arm(10e3)
+    assert found.overshoot_percent == pytest.approx(1.0, abs=0.5)
+    assert found.settling_time == pytest.approx(1.5, abs=0.2)
+
+
+def test_twice_that_gain_overshoots_by_39_percent() -> None:
+    _, found = arm(20e3)
+    assert found.overshoot_percent == pytest.approx(39.0, abs=2.0)
+
+
+def test_four_times_that_gain_reverses_at_the_end_stop() -> None:
+    angle, found = arm(40e3)
+    assert np.max(angle) == 0.75 * pi
+    turns = np.count_nonzero(np.diff(np.sign(angle[TIMES > 0.5] - pi / 2)) != 0)
+    assert turns >= 3
+    assert not found.settling_time < 3.0
+
+
+def test_without_the_tube_friction_leaves_14_degrees() -> None:
+    angle, found = arm(10e3, None)
+    coulomb = ACTUATOR["F_c"] / (ACTUATOR["A_m"] * 10e3)
+    assert degrees(coulomb) == pytest.approx(14.1, abs=0.05)
+    assert found.final_value == pytest.approx(pi / 2 - coulomb, abs=1e-3)
+    assert np.all(np.diff(angle) >= 0)
+
+
+@pytest.mark.parametrize("transport", [None, Transport(0.8, 0.0, 0.1), Transport(1.2, 0.3, 0.1)])
+@pytest.mark.parametrize("limit", [None, 1.5])
+def test_a_loop_in_the_differential_form_equals_the_same_loop_written_by_hand(
+    transport: Transport | None, limit: float | None
+) -> None:
+    loop = close_loop(lag(), ProportionalControl("u", "y", 3.0, limit, transport))
+    with_limit = "max(-1.5, min(1.5, 3*({0})))" if limit else "3*({0})"
+    element = transport or Transport()
+    error = with_limit.format(f"r(t - {element.delay}) - y(t - {element.delay})")
+    states, equations = {"y": "m"}, {"y": "(u(t-L) - y)/T"}
+    if element.time_constant:
+        states["u"] = "V"
+        equations["u"] = f"({element.gain}*{error} - u)/{element.time_constant}"
+    else:
+        late = f"t - L - {element.delay}"
+        drive = with_limit.format(f"r({late}) - y({late})")
+        equations["y"] = f"({element.gain}*{drive} - y)/T"
+    twin = parse_model({**lag().document, "inputs": {"r": "m"}, "states": states,
+                        "equations": equations, "initial": {}})  # fmt: skip
+    values = {"T": 0.7, "L": 0.15}
+    found = simulate(loop.model, [stepped(2.0, "m")], values, times=TIMES)
+    reference = stepped(2.0)
+    given = Channel("r", reference.times, reference.values, hold="zero")
+    expected = simulate(twin, [given], values, times=TIMES).channel("y").values
+    np.testing.assert_allclose(found.channel("y").values, expected, rtol=1e-9, atol=1e-12)
+    command = found.channel(loop.command).values
+    wanted = 3.0 * (2.0 - expected)
+    np.testing.assert_allclose(command, wanted if limit is None else np.clip(wanted, -1.5, 1.5),
+                               rtol=1e-9)  # fmt: skip
+
+
+def test_a_recursion_that_answers_at_once_has_a_controller_one_step_late() -> None:
+    direct = {"name": "d", "form": "difference", "inputs": {"u": "V"}, "states": {"x": "m"},
+              "equations": {"x": "0.5*x(k-1) + 0.4*u"}, "outputs": {"y": "x"}}  # fmt: skip
+    late = direct | {"equations": {"x": "0.5*x(k-1) + 0.4*u(k-1)"}}
+    control = ProportionalControl("u", "y", 1.1)
+    loops = [close_loop(parse_model(one), control) for one in (direct, late)]
+    assert [loop.steps_late for loop in loops] == [1, 0]
+    first, second = (simulate(loop.model, [stepped(1.0, "m")], {}, times=TIMES) for loop in loops)
+    x, expected = 0.0, []
+    for _ in TIMES:
+        expected.append(x)
+        x = 0.5 * x + 0.4 * 1.1 * (1.0 - x)
+    np.testing.assert_allclose(second.channel("y").values, expected, rtol=1e-12)
+    np.testing.assert_allclose(first.channel("y").values[1:], expected[1:], rtol=1e-12)
+
+
+def test_a_polynomial_can_be_controlled() -> None:
+    narx = parse_model({
+        "name": "n", "form": "polynomial", "output": "y", "inputs": {"u": "V"}, "degree": 1,
+        "lags": {"y": [1], "u": [1]}, "coefficients": {"lower": -2, "upper": 2},
+        "initial": {"y": 0},
+    })  # fmt: skip
+    loop = close_loop(narx, ProportionalControl("u", "y", 2.0))
+    names = [parameter.name for parameter in narx.parameters]
+    values = loop.values(dict(zip(names, (0.8, 0.1), strict=True)))
+    found = simulate(loop.model, [stepped(1.0, "1")], values, times=TIMES).channel("y").values
+    assert found[-1] == pytest.approx(0.2 / (1 - 0.8 + 0.2), rel=1e-9)
+
+
+def test_an_output_with_the_input_in_it_needs_a_transport_that_takes_time() -> None:
+    direct = lag("y + 0.1*u")
+    with pytest.raises(InvalidSettings, match="algebraic loop"):
+        close_loop(direct, ProportionalControl("u", "y", 1.0, None, Transport(1.0, 0.0, 0.2)))
+    loop = close_loop(direct, ProportionalControl("u", "y", 1.0, None, Transport(1.0, 0.1, 0.0)))
+    found = simulate(loop.model, [stepped(1.0, "m")], {"T": 0.5, "L": 0.0}, times=TIMES)
+    # y = x + 0.1 u and u = 1 - y at rest, where x = u
+    assert found.channel("y").values[-1] == pytest.approx(1.1 / 2.1, rel=1e-6)
+
+
+def test_the_loop_names_its_signals_anew_where_the_plant_has_those_names() -> None:
+    taken = lag(parameters={"T": {"lower": 0.1, "upper": 2}, "L": {"lower": 0, "upper": 1},
+                            "reference": {"lower": 0, "upper": 1}})  # fmt: skip
+    loop = close_loop(taken, ProportionalControl("u", "y", 1.0))
+    assert [one.name for one in loop.model.inputs] == [loop.reference] == ["reference_"]
+    assert [one.name for one in loop.model.outputs] == ["y", "u", "command"]
+    assert [one.unit for one in loop.model.outputs] == ["m", "V", "V"]
+
+
+@pytest.mark.parametrize(
+    ("make", "pointer", "part"),
+    [
+        (lambda: ProportionalControl("v", "y", 1.0), "/input", "no input 'v'"),
+        (lambda: ProportionalControl("u", "x", 1.0), "/output", "no output 'x'"),
+        (lambda: ProportionalControl("u", "y", float("nan")), "/gain", "finite"),
+        (lambda: ProportionalControl("u", "y", 1.0, 0.0), "/limit", "above 0"),
+        (lambda: Transport(1.0, -1.0), "/transport/time_constant", "0 or more"),
+    ],
+)
+def test_what_cannot_be_controlled_is_told(make: Any, pointer: str, part: str) -> None:
+    with pytest.raises(InvalidSettings, match=part) as caught:
+        close_loop(lag(), make())
+    assert caught.value.pointer == pointer
+
+
+def test_metrics_of_a_second_order_step_are_those_of_its_formula() -> None:
+    damping, rate = 0.4, 3.0
+    times = np.linspace(0, 12, 12001)
+    free = rate * np.sqrt(1 - damping**2)
+    shape = np.cos(free * times) + damping * rate / free * np.sin(free * times)
+    values = 1 + 2 * (1 - np.exp(-damping * rate * times) * shape)
+    found = step_metrics(times + 5, values, at=5.0, before=1.0, after=3.0)
+    overshoot = 100 * np.exp(-pi * damping / np.sqrt(1 - damping**2))
+    assert found.overshoot_percent == pytest.approx(overshoot, rel=1e-3)
+    assert found.steady_error == pytest.approx(0.0, abs=1e-4)
+    last = np.flatnonzero(np.abs(values - found.final_value) > 0.04)[-1]
+    assert found.settling_time == pytest.approx(times[last + 1])
+    way = (values - 1) / 2
+    assert found.rise_time == pytest.approx(
+        float(np.interp(0.9, way[:1000], times[:1000]) - np.interp(0.1, way[:1000], times[:1000]))
+    )
+
+
+def test_metrics_need_a_step_that_was_recorded() -> None:
+    with pytest.raises(InvalidRecord, match="no two samples after"):
+        step_metrics(TIMES, TIMES, at=6.0, before=0.0, after=1.0)
+    with pytest.raises(InvalidRecord, match="does not change"):
+        step_metrics(TIMES, TIMES, at=1.0, before=1.0, after=1.0)
