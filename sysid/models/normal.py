@@ -72,6 +72,7 @@ def _terms(written: Any, model: Model) -> object:
     candidates = written.get("candidates", "all")
     listed = candidates if isinstance(candidates, str) else [_text(one) for one in candidates]
     rule |= {"criterion": model.rule.criterion, "exchange": model.rule.exchange}
+    rule["error"] = model.rule.error
     return {**rule, "candidates": listed}
 
 

@@ -10,7 +10,7 @@ from itertools import combinations_with_replacement
 from math import comb
 from typing import Any, NamedTuple, cast
 
-from sysid.errors import InvalidBounds, nearest
+from sysid.errors import InvalidBounds, InvalidSettings, nearest
 from sysid.language.checker import check
 from sysid.language.lags import delay
 from sysid.language.printer import text
@@ -19,7 +19,7 @@ from sysid.language.tree import Binary, Expression, Number, Past, Symbol
 from sysid.models.equations import note
 from sysid.models.reader import Reader, pointer, shown
 from sysid.models.sections import MAX_PARAMETERS
-from sysid.models.terms import Criterion, Term, TermRule
+from sysid.models.terms import Criterion, ErrorKind, Term, TermRule
 from sysid.parameters import Parameter, Scale
 
 FIELDS = ("output", "degree", "lags", "coefficients", "constant", "terms")
@@ -30,7 +30,23 @@ MAX_CANDIDATES = 512
 _MAX_DEGREE = 9
 _SELECTORS = ("frols",)
 _CRITERIA = ("none", "bic")
-_RULE_FIELDS = ("select", "keep", "err", "criterion", "exchange", "candidates")
+_ERRORS = ("one-step", "simulation")
+_RULE_FIELDS = ("select", "keep", "err", "criterion", "exchange", "error", "candidates")
+
+
+def check_samples(candidates: int, samples: int) -> None:
+    """Raise if a selection has more candidates than samples to tell them apart by.
+
+    Raises
+    ------
+    InvalidSettings
+    """
+    if samples < candidates:
+        raise InvalidSettings(
+            "/model/terms",
+            f"{candidates} candidates cannot be told apart by {samples} samples; give longer "
+            "records, a lower degree or fewer lags",
+        )
 
 
 class Polynomial(NamedTuple):
@@ -71,11 +87,11 @@ def _rule(reader: Reader, written: Mapping[str, Any], candidates: int) -> TermRu
     most, keep = min(candidates, MAX_PARAMETERS), fields.get("keep")
     if keep is None and err is None and criterion == "none":
         reader.fault("/terms/keep", "is missing; say how many terms to keep, such as 8")
-    if keep is None or most == 0:  # without candidates, that is the fault to tell
-        number = max(most, 1)
-    else:
-        number = _kept(reader, keep, candidates, most)
-    return TermRule(number, err, cast(Criterion, criterion), exchange)
+    error = reader.choice(fields.get("error", "one-step"), _ERRORS, "/terms/error")
+    # Without candidates, that is the fault to tell.
+    all_of_them = keep is None or most == 0
+    number = max(most, 1) if all_of_them else _kept(reader, keep, candidates, most)
+    return TermRule(number, err, cast(Criterion, criterion), exchange, cast(ErrorKind, error))
 
 
 def _share(reader: Reader, written: object) -> float:

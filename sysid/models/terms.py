@@ -8,6 +8,7 @@ from sysid.language.printer import text
 from sysid.language.tree import Past
 
 Criterion = Literal["none", "bic"]
+ErrorKind = Literal["one-step", "simulation"]
 
 
 class Term(NamedTuple):
@@ -45,12 +46,15 @@ class TermRule:
         ``bic``: the number of terms with the least Bayesian information criterion.
     exchange : bool
         Whether a taken term may give way to a better one afterwards.
+    error : {"one-step", "simulation"}
+        Which error the terms are to explain; the latter begins with the former.
     """
 
     keep: int
     err: float | None = None
     criterion: Criterion = "none"
     exchange: bool = True
+    error: ErrorKind = "one-step"
 
 
 class SelectedTerm(NamedTuple):
@@ -64,7 +68,8 @@ class SelectedTerm(NamedTuple):
     cumulated : float
         Share explained with all terms so far.
     coefficient : float
-        One-step least-squares coefficient in the model of all selected terms.
+        Coefficient in the model of all selected terms, before the search: by least squares one
+        step ahead, or on the free run where the terms were selected by that.
     """
 
     term: str

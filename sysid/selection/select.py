@@ -5,8 +5,8 @@ from dataclasses import replace
 from math import prod
 from typing import Any
 
-from sysid.errors import InvalidSettings
 from sysid.models.model import Model
+from sysid.models.polynomial import check_samples
 from sysid.models.spec import with_terms
 from sysid.models.terms import SelectedTerm, Selection, TermRule
 from sysid.parameters import Parameter, override
@@ -14,6 +14,7 @@ from sysid.records import Record
 from sysid.selection.frols import Forward, forward, select, solved
 from sysid.selection.lagsearch import affordable_rows, lag_values, search
 from sysid.selection.regression import Regression
+from sysid.selection.simulated import reselected
 from sysid.threads import one_thread
 
 Changes = Mapping[str, Mapping[str, Any]]
@@ -24,9 +25,9 @@ def selected(
 ) -> tuple[Model, dict[str, Mapping[str, Any]]]:
     """The model with the terms that its rule selects on the records; another as it is.
 
-    Without records the model stays as it is, too. Unknown lags are tried at whole samples inside their bounds; the terms are those at the lags
-    where they explain most. The lags stay unknown: their values are in the `selection` of the
-    model, for the search to begin with.
+    Without records the model stays as it is, too. Unknown lags are tried at whole samples inside
+    their bounds; the terms are those at the lags where they explain most. The lags stay unknown:
+    their values are in the `selection` of the model, for the search to begin with.
 
     Parameters
     ----------
@@ -60,6 +61,11 @@ def selected(
     )
     with one_thread():  # so that the last bit does not depend on the number of cores
         found, lags, coefficients, samples = _found(model, model.rule, records, parameters, skip)
+        if model.rule.error == "simulation":
+            better = reselected(model, model.rule, records, given, skip, found.order, lags)
+            if better is not None:
+                found, lags = better.found, better.lags
+                coefficients = better.coefficients.tolist()
     resolved = with_terms(model, [model.terms[i].label for i in found.order])
     dropped = frozenset(own - {parameter.name for parameter in resolved.parameters})
     selection = Selection(_told(model, found, coefficients), lags, samples, dropped)
@@ -67,27 +73,12 @@ def selected(
     return replace(resolved, selection=selection), kept
 
 
-def enough_samples(model: Model, samples: int) -> None:
-    """Raise if a selection has more candidates than samples to tell them apart by.
-
-    Raises
-    ------
-    InvalidSettings
-    """
-    if model.rule is not None and samples < len(model.terms):
-        raise InvalidSettings(
-            "/model/terms",
-            f"{len(model.terms)} candidates cannot be told apart by {samples} samples; give "
-            "longer records, a lower degree or fewer lags",
-        )
-
-
 def _found(
     model: Model, rule: TermRule, records: Sequence[Record],
     parameters: Sequence[Parameter], skip: int,
 ) -> tuple[Forward, dict[str, float], list[float], int]:  # fmt: skip
     regression = Regression.of(model, records, parameters, skip)
-    enough_samples(model, regression.samples)
+    check_samples(len(model.terms), regression.samples)
     values = lag_values(model, parameters, regression.pieces[0].period)
     lags: dict[str, float] = {}
     if values:
@@ -100,7 +91,7 @@ def _found(
 
         lags = search(values, unexplained)[0].lags
     triangle, samples = regression.triangle(model.terms, lags)
-    enough_samples(model, samples)
+    check_samples(len(model.terms), samples)
     found = select(triangle, rule, samples)
     return found, lags, solved(triangle, found.order).tolist(), samples
 

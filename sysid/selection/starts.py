@@ -86,7 +86,8 @@ class _Finder:
         """All that a free run can follow, best first."""
         if self._regression.samples == 0:
             return Starts()
-        found: list[tuple[float, int, _Start]] = []
+        tried = self._tried(self._from_selection())
+        found = [(value, i, start) for i, (value, start) in enumerate(tried)]
         for lags in self._lags():
             tried = self._tried([(lags, c) for c in self._one_step(lags)])
             found += [(value, len(found) + i, start) for i, (value, start) in enumerate(tried)]
@@ -97,6 +98,15 @@ class _Finder:
         values = tuple(self._values(start) for _, _, start in ranked)
         distinct = [one for i, one in enumerate(values) if one not in values[:i]]
         return Starts(tuple(distinct), self.evaluations)
+
+    def _from_selection(self) -> list["_Start"]:
+        """Lags and coefficients that the selection of the terms has found."""
+        selection = self._problem.model.selection
+        if selection is None or not selection.terms:
+            return []
+        known = {one.term: one.coefficient for one in selection.terms}
+        coefficients = np.array([known.get(term.label, 0.0) for term in self._terms])
+        return [(dict(selection.lags), coefficients)]
 
     def _lags(self) -> list[dict[str, float]]:
         """Combinations of the lags to begin with, none of them beside a better one."""
