@@ -72,6 +72,48 @@ class ResponseOut(Answer):
     experiments: list[ExperimentOut]
 
 
+class CorrelationOut(Answer):
+    """A correlation function of residuals with its bands, and the test made of it.
+
+    `input` is null for the autocorrelation. `lags` are in periods of `period` seconds, or, where
+    `period` is null, in samples of irregular times. Bands are symmetric about zero.
+    """
+
+    experiment: int
+    output: str
+    test: Literal["whiteness", "independence"]
+    input: str | None
+    outcome: Literal["passed", "failed", "not tested"]
+    reason: str
+    samples: int
+    lags_tested: int
+    inside95: float | None
+    inside99: float | None
+    statistic: float | None
+    degrees: float | None
+    p: float | None
+    period: float | None
+    lags: list[float]
+    values: list[float]
+    band95: list[float]
+    band99: list[float]
+
+
+class ResidualsOut(Answer):
+    """Tests of a run's residuals with their correlation functions.
+
+    `level` is the chance that a true model fails one test or more of all; `passed` is null where
+    nothing could be tested; `note` says what could not be read.
+    """
+
+    id: str
+    data: Literal["estimation", "validation"]
+    passed: bool | None
+    level: float
+    note: str
+    tests: list[CorrelationOut]
+
+
 class MigrantOut(Answer):
     """One line of the migration log."""
 

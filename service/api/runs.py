@@ -2,11 +2,11 @@
 
 from fastapi import APIRouter, Request, Response
 
-from service import responses, runs
+from service import residuals, responses, runs
 from service.api.content import content_of
 from service.api.deps import MaxPoints, PartsDep, ReadSession
 from service.errors import NotFound
-from service.schemas_runs import HistoryOut, MigrationsOut, ResponseOut, RunOut
+from service.schemas_runs import HistoryOut, MigrationsOut, ResidualsOut, ResponseOut, RunOut
 from service.storage.runs import RunRepository
 
 router = APIRouter(prefix="/v1/runs", tags=["runs"])
@@ -36,6 +36,12 @@ def response(
 ) -> ResponseOut:
     """Measured and simulated outputs, reduced so that extremes stay visible."""
     return responses.response(session, parts.store, run_id, max_points)
+
+
+@router.get("/{run_id}/residuals")
+def residual_tests(run_id: str, session: ReadSession, parts: PartsDep) -> ResidualsOut:
+    """Auto- and cross-correlation of the residuals with 95 and 99 % bands, and their tests."""
+    return residuals.residuals(session, parts.store, run_id)
 
 
 @router.head("/{run_id}/signals.mcap", include_in_schema=False)
