@@ -144,18 +144,21 @@ def against_own_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
 
 
 def growth(repeats: int) -> list[Row]:
-    """Whether the time is linear: the largest departure from a straight line through it."""
+    """Whether the time is linear: a straight line through it, and how far the worst lies off."""
     rows = []
-    sizes = {"samples": (300, 1000, 3000, 10_000), "individuals": (48, 96, 480, 960)}
+    sizes = {"sample": (300, 1000, 3000, 10_000), "individual": (48, 96, 480, 960)}
     for what, counts in sizes.items():
         times = []
         for count in counts:
-            samples, many = (count, 48) if what == "samples" else (300, count)
+            samples, many = (count, 48) if what == "sample" else (300, count)
             example, theta = problem(duffing("difference"), samples), individuals(many)
             times.append(microseconds(lambda e=example, t=theta: e.fitness(t), repeats))
-        each = np.array(times) / np.array(counts)
-        rows.append(Row(f"time for each of {counts[0]} to {counts[-1]} {what}: largest ÷ least",
-                        float(each.max() / each.min()), "", 1.5))  # fmt: skip
+        n, t = np.array(counts, float), np.array(times)
+        slope, start = np.polyfit(n, t, 1, w=1 / t)  # relative departures count
+        off = float(np.max(np.abs((start + slope * n) / t - 1)))
+        span = f"{counts[0]} to {counts[-1]} {what}s"
+        rows.append(Row(f"{span}: line {start:.1f} µs + {1e3 * slope:.1f} ns a {what}, worst off",
+                        100 * off, "%", 20.0))  # fmt: skip
     return rows
 
 

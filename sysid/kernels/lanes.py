@@ -15,7 +15,6 @@ from sysid.kernels.vectormath import vector_functions
 DOUBLE, INT, BOOL = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
 VECTOR, INTS, BOOLS = (ir.VectorType(kind, LANES) for kind in (DOUBLE, INT, BOOL))
 _INT32 = ir.IntType(32)
-_POINTERS = ir.VectorType(ir.PointerType(), LANES)
 
 FLAGS = ("contract", "nsz", "arcp")
 """Fast-math flags in use: fused multiply-add, any sign of zero, reciprocal for a division.
@@ -178,14 +177,20 @@ class Lanes:
         return self.builder.add(start, self.builder.shl(index, self.splat(self.integer(3))))
 
     def gather(self, addresses: Value, shift: Value) -> Value:
-        """The doubles at `addresses`, each `shift` doubles further."""
-        step = self.splat(self.builder.shl(shift, self.integer(3)))
-        pointers = self.builder.inttoptr(self.builder.add(addresses, step), _POINTERS)
-        name = f"llvm.masked.gather.v{LANES}f64.v{LANES}p0"
-        signature = ir.FunctionType(VECTOR, [_POINTERS, _INT32, BOOLS, VECTOR])
-        mask = ir.Constant(BOOLS, [1] * LANES)
-        arguments = [pointers, ir.Constant(_INT32, 8), mask, ir.Constant(VECTOR, ir.Undefined)]
-        return self.builder.call(self._declared(name, signature), arguments)
+        """The doubles at `addresses`, each `shift` doubles further.
+
+        One load for each lane, not the processor's gather: that is slower where its microcode
+        guards against leaks of data (docs/performance.md), and nowhere faster by much.
+        """
+        b = self.builder
+        step = b.shl(shift, self.integer(3))
+        found = ir.Constant(VECTOR, ir.Undefined)
+        for number in range(LANES):
+            lane = ir.Constant(_INT32, number)
+            start = b.inttoptr(b.extract_element(addresses, lane), ir.PointerType())
+            place = b.gep(start, [step], source_etype=ir.IntType(8))
+            found = b.insert_element(found, b.load(place, typ=DOUBLE, align=8), lane)
+        return found
 
     def copy_rows(self, base: Value, target: Value, source: Value, doubles: Value) -> None:
         """Copy doubles inside one array; the two parts do not overlap."""
