@@ -241,9 +241,23 @@ class Client:
         """Measured and simulated outputs."""
         return self._json(calls.read("runs", run, "response", max_points=max_points))
 
+    def simulate_run(
+        self, run: str, body: Mapping[str, Any], max_points: int = 1000
+    ) -> Document:
+        """Simulate the identified model on a new input or under proportional control."""
+        return self._json(calls.act("runs", run, "simulate", body, max_points=max_points))
+
     def migrations(self, run: str) -> Document:
         """The migration log."""
         return self._json(calls.read("runs", run, "migrations"))
+
+    def residuals(self, run: str) -> Document:
+        """Correlation functions of the residuals with their bands and tests."""
+        return self._json(calls.read("runs", run, "residuals"))
+
+    def compare(self, *runs: str) -> Document:
+        """Runs on the same data side by side, the best first."""
+        return self._json(calls.create("runs:compare", {"runs": runs}))
 
 
 class AsyncClient:
@@ -330,6 +344,12 @@ class AsyncClient:
                 return state
             await asyncio.sleep(poll)
 
+    async def simulate_run(
+        self, run: str, body: Mapping[str, Any], max_points: int = 1000
+    ) -> Document:
+        """Simulate the identified model on a new input or under proportional control."""
+        return await self._json(calls.act("runs", run, "simulate", body, max_points=max_points))
+
     async def runs(self, job: str) -> AsyncIterator[Document]:
         """Runs of a job, page by page."""
         cursor: str | None = None
@@ -348,3 +368,11 @@ class AsyncClient:
     async def history(self, run: str) -> Document:
         """Improvements of each island's champion."""
         return await self._json(calls.read("runs", run, "history"))
+
+    async def residuals(self, run: str) -> Document:
+        """Correlation functions of the residuals with their bands and tests."""
+        return await self._json(calls.read("runs", run, "residuals"))
+
+    async def compare(self, *runs: str) -> Document:
+        """Runs on the same data side by side, the best first."""
+        return await self._json(calls.create("runs:compare", {"runs": runs}))

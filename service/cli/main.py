@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from service.calls import ClientError
-from service.cli import datasets, jobs, models, serving, upkeep
+from service.cli import datasets, jobs, models, runs, serving, upkeep
 from service.cli.common import err, out
 from service.cli.identify import identify
 from service.errors import ServiceError
@@ -27,7 +27,7 @@ app.command()(identify)
 app.command()(jobs.submit)
 app.command()(jobs.watch)
 app.command("jobs")(jobs.listing)
-app.command("runs")(jobs.runs)
+app.add_typer(runs.app, name="runs")
 app.command()(jobs.cancel)
 app.command()(jobs.resume)
 app.command()(jobs.report)

@@ -1,0 +1,116 @@
+"""`lagid runs`: list the runs of a job, and what can be asked of single ones."""
+
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from service.cli.common import (
+    DEFAULT_URL,
+    AsJson,
+    Key,
+    Url,
+    connected,
+    estimate,
+    out,
+    print_json,
+    print_table,
+)
+from service.cli.jobs import runs as listing
+
+LISTING = "list"
+
+RunName = Annotated[str, typer.Argument(metavar="RUN", help="Id of a run.")]
+
+
+class _Listing(TyperGroup):
+    """Commands on runs; without the name of one, the runs of a job are listed."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args or args[0] not in (*self.commands, "--help"):
+            args = [LISTING, *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=_Listing, add_completion=False,
+    help="List the runs of a job with their estimates: lagid runs [JOB]; or ask about one run.",
+)  # fmt: skip
+app.command(LISTING)(listing)
+
+
+@app.command()
+def residuals(
+    run: RunName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
+) -> None:
+    """Tell whether a run's residuals are white and independent of the inputs."""
+    with connected(url, key) as client:
+        found = client.residuals(run)
+    if as_json:
+        print_json(found)
+        return
+    headings = ("test", "experiment", "output", "input", ">samples", ">inside 95 %",
+                ">inside 99 %", ">p", "verdict")  # fmt: skip
+    print_table(headings, map(_tested, found["tests"]), empty="no tests")
+    verdict = {True: "passed", False: "failed", None: "not tested"}[found["passed"]]
+    out.print(f"residuals on {found['data']} data: {verdict}", markup=False)
+    if found["note"]:
+        out.print(f"note: {found['note']}", markup=False, soft_wrap=True)
+
+
+@app.command()
+def compare(
+    runs: Annotated[list[str], typer.Argument(metavar="RUN RUN…", help="Ids of two runs or more.")],
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare runs of several models on the same data."""
+    with connected(url, key) as client:
+        found = client.compare(*runs)
+    if as_json:
+        print_json(found)
+        return
+    headings = ("run", "model", ">parameters", ">samples", f">RMS [{found['unit']}]", ">fit %",
+                ">validation %", ">AIC", ">BIC", "residuals",
+                *(f">{one['name']}" for one in found["parameters"]))  # fmt: skip
+    print_table(headings, [_compared(one, found["parameters"]) for one in found["runs"]],
+                empty="no runs")  # fmt: skip
+    for note in found["notes"]:
+        out.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def _tested(one: dict[str, Any]) -> tuple[object, ...]:
+    reason = f": {one['reason']}" if one["reason"] else ""
+    return (
+        one["test"], one["experiment"] + 1, one["output"], one["input"], one["samples"],
+        _percent(one["inside95"]), _percent(one["inside99"]), _chance(one["p"]),
+        f"{one['outcome']}{reason}",
+    )  # fmt: skip
+
+
+def _compared(one: dict[str, Any], parameters: list[dict[str, Any]]) -> tuple[object, ...]:
+    values = [
+        next((estimate(value) for value in parameter["values"] if value["run"] == one["run"]), None)
+        for parameter in parameters
+    ]
+    passed = {True: "passed", False: "failed", None: None}[one["residuals_passed"]]
+    return (
+        one["run"], one["title"], one["parameters"], one["samples"], one["rms"],
+        _two(one["fit_estimation"]), _two(one["fit_validation"]), _two(one["aic"]),
+        _two(one["bic"]), passed, *values,
+    )  # fmt: skip
+
+
+def _percent(part: float | None) -> str | None:
+    return None if part is None else f"{100 * part:.0f}"
+
+
+def _chance(p: float | None) -> str | None:
+    if p is None:
+        return None
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def _two(value: float | None) -> str | None:
+    return None if value is None else f"{value:.2f}"
