@@ -140,13 +140,18 @@ def _ordered(
     cursor: str | None,
 ) -> Select[Run]:
     by = column.desc() if descending else column.asc()
-    query = query.order_by(column.is_(None), by, Run.number)
+    if column is Run.number:  # never NULL and no two alike: plain, so that its index serves
+        query = query.order_by(by)
+    else:
+        query = query.order_by(column.is_(None), by, Run.number)
     if cursor is None:
         return query
     value, number = _position(cursor)
     if value is None:
         return query.where(column.is_(None), Run.number > number)
     beyond = column < value if descending else column > value
+    if column is Run.number:
+        return query.where(beyond)
     beside = (column == value) & (Run.number > number)
     return query.where(or_(beyond, beside, column.is_(None)))
 
