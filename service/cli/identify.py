@@ -140,7 +140,7 @@ def read(path: Path, reading: Reading) -> "Recording":
 
 def tell(model: "Model", found: "Identification", seconds: float, json_file: str | None) -> None:
     """Print the estimates, or write the result as JSON, or both."""
-    from service.dispatch.results import result_document
+    from service.result_document import result_document
 
     document = result_document(found, seconds)
     if json_file == "-":
