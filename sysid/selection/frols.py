@@ -3,9 +3,9 @@
 The selection is that of Chen, Billings and Luo (1989): each step takes the term whose part
 orthogonal to those already taken explains most of what is left of the output, and its
 error-reduction ratio is that share. A forward choice cannot be taken back, and past values of a
-smooth signal look alike, so that an early choice may stand for several true terms. So by
-exchange: each taken term in turn gives way to the one that explains most in its stead, until
-none does better.
+smooth signal look alike, so that an early choice may stand for several true terms. Hence, with
+`exchange`, more terms than wanted are taken and those that are needed least given back; and each
+term in turn gives way to the one that explains most in its stead, until none does better.
 """
 
 from collections.abc import Sequence
@@ -20,6 +20,8 @@ _DEPENDENT = 1e-20  # of a column's squares: less is rounding, the column depend
 _EXPLAINED = 1e-24  # of the output's squares: less is rounding, nothing is left to explain
 _GAIN = 1e-6  # of what is unexplained: an exchange that gains less is not made
 _ROUNDS = 20
+_MOST_BACKWARD = 120  # terms from which some are given back
+_OPERATIONS = 4e9  # of all exchanges together, about
 
 
 class Forward(NamedTuple):
@@ -104,7 +106,8 @@ def exchanged(triangle: FloatArray, order: Sequence[int]) -> tuple[int, ...]:
     least = _left_over(triangle, chosen)
     squares = np.sum(np.square(triangle[:, :-1]), axis=0)
     floor = _EXPLAINED * float(triangle[:, -1] @ triangle[:, -1])
-    for _ in range(_ROUNDS):
+    one_round = 4 * max(len(chosen), 1) ** 2 * triangle.shape[1] ** 2
+    for _ in range(min(_ROUNDS, int(_OPERATIONS / one_round))):
         before = least
         for place in range(len(chosen)):
             others = chosen[:place] + chosen[place + 1 :]
@@ -157,20 +160,50 @@ def solved(triangle: FloatArray, taken: Sequence[int], ridge: float = 0.0) -> Fl
     return found
 
 
-def count_by_bic(found: Forward, samples: int) -> int:
-    """Number of terms with the least n ln(S / n) + k ln n, S the squares left with k terms."""
-    counts = np.arange(1, len(found.left) + 1)
-    shares = np.maximum(np.array(found.left), _EXPLAINED)
-    values = samples * np.log(shares) + counts * np.log(max(samples, 1))
-    return int(np.argmin(values)) + 1 if counts.size else 0
+def backward(triangle: FloatArray, order: Sequence[int]) -> dict[int, tuple[int, ...]]:
+    """Of each number of terms a set: from all of `order`, the least needed given back in turn.
+
+    Giving back term i leaves aᵢ² / (G⁻¹)ᵢᵢ more, G the inner products of the terms.
+    """
+    taken = list(order)
+    found = {len(taken): tuple(taken)}
+    while len(taken) > 1:
+        basis, upper = np.linalg.qr(triangle[:, taken])
+        inverse = np.linalg.pinv(upper)
+        solution = inverse @ (basis.T @ triangle[:, -1])
+        spread = np.sum(np.square(inverse), axis=1)
+        taken.pop(int(np.argmin(np.square(solution) / np.where(spread > 0, spread, 1.0))))
+        found[len(taken)] = tuple(taken)
+    return found
 
 
 def select(triangle: FloatArray, rule: TermRule, samples: int) -> Forward:
     """The terms by a rule, in the order in which they explain most."""
-    found = forward(triangle, rule.keep, rule.err)
-    if rule.criterion == "bic":
-        found = found.first(count_by_bic(found, samples))
     if not rule.exchange:
-        return found
-    chosen = exchanged(triangle, found.order)
-    return forward(triangle, len(chosen), among=chosen)
+        found = forward(triangle, rule.keep, rule.err)
+        return found.first(_number(found.left, rule, samples))
+    taken = forward(triangle, min(2 * rule.keep + 2, max(rule.keep, _MOST_BACKWARD))).order
+    given_back = backward(triangle, taken) if len(taken) <= _MOST_BACKWARD else {}
+    sets = [
+        [taken[:k], given_back.get(k, taken[:k])] for k in range(1, min(rule.keep, len(taken)) + 1)
+    ]
+    whole = float(triangle[:, -1] @ triangle[:, -1])
+    left = [min(_left_over(triangle, one) for one in pair) / whole for pair in sets]
+    number = _number(left, rule, samples)
+    better = [exchanged(triangle, one) for one in sets[number - 1]] if number else [()]
+    best = min(better, key=lambda one: _left_over(triangle, one))
+    return forward(triangle, number, among=best)
+
+
+def _number(left: Sequence[float], rule: TermRule, samples: int) -> int:
+    """How many terms a rule asks for; `left`: the share unexplained with 1, 2, … terms.
+
+    ``bic``: as many as have the least n ln(S / n) + k ln n, S the squares left with k terms.
+    """
+    enough = [k for k, share in enumerate(left, 1) if share < max(_EXPLAINED, rule.err or 0.0)]
+    number = min(enough, default=len(left))
+    if rule.criterion == "none" or number == 0:
+        return number
+    shares = np.maximum(np.array(left[:number]), _EXPLAINED)
+    values = samples * np.log(shares) + np.arange(1, number + 1) * np.log(max(samples, 1))
+    return int(np.argmin(values)) + 1

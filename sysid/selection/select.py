@@ -5,6 +5,7 @@ from dataclasses import replace
 from math import prod
 from typing import Any
 
+from sysid.errors import InvalidSettings
 from sysid.models.model import Model
 from sysid.models.polynomial import check_samples
 from sysid.models.spec import with_terms
@@ -48,7 +49,7 @@ def selected(
     Raises
     ------
     InvalidSettings
-        If the records have fewer samples than there are candidates.
+        If the records have fewer samples than there are candidates, or nothing to explain.
     InvalidRecord, RecordTooShort, InvalidBounds
         If a record does not have what the model needs, or a change cannot be used.
     """
@@ -93,6 +94,12 @@ def _found(
     triangle, samples = regression.triangle(model.terms, lags)
     check_samples(len(model.terms), samples)
     found = select(triangle, rule, samples)
+    if not found.order:
+        raise InvalidSettings(
+            "/model/terms",
+            "the output, or every candidate, is zero where it is scored; there is nothing to "
+            "explain, so no term can be selected",
+        )
     return found, lags, solved(triangle, found.order).tolist(), samples
 
 
