@@ -22,6 +22,7 @@ from sysid.language.lags import past_values
 from sysid.models.initial import initial_parameters
 from sysid.models.lags import check_lags
 from sysid.models.model import Model
+from sysid.models.polynomial import check_samples
 from sysid.parameters import Parameter, override
 from sysid.ties import tied_model, ties_of
 
@@ -74,6 +75,8 @@ class JobChecker:
         ties = _tried(ties_of, found, model[0], parameters or model[0].parameters)
         tied = tied_model(model[0], ties or {})
         _tried(check_lags, found, tied, own)
+        if model[0].rule is not None:
+            _tried(check_samples, found, len(model[0].terms), self._samples(body))
         found += self._repeated(body)
         found += self._data(body, tied, own)
         return found + list(_signal_faults(body, model[0]))
@@ -136,6 +139,13 @@ class JobChecker:
             if isinstance(one, Dataset)
         )  # fmt: skip
         return (*model.parameters, *initial_parameters(model, pieces))
+
+    def _samples(self, body: Body) -> int:
+        """Samples of all datasets for the estimate together; a dataset that is missing has many."""
+        found = [self.dataset(reference) for reference in body["datasets"]]
+        if not all(isinstance(one, Dataset) for one in found):
+            return MOST_GENES
+        return sum(one.n_samples for one in found if isinstance(one, Dataset))
 
     def _conversions(self, body: Body) -> Iterator[FieldError]:
         found: list[FieldError] = []

@@ -1,0 +1,179 @@
+"""Polynomials whose search begins with least squares one step ahead: the whole way."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.identify import identify
+from sysid.models.library import load_model
+from sysid.models.model import Model
+from sysid.models.spec import parse_model
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+from sysid.result import Identification
+from sysid.run import begin
+from sysid.selection import equation_error_starts
+from sysid.settings import GeneticAlgorithm, IslandChange, Stop
+from sysid.simulation import simulate
+from tests.polynomials import LAGGED, TRUTH, document, frols, lagged, record_of
+
+NARX = {
+    "a[y(k-1)]": 0.5, "a[y(k-1-dh)]": -0.2, "a[u(k-1)]": 0.6, "a[u(k-1-dk)]": 0.3,
+    "a[y(k-1)**2]": -0.1, "a[y(k-1)*u(k-1)]": 0.15, "a[y(k-1-dh)*u(k-1-dk)]": -0.1,
+    "a[u(k-1-dk)**2]": 0.2,
+}  # fmt: skip
+SMALL = GeneticAlgorithm(generations=40)
+
+
+def narx_record(dh: float, dk: float, noise: float = 0.0, samples: int = 500) -> Record:
+    """The catalogue model's free run from an input that is random in each sample."""
+    model = load_model("narx")
+    rng = np.random.default_rng(3)
+    times = 0.1 * np.arange(samples)
+    source = Channel("u", times, rng.uniform(-1.0, 1.0, samples))
+    values = {one.name: 0.0 for one in model.parameters} | NARX | {"dh": dh, "dk": dk, "y(0)": 0.0}
+    clean = simulate(model, [source], values, times=times).channel("y").values
+    return Record((source,), (Channel("y", times, clean + noise * rng.standard_normal(samples)),))
+
+
+def values(found: Identification) -> dict[str, float]:
+    return {one.name: one.value for one in found.estimates}
+
+
+def problem(record: Record, **fields: Any) -> Problem:
+    return Problem.build(load_model("narx"), [record], **fields)
+
+
+@pytest.mark.parametrize(("dh", "dk"), [(3.0, 7.0), (4.3, 12.6), (1.5, 30.2)])
+def test_all_coefficients_and_both_lags_of_the_catalogue_model_are_recovered(
+    dh: float, dk: float
+) -> None:
+    model = load_model("narx")
+    truth = {one.name: 0.0 for one in model.parameters} | NARX | {"dh": dh, "dk": dk}
+    found = identify(model, narx_record(dh, dk))
+    assert values(found) == pytest.approx(truth, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_with_measurement_noise_they_are_recovered_within_their_errors() -> None:
+    model = load_model("narx")
+    truth = {one.name: 0.0 for one in model.parameters} | NARX | {"dh": 3.4, "dk": 7.7}
+    found = identify(model, narx_record(3.4, 7.7, noise=0.05))
+    assert found.rms == pytest.approx(0.05, rel=0.1)
+    far = [
+        one.name
+        for one in found.estimates
+        if one.stderr is None or abs(one.value - truth[one.name]) > 4 * one.stderr
+    ]
+    assert far == []
+
+
+def test_the_starts_hold_the_solution_of_data_without_noise() -> None:
+    posed = problem(narx_record(3.0, 7.0))
+    starts = equation_error_starts(posed, GeneticAlgorithm())
+    assert starts.values[0] == pytest.approx(
+        {one.name: 0.0 for one in posed.space} | NARX | {"dh": 3.0, "dk": 7.0}, abs=1e-9
+    )
+
+
+def fitness(posed: Problem, start: Any) -> float:
+    theta = np.array([[start[one.name] for one in posed.space]])
+    return float(posed.fitness(theta)[0])
+
+
+def test_starts_come_best_first_inside_the_bounds_and_finite() -> None:
+    changes = {"a[u(k-1)]": {"lower": -0.1, "upper": 0.1}, "dk": {"upper": 5}}
+    posed = problem(narx_record(3.0, 7.0, noise=0.1), parameters=changes)
+    starts = equation_error_starts(posed, GeneticAlgorithm()).values
+    reached = [fitness(posed, start) for start in starts]
+    assert reached == sorted(reached)
+    assert np.isfinite(reached[-1])
+    for start in starts:
+        assert all(one.lower <= start[one.name] <= one.upper for one in posed.space)
+
+
+def test_simulated_past_values_take_away_the_bias_of_noisy_ones() -> None:
+    """One step ahead, noise pulls the coefficients of the past output towards zero."""
+    record = record_of(TRUTH, samples=3000, noise=0.2)
+    posed = Problem.build(parse_model(document(list(TRUTH))), [record])
+    best = equation_error_starts(posed, GeneticAlgorithm()).values[0]
+    assert best["a[y(k-1)]"] == pytest.approx(TRUTH["y(k-1)"], abs=0.05)
+    assert best["a[y(k-2)]"] == pytest.approx(TRUTH["y(k-2)"], abs=0.05)
+
+
+def test_a_fixed_coefficient_is_kept_and_the_others_are_solved_for() -> None:
+    changes = {"a[y(k-1)]": {"fixed": TRUTH["y(k-1)"]}}
+    record = record_of(TRUTH)
+    posed = Problem.build(parse_model(document(list(TRUTH))), [record], parameters=changes)
+    best = equation_error_starts(posed, GeneticAlgorithm()).values[0]
+    rest = {f"a[{term}]": value for term, value in TRUTH.items() if term != "y(k-1)"}
+    assert best == pytest.approx(rest, abs=1e-9)
+
+
+@pytest.mark.parametrize("method", ["simple", "improved-paper"])
+def test_the_methods_of_the_paper_begin_without_starts(method: Any) -> None:
+    posed = problem(narx_record(3.0, 7.0))
+    algorithm = GeneticAlgorithm(method=method)
+    assert equation_error_starts(posed, algorithm).values == ()
+    islands = (IslandChange(method=method), IslandChange(method="improved"))
+    mixed = GeneticAlgorithm(islands=islands)
+    other = GeneticAlgorithm(islands=(IslandChange(method=method), IslandChange(method=method)))
+    one, two = begin(posed, mixed, 1).islands
+    alone = begin(posed, other, 1).islands
+    assert np.array_equal(one.words, alone[0].words)
+    assert not np.array_equal(two.words, alone[1].words)
+
+
+def test_a_model_that_is_no_polynomial_has_no_starts() -> None:
+    recursion = replace(load_model("narx"), form="difference")
+    posed = Problem.build(recursion, [narx_record(3.0, 7.0)])
+    assert equation_error_starts(posed, GeneticAlgorithm()).values == ()
+
+
+@pytest.mark.parametrize("evaluations", [100, 1000])
+def test_simulations_of_the_starts_count(evaluations: int) -> None:
+    algorithm = GeneticAlgorithm(stop=Stop(evaluations=evaluations))
+    posed = problem(narx_record(3.0, 7.0, noise=0.05))
+    starts = equation_error_starts(posed, algorithm)
+    assert 0 < starts.evaluations <= evaluations // 4
+    assert begin(posed, algorithm, 1).evaluations == starts.evaluations
+    found = identify(posed.model, posed.records, algorithm)
+    assert found.evaluations <= evaluations
+
+
+def selecting(**changes: Any) -> Model:
+    return parse_model(lagged(frols(5), **changes))
+
+
+def test_selected_terms_are_told_with_the_result_and_searched_with_their_lags() -> None:
+    found = identify(selecting(), record_of(LAGGED, lags={"dh": 2.4, "dk": 5.6}), SMALL)
+    assert {one.term for one in found.selection} == set(LAGGED)
+    truth = {f"a[{term}]": value for term, value in LAGGED.items()} | {"dh": 2.4, "dk": 5.6}
+    assert values(found) == pytest.approx(truth, abs=1e-5)
+    cumulated = np.cumsum([one.err for one in found.selection])
+    assert [one.cumulated for one in found.selection] == pytest.approx(list(cumulated))
+
+
+def test_a_model_without_a_selection_tells_none() -> None:
+    record = record_of(TRUTH)
+    assert identify(parse_model(document(list(TRUTH))), record, SMALL).selection == ()
+
+
+def test_terms_are_selected_on_the_part_for_estimation_only() -> None:
+    record = record_of(TRUTH)
+    values = record.outputs[0].values.copy()
+    values[320:] = 100.0  # nonsense in the part for validation
+    broken = replace(record, outputs=(replace(record.outputs[0], values=values),))
+    model = parse_model(document(frols(5)))
+    found = identify(model, broken, SMALL, validation_fraction=0.2)
+    assert {one.term for one in found.selection} == set(TRUTH)
+    assert found.rms == pytest.approx(0.0, abs=1e-6)
+
+
+def test_the_same_selection_repeats_bit_for_bit() -> None:
+    record = record_of(LAGGED, lags={"dh": 2.4, "dk": 5.6}, noise=0.05)
+    one, other = (identify(selecting(), record, SMALL) for _ in range(2))
+    assert one.selection == other.selection
+    assert values(one) == values(other)
