@@ -33,6 +33,7 @@ _LARGEST_SHARE = 0.05  # a threshold above this part of the excursion tells no o
 _TOLERANCE = 0.01  # of the range: a signal at rest stays within it
 _NOTABLE = 0.1  # of the input's range: a step that counts
 _REST = 10  # samples at least
+_LAST = 0.25  # of a rest: the part from which the level is taken
 _CREEP = 0.5  # of the threshold: what still moves so far by itself is not at rest
 _STAYS = 3  # samples beyond the threshold that make an onset
 
@@ -138,7 +139,7 @@ def _onset(
     times: FloatArray, values: FloatArray, event: _Event, noise: float, *, held: bool
 ) -> _Onset | None:
     """When a signal leaves the level at which it rests before an event; None if not clear."""
-    before = _span(times, max(event.rest, 0.5 * (event.rest + event.leaves)), event.leaves)
+    before = _span(times, event.leaves - _LAST * (event.leaves - event.rest), event.leaves)
     after = _span(times, event.leaves, event.until)
     if before.stop - before.start < _REST // 2 or after.stop - after.start < _STAYS:
         return None

@@ -1,0 +1,33 @@
+"""Jobs that are carried out in this process: queue, workers' code and ledger, without Ray."""
+
+from datetime import timedelta
+from typing import Any
+
+from service import jobs
+from service.api.deps import Parts
+from service.dispatch.preparing import JobRuns
+from service.dispatch.recording import Recorder
+from service.schemas_jobs import JobIn
+from service.storage.queue import Queue
+from service.storage.runs import RunRepository
+from workers.feeding import Feeder
+from workers.inline import InlineCrew
+
+
+def identified(parts: Parts, body: dict[str, Any], steps: int = 5000) -> tuple[str, list[str]]:
+    """Submit a job and carry it out; gives its id and those of its runs."""
+    with parts.database.write() as session:
+        job = jobs.submit(session, JobIn.model_validate(body), parts.settings).job.id
+        claim = Queue(session).claim("test", timedelta(hours=1))
+    assert claim is not None
+    assert claim.job.id == job
+    source = JobRuns(parts.database, claim, parts.store)
+    recorder = Recorder(parts.database, claim, source.save)
+    feeder: Feeder[str] = Feeder(InlineCrew())
+    feeder.add(job, source, recorder)
+    for _ in range(steps):
+        if feeder.step(0.05):
+            recorder.finish()
+            break
+    with parts.database.read() as session:
+        return job, [run.id for run in RunRepository(session).page(job, limit=100).items]

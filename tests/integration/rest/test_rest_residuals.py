@@ -1,0 +1,169 @@
+"""Residual tests, onset delays and comparisons of runs that were identified, over REST."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from service.api.deps import Parts
+from service.app import create_app
+from service.client import Client
+from service.storage.errors import ObjectMissing
+from service.storage.objects import ObjectStore
+from sysid.records import Recording
+from tests.identified import identified
+from tests.integration.rest.test_client import Through
+from tests.rest import CSV, refused, settings_of
+
+N, STEP, NOISE = 500, 0.05, 0.02
+SMALL = {"population": 20, "generations": 40, "islands": 1}
+BOUNDS = {"K": {"lower": 0, "upper": 5}, "L": {"upper": 2}}
+
+
+class Served(NamedTuple):
+    """An application with a job of two models on the same data, and one on other data."""
+
+    server: TestClient
+    parts: Parts
+    dataset: str
+    runs: list[str]
+    other: str
+
+
+def recording(seed: int) -> bytes:
+    """CSV of two equal lags behind a dead time of 0.4 s, with white noise."""
+    draw = np.random.default_rng(seed)
+    u = np.repeat(draw.choice([0.0, 1.0], N // 50), 50)
+    u[:50], u[50:100] = 0.0, 1.0
+    x, y = 0.0, np.zeros(N)
+    for k in range(1, N):
+        delayed = u[k - 9] if k >= 9 else 0.0
+        before = y[k - 1]
+        y[k] = before + STEP * (x - before) / 0.3
+        x += STEP * (2 * delayed - x) / 0.3
+    y += draw.normal(0, NOISE, N)
+    rows = ["t,u,y", *(f"{k * STEP:.6g},{a:.6g},{b:.6g}" for k, (a, b) in enumerate(zip(u, y)))]  # noqa: B905
+    return "\n".join(rows).encode()
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    app = create_app(settings_of(tmp_path_factory.mktemp("residuals")))
+    with TestClient(app) as server:
+        data = [
+            server.post(f"/v1/datasets?name=d{k}", content=recording(k), headers=CSV).json()["id"]
+            for k in (1, 2)
+        ]
+        parts = server.app.state.parts  # type: ignore[attr-defined]
+        body = {
+            "model": "fopdt", "datasets": data[:1], "hold": {"u": "zero"}, "algorithm": SMALL,
+            "parameters": BOUNDS, "validation": {"fraction": 0.3},
+        }  # fmt: skip
+        models = {"axes": [{"path": "/model", "values": ["fopdt", "sopdt"]}]}
+        _, runs = identified(parts, {**body, "sweep": models})
+        _, other = identified(parts, {**body, "datasets": data[1:]})
+        yield Served(server, parts, data[0], runs, other[0])
+
+
+def result(served: Served, run: str) -> dict[str, Any]:
+    document: dict[str, Any] = served.server.get(f"/v1/runs/{run}").json()
+    assert document["state"] == "succeeded", document["error"]
+    return document
+
+
+def test_functions_that_are_asked_for_have_the_verdicts_that_were_stored(served: Served) -> None:
+    for run in served.runs:
+        stored = result(served, run)["residual_tests"]
+        asked = served.server.get(f"/v1/runs/{run}/residuals").json()
+        assert asked["passed"] == stored["passed"]
+        assert asked["data"] == stored["data"] == "validation"
+        assert asked["note"] == ""
+        for one, kept in zip(asked["tests"], stored["tests"], strict=True):
+            assert {name: one[name] for name in kept if name not in ("statistic", "p")} == {
+                name: value for name, value in kept.items() if name not in ("statistic", "p")
+            }
+            assert one["statistic"] == pytest.approx(kept["statistic"], rel=1e-9)
+            assert one["p"] == pytest.approx(kept["p"], rel=1e-6, abs=1e-12)
+            assert len(one["lags"]) == len(one["values"]) == len(one["band99"])
+
+
+def test_the_true_structure_passes_and_a_simpler_one_fails(served: Served) -> None:
+    fopdt, sopdt = (result(served, run)["residual_tests"] for run in served.runs)
+    assert fopdt["passed"] is False
+    assert sopdt["passed"] is True
+
+
+def test_the_onset_delay_is_that_of_the_measurement_whatever_the_model(served: Served) -> None:
+    first, second = (result(served, run)["onset_delays"] for run in served.runs)
+    assert first == second
+    assert first[0]["output"] == "y"
+    assert first[0]["unit"] == "s"
+    assert 0.4 < first[0]["delay"] < 0.6  # behind the dead time two lags hesitate
+
+
+def test_a_run_without_signals_has_no_residuals(served: Served) -> None:
+    body = {"model": "fopdt", "datasets": [served.dataset]}
+    job = served.server.post("/v1/jobs", json=body).json()["id"]
+    run = served.server.get(f"/v1/jobs/{job}/runs").json()["items"][0]["id"]
+    refused(served.server.get(f"/v1/runs/{run}/residuals"), 404, "not-found")
+    faults = refused(
+        served.server.post("/v1/runs:compare", json={"runs": [run, served.runs[0]]}),
+        422, "invalid",
+    )  # fmt: skip
+    assert faults[0]["pointer"] == "/runs/0"
+    assert "queued" in faults[0]["detail"]
+
+
+def test_a_comparison_has_the_better_model_first_and_flags_what_depends_on_it(
+    served: Served,
+) -> None:
+    client = Client("http://testserver", transport=Through(served.server))
+    found = client.compare(*served.runs)
+    assert [one["model"] for one in found["runs"]] == ["sopdt", "fopdt"]
+    better, worse = found["runs"]
+    assert better["rms"] < worse["rms"]
+    assert better["bic"] < worse["bic"]
+    assert better["samples"] == worse["samples"] == 350
+    assert better["residuals_passed"] is True
+    lag = next(one for one in found["parameters"] if one["name"] == "L")
+    assert lag["differs"]
+    assert any(note.startswith("L depends on the model: ") for note in found["notes"])
+    assert client.residuals(served.runs[0])["id"] == served.runs[0]
+
+
+def test_runs_on_other_data_do_not_compare(served: Served) -> None:
+    answer = served.server.post("/v1/runs:compare", json={"runs": [served.runs[0], served.other]})
+    faults = refused(answer, 422, "invalid")
+    assert faults[0]["pointer"] == "/runs/1"
+    assert "other datasets" in faults[0]["detail"]
+
+
+@pytest.mark.parametrize(
+    ("runs", "expected"),
+    [(["run_x", "run_y"], "run_x"), (["a"], "at least 2"), ([], "at least 2")],
+)
+def test_a_comparison_of_nothing_is_refused(
+    served: Served, runs: list[str], expected: str
+) -> None:  # fmt: skip
+    faults = refused(served.server.post("/v1/runs:compare", json={"runs": runs}), 422, "invalid")
+    assert expected in faults[0]["detail"]
+
+
+def test_a_run_is_not_compared_with_itself(served: Served) -> None:
+    twice = [served.runs[0], served.runs[0]]
+    faults = refused(served.server.post("/v1/runs:compare", json={"runs": twice}), 422, "invalid")
+    assert "named twice" in faults[0]["detail"]
+
+
+def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lost(store: ObjectStore, sha256: str) -> Recording:
+        raise ObjectMissing(sha256)
+
+    monkeypatch.setattr("service.residuals.recording_of", lost)
+    asked = served.server.get(f"/v1/runs/{served.runs[0]}/residuals").json()
+    assert [one["test"] for one in asked["tests"]] == ["whiteness"]
+    assert "not to be had any more" in asked["note"]

@@ -1,0 +1,133 @@
+"""The onset delay: read from the measurement, against systems whose delay is known."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.signals.csv_reader import read_csv
+from sysid.models.library import load_model
+from sysid.onset import OnsetDelay, onset_delays
+from sysid.records import Channel, Hold, Record
+from sysid.types import FloatArray
+
+STEP, HOLD = 0.01, 300
+LEVELS = np.array([0.0, 1.0, 0.4, 0.9, 0.1, 0.6])
+K, T, L = 2.0, 0.35, 0.127
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("LAGID_DATA", ROOT.parent / "shared" / "data"))
+
+
+def response(times: FloatArray, delay: float = L) -> FloatArray:
+    """Exact response of a first-order system behind a delay to the steps of `LEVELS`."""
+    y = np.zeros(times.size)
+    before = 0.0
+    for number, level in enumerate(LEVELS):
+        begins = number * HOLD * STEP + delay
+        y += K * (level - before) * np.where(times < begins, 0, 1 - np.exp(-(times - begins) / T))
+        before = level
+    return y
+
+
+TIMES = np.arange(LEVELS.size * HOLD) * STEP
+EXPECTED = L - T * np.log(1 - 0.02)  # 2 % of a first-order response come so much later
+
+
+def delays(
+    u: FloatArray, y: FloatArray, *, times: FloatArray = TIMES, hold: Hold = "zero",
+    others: tuple[Channel, ...] = (),
+) -> OnsetDelay:  # fmt: skip
+    record = Record((Channel("u", TIMES[: u.size], u, hold=hold), *others),
+                    (Channel("y", times, y),))  # fmt: skip
+    return onset_delays(load_model("fopdt"), (record,))[0]
+
+
+def steps() -> FloatArray:
+    return np.repeat(LEVELS, HOLD)
+
+
+def test_without_noise_it_is_the_delay_and_two_per_cent_of_the_rise() -> None:
+    found = delays(steps(), response(TIMES))
+    assert found.delay == pytest.approx(EXPECTED, abs=0.002)
+    assert found.events == LEVELS.size - 1
+    assert found.threshold == 0.02
+    assert found.spread is not None
+    assert found.spread < 0.003
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_with_noise_it_is_a_few_samples_off_at_most(seed: int) -> None:
+    noise = 0.005 * np.random.default_rng(seed).normal(size=TIMES.size)
+    found = delays(steps(), response(TIMES) + noise)
+    assert found.delay == pytest.approx(EXPECTED, abs=0.02)
+    assert found.threshold is not None
+    assert found.threshold >= 0.02
+
+
+def test_a_later_output_has_a_delay_that_is_longer_by_as_much() -> None:
+    first, later = (delays(steps(), response(TIMES, lag)).delay for lag in (0.1, 0.35))
+    assert first is not None
+    assert later == pytest.approx(first + 0.25, abs=0.003)
+
+
+def test_a_ramp_of_the_input_is_not_counted_as_delay() -> None:
+    ramp = np.interp(TIMES, [1.0, 1.4], [0.0, 1.0])
+    late = np.interp(TIMES - 0.3, [1.0, 1.4], [0.0, 1.0])
+    assert delays(ramp, late, hold="first").delay == pytest.approx(0.3, abs=0.002)
+
+
+def test_missing_and_irregular_samples_of_the_output_do_no_harm() -> None:
+    draw = np.random.default_rng(1)
+    times = np.sort(draw.uniform(0, TIMES[-1], TIMES.size))
+    y = response(times)
+    y[draw.random(times.size) < 0.1] = np.nan
+    assert delays(steps(), y, times=times).delay == pytest.approx(EXPECTED, abs=0.02)
+
+
+def test_the_unit_of_neither_signal_matters() -> None:
+    plain = delays(steps(), response(TIMES))
+    other = delays(1e5 * steps() + 3e5, -4e3 * response(TIMES) + 7.0)
+    assert other.delay == pytest.approx(plain.delay, abs=1e-9)
+    assert other.events == plain.events
+
+
+@pytest.mark.parametrize(
+    ("u", "y", "reason"),
+    [
+        (np.sin(TIMES), response(TIMES), "does not rest"),
+        (np.ones(TIMES.size), response(TIMES), "does not rest"),
+        (steps(), np.random.default_rng(0).normal(size=TIMES.size), "not clear"),
+        (steps(), 0.3 * TIMES + response(TIMES), "does not rest before any step"),
+        (steps(), np.zeros(TIMES.size), "not clear"),
+    ],
+    ids=["sine", "constant", "noise", "drift", "nothing"],
+)
+def test_what_has_no_clear_onset_says_why(u: FloatArray, y: FloatArray, reason: str) -> None:
+    found = delays(u, y)
+    assert found.delay is None
+    assert found.events == 0
+    assert reason in found.reason
+
+
+def test_steps_at_which_another_input_moves_too_do_not_count() -> None:
+    model = load_model("fopdt")
+    two = Channel("u", TIMES, steps(), hold="zero")
+    moving = Channel("other", TIMES, np.sin(9 * TIMES))
+    record = Record((two, moving), (Channel("y", TIMES, response(TIMES)),))
+    # The model has one input only: what else was recorded is no cause.
+    assert onset_delays(model, (record,))[0].delay is not None
+    assert len(onset_delays(model, (record,))) == 1
+
+
+@pytest.mark.data
+@pytest.mark.skipif(not DATA.is_dir(), reason="the measured records (LAGID_DATA) are absent")
+@pytest.mark.parametrize("length", [20, 40, 80])
+@pytest.mark.parametrize("pattern", [1, 2])
+def test_of_a_long_tube_it_is_about_3_46_ms_a_metre(length: int, pattern: int) -> None:
+    file = DATA / "tube_reference" / f"tube_{length:03d}m_pattern{pattern}.csv"
+    recording, _ = read_csv(file)
+    record = recording.record({"u": "P1_meas_Pa"}, {"y": "P2_meas_Pa"})
+    found = onset_delays(load_model("fopdt"), (record,))[0]
+    assert found.delay == pytest.approx(3.46e-3 * length, rel=0.1)
