@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from numpy.fft import irfft, rfft
 from scipy.special import gammaincc
 
 from sysid.problem import Problem
@@ -325,7 +325,7 @@ def _shifted(laid: _Laid, channel: Channel, lag: float) -> FloatArray:
 def _covariance(residual: FloatArray, present: BoolArray, columns: FloatArray) -> FloatArray:
     """Covariance of Σ e(i) u_a(i) over the noise e, given the columns u_a (n, N)."""
     n = residual.size
-    length = next_fast_len(2 * n, real=True)
+    length = 1 << (2 * n - 1).bit_length()
     raw = irfft(np.square(np.abs(rfft(residual, length))), length)[:n]
     pairs = np.rint(irfft(np.square(np.abs(rfft(present.astype(float), length))), length)[:n])
     autocovariance = raw / np.count_nonzero(present)
