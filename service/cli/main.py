@@ -10,6 +10,7 @@ from service.calls import ClientError
 from service.cli import datasets, jobs, models, runs, serving, upkeep
 from service.cli.common import err, out
 from service.cli.identify import identify
+from service.cli.paper import paper
 from service.errors import ServiceError
 
 app = typer.Typer(
@@ -24,6 +25,7 @@ app = typer.Typer(
 app.command()(serving.serve)
 app.command()(serving.dispatcher)
 app.command()(identify)
+app.command()(paper)
 app.command()(jobs.submit)
 app.command()(jobs.watch)
 app.command("jobs")(jobs.listing)

@@ -40,16 +40,16 @@ def job_report(session: Session, store: ObjectStore, job_id: str) -> str:
         sections=[
             (run_in_full(session, job, run), _figures(session, store, job, run)) for run in chosen
         ],
-        datasets=dataset_links(session, job), policy=policy(), style=_style(),
-        plotly_code=_plotly(), draw=_draw(),
-        templates=_json({"light": template("light"), "dark": template("dark")}),
+        datasets=dataset_links(session, job), policy=policy(), style=style(),
+        plotly_code=plotly(), draw=draw(),
+        templates=as_json({"light": template("light"), "dark": template("dark")}),
     )  # fmt: skip
 
 
 @cache
 def policy() -> str:
     """Content security policy: the two scripts of the report by their hashes, nothing from afar."""
-    hashes = " ".join(f"'sha256-{_hash(script)}'" for script in (_plotly(), _draw()))
+    hashes = " ".join(f"'sha256-{_hash(script)}'" for script in (plotly(), draw()))
     return (
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:"
     )
@@ -70,7 +70,7 @@ def _figures(
         ("What each island found", figures.waterfall(evidence)),
     ]
     return [
-        (title, figure["layout"]["height"], _json(_bare(figure)))
+        (title, figure["layout"]["height"], as_json(bare(figure)))
         for title, figure in made
         if any(_has_points(trace) for trace in figure["data"])
     ]
@@ -80,30 +80,33 @@ def _has_points(trace: dict[str, Any]) -> bool:
     return len(trace["x"]) > 0
 
 
-def _bare(figure: Figure) -> Figure:
+def bare(figure: Figure) -> Figure:
     """Without the template, which the report holds once for all its figures."""
     kept = {name: value for name, value in figure["layout"].items() if name != "template"}
     return {"data": figure["data"], "layout": kept}
 
 
-def _json(value: object) -> Markup:
+def as_json(value: object) -> Markup:
     """JSON inside a script element: no text in it can end the element."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
 @cache
-def _plotly() -> Markup:
+def plotly() -> Markup:
+    """The Plotly bundle as the content of a script element."""
     return _script(assets.plotly_file().read_text(encoding="utf-8"))
 
 
 @cache
-def _draw() -> Markup:
+def draw() -> Markup:
+    """What draws the figures, as the content of a script element."""
     return _script((assets.STATIC / "report.js").read_text(encoding="utf-8"))
 
 
 @cache
-def _style() -> Markup:
+def style() -> Markup:
+    """The sheet of pages and reports."""
     return Markup((assets.STATIC / "lagid.css").read_text(encoding="utf-8"))
 
 

@@ -1,0 +1,66 @@
+"""`lagid paper`: the paper's tables and figures made anew by jobs, as tables and one report."""
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated
+
+import typer
+
+from service.cli.common import Key, err, fail, out
+from service.client import Client
+from service.embedded import embedded_service
+
+
+def paper(
+    output: Annotated[Path, typer.Option(help="Where the report goes.")] = Path("paper.html"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer replicates; under a minute.")
+    ] = False,
+    only: Annotated[
+        str | None,
+        typer.Option(help="Parts, such as table1,figure15 (default: all).", show_default=False),
+    ] = None,
+    url: Annotated[
+        str | None,
+        typer.Option(help="A server that does the work; else one is started for it.",
+                     show_default=False),
+    ] = None,
+    key: Key = None,
+) -> None:  # fmt: skip
+    """Reproduce the paper's tables and figures with real jobs; print tables, write a report."""
+    from service.paper.bench import Bench
+    from service.paper.parts import markdown
+    from service.paper.report import page
+    from service.paper.study import chosen, conduct
+
+    names = chosen(only)
+    if not output.parent.is_dir():
+        fail(f"--output: there is no folder {output.parent}", 2)
+    start = time.monotonic()
+    sections = []
+    with _client(url, key) as client:
+        bench = Bench(client, quick, lambda text: err.print(f"… {text}", markup=False))
+        for section in conduct(bench, names):
+            sections.append(section)
+            out.print(markdown(section), markup=False, soft_wrap=True)
+    output.write_text(page(sections, quick=quick), encoding="utf-8")
+    out.print(f"report {output.resolve()} ({time.monotonic() - start:.0f} s)", soft_wrap=True)
+
+
+@contextmanager
+def _client(url: str | None, key: str | None) -> Iterator[Client]:
+    """A client of the given server, or of one that lives as long as the command."""
+    if url is not None:
+        with Client(url, key) as client:
+            yield client
+        return
+    with (
+        TemporaryDirectory(prefix="lagid-paper-") as folder,
+        embedded_service(Path(folder), cpus=os.cpu_count()) as own,
+        Client(own) as client,
+    ):
+        yield client

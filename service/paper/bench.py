@@ -1,0 +1,100 @@
+"""Submits the jobs of the study, waits for them, and reads what the figures need."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from service.client import Client
+from service.errors import ServiceError
+
+Document = Mapping[str, Any]
+METHODS = ("simple", "improved-paper", "improved")
+RESPONSE_POINTS = 700
+
+
+class StudyFailed(ServiceError):
+    """A job of the study did not succeed."""
+
+    def __init__(self, name: str, job: Document) -> None:
+        found = job.get("error") or f"{job['progress']['failed']} of its runs failed"
+        super().__init__(f"the job {name!r} ({job['id']}) {job['state']}: {found}")
+
+
+@dataclass(frozen=True, slots=True)
+class Improvement:
+    """A better champion of a whole archipelago."""
+
+    generation: int
+    rms: float
+    parameters: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One run: its result document, its champion's progress, its response."""
+
+    run: Document
+    progress: Sequence[Improvement]
+    response: Document
+
+    def value(self, name: str) -> float:
+        """An estimate."""
+        return float(self.parameter(name)["value"])
+
+    def stderr(self, name: str) -> float | None:
+        """Its standard error; None where there is none."""
+        found = self.parameter(name)["stderr"]
+        return None if found is None else float(found)
+
+    def parameter(self, name: str) -> Document:
+        """The entry of one parameter."""
+        return next(one for one in self.run["parameters"] if one["name"] == name)
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """The service that does the work. `quick` asks for smaller studies; `say` tells what is on."""
+
+    client: Client
+    quick: bool
+    say: Callable[[str], object]
+
+    def runs(self, body: Document) -> list[dict[str, Any]]:
+        """Submit one job and wait for its runs.
+
+        Raises
+        ------
+        StudyFailed
+            If the job or one of its runs failed.
+        """
+        name = str(body["name"])
+        self.say(name)
+        job = self.client.submit(body)
+        ended = self.client.wait(job["id"], poll=0.15)
+        if ended["state"] != "succeeded" or ended["progress"]["failed"]:
+            raise StudyFailed(name, ended)
+        return self.client.runs(job["id"])
+
+    def methods(self, body: Document) -> dict[str, Found]:
+        """One job that compares the three methods on one problem: method → what it found."""
+        axes = [{"path": "/algorithm/method", "values": list(METHODS)}]
+        runs = self.runs({**body, "sweep": {"axes": axes}})
+        return {run["cell"]["/algorithm/method"]: self.found(run) for run in runs}
+
+    def found(self, run: Document) -> Found:
+        """A run with its history and response."""
+        history = self.client.history(run["id"])
+        response = self.client.response(run["id"], max_points=RESPONSE_POINTS)
+        return Found(run, champions(history), response)
+
+
+def champions(history: Document) -> list[Improvement]:
+    """The best of all islands over the generations, from the history of each island."""
+    points = [one for island in history["islands"] for one in island]
+    kept: list[Improvement] = []
+    for point in sorted(points, key=lambda one: (one["generation"], -one["rms"])):
+        if kept and point["rms"] >= kept[-1].rms:
+            continue
+        values = dict(zip(history["names"], point["parameters"], strict=True))
+        kept.append(Improvement(point["generation"], point["rms"], values))
+    return kept

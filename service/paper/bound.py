@@ -1,0 +1,38 @@
+"""The Cramér–Rao bound of a model's parameters at their true values."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sysid.models.model import Model
+from sysid.records import Channel
+from sysid.simulation import simulate
+
+STEP = 1e-4
+
+
+def cramer_rao(
+    model: Model,
+    inputs: list[Channel],
+    true: Mapping[str, float],
+    sigma: float,
+    times: NDArray[np.float64],
+) -> dict[str, float]:
+    """Least standard deviation that an unbiased estimator can reach, parameter by parameter.
+
+    The square roots of the diagonal of σ²(SᵀS)⁻¹, S the central differences of the first output
+    by each parameter of `true`, for white Gaussian measurement noise of deviation `sigma`.
+    """
+
+    def output(name: str, shift: float) -> NDArray[np.float64]:
+        moved = {**true, name: true[name] + shift}
+        return np.asarray(simulate(model, inputs, moved, times=times).channels[0].values)
+
+    steps = {name: STEP * max(abs(value), 1e-6) for name, value in true.items()}
+    columns = [
+        (output(name, step) - output(name, -step)) / (2 * step) for name, step in steps.items()
+    ]
+    sensitivity = np.stack(columns, axis=1)
+    covariance = sigma**2 * np.linalg.inv(sensitivity.T @ sensitivity)
+    return dict(zip(true, np.sqrt(np.diag(covariance)).tolist(), strict=True))

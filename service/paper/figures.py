@@ -1,0 +1,117 @@
+"""Figures of the study that compare methods; their looks are those of `service.web.figures`."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from service.paper.bench import Found
+from service.web import theme
+from service.web.figures import Figure, finite, layout
+
+Line = dict[str, Any]
+_STYLES: Mapping[str, dict[str, Any]] = {
+    "simple": {"color": theme.VERMILLION, "dash": "dash", "width": 1.6},
+    "improved-paper": {"color": theme.PURPLE, "dash": "dashdot", "width": 1.6},
+    "improved": {"color": theme.BLUE, "dash": "solid", "width": 2},
+}
+HEIGHT = 320
+
+
+def style(method: str) -> dict[str, Any]:
+    """Colour and dash of a method, the same in every figure."""
+    return dict(_STYLES[method])
+
+
+def line(name: str, x: Sequence[float], y: Sequence[float | None], **looks: Any) -> Line:
+    """A line of a figure."""
+    values = finite(float("nan") if v is None else v for v in y)
+    return {"type": "scatter", "mode": "lines", "name": name, "x": finite(x), "y": values, **looks}
+
+
+def axis(title: str, **more: Any) -> dict[str, Any]:
+    """An axis with its title."""
+    return {"title": {"text": title}, **more}
+
+
+def chart(data: list[Line], x: str, y: str, **more: Any) -> Figure:
+    """One pair of axes."""
+    return {"data": data, "layout": layout(HEIGHT, **{"xaxis": axis(x), "yaxis": axis(y), **more})}
+
+
+def convergence(found: Mapping[str, Found], names: Sequence[str],
+                true: Mapping[str, float]) -> Figure:  # fmt: skip
+    """Champion's parameters over the generations, method by method, one plot a parameter."""
+    end = _end(found)
+    data: list[Line] = []
+    axes: dict[str, Any] = {}
+    width = 1 / len(names)
+    for number, name in enumerate(names):
+        tag = "" if number == 0 else str(number + 1)
+        place = {"xaxis": f"x{tag}", "yaxis": f"y{tag}", "showlegend": number == 0}
+        for method, one in found.items():
+            x = [float(point.generation) for point in one.progress]
+            y = [point.parameters[name] for point in one.progress]
+            looks = {**style(method), "shape": "hv"}
+            data.append(line(method, [*x, end], [*y, y[-1]], line=looks, **place))
+        if name in true:
+            level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
+            data.append(line("true value", [0, end], [true[name]] * 2, line=level, **place))
+        left = number * width + (0.04 if number else 0)
+        span = {"domain": [left, (number + 1) * width - (0.04 if number + 1 < len(names) else 0)]}
+        axes[f"xaxis{tag}"] = axis("generation", anchor=f"y{tag}", rangemode="tozero", **span)
+        unit = next(iter(found.values())).parameter(name)["unit"]
+        axes[f"yaxis{tag}"] = axis(_with_unit(name, unit), anchor=f"x{tag}")
+    return {"data": data, "layout": layout(HEIGHT, **axes)}
+
+
+def rms_history(found: Mapping[str, Found], unit: str, floor: float | None = None) -> Figure:
+    """RMS of the champion over the generations, method by method, and the noise's deviation."""
+    end = _end(found)
+    data = []
+    for method, one in found.items():
+        x = [float(point.generation) for point in one.progress]
+        y = [point.rms for point in one.progress]
+        looks = {**style(method), "shape": "hv"}
+        data.append(line(method, [*x, end], [*y, y[-1]], line=looks))
+    if floor is not None:
+        level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
+        data.append(line("noise", [0, end], [floor] * 2, line=level))
+    log = axis(f"RMS [{unit}]", type="log", exponentformat="e")
+    return chart(data, "generation", "", xaxis=axis("generation", rangemode="tozero"), yaxis=log)
+
+
+def responses(found: Mapping[str, Found], experiment: int = 0) -> Figure:
+    """The measured output and what each method's model gives."""
+    first = next(iter(found.values())).response["experiments"][experiment]["measured"][0]
+    dots = {"mode": "markers", "marker": {"color": theme.GREY, "size": 4}}
+    data = [line("measured", first["times"], first["values"], **dots)]
+    for method, one in found.items():
+        series = one.response["experiments"][experiment]["simulated"][0]
+        data.append(line(method, series["times"], series["values"], line=style(method)))
+    return chart(data, "time [s]", _with_unit(first["name"], first["unit"]))
+
+
+def band(x: Sequence[float], lower: Sequence[float], upper: Sequence[float], method: str) -> Line:
+    """The area between two lines, in the method's colour."""
+    colour = theme.SHADE if method == "" else _faint(style(method)["color"])
+    around = [*x, *reversed(x)], [*upper, *reversed(lower)]
+    return line("", *around, fill="toself", fillcolor=colour, line={"width": 0},
+                hoverinfo="skip", showlegend=False)  # fmt: skip
+
+
+def points(name: str, x: Sequence[float], y: Sequence[float], method: str) -> Line:
+    """Single runs of a method."""
+    marker = {"color": style(method)["color"], "size": 4, "opacity": 0.45}
+    return line(name, x, y, mode="markers", marker=marker, showlegend=False)
+
+
+def _faint(colour: str) -> str:
+    red, green, blue = (int(colour[n : n + 2], 16) for n in (1, 3, 5))
+    return f"rgba({red},{green},{blue},0.16)"
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return name if unit == "1" else f"{name} [{unit}]"
+
+
+def _end(found: Mapping[str, Found]) -> float:
+    return float(max(one.run["generations"] for one in found.values()))

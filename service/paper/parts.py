@@ -1,0 +1,80 @@
+"""What a report is made of: tables, figures and text, as plain values."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows of text under headings; the first column names the rows."""
+
+    title: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """A figure and its caption: what the paper shows, what ours shows."""
+
+    title: str
+    figure: Mapping[str, Any]
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """A statement that the study was to bear out, and whether it did."""
+
+    text: str
+    holds: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One part of the study. `skipped` says why there is nothing in it."""
+
+    title: str
+    text: str = ""
+    tables: Sequence[Table] = ()
+    plots: Sequence[Plot] = ()
+    checks: Sequence[Check] = ()
+    skipped: str = ""
+    links: Sequence[str] = field(default=())
+
+
+def markdown(section: Section) -> str:
+    """The tables and statements of a section for the terminal; figures are in the report."""
+    blocks = [f"## {section.title}"]
+    if section.skipped:
+        blocks.append(f"skipped: {section.skipped}")
+    if section.text:
+        blocks.append(section.text)
+    for table in section.tables:
+        blocks += [f"**{table.title}**", _rows(table)]
+        if table.note:
+            blocks.append(table.note)
+    if section.checks:
+        blocks.append("\n".join(f"- {verdict(one)}: {one.text}" for one in section.checks))
+    return "\n\n".join(blocks) + "\n"
+
+
+def verdict(check: Check) -> str:
+    """How a check is announced."""
+    return "holds" if check.holds else "does NOT hold"
+
+
+def _rows(table: Table) -> str:
+    cells = [list(table.headings), *[list(row) for row in table.rows]]
+    cells = [[cell.replace("|", "\\|") for cell in row] for row in cells]
+    widths = [max(3, *(len(row[n]) for row in cells)) for n in range(len(table.headings))]
+    marks = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
+    lines = [cells[0], marks, *cells[1:]]
+    return "\n".join(f"| {' | '.join(_set(line, widths))} |" for line in lines)
+
+
+def _set(line: Sequence[str], widths: Sequence[int]) -> list[str]:
+    first, *rest = zip(line, widths, strict=True)
+    return [first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in rest)]
