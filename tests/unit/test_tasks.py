@@ -5,8 +5,13 @@ from dataclasses import replace
 import pytest
 
 import workers.tasks
-from tests.runs import RECORDS, spec
-from workers.ports import Advance, Concluded, Failure
+from sysid.identify import identify
+from sysid.models.spec import parse_model
+from sysid.settings import GeneticAlgorithm
+from tests.polynomials import frols, lagged
+from tests.runs import RECORDS, bits, carry_out, spec
+from workers.inline import InlineCrew
+from workers.ports import Advance, Concluded, Failure, ProblemSpec, RunSpec
 
 FAULTY_SEED = 13
 
@@ -48,3 +53,14 @@ def test_a_run_whose_model_diverges_everywhere_fails_with_that_message() -> None
     assert isinstance(done.outcome, Failure)
     assert "the model diverged for every one of" in done.outcome.reason
     assert "narrow the bounds" in done.outcome.reason
+
+
+def test_a_run_that_selects_terms_gives_the_bits_of_the_library_call() -> None:
+    asked = lagged(frols(4))
+    problem = ProblemSpec(model=asked, records="short", skip=3)
+    settings = GeneticAlgorithm(generations=10)
+    (result,) = carry_out(InlineCrew(), {"r": RunSpec(problem, settings, 4)}).results["r"]
+    alone = identify(parse_model(asked), RECORDS["short"], settings, seed=4, skip=3)
+    assert len(alone.selection) == 4
+    assert result.selection == alone.selection
+    assert bits(result) == bits(alone)
