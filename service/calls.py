@@ -67,9 +67,9 @@ def read(*parts: str, **params: Any) -> Call:
     return Call("GET", "/v1/" + "/".join(_quoted(part) for part in parts), given)
 
 
-def act(what: str, name: str, verb: str, body: Any = None) -> Call:
+def act(what: str, name: str, verb: str, body: Any = None, **params: Any) -> Call:
     """POST of an action upon one thing, such as ``/v1/jobs/job_…:cancel``."""
-    return Call("POST", f"/v1/{what}/{_quoted(name)}:{verb}", json=body)
+    return Call("POST", f"/v1/{what}/{_quoted(name)}:{verb}", params, json=body)
 
 
 def create(what: str, body: Any, headers: Mapping[str, str] | None = None) -> Call:

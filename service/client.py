@@ -241,9 +241,7 @@ class Client:
         """Measured and simulated outputs."""
         return self._json(calls.read("runs", run, "response", max_points=max_points))
 
-    def simulate_run(
-        self, run: str, body: Mapping[str, Any], max_points: int = 1000
-    ) -> Document:
+    def simulate_run(self, run: str, body: Mapping[str, Any], max_points: int = 1000) -> Document:
         """Simulate the identified model on a new input or under proportional control."""
         return self._json(calls.act("runs", run, "simulate", body, max_points=max_points))
 

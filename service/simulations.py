@@ -1,7 +1,6 @@
 """Use case: a dataset simulated from a model, its true parameters, inputs, and noise."""
 
-from collections.abc import Mapping
-from math import pi
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,20 +9,12 @@ from sqlalchemy.orm import Session
 from service import models
 from service.datasets import add_recording, key_of
 from service.errors import FieldError, InvalidRequest
-from service.recordings import recording_of
-from service.schemas_datasets import (
-    BinaryInput,
-    DatasetInput,
-    ExpressionInput,
-    InputIn,
-    SimulateIn,
-    StepInput,
-    Wave,
-)
+from service.inputs import Signals
+from service.schemas_datasets import InputIn, SimulateIn
 from service.storage.datasets import DatasetRepository, Stored
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from sysid.errors import InvalidRecord, SysidError, nearest
+from sysid.errors import nearest
 from sysid.models.model import FixedInitial, Model
 from sysid.records import Channel, Recording
 from sysid.types import FloatArray
@@ -47,9 +38,11 @@ def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored
         if faults:
             raise InvalidRequest(faults)
         times = np.arange(body.samples, dtype=np.float64) * body.sample_time
-        signals = _Signals(session, store, times)
+        signals = Signals(session, store, times)
         inputs = [
-            Channel(one.name, times, signals.of(one.name, body.inputs[one.name]), one.unit)
+            Channel(
+                one.name, times, signals.of(f"/inputs/{one.name}", body.inputs[one.name]), one.unit
+            )
             for one in model.inputs
         ]
     recording = _simulated(model, inputs, body, times)
@@ -62,42 +55,6 @@ def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored
         database, store, recording, name=body.name or f"{model.name}, simulated",
         kind="simulate", key=key, details=details, parents=signals.parents, relation="simulated",
     )  # fmt: skip
-
-
-class _Signals:
-    """Values of inputs at given times; remembers the datasets they came from."""
-
-    def __init__(self, session: Session, store: ObjectStore, times: FloatArray) -> None:
-        self.parents: list[str] = []
-        self._session, self._store, self._times = session, store, times
-
-    def of(self, name: str, signal: InputIn) -> FloatArray:
-        """Values of one input."""
-        t = self._times
-        match signal:
-            case Wave():
-                angle = _omega(signal) * t + signal.phase
-                wave = np.cos(angle) if signal.kind == "cosine" else np.sin(angle)
-                return np.asarray(signal.offset + signal.amplitude * wave)
-            case StepInput():
-                return np.asarray(signal.offset + signal.amplitude * (t >= signal.time))
-            case BinaryInput():
-                draws = _binary(t, signal.period, signal.seed)
-                return np.asarray(signal.offset + signal.amplitude * draws)
-            case ExpressionInput():
-                return _evaluated(name, signal.expression, t)
-            case DatasetInput():
-                return self._recorded(name, signal)
-
-    def _recorded(self, name: str, signal: DatasetInput) -> FloatArray:
-        row = DatasetRepository(self._session).get(signal.dataset)
-        try:
-            channel = recording_of(self._store, row.sha256).channel(signal.channel)
-        except InvalidRecord as error:
-            raise InvalidRequest.at(f"/inputs/{name}/channel", str(error)) from None
-        if row.id not in self.parents:
-            self.parents.append(row.id)
-        return np.asarray(np.interp(self._times, channel.times, channel.values))
 
 
 def _model(session: Session, reference: Any) -> tuple[Model, Any]:
@@ -120,6 +77,24 @@ def _simulated(
     known = {p.name: p.fixed for p in model.parameters if p.fixed is not None}
     values = {**rest, **known, **body.parameters}
     outputs = simulated(model, inputs, values, times=times).channels
+    check_finite(outputs, times)
+    recording = Recording((*inputs, *outputs))
+    if body.noise.sigma == 0:
+        return recording
+    from sysid.derivations import derive
+
+    names = [channel.name for channel in outputs]
+    return derive(recording, [{"noise": {**body.noise.model_dump(), "channels": names}}])
+
+
+def check_finite(outputs: Sequence[Channel], times: FloatArray) -> None:
+    """Refuse a simulation that diverges.
+
+    Raises
+    ------
+    InvalidRequest
+        With the output and the time.
+    """
     for channel in outputs:
         wrong = np.flatnonzero(~np.isfinite(channel.values))
         if wrong.size:
@@ -128,13 +103,6 @@ def _simulated(
                 f"with these values output {channel.name!r} diverges at "
                 f"t = {times[wrong[0]]:g} s; choose others, or a smaller sample_time",
             )
-    recording = Recording((*inputs, *outputs))
-    if body.noise.sigma == 0:
-        return recording
-    from sysid.derivations import derive
-
-    names = [channel.name for channel in outputs]
-    return derive(recording, [{"noise": {**body.noise.model_dump(), "channels": names}}])
 
 
 def _parameter_faults(model: Model, values: Mapping[str, float]) -> list[FieldError]:
@@ -145,7 +113,7 @@ def _parameter_faults(model: Model, values: Mapping[str, float]) -> list[FieldEr
                    f"{nearest(name, known)}")
         for name in values if name not in known
     ]  # fmt: skip
-    missing = [p for p in model.parameters if p.fixed is None and p.name not in values]
+    missing = [p for p in model.parameters if p.is_free and p.name not in values]
     return faults + [
         FieldError(f"/parameters/{p.name}", f"give the true value of {p.name!r} [{p.unit}]")
         for p in missing
@@ -163,33 +131,3 @@ def _input_faults(model: Model, inputs: Mapping[str, InputIn]) -> list[FieldErro
                    '{"kind": "cosine", "amplitude": 1, "frequency": 0.5}')
         for name in known if name not in inputs
     ]  # fmt: skip
-
-
-def _omega(wave: Wave) -> float:
-    """Angular frequency in rad/s."""
-    if wave.frequency is not None:
-        return 2 * pi * wave.frequency
-    return wave.omega or 0.0
-
-
-def _binary(times: FloatArray, period: float, seed: int) -> FloatArray:
-    places = (times / period).astype(np.int64)
-    draws = np.random.Generator(np.random.Philox(seed)).integers(0, 2, int(places[-1]) + 1)
-    return np.where(draws[places] == 1, 1.0, -1.0)
-
-
-def _evaluated(name: str, expression: str, times: FloatArray) -> FloatArray:
-    """An expression of t, computed as the output of a model that has nothing else."""
-    from sysid.models.spec import parse_model
-    from sysid.simulation import simulate as simulated
-
-    document = {
-        "name": "input", "form": "difference", "states": {"unused": "1"},
-        "equations": {"unused": "0"}, "initial": {"unused": 0}, "outputs": {"value": expression},
-    }  # fmt: skip
-    try:
-        return simulated(parse_model(document), [], {}, times=times).channel("value").values
-    except SysidError as error:
-        pointer = f"/inputs/{name}/expression"
-        detail = str(error).replace("/outputs/value, ", "").replace("/outputs/value: ", "")
-        raise InvalidRequest.at(pointer, detail) from None

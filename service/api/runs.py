@@ -2,11 +2,12 @@
 
 from fastapi import APIRouter, Request, Response
 
-from service import residuals, responses, runs
+from service import residuals, responses, run_simulations, runs
 from service.api.content import content_of
 from service.api.deps import MaxPoints, PartsDep, ReadSession
 from service.errors import NotFound
 from service.schemas_runs import HistoryOut, MigrationsOut, ResidualsOut, ResponseOut, RunOut
+from service.schemas_simulations import RunSimulateIn, RunSimulationOut
 from service.storage.runs import RunRepository
 
 router = APIRouter(prefix="/v1/runs", tags=["runs"])
@@ -42,6 +43,14 @@ def response(
 def residual_tests(run_id: str, session: ReadSession, parts: PartsDep) -> ResidualsOut:
     """Auto- and cross-correlation of the residuals with 95 and 99 % bands, and their tests."""
     return residuals.residuals(session, parts.store, run_id)
+
+
+@router.post("/{run_id}:simulate")
+def simulate(
+    run_id: str, body: RunSimulateIn, parts: PartsDep, max_points: MaxPoints = 1000
+) -> RunSimulationOut:
+    """Simulate the identified model on new inputs or under proportional control."""
+    return run_simulations.simulate(parts.database, parts.store, run_id, body, max_points)
 
 
 @router.head("/{run_id}/signals.mcap", include_in_schema=False)

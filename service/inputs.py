@@ -1,0 +1,142 @@
+"""Signals that a request describes: waves, steps, random binary signals, expressions, records."""
+
+from math import pi
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from service.errors import InvalidRequest
+from service.recordings import recording_of
+from service.schemas_datasets import (
+    BinaryInput,
+    DatasetInput,
+    ExpressionInput,
+    InputIn,
+    StepInput,
+    Wave,
+)
+from service.schemas_simulations import RunInputIn, SeriesInput
+from service.storage.datasets import DatasetRepository
+from service.storage.objects import ObjectStore
+from sysid.errors import InvalidRecord, SysidError
+from sysid.records import Channel
+from sysid.types import FloatArray
+
+
+class Signals:
+    """Values of inputs at given times; remembers the datasets they came from.
+
+    Parameters
+    ----------
+    times : FloatArray, shape (N,)
+        In s.
+    """
+
+    def __init__(self, session: Session, store: ObjectStore, times: FloatArray) -> None:
+        self.parents: list[str] = []
+        self._session, self._store, self._times = session, store, times
+
+    def of(self, pointer: str, signal: InputIn) -> FloatArray:
+        """Values of one input, which stands at `pointer` in the request.
+
+        Raises
+        ------
+        InvalidRequest
+            If an expression cannot be used, or a dataset has no such channel.
+        """
+        t = self._times
+        match signal:
+            case Wave():
+                angle = _omega(signal) * t + signal.phase
+                wave = np.cos(angle) if signal.kind == "cosine" else np.sin(angle)
+                return np.asarray(signal.offset + signal.amplitude * wave)
+            case StepInput():
+                return np.asarray(signal.offset + signal.amplitude * (t >= signal.time))
+            case BinaryInput():
+                draws = _binary(t, signal.period, signal.seed)
+                return np.asarray(signal.offset + signal.amplitude * draws)
+            case ExpressionInput():
+                return _evaluated(pointer, signal.expression, t)
+            case DatasetInput():
+                channel = self._recorded(pointer, signal)
+                return np.asarray(np.interp(t, channel.times, channel.values))
+
+    def channel(self, pointer: str, name: str, unit: str, signal: RunInputIn) -> Channel:
+        """One input with what it does between its samples; before a step it has its offset.
+
+        Raises
+        ------
+        InvalidRequest, InvalidRecord
+            As `of`; if a step lies before the start, or given times decrease.
+        """
+        match signal:
+            case SeriesInput():
+                times, values = (np.array(one) for one in (signal.times, signal.values))
+                return Channel(name, times, values, unit, signal.hold)
+            case DatasetInput():
+                found = self._recorded(pointer, signal)
+                return Channel(name, found.times, found.values, unit, found.hold)
+            case StepInput():
+                return self._stepped(pointer, name, unit, signal)
+            case _:
+                return Channel(name, self._times, self.of(pointer, signal), unit)
+
+    def _stepped(self, pointer: str, name: str, unit: str, signal: StepInput) -> Channel:
+        start, stop = float(self._times[0]), float(self._times[-1])
+        if not start <= signal.time < stop:
+            raise InvalidRequest.at(
+                f"{pointer}/time",
+                f"{signal.time:g} s is outside the simulation, from {start:g} to {stop:g} s",
+            )
+        before = start - float(self._times[1] - self._times[0])
+        later = signal.offset + signal.amplitude
+        times = np.array([before, signal.time, stop])
+        return Channel(name, times, np.array([signal.offset, later, later]), unit, "zero")
+
+    def _recorded(self, pointer: str, signal: DatasetInput) -> Channel:
+        row = DatasetRepository(self._session).get(signal.dataset)
+        try:
+            channel = recording_of(self._store, row.sha256).channel(signal.channel)
+        except InvalidRecord as error:
+            raise InvalidRequest.at(f"{pointer}/channel", str(error)) from None
+        if row.id not in self.parents:
+            self.parents.append(row.id)
+        return channel
+
+
+def sampled(channel: Channel, times: FloatArray) -> FloatArray:
+    """Values of a channel at other times; of a held one, those after its jumps."""
+    if channel.hold != "zero":
+        return np.interp(times, channel.times, channel.values)
+    last = np.searchsorted(channel.times, times, side="right") - 1
+    found: FloatArray = channel.values[np.clip(last, 0, channel.times.size - 1)]
+    return found
+
+
+def _omega(wave: Wave) -> float:
+    """Angular frequency in rad/s."""
+    if wave.frequency is not None:
+        return 2 * pi * wave.frequency
+    return wave.omega or 0.0
+
+
+def _binary(times: FloatArray, period: float, seed: int) -> FloatArray:
+    places = (times / period).astype(np.int64)
+    draws = np.random.Generator(np.random.Philox(seed)).integers(0, 2, int(places[-1]) + 1)
+    return np.where(draws[places] == 1, 1.0, -1.0)
+
+
+def _evaluated(pointer: str, expression: str, times: FloatArray) -> FloatArray:
+    """An expression of t, computed as the output of a model that has nothing else."""
+    from sysid.models.spec import parse_model
+    from sysid.simulation import simulate as simulated
+
+    document = {
+        "name": "input", "form": "difference", "states": {"unused": "1"},
+        "equations": {"unused": "0"}, "initial": {"unused": 0}, "outputs": {"value": expression},
+    }  # fmt: skip
+    try:
+        return simulated(parse_model(document), [], {}, times=times).channel("value").values
+    except SysidError as error:
+        detail = str(error).replace("/outputs/value, ", "").replace("/outputs/value: ", "")
+        raise InvalidRequest.at(f"{pointer}/expression", detail) from None

@@ -1,0 +1,187 @@
+"""Runs simulated on new inputs and in closed loops, over REST, the client and the command line."""
+
+from collections.abc import Iterator
+from math import degrees, pi
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from service.app import create_app
+from service.client import Client
+from service.signals.reader import read_recording
+from tests.identified import identified
+from tests.integration.rest.test_client import Through
+from tests.rest import CSV, recording, refused, settings_of
+
+SMALL = {"population": 16, "generations": 25, "islands": 1}
+ARM = {"J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3}
+NEAR = {name: {"lower": 0.9 * value, "upper": 1.1 * value} for name, value in ARM.items()}
+STEP = {"kind": "step", "amplitude": pi / 2}
+TUBE = {"time_constant": 0.35, "delay": 0.127}
+CONTROL = {"input": "P_a", "output": "theta", "gain": 10e3, "limit": 0.25e6, "transport": TUBE,
+           "reference": STEP}  # fmt: skip
+LOOP = {"control": CONTROL, "samples": 601}
+
+
+class Served(NamedTuple):
+    """An application with an identified actuator, an identified lag and a run without result."""
+
+    server: TestClient
+    arm: str
+    lag: str
+    queued: str
+    dataset: str
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    app = create_app(settings_of(tmp_path_factory.mktemp("simulated")))
+    with TestClient(app) as server:
+        parts = app.state.parts
+        pressure = "12e3*(0.55*sin(2.2*t) + 0.6*sin(5.65*t + 1) + 0.5*sin(14.5*t + 2))"
+        made = server.post("/v1/datasets:simulate", json={
+            "model": "actuator", "parameters": ARM, "samples": 600, "sample_time": 0.01,
+            "inputs": {"P_a": {"kind": "expression", "expression": pressure}},
+        })  # fmt: skip
+        assert made.status_code == 201, made.text
+        arm = {"model": "actuator", "datasets": [made.json()["id"]], "algorithm": SMALL,
+               "parameters": {**NEAR, "theta(0)": {"fixed": 0}}}  # fmt: skip
+        steps = server.post("/v1/datasets", content=recording(), headers=CSV).json()["id"]
+        lag = {"model": "fopdt", "datasets": [steps], "algorithm": SMALL}
+        _, [first] = identified(parts, arm)
+        _, [second] = identified(parts, lag)
+        job = server.post("/v1/jobs", json=lag).json()["id"]
+        [waiting] = Client("http://testserver", transport=Through(server)).runs(job)
+        yield Served(server, first, second, waiting["id"], steps)
+
+
+def simulated(served: Served, run: str, body: dict[str, Any], **query: Any) -> dict[str, Any]:
+    answer = served.server.post(f"/v1/runs/{run}:simulate", json=body, params=query)
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
+
+
+def test_the_identified_arm_under_control_behaves_as_in_figure_21(served: Served) -> None:
+    found = simulated(served, served.arm, LOOP)
+    metrics = found["metrics"]
+    assert (metrics["output"], metrics["unit"]) == ("theta", "rad")
+    assert metrics["overshoot_percent"] == pytest.approx(1.0, abs=0.6)
+    assert metrics["settling_time"] == pytest.approx(1.6, abs=0.2)
+    assert [one["name"] for one in found["outputs"]] == ["theta"]
+    assert [one["name"] for one in found["inputs"]] == ["P_a"]
+    assert max(found["command"]["values"]) == pytest.approx(10e3 * pi / 2, rel=1e-3)
+    assert found["reference"]["values"][0] == pytest.approx(pi / 2)
+    assert found["dataset"] is None
+
+
+def test_without_transport_the_controller_is_a_step_late_and_friction_leaves_an_error(
+    served: Served,
+) -> None:
+    control = {key: value for key, value in CONTROL.items() if key != "transport"}
+    found = simulated(served, served.arm, {**LOOP, "control": control})
+    expected = found["parameters"]["F_c"] / (found["parameters"]["A_m"] * 10e3)
+    assert found["metrics"]["steady_error"] == pytest.approx(expected, abs=1e-3)
+    assert degrees(expected) == pytest.approx(14.1, abs=0.5)
+    assert found["metrics"]["rise_time"] is None
+    [note] = found["notes"]
+    assert "0.0025 s late" in note
+
+
+def test_overridden_parameters_are_used_and_ties_follow_them(served: Served) -> None:
+    found = simulated(served, served.arm, {**LOOP, "parameters": {"F_c": 0.0, "k_a": 50.0}})
+    assert found["parameters"]["F_c"] == 0.0
+    alone = simulated(served, served.arm, {**LOOP, "parameters": {"k_a": 50.0, "F_c": 0.0,
+                                                                  "k_b": 50.0}})  # fmt: skip
+    assert found["outputs"] == alone["outputs"]
+
+
+def test_an_open_loop_follows_given_samples_a_dataset_or_a_formula(served: Served) -> None:
+    found = simulated(served, served.lag, {"inputs": {"u": {"kind": "step", "time": 1.0}},
+                                           "samples": 201, "sample_time": 0.05})  # fmt: skip
+    values = np.array(found["outputs"][0]["values"])
+    times = np.array(found["outputs"][0]["times"])
+    p = found["parameters"]
+    late = np.maximum(times - 1.0 - p["L"], 0.0)
+    np.testing.assert_allclose(values, p["y0"] + p["K"] * (1 - np.exp(-late / p["T"])),
+                               rtol=1e-3)  # fmt: skip
+    assert found["metrics"] is found["reference"] is None
+    inputs = (
+        {"kind": "series", "times": [0.0, 1.0], "values": [0.0, 1.0], "hold": "zero"},
+        {"kind": "dataset", "dataset": served.dataset, "channel": "u"},
+        {"kind": "cosine", "frequency": 0.1},
+    )
+    for one in inputs:
+        again = simulated(served, served.lag, {"inputs": {"u": one}, "samples": 101})
+        assert again["outputs"][0]["samples"] == 101
+        if one["kind"] == "series":
+            expected = np.interp(again["outputs"][0]["times"], times, values)
+            np.testing.assert_allclose(again["outputs"][0]["values"], expected, rtol=1e-2)
+
+
+def test_a_stored_simulation_is_a_dataset_that_knows_its_run_and_is_made_once(
+    served: Served,
+) -> None:
+    body = {**LOOP, "store": True, "name": "ninety degrees"}
+    first, again = (simulated(served, served.arm, body, max_points=10) for _ in range(2))
+    assert first["dataset"]["id"] == again["dataset"]["id"]
+    dataset = first["dataset"]
+    assert (dataset["name"], dataset["kind"]) == ("ninety degrees", "simulate")
+    assert [c["name"] for c in dataset["channels"]] == ["P_a", "theta", "reference"]
+    assert len(first["outputs"][0]["values"]) <= 10
+    lineage = served.server.get(f"/v1/datasets/{dataset['id']}/lineage").json()["edges"]
+    assert {"parent": served.arm, "child": dataset["id"], "relation": "simulated"} in lineage
+    content = served.server.get(f"/v1/datasets/{dataset['id']}/content").content
+    angle = read_recording(content).channel("theta").values
+    assert angle.size == 601
+    whole = simulated(served, served.arm, LOOP)["outputs"][0]["values"]
+    np.testing.assert_array_equal(angle, whole)
+
+
+@pytest.mark.parametrize(
+    ("change", "pointer", "part"),
+    [
+        ({"control": {**CONTROL, "input": "P"}}, "/inputs/P_a", "or close the loop"),
+        ({"control": {**CONTROL, "output": "theta_"}}, "/control/output", "did you mean 'theta'"),
+        ({"control": {**CONTROL, "limit": 0}}, "/control/limit", "greater than 0"),
+        ({"control": {**CONTROL, "transport": {"delay": -1}}}, "/control/transport/delay", "0"),
+        ({"control": {**CONTROL, "reference": {**STEP, "time": 9}}}, "/control/reference/time",
+         "outside the simulation, from 0 to 6 s"),
+        ({"inputs": {"P_a": STEP}}, "/inputs/P_a", "the controller gives this input"),
+        ({"inputs": {"u": STEP}}, "/inputs/u", "no input 'u'"),
+        ({"control": None}, "/inputs/P_a", "give input 'P_a'"),
+        ({"parameters": {"Fc": 1.0}}, "/parameters/Fc", "did you mean 'F_c'"),
+        ({"samples": 1}, "/samples", "2"),
+        ({"samples": 2_000_000}, "/samples", "1000000"),
+        ({"control": {**CONTROL, "transport": {"delay": 7}}}, "", "lag"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_simulated_is_told_where_it_is(
+    served: Served, change: dict[str, Any], pointer: str, part: str
+) -> None:
+    answer = served.server.post(f"/v1/runs/{served.arm}:simulate", json={**LOOP, **change})
+    faults = refused(answer, 422, "invalid")
+    assert pointer in {fault["pointer"] for fault in faults}
+    assert any(part in fault["detail"] for fault in faults), faults
+
+
+def test_a_run_without_estimates_or_without_existence_is_told(served: Served) -> None:
+    path = f"/v1/runs/{served.queued}:simulate"
+    answer = served.server.post(path, json={"inputs": {"u": STEP}, "samples": 10})
+    refused(answer, 409, "conflict")
+    refused(served.server.post("/v1/runs/run_x:simulate", json=LOOP), 404, "not-found")
+
+
+def test_a_simulation_that_diverges_is_told_with_its_time(served: Served) -> None:
+    control = {"input": "u", "output": "y", "gain": 1e30, "reference": STEP}
+    body = {"control": control, "samples": 201, "parameters": {"L": 0.5}}
+    faults = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
+                     "invalid")  # fmt: skip
+    assert "diverges at t =" in faults[0]["detail"]
+
+
+def test_the_client_simulates_a_run(served: Served) -> None:
+    client = Client("http://testserver", transport=Through(served.server))
+    found = client.simulate_run(served.arm, LOOP, max_points=50)
+    assert len(found["outputs"][0]["times"]) <= 50
