@@ -60,9 +60,8 @@ bench-full: $(READY)
 	$(BIN)/python benchmarks/mcap.py --json benchmarks/results/mcap.json
 
 real-data: $(READY)
-	$(BIN)/python benchmarks/real_data/silverbox.py
-	$(BIN)/python benchmarks/real_data/pneuact_tube.py
-	$(BIN)/python benchmarks/real_data/dryer2.py
+	@mkdir -p benchmarks/results
+	$(BIN)/python -m benchmarks.real_data.all --json benchmarks/results/real_data.json
 
 clean:
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build ./*.egg-info

@@ -2,12 +2,12 @@
 
 import os
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from benchmarks.table import Row
+from benchmarks.table import Row, Skipped, parser, report
 from service.client import Client
 from service.embedded import embedded_service
 
@@ -18,6 +18,22 @@ def data_folder() -> Path | None:
     """Return the folder of measured records (`LAGID_DATA`), or None when it is absent."""
     folder = Path(os.environ.get("LAGID_DATA", ROOT.parent / "shared" / "data"))
     return folder if folder.is_dir() else None
+
+
+Measure = Callable[[Client, Path], list[Row]]
+"""A program's work: from a client and the folder of records to its rows."""
+
+
+def program(title: str, description: str, measure: Measure) -> None:
+    """Run one program from the command line: options, a service, its table."""
+    options = parser(description).parse_args()
+    folder = data_folder()
+    if folder is None:
+        report(title, [], [Skipped(title, "LAGID_DATA is absent")], options)
+        return
+    with service() as (client, _):
+        rows = measure(client, folder)
+    report(title, [*rows, peak_memory_row()], [], options)
 
 
 @contextmanager
@@ -33,12 +49,17 @@ def service() -> Iterator[tuple[Client, Path]]:
 
 def identify(client: Client, body: Mapping[str, Any]) -> dict[str, Any]:
     """Submit a job of one run over REST, wait for it, and return the run's result."""
+    (run,) = identify_all(client, body)
+    return run
+
+
+def identify_all(client: Client, body: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Submit a job over REST, wait for it, and return the results of its runs in their order."""
     job = client.submit(body)
     ended = client.wait(job["id"], progress=lambda _: PEAK.sample())
-    (run,) = client.runs(job["id"])
     if ended["state"] != "succeeded":
         raise SystemExit(f"job {body['name']!r} {ended['state']}: {ended.get('error')}")
-    return client.run(run["id"])
+    return [client.run(run["id"]) for run in client.runs(job["id"])]
 
 
 def print_estimates(title: str, run: Mapping[str, Any]) -> None:
