@@ -24,7 +24,9 @@ from sysid.parameters import Parameter
 from sysid.records import Record
 from sysid.types import FloatArray, IntArray
 
-_BLOCK = 4096  # rows folded in at once
+BLOCK = 4096
+"""Rows folded in at once."""
+
 _WHOLE = 1e-9  # samples: nearer, a lag is a whole number of them
 
 Reading = Callable[[Past], FloatArray]
@@ -114,15 +116,20 @@ class Regression:
             outputs = [piece.output]
             if simulated is not None:
                 outputs.insert(0, simulated[number])
-            for first in range(0, piece.rows.size, _BLOCK):
-                rows = piece.rows[first : first + _BLOCK]
+            for first in range(0, piece.rows.size, BLOCK):
+                rows = piece.rows[first : first + BLOCK]
                 parts = [columns(terms, past_of(piece, lags, rows, y), rows.size) for y in outputs]
                 block = np.column_stack([*parts, piece.output[rows]])
                 block = block[np.all(np.isfinite(block), axis=1)]
                 count += block.shape[0]
-                folded = np.asarray(np.linalg.qr(np.vstack([folded, block]), mode="r"))
+                folded = fold(folded, block)
         short = max(width - folded.shape[0], 0)
         return np.vstack([folded, np.zeros((short, width))]), count
+
+
+def fold(folded: FloatArray, block: FloatArray) -> FloatArray:
+    """R of the QR decomposition of all rows so far, with a block of further rows in it."""
+    return np.asarray(np.linalg.qr(np.vstack([folded, block]), mode="r"))
 
 
 def columns(terms: Sequence[Term], read: Reading, rows: int) -> FloatArray:

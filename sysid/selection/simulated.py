@@ -20,7 +20,7 @@ from sysid.problem import Problem
 from sysid.records import Record
 from sysid.refinement import refine
 from sysid.selection.frols import Forward, forward, select
-from sysid.selection.regression import lag_parameters
+from sysid.selection.regression import BLOCK, fold, lag_parameters
 from sysid.selection.starts import equation_error_starts
 from sysid.settings import GeneticAlgorithm
 from sysid.types import FloatArray
@@ -137,7 +137,11 @@ def _triangle(whole: Problem, values: Mapping[str, float]) -> FloatArray:
         slopes[:, batch] = np.where(np.all(np.isfinite(slope), axis=1)[:, None], slope, 0.0).T
     coefficients = np.array([values.get(term.coefficient, 0.0) for term in terms])
     target = (whole.evaluator.measured - here)[scored] + slopes @ coefficients
-    return np.asarray(np.linalg.qr(np.column_stack([slopes, target]), mode="r"))
+    folded = np.zeros((0, len(terms) + 1))
+    for first in range(0, target.size, BLOCK):
+        rows = slice(first, first + BLOCK)
+        folded = fold(folded, np.column_stack([slopes[rows], target[rows]]))
+    return folded
 
 
 def _told(
