@@ -86,7 +86,7 @@ def test_without_transport_the_controller_is_a_step_late_and_friction_leaves_an_
     assert degrees(expected) == pytest.approx(14.1, abs=0.5)
     assert found["metrics"]["rise_time"] is None
     [note] = found["notes"]
-    assert "0.0025 s late" in note
+    assert "0.00125 s late" in note
 
 
 def test_overridden_parameters_are_used_and_ties_follow_them(served: Served) -> None:

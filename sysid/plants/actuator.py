@@ -1,0 +1,194 @@
+"""The pneumatic vane actuator with stick-slip friction (Eq. 23-25), exact between its events.
+
+While it sticks and while it slides one way the actuator is linear, so each stretch is advanced by
+a matrix exponential; the instants of breaking away, of stopping and of reaching an end stop are
+found by bisection. Nothing is shared with the catalogue's model, which steps through them.
+"""
+
+from dataclasses import dataclass
+from math import copysign, isfinite, pi
+
+import numpy as np
+from scipy.linalg import expm
+
+from sysid.errors import InvalidRecord, InvalidSettings
+from sysid.records import Channel, Recording
+from sysid.types import FloatArray
+
+MOST_SAMPLES = 200_000
+"""Samples of one simulation at most: about ten seconds of work."""
+
+_LONGEST = 1e-3  # s between looks for an event
+_HALVINGS = 50
+_THETA, _OMEGA, _P, _SUPPLY, _SLOPE, _ONE = range(6)
+
+
+@dataclass(frozen=True, slots=True)
+class Actuator:
+    """Parameters of the actuator, by default those of the paper's Table 4 with k_b = k_a.
+
+    Attributes
+    ----------
+    J : float
+        Moment of inertia, kg·m².
+    F_c, F_max : float
+        Coulomb friction and break-away torque, N·m.
+    k_a, k_b : float
+        1/s.
+    k_c : float
+        Pa/rad.
+    A_m : float
+        Volume swept per radian, m³/rad (our choice; the paper gives none).
+    B : float
+        Viscous friction, N·m·s/rad (our choice).
+    theta_s : float
+        End stop on either side, rad.
+    """
+
+    J: float = 3.6e-4
+    F_c: float = 1.2317e-2
+    F_max: float = 3.3333e-2
+    k_a: float = 83.089
+    k_b: float = 83.089
+    k_c: float = 456.99e3
+    A_m: float = 5.0e-6
+    B: float = 1.0e-3
+    theta_s: float = 0.75 * pi
+
+    def __post_init__(self) -> None:
+        for name in ("J", "F_c", "F_max", "k_a", "k_b", "k_c", "A_m", "B", "theta_s"):
+            value = getattr(self, name)
+            if not isfinite(value) or value < 0 or (name in ("J", "A_m") and value == 0):
+                raise InvalidSettings(f"/parameters/{name}", f"{value!r} is not a number above 0")
+        if self.F_max < self.F_c:
+            raise InvalidSettings(
+                "/parameters/F_max",
+                f"{self.F_max:g} N·m is below the Coulomb friction of {self.F_c:g} N·m; need as "
+                "much or more",
+            )
+
+
+def simulate_actuator(actuator: Actuator, supply: Channel) -> Recording:
+    """Angle and chamber pressure from the supply pressure, at its samples; at rest before.
+
+    Parameters
+    ----------
+    actuator : Actuator
+    supply : Channel
+        Pressure difference P_a in Pa, held or on lines between its samples by its `hold`.
+
+    Returns
+    -------
+    Recording
+        Channels ``P_a`` [Pa], ``theta`` [rad] and ``P`` [Pa].
+
+    Raises
+    ------
+    InvalidRecord
+        If a sample is missing, times repeat, or there are more than `MOST_SAMPLES`.
+    """
+    times, values = supply.times, supply.values
+    if not 2 <= times.size <= MOST_SAMPLES:
+        raise InvalidRecord(f"found {times.size} samples; need from 2 to {MOST_SAMPLES}")
+    if not np.all(np.isfinite(values)) or np.any(np.diff(times) <= 0):
+        raise InvalidRecord("the supply pressure needs a value at every time, and later times")
+    plant = _Plant(actuator)
+    found = np.zeros((times.size, 2))
+    for k in range(times.size - 1):
+        step = float(times[k + 1] - times[k])
+        slope = 0.0 if supply.hold == "zero" else float(values[k + 1] - values[k]) / step
+        plant.advance(float(values[k]), slope, step)
+        found[k + 1] = plant.state[_THETA], plant.state[_P]
+    return Recording((
+        Channel("P_a", times, values, "Pa", supply.hold),
+        Channel("theta", times, found[:, 0].copy(), "rad"),
+        Channel("P", times, found[:, 1].copy(), "Pa"),
+    ))  # fmt: skip
+
+
+class _Plant:
+    """State and mode of the actuator: the way it slides (1, -1), or 0 while it sticks."""
+
+    def __init__(self, actuator: Actuator) -> None:
+        self._a = actuator
+        self.state = np.zeros(6)
+        self.state[_ONE] = 1.0
+        self._way = 0
+        self._systems = {way: self._system(way) for way in (-1, 0, 1)}
+        self._known: dict[tuple[int, float], FloatArray] = {}
+
+    def advance(self, supply: float, slope: float, time: float) -> None:
+        """Go on for a time (s) in which the supply begins with a value (Pa) and slope (Pa/s)."""
+        self.state[_SUPPLY], self.state[_SLOPE] = supply, slope
+        pieces = max(1, round(time / _LONGEST))
+        for _ in range(pieces):
+            left = time / pieces
+            self._choose()
+            while left > 0:
+                left -= self._until_event(left)
+
+    def _until_event(self, time: float) -> float:
+        """Go on until something changes, at most for a time; gives the time that passed."""
+        after = self._after(time, keep=True)
+        if not self._is_over(after):
+            self.state = after
+            return time
+        low, high = 0.0, time
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            if self._is_over(self._after(middle)):
+                high = middle
+            else:
+                low = middle
+        self.state = self._after(high)
+        self._end()
+        return high
+
+    def _is_over(self, state: FloatArray) -> bool:
+        """Whether the present mode has ended in a state that it would lead to."""
+        if self._way == 0:
+            return self._breaks_away(state) != 0
+        return bool(state[_OMEGA] * self._way < 0 or state[_THETA] * self._way > self._a.theta_s)
+
+    def _breaks_away(self, state: FloatArray) -> int:
+        """The way in which an arm at rest begins to slide; 0 if it stays."""
+        torque = self._a.A_m * state[_P]
+        way = int(copysign(1, torque))
+        if abs(torque) <= self._a.F_max or state[_THETA] * way >= self._a.theta_s:
+            return 0
+        return way
+
+    def _end(self) -> None:
+        """At an event: come to rest, or begin to slide."""
+        if self._way != 0:
+            limit = self._a.theta_s
+            self.state[_THETA] = min(max(self.state[_THETA], -limit), limit)
+            self.state[_OMEGA] = 0.0
+        self._way = self._breaks_away(self.state)
+
+    def _choose(self) -> None:
+        if self._way == 0:
+            self._way = self._breaks_away(self.state)
+
+    def _after(self, time: float, keep: bool = False) -> FloatArray:
+        """The state after a time in the present mode."""
+        key = (self._way, time)
+        matrix = self._known.get(key)
+        if matrix is None:
+            matrix = expm(self._systems[self._way] * time)
+            if keep and len(self._known) < 64:
+                self._known[key] = matrix
+        found: FloatArray = matrix @ self.state
+        return found
+
+    def _system(self, way: int) -> FloatArray:
+        """Matrix of d/dt (theta, omega, P, supply, its slope, 1) in a mode."""
+        a = self._a
+        system = np.zeros((6, 6))
+        system[_P, [_P, _SUPPLY]] = -a.k_a, a.k_b
+        system[_SUPPLY, _SLOPE] = 1.0
+        if way != 0:
+            system[_THETA, _OMEGA] = 1.0
+            system[_OMEGA, [_OMEGA, _P, _ONE]] = -a.B / a.J, a.A_m / a.J, -a.F_c * way / a.J
+            system[_P, _OMEGA] = -a.k_c
+        return system
