@@ -38,6 +38,7 @@ class _Page(HTMLResponse):
 Hidden: dict[str, Any] = {"include_in_schema": False, "response_class": HTMLResponse}
 StateFilter = Annotated[State | None, Query()]
 Choice = Annotated[FigureChoice, Query()]
+ComparedRuns = Annotated[list[str], Query(min_length=2, max_length=50)]
 
 
 @router.get("/docs", **Hidden)
@@ -64,6 +65,12 @@ def job_page(
 def run_page(run_id: str, request: Request, session: ReadSession) -> Response:
     """The job of one run, with this run in full."""
     return _Page(pages.run_page(session, run_id, str(request.base_url)))
+
+
+@router.get("/compare", **Hidden)
+def compare_page(session: ReadSession, run: ComparedRuns) -> Response:
+    """Runs of several models on the same data side by side."""
+    return _Page(pages.compare_page(session, run))
 
 
 @router.get("/datasets/{dataset_id}", **Hidden)

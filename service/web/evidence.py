@@ -67,6 +67,22 @@ class Experiment:
     validation_from: float | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrelationTrace:
+    """A correlation function of residuals over lags, with its bands.
+
+    `period` (s) is that of a lag; None where lags count irregular samples.
+    """
+
+    title: str
+    is_auto: bool
+    period: float | None
+    lags: Floats
+    values: Floats
+    band95: Floats
+    band99: Floats
+
+
 @dataclass(frozen=True, slots=True)
 class RunEvidence:
     """All that is known of one run's search and result.

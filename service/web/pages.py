@@ -13,6 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from sqlalchemy.orm import Session
 
 from service import models
+from service.comparison import compare
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import NotFound
 from service.storage.events import EventRepository
@@ -22,6 +23,8 @@ from service.storage.runs import RunRepository
 from service.storage.tables import Dataset, Job, Run, State
 from service.web import assets, figures_signals, formats
 from service.web.figures import WATERFALL_HEIGHT, convergence_height, correlation_height
+from service.web.figures_residuals import residuals_height
+from service.web.findings import findings_of
 from service.web.reading import model_of, run_body, sought_parameters, unit_of
 from service.web.reference import operations
 from service.web.views import JobView, RunView, event_view, job_view, run_view
@@ -29,6 +32,7 @@ from service.web.views import JobView, RunView, event_view, job_view, run_view
 JOBS_PER_PAGE = 50
 RUNS_PER_PAGE = 100
 EVENTS_SHOWN = 100
+COMPARED = 50
 
 
 @cache
@@ -88,9 +92,27 @@ def job_page(
         "job.html", job=view, runs=[run_summary(session, job, run) for run in page.items],
         run=run_in_full(session, job, chosen) if chosen else None,
         next_runs=_query({"cursor": page.next}) if page.next else "",
+        comparable=_comparable(page.items),
         datasets=dataset_links(session, job), commands=_commands(view, base_url),
         events=[event_view(one) for one in _events(session, job)],
     )  # fmt: skip
+
+
+def compare_page(session: Session, runs: Sequence[str]) -> str:
+    """Runs of several models side by side.
+
+    Raises
+    ------
+    InvalidRequest
+        If the runs do not compare.
+    """
+    found = compare(session, runs)
+    rows = []
+    for one in found.parameters:
+        known = {value.run: formats.estimate(value.value, value.stderr) for value in one.values}
+        texts = [" ± ".join(filter(None, known.get(run.run, ()))) for run in found.runs]
+        rows.append({"name": one.name, "unit": one.unit, "differs": one.differs, "texts": texts})
+    return render("compare.html", found=found, parameters=rows)
 
 
 def run_page(session: Session, run_id: str, base_url: str) -> str:
@@ -147,14 +169,30 @@ def run_in_full(session: Session, job: Job, run: Run) -> RunView:
         "response": figures_signals.response_height(*_counts(body)) if run.signals_sha256 else 0,
         "convergence": convergence_height(len(sought), columns=3),
         "correlation": correlation_height(len(sought)) if result.get("correlation") else 0,
+        "residuals": _residuals_height(result) if run.signals_sha256 else 0,
         "waterfall": WATERFALL_HEIGHT if result.get("islands") else 0,
     }
     return run_view(run, unit_of(session, body), heights)
 
 
+def _residuals_height(result: Mapping[str, Any]) -> int:
+    n_figures = findings_of(result).n_figures
+    return residuals_height(n_figures) if n_figures else 0
+
+
 def _counts(body: dict[str, Any]) -> tuple[int, int]:
     model = model_of(body)
     return (len(model.outputs), len(model.inputs)) if model else (1, 1)
+
+
+def _comparable(runs: Sequence[Run]) -> str:
+    """Query of a comparison of a sweep over models, of the first of each that has a result."""
+    first: dict[str, str] = {}
+    for run in runs:
+        if "/model" in run.cell and run.result is not None:
+            first.setdefault(repr(run.cell["/model"]), run.id)
+    chosen = list(first.values())[:COMPARED]
+    return urlencode([("run", one) for one in chosen]) if len(chosen) > 1 else ""
 
 
 def _best(runs: RunRepository, job: Job) -> Run | None:

@@ -10,12 +10,14 @@ from typing import Any
 from markupsafe import Markup
 from sqlalchemy.orm import Session
 
+from service.residuals import residuals_of
 from service.storage.jobs import JobRepository
 from service.storage.objects import ObjectStore
 from service.storage.runs import RunOrder, RunRepository
 from service.storage.tables import Job, Run
 from service.web import assets, figures, figures_signals
 from service.web.figures import Figure
+from service.web.findings import residual_figure
 from service.web.pages import dataset_links, render, run_in_full, run_summary
 from service.web.reading import evidence_of, unit_of
 from service.web.signals import experiments_of
@@ -64,6 +66,12 @@ def _figures(
     for experiment in experiments_of(session, store, job, run)[:EXPERIMENTS_SHOWN]:
         title = f"Measured against identified: {experiment.name}"
         made.append((title, figures_signals.response(experiment)))
+    tested = residuals_of(session, store, job, run)
+    if tested is not None:
+        made += [
+            (f"Correlation of the residuals: {name}", residual_figure(tested, number))
+            for number, name in enumerate(tested.names[:EXPERIMENTS_SHOWN])
+        ]
     made += [
         ("Convergence of the parameters", figures.convergence(evidence)),
         ("Correlation of the estimates", figures.correlation(evidence)),

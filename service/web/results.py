@@ -6,17 +6,19 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from service.errors import NotFound
+from service.residuals import residuals_of
 from service.storage.datasets import DatasetRepository
 from service.storage.jobs import JobRepository
 from service.storage.objects import ObjectStore
 from service.storage.runs import RunRepository
 from service.web import figures, figures_signals
 from service.web.figures import Abscissa, Figure
+from service.web.findings import residual_figure
 from service.web.reading import evidence_of
 from service.web.signals import experiments_of, traces_of
 from service.web.theme import Theme
 
-FigureName = Literal["history", "convergence", "response", "correlation", "waterfall"]
+FigureName = Literal["history", "convergence", "response", "residuals", "correlation", "waterfall"]
 
 
 class FigureChoice(BaseModel):
@@ -49,18 +51,27 @@ def run_figure(
         experiments = experiments_of(session, store, job, run)
         if not experiments:
             return {"data": [], "layout": figures.layout(200)}
-        if choice.experiment >= len(experiments):
-            last = f"; the last is {len(experiments) - 1}"
-            raise NotFound("experiment", str(choice.experiment), last)
+        _check_experiment(choice.experiment, len(experiments))
         figure = figures_signals.response(experiments[choice.experiment], choice.start, choice.stop)
         figure["layout"]["meta"]["experiments"] = [one.name for one in experiments]
         return figure
+    if name == "residuals":
+        tested = residuals_of(session, store, job, run)
+        if tested is None:
+            return {"data": [], "layout": figures.layout(200)}
+        _check_experiment(choice.experiment, len(tested.names))
+        return residual_figure(tested, choice.experiment, min(choice.columns, 2))
     evidence = evidence_of(session, job, run)
     if name == "history":
         return figures.history(evidence, choice.abscissa)
     if name == "convergence":
         return figures.convergence(evidence, choice.columns)
     return figures.correlation(evidence) if name == "correlation" else figures.waterfall(evidence)
+
+
+def _check_experiment(number: int, count: int) -> None:
+    if number >= count:
+        raise NotFound("experiment", str(number), f"; the last is {count - 1}")
 
 
 def dataset_figure(

@@ -8,6 +8,7 @@ from typing import Any
 
 from service.storage.tables import Event, Job, Run, State
 from service.web import formats
+from service.web.findings import Findings, findings_of
 
 Document = Mapping[str, Any]
 
@@ -49,6 +50,7 @@ class RunView:
     warnings: Sequence[str]
     has_signals: bool
     heights: Mapping[str, int]
+    findings: Findings
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +125,7 @@ def run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
         generations=run.generations, seconds=run.seconds, error=run.error,
         estimates=[estimate_view(one) for one in result.get("parameters", ())],
         warnings=list(result.get("warnings", ())), has_signals=run.signals_sha256 is not None,
-        heights=heights,
+        heights=heights, findings=findings_of(result),
     )  # fmt: skip
 
 

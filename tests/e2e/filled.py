@@ -181,7 +181,26 @@ def _result(rms: float = SIGMA) -> dict[str, Any]:
                     for i in range(4)],
         "correlation": {"names": ["K", "T", "L"],
                         "matrix": [[1, 0.31, -0.05], [0.31, 1, -0.78], [-0.05, -0.78, 1]]},
+        "criteria": {"aic": 2336.4, "aicc": 2336.5, "bic": 2359.0, "samples": 2100,
+                     "parameters": 3},
+        "identifiability": {"condition": 41.0, "singular_values": [8.1, 2.2, 0.2], "groups": [
+            {"members": ["T", "L"], "expression": "T + L", "value": 0.4616, "stderr": 0.00014},
+        ]},
+        "residual_tests": {"data": "validation", "level": 0.05, "passed": True, "tests": [
+            _tested("whiteness", None, 0.96, 0.412), _tested("independence", "u", 1.0, 0.077),
+        ]},
+        "onset_delays": [{"experiment": 0, "input": "u", "output": "p", "delay": 0.1197,
+                          "unit": "s", "spread": 0.0006, "events": 9, "threshold": 0.02,
+                          "reason": ""}],
         "warnings": ["T and L are strongly correlated (−0.78): T + L is better known than either"],
+    }  # fmt: skip
+
+
+def _tested(kind: str, signal: str | None, inside: float, p: float) -> dict[str, Any]:
+    return {
+        "experiment": 0, "output": "p", "test": kind, "input": signal, "outcome": "passed",
+        "reason": "", "samples": 900, "lags_tested": 25, "inside95": inside, "inside99": 1.0,
+        "statistic": 26.1, "degrees": 25.0, "p": p,
     }  # fmt: skip
 
 

@@ -59,11 +59,43 @@ def test_a_finished_job_shows_estimates_and_plots_and_opens_no_stream(
     assert [url for url in asked if not url.startswith(site.url)] == []
 
 
+def test_residual_tests_show_their_bands_and_verdicts(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    rows = page.locator("table.tests tbody tr")
+    expect(rows).to_have_count(2)
+    expect(rows.nth(0)).to_have_text(re.compile(r"p\s*white.*passed", re.S))
+    expect(rows.nth(1)).to_have_text(re.compile(r"independent of u.*passed", re.S))
+    plot = page.locator(figure(page, "residuals"))
+    assert plot.locator(".barlayer .trace").count() == 2
+    bars = "plot => plot.data.filter(one => one.type === 'bar').map(one => one.x.length)"
+    assert plot.evaluate(bars) == [25, 51]  # lags 1 … 25, and -25 … 25
+    outside = (
+        "plot => plot.data.filter(one => one.name === '95 % band')"
+        ".every(one => one.y.every(value => Math.abs(value) < 0.2))"
+    )
+    assert plot.evaluate(outside)
+    expect(page.locator("dl.findings")).to_contain_text("T + L = 0.46160 ± 0.00014")
+    expect(page.locator("dl.findings")).to_contain_text("Onset delay, p behind u")
+
+
+def test_runs_are_compared_side_by_side(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.sweep}")
+    links = page.locator("table.runs tbody a")
+    chosen = [links.nth(k).get_attribute("href") or "" for k in (1, 2)]
+    query = "&".join(f"run={one.removeprefix('/runs/')}" for one in chosen)
+    page.goto(f"{site.url}/compare?{query}")
+    expect(page.locator("table.runs tbody tr")).to_have_count(2)
+    expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
+    page.locator("table.runs tbody a").first.click()
+    expect(page.locator('tr[aria-current="true"]')).to_contain_text("run ")
+
+
 def test_plots_take_the_room_that_was_left_for_them(site: Site, page: Page) -> None:
     page.goto(f"{site.url}/jobs/{site.filled.finished}")
     height = "document.documentElement.scrollHeight"
     before = page.evaluate(height)
-    for name in ("history", "convergence", "response", "correlation", "waterfall"):
+    names = ("history", "convergence", "response", "residuals", "correlation", "waterfall")
+    for name in names:
         figure(page, name)
     assert page.evaluate(height) == before
 
@@ -168,5 +200,5 @@ def test_the_report_is_drawn_without_a_server(site: Site, page: Page) -> None:
     page.route("**/*", lambda route: route.abort())
     page.set_content(answer.text())
     page.wait_for_selector(".plot .main-svg")
-    assert page.locator(".js-plotly-plot").count() == 5
+    assert page.locator(".js-plotly-plot").count() == 6
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))

@@ -70,16 +70,17 @@ function abscissa(button) {
   choose(plots().find((p) => p.dataset.figure === 'history'), 'abscissa', button.dataset.abscissa);
 }
 
-// Which records there are, the response itself tells.
+// Which records there are, the figure itself tells.
 document.addEventListener('drawn', ({ target, detail }) => {
   const names = detail.meta?.experiments ?? [];
-  const choice = document.querySelector('[data-experiment]');
-  if (target.dataset.figure !== 'response' || names.length < 2 || choice.options.length) return;
+  const choice = document.querySelector(`[data-experiment="${target.dataset.figure}"]`);
+  if (!choice || names.length < 2 || choice.options.length) return;
   names.forEach((name, place) => choice.append(new Option(`${place + 1} · ${name}`, place)));
   choice.parentElement.hidden = false;
 });
-document.querySelector('[data-experiment]')?.addEventListener('change', ({ target }) => {
-  choose(plots().find((p) => p.dataset.figure === 'response'), 'experiment', target.value);
+document.addEventListener('change', ({ target }) => {
+  const name = target.dataset.experiment;
+  if (name) choose(plots().find((p) => p.dataset.figure === name), 'experiment', target.value);
 });
 
 addEventListener('pagehide', close);
