@@ -1,10 +1,14 @@
 """Figures of the study that compare methods; their looks are those of `service.web.figures`."""
 
 from collections.abc import Mapping, Sequence
+from math import ceil, floor, log10
 from typing import Any
+
+import numpy as np
 
 from service.paper.bench import Found
 from service.web import theme
+from service.web.evidence import Floats
 from service.web.figures import Figure, finite, layout
 
 Line = dict[str, Any]
@@ -14,6 +18,7 @@ _STYLES: Mapping[str, dict[str, Any]] = {
     "improved": {"color": theme.BLUE, "dash": "solid", "width": 2},
 }
 HEIGHT = 320
+GAP = 0.07  # half the room between two plots, as a share of the width
 
 
 def style(method: str) -> dict[str, Any]:
@@ -55,39 +60,79 @@ def convergence(found: Mapping[str, Found], names: Sequence[str],
         if name in true:
             level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
             data.append(line("true value", [0, end], [true[name]] * 2, line=level, **place))
-        left = number * width + (0.04 if number else 0)
-        span = {"domain": [left, (number + 1) * width - (0.04 if number + 1 < len(names) else 0)]}
+        last = number + 1 == len(names)
+        span = {
+            "domain": [
+                number * width + (GAP if number else 0),
+                (number + 1) * width - (0 if last else GAP),
+            ]
+        }
         axes[f"xaxis{tag}"] = axis("generation", anchor=f"y{tag}", rangemode="tozero", **span)
         unit = next(iter(found.values())).parameter(name)["unit"]
         axes[f"yaxis{tag}"] = axis(_with_unit(name, unit), anchor=f"x{tag}")
     return {"data": data, "layout": layout(HEIGHT, **axes)}
 
 
-def rms_history(found: Mapping[str, Found], unit: str, floor: float | None = None) -> Figure:
-    """RMS of the champion over the generations, method by method, and the noise's deviation."""
+def rms_history(
+    found: Mapping[str, Found], unit: str, noise: float | None = None, *, scale: float = 1.0
+) -> Figure:
+    """RMS of the champion over the generations, method by method, and the noise's deviation.
+
+    `scale` turns the results' unit into `unit`, which is also that of `noise`.
+    """
     end = _end(found)
     data = []
     for method, one in found.items():
         x = [float(point.generation) for point in one.progress]
-        y = [point.rms for point in one.progress]
+        y = [scale * point.rms for point in one.progress]
         looks = {**style(method), "shape": "hv"}
         data.append(line(method, [*x, end], [*y, y[-1]], line=looks))
-    if floor is not None:
+    if noise is not None:
         level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
-        data.append(line("noise", [0, end], [floor] * 2, line=level))
-    log = axis(f"RMS [{unit}]", type="log", exponentformat="e")
+        data.append(line("noise", [0, end], [noise] * 2, line=level))
+    values = [scale * point.rms for one in found.values() for point in one.progress]
+    marks = decades(min(values), max(values))
+    log = axis(f"RMS [{unit}]", type="log", tickvals=marks, ticktext=[f"{v:g}" for v in marks])
     return chart(data, "generation", "", xaxis=axis("generation", rangemode="tozero"), yaxis=log)
 
 
+def decades(low: float, high: float) -> list[float]:
+    """Marks 1, 2, 5, 10 … of a logarithmic axis around what is drawn; Plotly's own drop zeros."""
+    if not 0 < low <= high:
+        return []
+    first, last = floor(log10(low)) - 1, ceil(log10(high)) + 1
+    marks = [float(f"{digit}e{power}") for power in range(first, last) for digit in (1, 2, 5)]
+    below = max((v for v in marks if v <= low), default=marks[0])
+    above = min((v for v in marks if v >= high), default=marks[-1])
+    kept = [v for v in marks if below <= v <= above]
+    return kept if len(kept) <= 9 else [v for v in kept if f"{v:e}".startswith("1")]
+
+
 def responses(found: Mapping[str, Found], experiment: int = 0) -> Figure:
-    """The measured output and what each method's model gives."""
+    """The measured output and what each method's model gives; below, what is left of it."""
     first = next(iter(found.values())).response["experiments"][experiment]["measured"][0]
     dots = {"mode": "markers", "marker": {"color": theme.GREY, "size": 4}}
     data = [line("measured", first["times"], first["values"], **dots)]
     for method, one in found.items():
-        series = one.response["experiments"][experiment]["simulated"][0]
-        data.append(line(method, series["times"], series["values"], line=style(method)))
-    return chart(data, "time [s]", _with_unit(first["name"], first["unit"]))
+        shown = one.response["experiments"][experiment]
+        series, measured = shown["simulated"][0], shown["measured"][0]
+        looks = style(method)
+        data.append(line(method, series["times"], series["values"], line=looks))
+        there = np.interp(measured["times"], series["times"], _numbers(series["values"]))
+        rest = (_numbers(measured["values"]) - there).tolist()
+        thin = {**looks, "width": 1}
+        data.append(line(method, measured["times"], rest, line=thin, yaxis="y2", showlegend=False))
+    unit = first["unit"]
+    axes = {
+        "xaxis": axis("time [s]", anchor="y2"),
+        "yaxis": axis(_with_unit(first["name"], unit), domain=[0.42, 1]),
+        "yaxis2": axis(_with_unit("residual", unit), domain=[0, 0.32], nticks=4),
+    }
+    return {"data": data, "layout": layout(HEIGHT + 100, **axes)}
+
+
+def _numbers(values: Sequence[float | None]) -> Floats:
+    return np.array([np.nan if v is None else v for v in values], dtype=np.float64)
 
 
 def band(x: Sequence[float], lower: Sequence[float], upper: Sequence[float], method: str) -> Line:

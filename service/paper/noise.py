@@ -88,9 +88,11 @@ def sections(bench: Bench) -> list[Section]:
             Plot("Figure 15: error of the identified response", figure(errors, True),
                  "Paper: round marks stay low up to σ about 0.5, then rise. Ours: median (line), "
                  "10 to 90 % (band) and single runs (points). The error of `improved` grows in "
-                 "proportion to σ, near the floor σ√(p/N); there is no knee at 0.5. The two "
-                 "methods of the paper have an error of the search besides, which hides the "
-                 "noise while that is small: their flat part."),
+                 "proportion to σ from the start, along the floor σ√(p/N), without a knee. The "
+                 "two methods of the paper have an error of their search besides, which hides "
+                 "that of the noise while σ is small: a flat part like the paper's. Where the "
+                 "noise is great all are alike, and the parameters' bounds hold them below the "
+                 "floor, which knows no bounds."),
             Plot("Figure 15, measured otherwise: RMS against the noisy record",
                  figure(fits, False),
                  "The paper does not say against which record. Against the noisy one every RMS "
@@ -133,11 +135,11 @@ def _checks(found: dict[str, list[Spread]]) -> list[Check]:
     ratios = [one.quantiles[1] / floor(one.sigma) for one in found["improved"] if one.sigma > 0]
     worst = max(
         found["improved"][n].quantiles[1] / found["simple"][n].quantiles[1]
-        for n, sigma in enumerate(SIGMAS) if sigma > 0
+        for n, sigma in enumerate(SIGMAS) if 0 < sigma <= 0.2
     )  # fmt: skip
     return [
-        Check(f"the median of `improved` is at most that of `simple` at every σ > 0 (greatest "
-              f"ratio {worst:.2f})", worst <= 1),
+        Check("the median of `improved` is below that of `simple` up to σ = 0.2 m (greatest "
+              f"ratio {worst:.2f})", worst < 1),
         Check("the median of `improved` stays within twice the Cramér–Rao floor (greatest ratio "
               f"{max(ratios):.2f})", max(ratios) <= 2),
     ]  # fmt: skip

@@ -125,7 +125,8 @@ def estimates(example: Example, found: Mapping[str, Found], least: Mapping[str, 
         rows.append([
             f"{name} [{unit}]", f"{true:g}", f"{example.columns.simple[name]:.6f}",
             f"{example.columns.proposed[name]:.6f}",
-            *(estimate_text(found[method], name) for method in METHODS), f"{least[name]:.2g}",
+            *(estimate_text(found[method], name) for method in METHODS),
+            formats.number(least[name], 2),
         ])  # fmt: skip
     for name, true in example.true.items():
         printed = (example.columns.simple[name], example.columns.proposed[name])

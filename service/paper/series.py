@@ -6,7 +6,7 @@ from typing import Any
 from service.paper import figures
 from service.paper.bench import Bench
 from service.paper.parts import Plot, Section, Table
-from service.web import theme
+from service.web import formats, theme
 
 RATE, END = 0.8, 5.0
 TERMS = (1, 2, 3, 4, 5)
@@ -37,7 +37,7 @@ def sections(bench: Bench) -> list[Section]:
     for title, period in READINGS:
         bench.say(f"paper Figures 2 and 3, {title}")
         lines = {n: _simulated(bench, n, period) for n in TERMS}
-        rows.append([title, *(f"{y[-1] - exact(t[-1]):.4g}" for t, y in lines.values())])
+        rows.append([title, *(formats.number(y[-1] - exact(t[-1])) for t, y in lines.values())])
         plots += _plots(title, lines)
     return [
         Section(
@@ -76,7 +76,8 @@ def _plots(title: str, lines: dict[int, tuple[list[float], list[float]]]) -> lis
     return [
         Plot(f"Figure 2, {title}", figures.chart(outputs, "time [s]", "y"),
              "Paper: the broken lines of the series near the solid exact solution as n grows. "
-             "Ours: the same order."),
+             f"Ours too; n = {TERMS[-1]} reaches "
+             f"{100 * lines[TERMS[-1]][1][-1] / exact(times[-1]):.0f} % of it at {END:g} s."),
         Plot(f"Figure 3, {title}", figures.chart(errors, "time [s]", "ŷ − y"),
              "Paper: the error shrinks with n. Ours: at the end "
              f"{first:.3g} with n = {TERMS[0]} and {last:.3g} with n = {TERMS[-1]}."),

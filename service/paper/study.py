@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
 from service.errors import ServiceError
-from service.paper import noise, oscillators, series, tube
+from service.paper import actuator, noise, oscillators, series, tube
 from service.paper.bench import Bench
 from service.paper.parts import Section
 
@@ -15,10 +15,11 @@ PARTS: Mapping[str, Part] = {
     "table2": partial(oscillators.sections, example=oscillators.EXAMPLE_2),
     "noise": noise.sections,
     "table3": tube.sections,
+    "table4": actuator.sections,
 }
 _FIGURES: Mapping[str, Iterable[int]] = {
     "series": (2, 3), "table1": range(7, 11), "table2": range(11, 15), "noise": (15,),
-    "table3": (17, 18),
+    "table3": (17, 18), "table4": (20, 21),
 }  # fmt: skip
 _BY_FIGURE = {f"figure{number}": part for part, all_ in _FIGURES.items() for number in all_}
 

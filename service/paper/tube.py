@@ -58,7 +58,7 @@ def sections(bench: Bench) -> list[Section]:
         TITLE,
         "Model `tube`, K e^(−Ls)/(Ts + 1) (Eq. 21), from the pressure at one gauge to that at the "
         "other. The records are of a gas-dynamic model of the paper's tube with gauges of 12 bit "
-        "and noise of 0.5 kPa, not of the paper's own tube, which are not published.",
+        "and noise of 0.5 kPa, not of the paper's own tube, whose records are not published.",
         [_table(found)],
         [plot for n, one in enumerate(found, 1) for plot in _plots(bench, n, one,
                                                                    stored[n - 1]["id"])],
@@ -86,7 +86,7 @@ def _table(found: list[dict[str, Found]]) -> Table:
         "Table 3",
         ["parameter", "paper, simple", "paper, proposed", *(f"ours, {m}" for m in METHODS)], rows,
         "Standard errors suppose white residuals. A first-order model of a long tube leaves "
-        "13 kPa of structure, so the two patterns differ by more than they say.",
+        "structure in them, so the two patterns differ by more than the errors say.",
     )  # fmt: skip
 
 
@@ -97,9 +97,8 @@ def _plots(bench: Bench, pattern: int, found: Mapping[str, Found], record: str) 
              "Paper: the outlet follows the inlet late and rounded. Ours: the same, with the "
              "response of the model that `improved` found."),
         Plot(f"Figure 18: RMS of the best individual, pattern {pattern}",
-             figures.rms_history(found, "Pa"),
-             f"Paper: the error of the proposed search is the smaller. Ours: {rms}. With three "
-             "parameters a simple search comes near, if it is given 400 generations."),
+             figures.rms_history(found, "kPa", scale=1e-3),
+             f"Paper: the error of the proposed search is the smaller. Ours: {rms}."),
     ]  # fmt: skip
 
 
