@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from sysid.ga.chromosome import located, placed
 from sysid.islands.archipelago import loss_scale
+from sysid.least_squares import TRIED, Loss, solve
 from sysid.problem import Problem
 from sysid.types import FloatArray
 
@@ -16,9 +16,7 @@ _DIFFERENCE = 1e-6  # of the range
 _STEPS = 60
 _LONG = 2_000_000  # measured values times parameters: from here on, few starts and steps
 _AT_BOUND = 1e-6
-# Residual of a diverged simulation, in units of the outputs: finite, so that a smaller step is
-# tried.
-_REJECTED = 1e10
+_ENDS = 3  # simulations of a start and of an end, besides the steps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +46,7 @@ def refine(
         beside = any(np.max(np.abs(place - other)) < _SAME for other in taken)
         if beside or len(taken) == most or not np.isfinite(values[i]):
             continue
-        if left < 2 * (place.size + 2):
+        if left < place.size + TRIED + _ENDS:
             break
         taken.append(place)
         refined = _refined(problem, starts[i], place, float(values[i]), left)
@@ -61,14 +59,10 @@ def _refined(
 ) -> Refined:
     """Least squares from one start; the search may use `left` simulations."""
     search = _LeastSquares(problem, max(problem.output_scale, rms))
-    steps = min(_STEPS, left // (place.size + 2))
-    scale = loss_scale(problem) / search.unit
-    solved = least_squares(
-        search.residuals, place, search.jacobian, bounds=(0.0, 1.0), method="trf",
-        loss="soft_l1" if scale > 0 else "linear", f_scale=scale or 1.0,
-        xtol=1e-12, ftol=1e-13, gtol=1e-14, max_nfev=steps,
-    )  # fmt: skip
-    theta, reached = search.best(solved.x)
+    steps = min(_STEPS, (left - _ENDS) // (place.size + TRIED))
+    loss = Loss(loss_scale(problem) / search.unit)
+    solved = solve(search.residuals, search.jacobian, place, loss, steps=steps)
+    theta, reached = search.best(solved.place)
     if reached > rms:
         theta, reached = start, rms
     return Refined(np.array(theta), reached, search.evaluations)
@@ -84,30 +78,27 @@ class _LeastSquares:
     def __init__(self, problem: Problem, scale: float) -> None:
         self.problem, self.evaluations = problem, 0
         self.unit = float(np.ldexp(1.0, int(np.frexp(scale)[1]))) if scale > 0 else 1.0
-        self._scored = problem.evaluator.weight > 0
+        weight = problem.evaluator.weight
+        scored = weight > 0
+        # A slice where nothing is left out: it copies nothing.
+        self._scored = slice(None) if scored.all() else scored
+        self._weight = weight[self._scored] / self.unit
+        self._measured = problem.evaluator.measured[self._scored]
 
-    def _predictions(self, places: FloatArray) -> FloatArray:
+    def residuals(self, places: FloatArray) -> FloatArray:
+        """Weighted residuals (P, n) of places (P, D), in one batch."""
         self.evaluations += places.shape[0]
         theta = located(self.problem.evaluator, np.ascontiguousarray(places))
-        weight = self.problem.evaluator.weight[self._scored] / self.unit
-        return np.asarray(weight * self.problem.predictions(theta)[:, self._scored])
+        predicted = self.problem.predictions(theta)
+        return np.asarray(self._weight * (predicted[:, self._scored] - self._measured))
 
-    def residuals(self, place: FloatArray) -> FloatArray:
-        evaluator = self.problem.evaluator
-        weight = evaluator.weight[self._scored] / self.unit
-        measured = weight * evaluator.measured[self._scored]
-        with np.errstate(invalid="ignore", over="ignore"):
-            error = self._predictions(place[None])[0] - measured
-        finite = bool(np.all(np.abs(error) < _REJECTED))
-        return error if finite else np.full(error.size, _REJECTED)
-
-    def jacobian(self, place: FloatArray) -> FloatArray:
-        """Forward differences away from the nearer bound, one batch of D + 1 simulations."""
+    def jacobian(self, place: FloatArray, error: FloatArray) -> FloatArray:
+        """Forward differences away from the nearer bound, one batch of D simulations."""
         steps = np.where(place < 0.5, _DIFFERENCE, -_DIFFERENCE)
-        predicted = self._predictions(np.vstack([place, place + np.diag(steps)]))
-        with np.errstate(invalid="ignore", over="ignore"):
-            slopes = (predicted[1:] - predicted[0]) / steps[:, None]
-        return np.ascontiguousarray(np.where(np.isfinite(slopes), slopes, 0.0).T)
+        slopes = (self.residuals(place + np.diag(steps)) - error) / steps[:, None]
+        if not np.isfinite(slopes).all():
+            slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+        return np.asarray(slopes.T)
 
     def best(self, place: FloatArray) -> tuple[FloatArray, float]:
         """The solution, moved onto a bound that it only approaches if that is not worse."""

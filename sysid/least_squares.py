@@ -1,0 +1,142 @@
+"""Bounded least squares on places in [0, 1], several damped steps tried in one batch.
+
+Levenberg-Marquardt with Marquardt's scaling [1]_; a place at a bound whose slope leads outwards is
+held there. Robust losses go by reweighting. The batches are what our kernels are made for: one
+gives the residuals of the steps for several dampings, one those for the Jacobian.
+
+.. [1] D. W. Marquardt, An algorithm for least-squares estimation of nonlinear parameters,
+   SIAM J. Appl. Math. 11 (1963) 431.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.types import FloatArray
+
+_DAMPINGS = np.array([0.0, 1e-4, 1e-2, 1.0, 1e2])
+"""Tried in one batch, times the present damping; 0 stands for the least one."""
+TRIED = _DAMPINGS.size
+"""Simulations of a batch of steps; the Jacobian takes one for each parameter besides."""
+_LEAST, _MOST = 1e-11, 1e12
+_STOPPED = 2  # steps in a row that gain next to nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Where the search ended.
+
+    Attributes
+    ----------
+    place : FloatArray
+        (D,) in [0, 1].
+    is_converged : bool
+        Whether the next step promises less than the tolerance; False after too many steps.
+    """
+
+    place: FloatArray
+    is_converged: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Σe², or with a scale s > 0 soft-l1, Σ 2s²(√(1 + (e/s)²) - 1)."""
+
+    scale: float = 0.0
+
+    def total(self, errors: FloatArray) -> FloatArray:
+        """The losses (P,) of residuals (P, n); ``inf`` where one is not finite."""
+        if self.scale == 0.0:
+            values = np.einsum("pn,pn->p", errors, errors)
+        else:
+            roots = np.sqrt(1 + (errors / self.scale) ** 2)
+            values = 2 * self.scale**2 * np.sum(roots - 1, axis=1)
+        return np.asarray(np.where(np.isfinite(values), values, np.inf))
+
+    def weighted(self, error: FloatArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Residuals and Jacobian whose squares have the loss's slope here."""
+        if self.scale == 0.0:
+            return error, columns
+        root = (1 + (error / self.scale) ** 2) ** -0.25
+        return root * error, root[:, None] * columns
+
+
+def solve(
+    residuals: Callable[[FloatArray], FloatArray],
+    jacobian: Callable[[FloatArray, FloatArray], FloatArray],
+    place: FloatArray,
+    loss: Loss,
+    *,
+    steps: int,
+    tolerance: float = 1e-12,
+) -> Solution:
+    """The local minimum that Levenberg-Marquardt finds from a place (D,).
+
+    Parameters
+    ----------
+    residuals : callable
+        Of places (P, D), the residuals (P, n).
+    jacobian : callable
+        Of a place (D,) and its residuals (n,), the Jacobian (n, D).
+    steps : int
+        Batches of steps at most.
+    tolerance : float
+        Of the loss: the part that a step must promise to be worth taking.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # a simulation may diverge
+        return _solved(residuals, jacobian, np.array(place), loss, steps, tolerance)
+
+
+def _solved(
+    residuals: Callable[[FloatArray], FloatArray],
+    jacobian: Callable[[FloatArray, FloatArray], FloatArray],
+    place: FloatArray, loss: Loss, steps: int, tolerance: float,
+) -> Solution:  # fmt: skip
+    damping, idle = 1e-3, 0
+    error = residuals(place[None])[0]
+    value = float(loss.total(error[None])[0])
+    for _ in range(steps):
+        normal, slope = _normal_equations(loss, error, jacobian(place, error), place)
+        tried = np.maximum(_DAMPINGS * damping, _LEAST)
+        moves = _moves(normal, slope, tried)
+        if float(slope @ moves[0]) <= tolerance * value:  # what the largest step promises
+            return Solution(place, True)
+        places = np.clip(place - moves, 0.0, 1.0)
+        errors = residuals(places)
+        values = loss.total(errors)
+        best = int(np.argmin(values))
+        if not values[best] < value:
+            damping *= 1e3
+            if damping > _MOST:  # no step gains: rounding is all that is left
+                return Solution(place, True)
+            continue
+        gained = (value - values[best]) / value
+        place, error, value = places[best], errors[best], float(values[best])
+        damping = float(np.clip(tried[best] if best else damping * 1e-2, _LEAST, _MOST))
+        idle = idle + 1 if gained <= tolerance else 0
+        if idle == _STOPPED:
+            return Solution(place, True)
+    return Solution(place, False)
+
+
+def _normal_equations(
+    loss: Loss, error: FloatArray, columns: FloatArray, place: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """JᵀJ and Jᵀe, with the rows and columns of held places cleared."""
+    rows, sloped = loss.weighted(error, columns)
+    normal, slope = sloped.T @ sloped, sloped.T @ rows
+    held = ((place <= 0.0) & (slope > 0)) | ((place >= 1.0) & (slope < 0))
+    held |= np.diag(normal) == 0.0
+    slope[held] = 0.0
+    normal[held, :] = normal[:, held] = 0.0
+    normal[held, held] = 1.0
+    return normal, slope
+
+
+def _moves(normal: FloatArray, slope: FloatArray, damping: FloatArray) -> FloatArray:
+    """The damped steps (P, D), one for each damping (P,)."""
+    damped = normal + damping[:, None, None] * (normal * np.eye(slope.size))
+    right = np.empty((damping.size, slope.size, 1))
+    right[:, :, 0] = slope
+    return np.asarray(np.linalg.solve(damped, right)[:, :, 0])
