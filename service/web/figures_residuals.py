@@ -7,9 +7,13 @@ import numpy as np
 
 from service.web import theme
 from service.web.evidence import CorrelationTrace, Floats
-from service.web.figures import Figure, finite, layout
+from service.web.figures import MARGIN, Figure, finite, layout
 
-_ROW_PX, _GAP = 220, 0.14
+# A row (px): its caption, the plot, and the axis below it; columns are a part of the width apart.
+_CAPTION_PX, _PLOT_PX, _AXIS_PX = 24, 150, 50
+_ROW_PX = _CAPTION_PX + _PLOT_PX + _AXIS_PX
+_MARGIN = {**MARGIN, "t": 34, "b": 6}
+_GAP = 0.08
 _BAND95 = "rgba(138,146,155,0.22)"
 
 
@@ -27,31 +31,31 @@ def residuals(
         "data": [],
         "layout": layout(
             residuals_height(len(functions), columns), annotations=[], bargap=0.45,
-            legend={"orientation": "h", "y": 0, "yref": "container", "yanchor": "bottom"},
-            meta={"experiments": list(names)},
+            margin=_MARGIN, meta={"experiments": list(names)},
         ),
     }  # fmt: skip
     for number, one in enumerate(functions):
         row, column = divmod(number, columns)
-        place = (row / rows, column / columns, 1 / rows, 1 / columns)
-        _add(figure, number, one, place)
+        wide = (1 - _GAP * (columns - 1)) / columns
+        left = column * (wide + _GAP)
+        top = 1 - (row * _ROW_PX + _CAPTION_PX) / (rows * _ROW_PX)
+        bottom = max(top - _PLOT_PX / (rows * _ROW_PX), 0.0)
+        _add(figure, number, one, ((left, min(left + wide, 1.0)), (bottom, top)))
     return figure
 
 
 def residuals_height(n_functions: int, columns: int = 2) -> int:
     """Height (px) of the figure, so that a page can leave room for it."""
     rows = -(-n_functions // max(1, min(columns, n_functions)))
-    return max(rows, 1) * _ROW_PX + 60
+    return max(rows, 1) * _ROW_PX + _MARGIN["t"] + _MARGIN["b"]
 
 
 def _add(
-    figure: Figure, number: int, one: CorrelationTrace, place: tuple[float, float, float, float]
-) -> None:
+    figure: Figure, number: int, one: CorrelationTrace,
+    place: tuple[tuple[float, float], tuple[float, float]],
+) -> None:  # fmt: skip
     axis = "" if number == 0 else str(number + 1)
-    down, across, high, wide = place
-    left, right = across, across + wide * (1 - _GAP / 2 if wide < 1 else 1)
-    top = 1 - down - 0.08 * high
-    bottom = 1 - down - high * (0.76 if high < 1 else 1)
+    across, upward = place
     shown = one.lags != 0 if one.is_auto else np.ones(one.lags.size, dtype=bool)
     lags, values = one.lags[shown], one.values[shown]
     bands = one.band95[shown], one.band99[shown]
@@ -60,16 +64,16 @@ def _add(
     reach = 1.2 * max(float(np.max(np.abs(values))), float(np.max(bands[1])), 1e-12)
     edge = 0.7
     figure["layout"][f"xaxis{axis}"] = {
-        "domain": [left, right], "anchor": f"y{axis}", "nticks": 7, "showgrid": False,
+        "domain": across, "anchor": f"y{axis}", "nticks": 7, "showgrid": False,
         "range": [float(lags[0]) - edge, float(lags[-1]) + edge], "zeroline": False,
         "title": {"text": _lag_title(one), "font": {"size": 11}, "standoff": 4},
     }  # fmt: skip
     figure["layout"][f"yaxis{axis}"] = {
-        "domain": [max(bottom, 0.0), top], "anchor": f"x{axis}", "nticks": 5,
+        "domain": upward, "anchor": f"x{axis}", "nticks": 5,
         "range": [-reach, reach],
     }  # fmt: skip
     figure["layout"]["annotations"].append({
-        "text": one.title, "xref": "paper", "yref": "paper", "x": left, "y": top,
+        "text": one.title, "xref": "paper", "yref": "paper", "x": across[0], "y": upward[1],
         "xanchor": "left", "yanchor": "bottom", "yshift": 3, "showarrow": False, "align": "left",
     })  # fmt: skip
 
