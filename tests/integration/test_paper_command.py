@@ -1,0 +1,73 @@
+"""`lagid paper` over a service of its own: the report's numbers are those of the jobs."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.client import Client
+from service.embedded import embedded_service
+
+pytestmark = [pytest.mark.slow, pytest.mark.ray, pytest.mark.timeout(120)]
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    with embedded_service(tmp_path_factory.mktemp("paper"), cpus=2) as address:
+        yield address
+
+
+def lagid(*words: object, **environment: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [sys.executable, "-m", "service.cli.main", "paper", *map(str, words)],
+        capture_output=True, text=True, timeout=90, check=False,
+        env={**os.environ, **environment},
+    )  # fmt: skip
+
+
+def test_the_tables_hold_the_estimates_of_the_jobs(url: str, tmp_path: Path) -> None:
+    report = tmp_path / "paper.html"
+    done = lagid("--quick", "--only", "table1", "--url", url, "--output", report)
+    assert done.returncode == 0, done.stderr
+    page = report.read_text(encoding="utf-8")
+    jobs = dict.fromkeys(re.findall(r"job_[0-9a-z]{26}", page))
+    assert len(jobs) == 3  # one for each reading
+    with Client(url) as client:
+        runs = [run for job in jobs for run in client.runs(job)]
+    assert len(runs) == 9
+    for run in runs:
+        assert f"{run['rms']:.6f}" in done.stdout
+        assert f">{run['rms']:.6f}<" in page
+        assert f">{run['evaluations']}<" in page
+    figures = re.findall(r'id="figure-[\d-]+">(.*?)</script>', page)
+    assert len(figures) == 12
+    assert all(json.loads(text)["data"] for text in figures)
+
+
+def test_without_its_data_the_tube_is_skipped_with_the_reason(url: str, tmp_path: Path) -> None:
+    report = tmp_path / "paper.html"
+    done = lagid("--only", "table3", "--url", url, "--output", report, LAGID_DATA=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    assert "skipped: no folder tube_reference; set LAGID_DATA" in done.stdout
+    assert "no folder tube_reference" in report.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("words", "told", "code"),
+    [
+        (["--only", "table9"], "--only: the study has no part 'table9'; need some of series", 1),
+        (["--output", "nowhere/paper.html"], "--output: there is no folder nowhere", 2),
+    ],
+)
+def test_what_cannot_be_done_is_refused_before_any_work(
+    words: list[str], told: str, code: int, tmp_path: Path
+) -> None:
+    done = lagid(*words, "--url", "http://127.0.0.1:1")
+    assert done.returncode == code
+    assert told in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
