@@ -110,7 +110,7 @@ def _rows(runs: Runs) -> list[Row]:
         error = median(errors) * sqrt(1.5708 / len(several)) if errors else float("nan")
         lags[length] = (median(one["value"] for one in found), error)
         rows += [
-            Row(f"{length:g} m, fit", fit, "%", 92.0 if length >= 3 else None, ">="),
+            Row(f"{length:g} m, fit", fit, "%", 93.0 if length >= 3 else None, ">="),
             Row(f"{length:g} m, L", 1e3 * lags[length][0], "ms"),
             Row(f"{length:g} m, standard error of L", 1e3 * error, "ms"),
             _told(length, several),

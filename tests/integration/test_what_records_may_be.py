@@ -1,0 +1,189 @@
+"""Records as they come: several, with gaps, irregular, drifting; each is identified as it is."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.derivations import derive
+from sysid.ga.chromosome import located
+from sysid.identify import identify
+from sysid.models.model import Model
+from sysid.models.spec import parse_model
+from sysid.problem import Problem
+from sysid.records import Channel, Record, Recording
+from sysid.result import Identification
+from sysid.settings import GeneticAlgorithm
+from sysid.simulation import simulate
+from sysid.types import FloatArray
+
+TRUTH = {"K": 2.0, "T": 0.6, "L": 0.37}
+QUICK = GeneticAlgorithm(generations=40)
+
+
+def lag_model(initial: Any = 0.0, **bounds: Mapping[str, Any]) -> Model:
+    """K e^(-Ls)/(Ts + 1)."""
+    parameters = {
+        "K": {"lower": -5, "upper": 5}, "T": {"lower": 0.05, "upper": 5},
+        "L": {"lower": 0, "upper": 2},
+    }  # fmt: skip
+    return parse_model({
+        "name": "lag", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
+        "parameters": parameters | bounds, "equations": {"x": "(K*u(t - L) - x)/T"},
+        "outputs": {"y": "x"}, "initial": {"x": initial},
+    })  # fmt: skip
+
+
+def source(seed: int = 1, samples: int = 400, period: float = 0.05) -> Channel:
+    """Levels of half a second, with ramps of one sample between them."""
+    drawn = np.random.default_rng(seed).uniform(-1, 1, samples)
+    times = period * np.arange(samples)
+    return Channel("u", times, drawn[(times / 0.5 + 1e-9).astype(int)], "V")
+
+
+def answer(given: Channel, start: float = 0.0, times: FloatArray | None = None) -> Channel:
+    """The true output from a start, without noise."""
+    model, at = lag_model({"lower": -9, "upper": 9}), given.times if times is None else times
+    return simulate(model, [given], {**TRUTH, "x(0)": start}, times=at).channels[0]
+
+
+def record(seed: int = 1, start: float = 0.0) -> Record:
+    return Record((source(seed),), (answer(source(seed), start),))
+
+
+def values(found: Identification) -> dict[str, float]:
+    return {one.name: one.value for one in found.estimates}
+
+
+def test_every_experiment_has_an_initial_state_of_its_own() -> None:
+    records = [record(1, 1.5), record(2, -0.8)]
+    found = values(identify(lag_model({"lower": -9, "upper": 9}), records, QUICK))
+    assert found == pytest.approx({**TRUTH, "x(0)": 1.5, "x(0)[2]": -0.8}, abs=1e-4)
+
+
+def test_a_measured_start_is_that_of_each_experiment() -> None:
+    records = [record(1, 1.5), record(2, -0.8)]
+    found = identify(lag_model("measured"), records, QUICK)
+    assert values(found) == pytest.approx(TRUTH, abs=1e-4)
+    starts = [outputs[0][0] for outputs in found.simulated]
+    assert starts == [1.5, -0.8]
+
+
+def test_a_fixed_start_is_not_estimated() -> None:
+    assert set(values(identify(lag_model(), record(), QUICK))) == set(TRUTH)
+
+
+def test_samples_that_are_missing_do_not_count() -> None:
+    whole = record()
+    y = whole.outputs[0].values.copy()
+    y[np.random.default_rng(5).random(y.size) < 0.4] = np.nan
+    gaps = replace(whole, outputs=(replace(whole.outputs[0], values=y),))
+    found = identify(lag_model(), gaps, QUICK)
+    assert values(found) == pytest.approx(TRUTH, abs=1e-4)
+    assert found.agreement[0].samples == np.count_nonzero(np.isfinite(y))
+
+
+def test_an_output_at_irregular_times_is_compared_at_its_own_times() -> None:
+    given = source()
+    times = np.sort(np.random.default_rng(6).uniform(0.0, given.times[-1], 150))
+    model = lag_model()
+    model = parse_model({**model.document, "solver": {"step": 0.01}})
+    values_ = simulate(model, [given], TRUTH, times=times).channels[0]
+    found = identify(model, Record((given,), (values_,)), QUICK)
+    assert values(found) == pytest.approx(TRUTH, abs=1e-3)
+    shifted = replace(values_, times=values_.times + 0.1)
+    late = identify(model, Record((given,), (shifted,)), QUICK)
+    assert values(late)["L"] == pytest.approx(TRUTH["L"] + 0.1, abs=0.02)
+
+
+def test_a_logarithmic_scale_divides_an_interval_by_ratios() -> None:
+    linear = Problem.build(lag_model(), [record()])
+    model = lag_model(T={"lower": 0.01, "upper": 100, "scale": "log"})
+    log = Problem.build(model, [record()])
+    middle = np.full((1, 3), 0.5)
+    assert located(linear.evaluator, middle)[0, 1] == pytest.approx((0.05 + 5) / 2)
+    assert located(log.evaluator, middle)[0, 1] == pytest.approx(1.0)
+    assert values(identify(model, record(), QUICK)) == pytest.approx(TRUTH, abs=1e-4)
+
+
+def test_the_output_with_more_weight_is_fitted_better() -> None:
+    """Two outputs that contradict each other."""
+    model = lag_model()
+    both = parse_model({**model.document, "outputs": {"y": "x", "z": "x"}})
+    y = answer(source())
+    data = Record((source(),), (y, Channel("z", y.times, 1.5 * y.values)))
+    for weights, gain in (({"y": 30.0, "z": 1.0}, 2.0), ({"y": 1.0, "z": 30.0}, 3.0)):
+        found = identify(both, data, QUICK, weights=weights)
+        assert values(found)["K"] == pytest.approx(gain, rel=0.01)
+
+
+DRIFT = 0.3 + 0.02 * source().times
+
+
+@pytest.mark.parametrize(
+    ("steps", "exact"),
+    [
+        ([{"trim": {"start": 3.0, "stop": 17.0}}], 1e-4),
+        ([{"trim": {"rows": [60, 340]}}], 1e-4),
+        ([{"split": {"fraction": 0.4, "part": "estimation"}}], 1e-4),
+        ([{"split": {"fraction": 0.6, "part": "validation"}}], 1e-4),
+        ([{"resample": {"sample_time": 0.025}}], 0.02),
+        ([{"offset": {"u": 0.0}}], 1e-4),
+    ],
+)
+def test_a_derived_recording_gives_the_same_system(
+    steps: Sequence[Mapping[str, Any]], exact: float
+) -> None:
+    given = source()
+    whole = Recording((given, answer(given)))
+    part = derive(whole, steps).record({"u": "u"}, {"y": "y"})
+    # What the input was before the part is not in it: a start and the first 2 s are left out.
+    model = lag_model({"lower": -9, "upper": 9})
+    found = identify(model, part, QUICK, skip=int(1.0 / 0.025))
+    assert {name: values(found)[name] for name in TRUTH} == pytest.approx(TRUTH, abs=exact)
+
+
+def test_a_drift_that_is_taken_away_does_no_harm() -> None:
+    given = source()
+    y = answer(given)
+    drifting = Recording((given, replace(y, values=y.values + DRIFT)))
+    flat = derive(drifting, [{"detrend": {"kind": "linear"}}]).record({"u": "u"}, {"y": "y"})
+    raw = drifting.record({"u": "u"}, {"y": "y"})
+    model = lag_model({"lower": -9, "upper": 9})
+    with_drift, without = (identify(model, one, QUICK) for one in (raw, flat))
+    assert without.rms < 0.2 * with_drift.rms
+    assert values(without)["K"] == pytest.approx(TRUTH["K"], rel=0.1)
+
+
+def test_one_step_prediction_uses_the_measured_past_and_a_free_run_does_not() -> None:
+    """With noise inside the loop one step ahead is right, and the free run is far off."""
+    model = parse_model({
+        "name": "arx", "form": "difference", "inputs": {"u": "V"}, "states": {"y": "m"},
+        "parameters": {"a": {"lower": -1, "upper": 1}, "b": {"lower": -5, "upper": 5}},
+        "equations": {"y": "a*y(k-1) + b*u(k-1)"}, "outputs": {"y": "y"},
+        "initial": {"y": "measured"},
+    })  # fmt: skip
+    given, rng = source(), np.random.default_rng(4)
+    y = np.zeros(given.times.size)
+    for k in range(1, y.size):
+        y[k] = 0.95 * y[k - 1] + 0.2 * given.values[k - 1] + 0.1 * rng.standard_normal()
+    data = Record((given,), (Channel("y", given.times, y),))
+    ahead = identify(model, data, QUICK, prediction="one-step")
+    free = identify(model, data, QUICK)
+    assert ahead.rms == pytest.approx(0.1, rel=0.1)
+    assert free.rms > 1.5 * ahead.rms
+    past = np.column_stack([y[:-1], given.values[:-1]])
+    least = np.linalg.lstsq(past, y[1:], rcond=None)[0]
+    assert list(values(ahead).values()) == pytest.approx(list(least), abs=1e-6)
+
+
+def test_the_hold_of_an_input_is_worth_half_a_sample_of_lag() -> None:
+    """A held input that is read as ramps seems to come earlier, so that the lag seems longer."""
+    held = replace(source(), hold="zero")
+    data = Record((held,), (answer(held),))
+    right = values(identify(lag_model(), data, QUICK))["L"]
+    ramps = values(identify(lag_model(), replace(data, inputs=(source(),)), QUICK))["L"]
+    assert right == pytest.approx(TRUTH["L"], abs=5e-3)
+    assert right + 0.01 < ramps < right + 0.04
