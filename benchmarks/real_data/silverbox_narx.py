@@ -1,18 +1,14 @@
 """Silverbox (measured): a NARX polynomial of 13 selected terms, free run on three tests."""
 
+from pathlib import Path
 from typing import Any
 
-from benchmarks.real_data.session import (
-    data_folder,
-    identify,
-    peak_memory_row,
-    print_estimates,
-    service,
-)
-from benchmarks.real_data.silverbox import PUBLISHED, TESTS
-from benchmarks.table import Row, Skipped, parser, report
+from benchmarks.real_data.session import identify, print_estimates, program
+from benchmarks.real_data.silverbox import ESTIMATION, PUBLISHED, TESTS
+from benchmarks.table import Row
+from service.client import Client
 
-ESTIMATION = [40650, 105712]  # the first 75 % of rows 40650:127400
+TITLE = "Silverbox, NARX, free run on the test parts"
 BARS_MV = {"multisine": 0.28, "arrow": 0.41, "arrow, first 32,000": 0.28}
 SECONDS = 120.0
 MODEL: dict[str, Any] = {
@@ -30,36 +26,29 @@ MODEL: dict[str, Any] = {
 SELECTIONS = {"one-step": MODEL["terms"], "simulation": MODEL["terms"] | {"error": "simulation"}}
 
 
-def main() -> None:
-    """Upload, derive, identify over REST, print."""
-    options = parser(__doc__ or "").parse_args()
-    folder = data_folder()
-    if folder is None:
-        report("Silverbox, NARX", [], [Skipped("silverbox", "LAGID_DATA is absent")], options)
-        return
-    with service() as (client, _):
-        raw = client.add_dataset(folder / "silverbox" / "silverbox_snls80mv.csv", name="silverbox")
+def measure(client: Client, folder: Path) -> list[Row]:
+    """Upload, derive, identify with terms selected by each error, print."""
+    raw = client.add_dataset(folder / "silverbox" / "silverbox_snls80mv.csv", name="silverbox")
 
-        def part(name: str, rows: list[int]) -> str:
-            return str(client.derive(raw["id"], [{"trim": {"rows": rows}}], name=name)["id"])
+    def part(name: str, rows: list[int]) -> str:
+        return str(client.derive(raw["id"], [{"trim": {"rows": rows}}], name=name)["id"])
 
-        tests = {name: part(f"silverbox {name}", rows) for name, rows in TESTS.items()}
-        data = {
-            "datasets": [part("silverbox estimation", ESTIMATION)],
-            "validation": {"datasets": list(tests.values())},
-            "skip": 50,
-        }
-        rows: list[Row] = []
-        for error, terms in SELECTIONS.items():
-            name = f"terms by the {error} error"
-            body = {"name": f"silverbox-narx-{error}", "model": MODEL | {"terms": terms}, **data}
-            run = identify(client, body)
-            print_estimates(f"Silverbox, {name}, 65,062 samples", run)
-            _print_selection(run)
-            rows += _rows(name, list(tests), run)
+    tests = {name: part(f"silverbox {name}", rows) for name, rows in TESTS.items()}
+    data = {
+        "datasets": [part("silverbox estimation", ESTIMATION)],
+        "validation": {"datasets": list(tests.values())},
+        "skip": 50,
+    }
+    rows: list[Row] = []
+    for error, terms in SELECTIONS.items():
+        name = f"terms by the {error} error"
+        body = {"name": f"silverbox-narx-{error}", "model": MODEL | {"terms": terms}, **data}
+        run = identify(client, body)
+        print_estimates(f"Silverbox, {name}, 65,062 samples", run)
+        _print_selection(run)
+        rows += _rows(name, list(tests), run)
     print(f"\n{PUBLISHED}")
-    rows.append(peak_memory_row())
-    report("Silverbox, NARX, free run on the test parts", rows, [], options)
+    return rows
 
 
 def _rows(name: str, tests: list[str], run: dict[str, Any]) -> list[Row]:
@@ -83,4 +72,4 @@ def _print_selection(run: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    program(TITLE, __doc__ or "", measure)

@@ -5,7 +5,7 @@ otherwise a coarse grid, and from its best points one lag at a time in turn.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import product
+from itertools import islice, product
 from math import ceil, floor, prod
 from typing import NamedTuple
 
@@ -18,8 +18,10 @@ from sysid.parameters import Parameter
 from sysid.selection.regression import lag_parameters
 
 _FULL = 4_000  # combinations up to which all are tried, if their cost allows
-_COARSE = 400
-_OPERATIONS = 1.5e10  # of all trials together, about
+_READING = 150.0  # operations that making one value of a column is worth
+_FEWEST = 60
+_COARSE = 0.1  # share of the trials that the coarse grid may take
+_OPERATIONS = 4e9  # of all trials together, about
 _BEGINNINGS = 3
 _ROUNDS = 6
 
@@ -66,14 +68,24 @@ def _whole(low: float, high: float, reach: float, begin: float) -> tuple[float, 
     return tuple(min(max(first + i * step, low), high) for i in range(count))
 
 
-def affordable_rows(combinations: int, terms: int) -> int:
-    """Rows that a trial may have, so that all trials together stay cheap."""
-    tried = min(combinations, _FULL)
-    return max(20 * terms, 500, int(_OPERATIONS / (2 * tried * (terms + 1) ** 2)))
+class Effort(NamedTuple):
+    """How many combinations may be tried, and on how many rows."""
+
+    trials: int
+    rows: int
 
 
-def search(values: Mapping[str, Sequence[float]], score: Score) -> list[Tried]:
-    """The combinations that were tried, best first."""
+def affordable(values: Mapping[str, Sequence[float]], terms: int) -> Effort:
+    """So much that all trials together stay cheap."""
+    least = max(5 * terms, 500)
+    each = 2.0 * (terms + 1) ** 2 + _READING * (terms + 1)
+    trials = int(min(max(_OPERATIONS / (each * least), _FEWEST), _FULL))
+    expected = min(trials, prod(len(axis) for axis in values.values()))
+    return Effort(trials, max(least, int(_OPERATIONS / (each * max(expected, 1)))))
+
+
+def search(values: Mapping[str, Sequence[float]], score: Score, trials: int = _FULL) -> list[Tried]:
+    """The combinations that were tried, best first; about `trials` of them at most."""
     names = list(values)
     axes = [list(values[name]) for name in names]
     known: dict[tuple[int, ...], float] = {}
@@ -84,14 +96,16 @@ def search(values: Mapping[str, Sequence[float]], score: Score) -> list[Tried]:
             known[place] = score(lags)
         return known[place]
 
-    if prod(len(axis) for axis in axes) <= _FULL:
-        for place in product(*(range(len(axis)) for axis in axes)):
+    sizes = [len(axis) for axis in axes]
+    if prod(sizes) <= trials:
+        for place in product(*(range(size) for size in sizes)):
             look(place)
     else:
-        for place in product(*_coarse([len(axis) for axis in axes])):
+        coarse = product(*_coarse(sizes, max(_COARSE * trials, _FEWEST / 2)))
+        for place in islice(coarse, trials):  # of many lags, even two values each are too many
             look(place)
         for begin in sorted(known, key=lambda p: (known[p], p))[:_BEGINNINGS]:
-            _descend(begin, [len(axis) for axis in axes], look)
+            _descend(begin, sizes, look, lambda: len(known) >= trials)
     ranked = sorted(known, key=lambda p: (known[p], p))
     return [
         Tried(known[place], {n: a[i] for n, a, i in zip(names, axes, place, strict=True)})
@@ -99,9 +113,9 @@ def search(values: Mapping[str, Sequence[float]], score: Score) -> list[Tried]:
     ]
 
 
-def _coarse(sizes: Sequence[int]) -> list[list[int]]:
-    """Evenly spread places on each axis, about `_COARSE` combinations in all."""
-    each = max(2, floor(_COARSE ** (1.0 / len(sizes))))
+def _coarse(sizes: Sequence[int], combinations: float) -> list[list[int]]:
+    """Evenly spread places on each axis, about so many combinations in all."""
+    each = max(2, floor(combinations ** (1.0 / len(sizes))))
     return [
         sorted({int(i) for i in np.round(np.linspace(0, size - 1, min(each, size)))})
         for size in sizes
@@ -109,17 +123,22 @@ def _coarse(sizes: Sequence[int]) -> list[list[int]]:
 
 
 def _descend(
-    place: tuple[int, ...], sizes: Sequence[int], look: Callable[[tuple[int, ...]], float]
+    place: tuple[int, ...],
+    sizes: Sequence[int],
+    look: Callable[[tuple[int, ...]], float],
+    is_over: Callable[[], bool],
 ) -> None:
     """One axis at a time: its best place, the others kept, until nothing gets better."""
     for _ in range(_ROUNDS):
         before = place
         for axis, size in enumerate(sizes):
-            tried = [(*place[:axis], i, *place[axis + 1 :]) for i in _line(size)]
-            place = min([place, *tried], key=lambda p: (look(p), p))
-            near = range(max(0, place[axis] - size // 64), min(size, place[axis] + size // 64 + 1))
-            tried = [(*place[:axis], i, *place[axis + 1 :]) for i in near]
-            place = min([place, *tried], key=lambda p: (look(p), p))
+            reach = max(1, size // 64)
+            for line in (_line(size), [place[axis] + i for i in range(-reach, reach + 1)]):
+                if is_over():
+                    return
+                inside = [i for i in line if 0 <= i < size]
+                tried = [(*place[:axis], i, *place[axis + 1 :]) for i in inside]
+                place = min([place, *tried], key=lambda p: (look(p), p))
         if place == before:
             return
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import prod
 from typing import Any
 
 from sysid.errors import InvalidSettings
@@ -13,7 +12,7 @@ from sysid.models.terms import SelectedTerm, Selection, TermRule
 from sysid.parameters import Parameter, override
 from sysid.records import Record
 from sysid.selection.frols import Forward, forward, select, solved
-from sysid.selection.lagsearch import affordable_rows, lag_values, search
+from sysid.selection.lagsearch import affordable, lag_values, search
 from sysid.selection.regression import Regression
 from sysid.selection.simulated import reselected
 from sysid.threads import one_thread
@@ -83,14 +82,14 @@ def _found(
     values = lag_values(model, parameters, regression.pieces[0].period)
     lags: dict[str, float] = {}
     if values:
-        combinations = prod(len(axis) for axis in values.values())
-        few = regression.thinned(affordable_rows(combinations, len(model.terms)))
+        effort = affordable(values, len(model.terms))
+        few = regression.thinned(effort.rows)
 
         def unexplained(tried: Mapping[str, float]) -> float:
             triangle, _ = few.triangle(model.terms, tried)
             return forward(triangle, rule.keep, rule.err).unexplained
 
-        lags = search(values, unexplained)[0].lags
+        lags = search(values, unexplained, effort.trials)[0].lags
     triangle, samples = regression.triangle(model.terms, lags)
     check_samples(len(model.terms), samples)
     found = select(triangle, rule, samples)

@@ -9,7 +9,6 @@ or as regressors. Each is run freely, and the search is given those that do best
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import prod
 from typing import TypeAlias
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy as np
 from sysid.islands.archipelago import of_island
 from sysid.problem import Problem
 from sysid.selection.frols import forward, solved
-from sysid.selection.lagsearch import affordable_rows, lag_values, search
+from sysid.selection.lagsearch import affordable, lag_values, search
 from sysid.selection.regression import Regression, lag_parameters
 from sysid.settings import GeneticAlgorithm
 from sysid.threads import one_thread
@@ -72,10 +71,10 @@ class _Finder:
         self._problem, self._left, self.evaluations = problem, most, 0
         model, names = problem.model, {p.name for p in problem.model.parameters}
         own = [one for one in problem.all_parameters if one.name in names]
-        self._terms = model.terms
         self._regression = Regression.laid(model, problem.records, problem.experiments, own)
         self._axes = lag_values(model, own, self._regression.pieces[0].period)
         fixed = {one.name: one.fixed for one in own if one.fixed is not None}
+        self._terms = tuple(t for t in model.terms if fixed.get(t.coefficient) != 0.0)
         self._given = {i: fixed[t.coefficient] for i, t in enumerate(self._terms)
                        if t.coefficient in fixed}  # fmt: skip
         self._sought = [i for i in range(len(self._terms)) if i not in self._given]
@@ -114,8 +113,8 @@ class _Finder:
         first = [dict(selection.lags)] if selection is not None and selection.lags else []
         if not self._axes:
             return [{}]
-        combinations = prod(len(axis) for axis in self._axes.values())
-        few = self._regression.thinned(affordable_rows(combinations, len(self._terms)))
+        effort = affordable(self._axes, len(self._terms))
+        few = self._regression.thinned(effort.rows)
 
         def unexplained(lags: Mapping[str, float]) -> float:
             triangle, _ = few.triangle(self._terms, lags)
@@ -123,7 +122,7 @@ class _Finder:
             return float(left @ left)
 
         taken = [one for one in first if one.keys() == self._axes.keys()]
-        for tried in search(self._axes, unexplained):
+        for tried in search(self._axes, unexplained, effort.trials):
             if not any(self._are_beside(tried.lags, other) for other in taken):
                 taken.append(tried.lags)
             if len(taken) == _LAGS:
