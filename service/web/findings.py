@@ -38,6 +38,15 @@ class OnsetView:
 
 
 @dataclass(frozen=True, slots=True)
+class SelectedView:
+    """One selected term of a polynomial."""
+
+    term: str
+    err: str
+    left: str
+
+
+@dataclass(frozen=True, slots=True)
 class Findings:
     """All of it for one run; empty where a result does not tell it.
 
@@ -51,6 +60,7 @@ class Findings:
     onsets: Sequence[OnsetView]
     groups: Sequence[str]
     criteria: Mapping[str, float | None]
+    selection: Sequence[SelectedView] = ()
 
 
 def findings_of(result: Document) -> Findings:
@@ -68,6 +78,11 @@ def findings_of(result: Document) -> Findings:
         onsets=[_onset(one, several) for one in onsets],
         groups=[_group(one) for one in groups if isinstance(one, dict)],
         criteria=result.get("criteria") or {},
+        selection=[
+            SelectedView(one["term"], formats.number(one["err"]),
+                         formats.number(max(1.0 - one["cumulated"], 0.0)))
+            for one in result.get("selection") or ()
+        ],
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service.models import resolved
+from service.web.findings import findings_of
 from sysid.errors import InvalidSettings
 from sysid.models.spec import parse_model
 from sysid.problem import Problem
@@ -287,3 +288,14 @@ def test_every_pair_of_terms_can_be_asked_for_as_candidates() -> None:
     for pair in combinations(["y(k-1)", "u(k-1)", "y(k-1)*u(k-1)"], 2):
         found = chosen(frols(1, candidates=list(pair)), record_of(TRUTH))
         assert set(found) <= set(pair)
+
+
+def test_pages_show_the_selected_terms_in_their_order() -> None:
+    first = {"term": "y(k-1)", "err": 0.583, "cumulated": 0.583, "coefficient": 1.5}
+    second = {"term": "u(k-1)", "err": 0.417, "cumulated": 1.0 + 1e-16, "coefficient": 0.5}
+    found = findings_of({"selection": [first, second]}).selection
+    assert [(one.term, one.err, one.left) for one in found] == [
+        ("y(k-1)", "0.5830", "0.4170"),
+        ("u(k-1)", "0.4170", "0"),
+    ]
+    assert findings_of({}).selection == []
