@@ -6,10 +6,11 @@ READY  := $(VENV)/.ready
 FAST   := not slow and not ray and not postgres and not browser and not data
 
 .DEFAULT_GOAL := help
-.PHONY: help demo serve test check format bench bench-full real-data clean
+.PHONY: help demo paper serve test check format bench bench-full real-data clean
 
 help:
 	@echo "make demo        set up, run the paper's Example 1 through the service, print the table"
+	@echo "make paper       set up, reproduce the paper's tables and figures with real jobs: paper.html"
 	@echo "make serve       set up, keep the service up on http://127.0.0.1:8000"
 	@echo "make test        set up, run the whole test suite"
 	@echo "make check       lint, types, import contracts, fast tests (before each commit)"
@@ -27,6 +28,9 @@ $(READY): requirements.lock pyproject.toml
 
 demo: $(READY)
 	@$(BIN)/lagid demo
+
+paper: $(READY)
+	@$(BIN)/lagid paper
 
 serve: $(READY)
 	@exec $(BIN)/lagid serve

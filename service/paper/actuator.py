@@ -113,7 +113,7 @@ def _table(found: Mapping[str, Found], title: str) -> Table:
         true = TRUE.get(name, TRUE["k_a"])
         paper = (published.TABLE_4.simple[name], published.TABLE_4.proposed[name])
         rows.append([
-            f"{name} [{unit}]", f"{true:.5g}", *(f"{value:.6g}" for value in paper),
+            f"{name} [{unit}]", f"{true:.6g}", *(f"{value:.6g}" for value in paper),
             *(_cell(found[method], name) for method in METHODS),
         ])  # fmt: skip
     rows.append(["RMS [mrad]", f"{1e3 * SIGMA:g}", "", "",
@@ -166,14 +166,14 @@ def _plots(
              figures.rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
              "Paper: the error becomes smaller gradually under the proposed search. "
              f"Ours: {_ends(found)}; the noise has {1e3 * SIGMA:g} mrad."),
-        Plot("Response to the record's input", figures.responses(found),
-             "Not in the paper: the record itself, with breaks in its course where the arm "
-             "sticks, and what is left of it."),
         Plot("Figure 21: step response under P control", figures.chart(data, "time [s]",
                                                                      "angle θ [°]"),
              "Paper: the response of the proposed search's model lies on the experiment's, that "
              "of the simple search beside it. Ours: the loop closed around each identified "
              "model, against the true parameters in place of the experiment."),
+        Plot("Response to the record's input", figures.responses(found),
+             "Not in the paper: the record itself, with breaks in its course where the arm "
+             "sticks, and what is left of it."),
     ]  # fmt: skip
 
 
