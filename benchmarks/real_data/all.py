@@ -3,13 +3,21 @@
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.real_data import dryer2, emps, pneuact_tube, silverbox, tube_reference
+from benchmarks.real_data import (
+    dryer2,
+    emps,
+    pneuact_tube,
+    silverbox,
+    silverbox_narx,
+    tube_reference,
+)
 from benchmarks.real_data.session import program
 from benchmarks.table import Row
 from service.client import Client
 
 PROGRAMS = {
     "Silverbox": silverbox.measure,
+    "Silverbox, NARX": silverbox_narx.measure,
     "EMPS": emps.measure,
     "dryer2": dryer2.measure,
     "pneuact": pneuact_tube.measure,
