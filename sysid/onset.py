@@ -198,10 +198,16 @@ def _rests(values: FloatArray) -> list[tuple[int, int]]:
     if values.size <= _REST:
         return []
     tolerance = max(_TOLERANCE * float(np.ptp(values)), 2.0 * _NOISE * _noise(values))
-    windows = np.lib.stride_tricks.sliding_window_view(values, _REST)
-    still = np.max(windows, axis=1) - np.min(windows, axis=1) <= tolerance
+    still = _running(values, np.maximum) - _running(values, np.minimum) <= tolerance
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
     return [(int(a), int(b) - 1 + _REST) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _running(values: FloatArray, extreme: np.ufunc) -> FloatArray:
+    """Extreme of every ten neighbours: of two, of four, of eight, of ten of them."""
+    for reach in (1, 2, 4, _REST - 8):
+        values = extreme(values[:-reach], values[reach:])
+    return values
 
 
 def _moves(channel: Channel, start: float, stop: float) -> bool:

@@ -25,23 +25,18 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.fft import irfft, rfft
 from scipy.special import gammaincc
 
+from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, lagged_sums, laid_out
 from sysid.problem import Problem
-from sysid.records import Channel, sampling_of
+from sysid.records import Channel
 from sysid.types import BoolArray, FloatArray
 
-MAX_LAG = 25
 LEVEL = 0.05
 """Chance that a true model with white noise fails one of its tests, all of them together."""
 
 _BAND95, _BAND99 = 1.959963984540054, 2.5758293035489004
-_FEWEST = 20  # samples: below, no test says anything
-_MOST = 50_000  # consecutive samples that are enough for any test; bounds the time it takes
-_ROUNDING = 1e-9  # of the output: below, the residual is rounding
-_GRID = 0.05  # of a period: so far from its place a sample may lie
-_GAPS = 0.5  # of the places of a grid are filled at least, else it is none
+_MOST = 20_000  # consecutive samples that are enough for any test; bounds the time it takes
 
 Kind = Literal["whiteness", "independence"]
 Outcome = Literal["passed", "failed", "not tested"]
@@ -130,7 +125,8 @@ def residual_tests(
     problem: Problem, simulated: FloatArray, data: Literal["estimation", "validation"]
 ) -> ResidualTests:
     """Test the residuals of simulated values (M,) on the records of a problem."""
-    return verdict(correlations(series_of(problem, simulated)), data)
+    found = correlations(series_of(problem, simulated), both_sides=False)
+    return verdict(found, data)
 
 
 def verdict(
@@ -169,7 +165,7 @@ def series(
     experiment: int, output: str, times: FloatArray, measured: FloatArray, simulated: FloatArray,
     scored: BoolArray, inputs: tuple[Channel, ...], loss_scale: float = 0.0,
 ) -> Series:  # fmt: skip
-    """Residuals from weighted outputs (N,); of a long record the last 50 000 scored samples.
+    """Residuals from weighted outputs (N,); of a long record the last 20 000 scored samples.
 
     `loss_scale` is that of a soft-l1 loss, 0 with squares.
     """
@@ -184,78 +180,42 @@ def series(
     return Series(experiment, output, times[kept], seen[kept], usable[kept], size, inputs)
 
 
-def correlations(found: Sequence[Series], level: float = LEVEL) -> list[Correlation]:
+def correlations(
+    found: Sequence[Series], level: float = LEVEL, *, both_sides: bool = True
+) -> list[Correlation]:
     """Autocorrelation of each series and its correlation with each input, all tested together.
 
-    `level` is shared out (Bonferroni): of n tests each is one at `level` / n.
+    `level` is shared out (Bonferroni): of n tests each is one at `level` / n. Without
+    `both_sides` the correlation with inputs to come, which is not tested, is left out.
     """
     count = sum(1 + len(one.inputs) for one in found if not _untestable(one))
     each = level / max(count, 1)
-    return [curve for one in found for curve in _of_series(one, each)]
+    return [curve for one in found for curve in _of_series(one, each, both_sides)]
 
 
-def _of_series(one: Series, level: float) -> Iterator[Correlation]:
+def _of_series(one: Series, level: float, both_sides: bool) -> Iterator[Correlation]:
     reason = _untestable(one)
     if reason:
         yield _not_tested(one, "whiteness", None, reason)
         for channel in one.inputs:
             yield _not_tested(one, "independence", channel.name, reason)
         return
-    laid = _laid(one)
+    laid = laid_out(one.times[one.scored], one.residual[one.scored])
     yield _whiteness(one, laid, level)
     for channel in one.inputs:
-        yield _independence(one, laid, channel, level)
+        yield _independence(one, laid, channel, level, both_sides=both_sides)
 
 
 def _untestable(one: Series) -> str:
     n = int(np.count_nonzero(one.scored))
-    if n < _FEWEST:
-        return f"{n} samples are too few; need {_FEWEST} or more"
-    if float(np.sqrt(np.mean(np.square(one.residual[one.scored])))) <= _ROUNDING * one.size:
+    if n < FEWEST:
+        return f"{n} samples are too few; need {FEWEST} or more"
+    if float(np.sqrt(np.mean(np.square(one.residual[one.scored])))) <= ROUNDING * one.size:
         return "the residuals are rounding: the model reproduces the data exactly"
     return ""
 
 
-class _Laid(NamedTuple):
-    """Residuals one beside the other, zero where one is missing, with their times."""
-
-    times: FloatArray
-    values: FloatArray
-    present: BoolArray
-    period: float
-    is_regular: bool
-
-    @property
-    def lags(self) -> int:
-        return min(MAX_LAG, int(np.count_nonzero(self.present)) // 4)
-
-
-def _laid(one: Series) -> _Laid:
-    """The scored residuals in places a period apart; irregular ones in their order."""
-    times, values = one.times[one.scored], one.residual[one.scored]
-    steps = np.diff(times)
-    period = float(np.median(steps)) if steps.size else 0.0
-    if period > 0:
-        rounded = np.cumsum(np.maximum(np.rint(steps / period), 0.0))
-        period = float((times[-1] - times[0]) / rounded[-1])  # not off by the rounding of one step
-        exact = np.concatenate([[0.0], steps / period])
-        places = np.concatenate([[0.0], rounded])
-        far = np.abs(exact - np.rint(exact))
-        is_regular = bool(np.all(far <= _GRID) and np.all(np.rint(exact[1:]) >= 1))
-        n = int(places[-1]) + 1
-        if is_regular and values.size >= _GAPS * n:
-            index = places.astype(np.intp)
-            filled, present = np.zeros(n), np.zeros(n, dtype=np.bool_)
-            filled[index], present[index] = values, True
-            laid = times[0] + period * np.arange(n)
-            laid[index] = times
-            return _Laid(laid, filled, present, period, is_regular=True)
-    distinct = max(np.unique(times).size - 1, 1)
-    spacing = float(times[-1] - times[0]) / distinct
-    return _Laid(times, values, np.ones(values.size, dtype=np.bool_), spacing, is_regular=False)
-
-
-def _whiteness(one: Series, laid: _Laid, level: float) -> Correlation:
+def _whiteness(one: Series, laid: Laid, level: float) -> Correlation:
     n = np.count_nonzero(laid.present)
     power = float(laid.values @ laid.values)
     lags = range(1, laid.lags + 1)
@@ -271,89 +231,35 @@ def _whiteness(one: Series, laid: _Laid, level: float) -> Correlation:
     )  # fmt: skip
 
 
-def _independence(one: Series, laid: _Laid, channel: Channel, level: float) -> Correlation:
-    m = laid.lags
+def _independence(
+    one: Series, laid: Laid, channel: Channel, level: float, *, both_sides: bool
+) -> Correlation:
     if not np.ptp(channel.values) > 0:
         return _not_tested(one, "independence", channel.name, "the input is constant")
     residual = np.where(laid.present, laid.values - np.mean(laid.values[laid.present]), 0.0)
-    shifted = [_shifted(laid, channel, k * laid.period) for k in range(-m, m + 1)]
-    # Of every lag the same samples, so that no lag is judged by more than another.
-    known = laid.present & np.all(np.isfinite(shifted), axis=0)
-    if np.count_nonzero(known) < _FEWEST:
-        return _not_tested(one, "independence", channel.name, "it overlaps the output too little")
-    columns = np.where(known, shifted, 0.0)
-    columns -= np.where(known, columns.sum(axis=1, keepdims=True) / known.sum(), 0.0)
-    sizes = np.sqrt(np.sum(np.square(columns), axis=1))
-    if not np.min(sizes[m:]) > _ROUNDING * np.max(np.abs(channel.values)):
-        return _not_tested(one, "independence", channel.name, "the input is constant there")
-    covariance = _covariance(residual, laid.present, columns)
-    sums, deviation = columns @ residual, np.sqrt(np.diag(covariance))
-    norm = sizes * np.sqrt(float(residual[known] @ residual[known]))
-    norm, deviation = np.maximum(norm, np.finfo(float).tiny), np.maximum(deviation, 1e-300)
-    past = slice(m, 2 * m + 1)
-    scaled = sums[past] / deviation[past]
-    spread = covariance[past, past] / np.outer(deviation[past], deviation[past])
-    count, squares = m + 1, float(np.sum(np.square(spread)))
+    if not np.max(np.abs(residual)) > ROUNDING * np.max(np.abs(laid.values)):
+        reason = "the residual is the same everywhere"
+        return _not_tested(one, "independence", channel.name, reason)
+    colour = colour_of(residual, laid.present)
+    past = lagged_sums(laid, residual, colour, channel, np.arange(laid.lags + 1.0))
+    if isinstance(past, str):
+        return _not_tested(one, "independence", channel.name, past)
+    scaled = past.sums / past.deviation
+    spread = past.covariance / np.outer(past.deviation, past.deviation)
+    count, squares = scaled.size, float(np.sum(np.square(spread)))
     # A sum of squares with mean `count` and variance 2·`squares` is a χ² times squares/count.
     statistic = float(scaled @ scaled) * count / squares
-    test = _test(
-        one, "independence", channel.name, scaled, statistic, count * count / squares, level
-    )
-    band = deviation / norm
+    degrees = count * count / squares
+    test = _test(one, "independence", channel.name, scaled, statistic, degrees, level)
+    parts = [past]
+    if both_sides:
+        future = lagged_sums(laid, residual, colour, channel, np.arange(-float(laid.lags), 0.0))
+        parts = [past] if isinstance(future, str) else [future, past]
+    band = np.concatenate([part.deviation / part.norm for part in parts])
     return Correlation(
-        test, laid.period, np.arange(-float(m), m + 1), sums / norm, _BAND95 * band, _BAND99 * band
-    )
-
-
-def _shifted(laid: _Laid, channel: Channel, lag: float) -> FloatArray:
-    """The input at the residuals' times less a lag (s); nan where it was not recorded."""
-    # A jump and the sample it is seen at may be a rounding apart: nearer than this, they are one.
-    slack = 1e-6 * laid.period
-    wanted = laid.times - lag
-    if channel.hold == "zero":
-        place = np.searchsorted(channel.times, wanted + slack, side="right") - 1
-        values = channel.values[np.clip(place, 0, channel.times.size - 1)]
-        period = sampling_of(channel.times).period
-        slack += period if np.isfinite(period) else 0.0  # the last value holds for a period
-    else:
-        values = np.interp(wanted, channel.times, channel.values)
-    first, last = channel.times[0], channel.times[-1]
-    inside = (wanted >= first - 1e-6 * laid.period) & (wanted <= last + slack)
-    return np.asarray(np.where(inside, values, np.nan))
-
-
-def _covariance(residual: FloatArray, present: BoolArray, columns: FloatArray) -> FloatArray:
-    """Covariance of Σ e(i) u_a(i) over the noise e, given the columns u_a (n, N)."""
-    n = residual.size
-    length = 1 << (2 * n - 1).bit_length()
-    raw = irfft(np.square(np.abs(rfft(residual, length))), length)[:n]
-    pairs = np.rint(irfft(np.square(np.abs(rfft(present.astype(float), length))), length)[:n])
-    autocovariance = raw / np.count_nonzero(present)
-    complete = np.where(pairs > 0, np.arange(n, 0.0, -1.0) / np.maximum(pairs, 1.0), 0.0)
-    autocovariance *= complete * np.count_nonzero(present) / n  # as if none were missing
-    taper = _parzen(n, _width(autocovariance, n))
-    kernel = np.zeros(length)
-    kernel[:n] = autocovariance * taper
-    kernel[length - n + 1 :] = kernel[1:n][::-1]
-    spectrum = np.maximum(rfft(kernel).real, 0.0)
-    weight = np.full(spectrum.size, 2.0)  # each frequency stands for its negative too
-    weight[0] = 1.0
-    if length % 2 == 0:
-        weight[-1] = 1.0
-    seen_by = rfft(columns, length, axis=1) * np.sqrt(spectrum * weight / length)
-    return np.asarray((seen_by @ seen_by.conj().T).real)
-
-
-def _width(autocovariance: FloatArray, n: int) -> float:
-    """Width of a Parzen window, by the rule of Andrews (1991) for first-order colour."""
-    rho = float(np.clip(autocovariance[1] / autocovariance[0], -0.99, 0.99))
-    curvature = 4.0 * rho**2 / (1.0 - rho) ** 4
-    return float(np.clip(2.66 * (curvature * n) ** 0.2, n ** (1 / 3), 0.25 * n))
-
-
-def _parzen(n: int, width: float) -> FloatArray:
-    x = np.minimum(np.arange(n) / width, 1.0)
-    return np.asarray(np.where(x <= 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3))
+        test, laid.period, np.concatenate([part.lags for part in parts]),
+        np.concatenate([part.sums / part.norm for part in parts]), _BAND95 * band, _BAND99 * band,
+    )  # fmt: skip
 
 
 def _test(

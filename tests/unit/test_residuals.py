@@ -182,6 +182,7 @@ def test_residuals_that_are_rounding_are_not_tested() -> None:
     ("residual", "u", "outcome", "reason"),
     [
         (np.ones(10), np.ones(10), ["not tested", "not tested"], "10 samples are too few"),
+        (np.ones(N), held(draws(0)), ["failed", "not tested"], "the same everywhere"),
         (draws(0).normal(size=N), np.ones(N), ["passed", "not tested"], "the input is constant"),
         (draws(0).normal(size=N), held(draws(0), 100)[:3], ["passed", "not tested"], "input"),
     ],

@@ -1,0 +1,113 @@
+"""Figure and table of the residual tests, and what pages show beside the estimates."""
+
+import json
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.web import figures
+from service.web.evidence import CorrelationTrace
+from service.web.figures_residuals import residuals, residuals_height
+from service.web.findings import chance, findings_of
+
+
+def trace(
+    *, is_auto: bool = True, period: float | None = 0.1, spike: float = 0.0
+) -> CorrelationTrace:
+    lags = np.arange(0.0 if is_auto else -25.0, 26.0)
+    values = 0.01 * np.cos(lags)
+    values[-3] += spike
+    if is_auto:
+        values[0] = 1.0
+    band = np.full(lags.size, 0.05)
+    return CorrelationTrace("of y", is_auto, period, lags, values, band, 1.3 * band)
+
+
+def bars(figure: dict[str, Any]) -> list[dict[str, Any]]:
+    return [one for one in figure["data"] if one["type"] == "bar"]
+
+
+def test_every_function_is_drawn_over_its_bands_and_lag_0_of_an_autocorrelation_is_not() -> None:
+    figure = residuals([trace(), trace(is_auto=False)])
+    first, second = bars(figure)
+    assert first["x"] == list(range(1, 26))
+    assert second["x"] == list(range(-25, 26))
+    assert {one["name"] for one in figure["data"]} == {"of y", "95 % band", "99 % band"}
+    reach = figure["layout"]["yaxis"]["range"][1]
+    assert 0.065 < reach < 0.2
+
+
+def test_a_lag_outside_the_band_has_another_colour_and_stays_in_sight() -> None:
+    figure = residuals([trace(spike=0.4)])
+    colours = bars(figure)[0]["marker"]["color"]
+    assert len(set(colours)) == 2
+    assert colours.count(colours[-3]) == 1
+    assert figure["layout"]["yaxis"]["range"][1] > 0.4
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+@pytest.mark.parametrize("columns", [1, 2])
+def test_the_plots_lie_inside_the_figure_and_apart(count: int, columns: int) -> None:
+    figure = residuals([trace()] * count, columns)
+    shown = figure["layout"]
+    assert shown["height"] == residuals_height(count, columns)
+    axes = [str(k) if k > 1 else "" for k in range(1, count + 1)]
+    boxes = [(*shown[f"xaxis{k}"]["domain"], *shown[f"yaxis{k}"]["domain"]) for k in axes]
+    assert all(0 <= low < high <= 1 for box in boxes for low, high in (box[:2], box[2:]))
+    for i, (left, right, bottom, top) in enumerate(boxes):
+        for other in boxes[i + 1 :]:
+            assert right < other[0] or other[1] < left or bottom > other[3] or top < other[2]
+
+
+def test_without_functions_there_is_nothing_to_draw() -> None:
+    assert residuals([])["data"] == []
+
+
+def test_the_axis_says_what_a_lag_is() -> None:
+    title = residuals([trace()])["layout"]["xaxis"]["title"]["text"]
+    assert title == "lag [samples of 0.1 s]"
+    assert residuals([trace(period=None)])["layout"]["xaxis"]["title"]["text"] == "lag [samples]"
+
+
+def test_the_figure_is_json_and_its_numbers_are_csv() -> None:
+    figure = residuals([trace(), trace(is_auto=False)])
+    json.dumps(figure, allow_nan=False)
+    rows = figures.as_csv(figure).splitlines()
+    assert rows[0] == "series,x,y"
+    assert sum(row.startswith("of y,") for row in rows) == 25 + 51
+
+
+def test_results_of_older_versions_have_no_findings() -> None:
+    found = findings_of({"residual_tests": {}, "identifiability": {"groups": [["T", "L"]]}})
+    assert found.verdict == ""
+    assert list(found.tests) == list(found.onsets) == list(found.groups) == []
+    assert found.criteria == {}
+    assert findings_of({}).n_figures == 0
+
+
+def test_a_test_that_was_not_made_says_why() -> None:
+    one = {"experiment": 0, "output": "y", "test": "independence", "input": "u",
+           "outcome": "not tested", "reason": "the input is constant", "p": None}  # fmt: skip
+    found = findings_of({"residual_tests": {"data": "estimation", "passed": None, "tests": [one]}})
+    assert found.verdict == "not tested"
+    assert found.n_figures == 0
+    assert found.tests[0].reason == "the input is constant"
+    assert found.tests[0].p == "–"
+
+
+def test_onset_delays_tell_steps_and_spread_or_the_reason() -> None:
+    clear = {"experiment": 0, "input": "u", "output": "y", "delay": 0.129, "unit": "s",
+             "spread": 0.005, "events": 9, "threshold": 0.02, "reason": ""}  # fmt: skip
+    vague = {**clear, "delay": None, "spread": None, "events": 0, "reason": "it does not rest"}
+    known, unknown = findings_of({"onset_delays": [clear, vague]}).onsets
+    assert re.fullmatch(r"0\.1290\s*s", known.text)
+    assert known.reason.startswith("9 steps, spread 0.0050")
+    assert unknown.text == ""
+    assert unknown.reason == "it does not rest"
+
+
+@pytest.mark.parametrize(("p", "text"), [(None, "–"), (0.0, "< 0.001"), (0.0414, "0.041")])
+def test_chances(p: float | None, text: str) -> None:
+    assert chance(p) == text
