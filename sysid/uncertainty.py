@@ -28,6 +28,7 @@ from sysid.problem import Problem
 from sysid.result import Criteria, Estimate, EstimateStatus, Uncertainty
 from sysid.sensitivities import sensitivities
 from sysid.symmetries import scalings
+from sysid.translations import translations
 from sysid.types import BoolArray, FloatArray
 
 _RANK = 1e-7  # of the largest singular value: below, the differences are rounding
@@ -90,13 +91,16 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
     gain = _possible_gain(_influence(error, loss_scale(problem)), sloping, place)
     scale = _physical(problem, theta)
     powers = scalings(problem.model, problem.all_parameters)
-    columns, known = _without_symmetries(columns, powers * theta / scale)
+    shifts, more = translations(problem, theta, columns, scale)
+    count += more
+    columns, known = _without_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
     singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
     kept = singular > _RANK * max(singular[0], np.finfo(float).tiny)
     kept[d - known :] = False
     inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
     covariance, noise = _covariance(error, columns, inverse, loss_scale(problem))
     member = np.any(rows[~kept] ** 2 > _NULL_MEMBER, axis=0) | np.any(powers != 0.0, axis=0)
+    member |= np.any(shifts != 0.0, axis=0)
     weak = kept & (noise >= _SAYS_NOTHING * singular)
     directions = _Directions(singular, rows, ~kept, weak, member)
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)

@@ -39,7 +39,7 @@ def lag_model(initial: Any = 0.0, **bounds: Mapping[str, Any]) -> Model:
 def source(seed: int = 1, samples: int = 400, period: float = 0.05) -> Channel:
     """Levels of half a second, with ramps of one sample between them."""
     drawn = np.random.default_rng(seed).uniform(-1, 1, samples)
-    times = period * np.arange(samples)
+    times: FloatArray = period * np.arange(samples, dtype=np.float64)
     return Channel("u", times, drawn[(times / 0.5 + 1e-9).astype(int)], "V")
 
 

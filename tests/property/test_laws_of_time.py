@@ -26,7 +26,8 @@ SYSTEMS: dict[str, dict[str, float]] = {
 
 def answer(name: str, values: FloatArray, hold: Hold) -> FloatArray:
     """Output of a system at rest to an input."""
-    model, times = load_model(name), PERIOD * np.arange(values.size)
+    model = load_model(name)
+    times: FloatArray = PERIOD * np.arange(values.size, dtype=np.float64)
     source = Channel(model.inputs[0].name, times, values, hold=hold)
     return simulate(model, [source], SYSTEMS[name], times=times).channels[0].values
 
