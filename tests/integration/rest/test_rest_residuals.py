@@ -1,15 +1,23 @@
 """Residual tests, onset delays and comparisons of runs that were identified, over REST."""
 
+import asyncio
+import html
+import json
+import re
 from collections.abc import Iterator
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
+import httpx
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
+from typer.testing import CliRunner
 
 from service.api.deps import Parts
 from service.app import create_app
-from service.client import Client
+from service.cli.runs import app as runs_app
+from service.client import AsyncClient, Client
 from service.storage.errors import ObjectMissing
 from service.storage.objects import ObjectStore
 from sysid.records import Recording
@@ -167,3 +175,66 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
     asked = served.server.get(f"/v1/runs/{served.runs[0]}/residuals").json()
     assert [one["test"] for one in asked["tests"]] == ["whiteness"]
     assert "not to be had any more" in asked["note"]
+
+
+def command(served: Served, monkeypatch: pytest.MonkeyPatch, *words: str) -> str:
+    """What a command under ``lagid runs`` prints."""
+    client = Client("http://testserver", transport=Through(served.server))
+    monkeypatch.setattr("service.cli.runs.connected", lambda url, key: nullcontext(client))
+    done = CliRunner().invoke(runs_app, list(words))
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_the_command_line_tells_the_verdicts(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = command(served, monkeypatch, "residuals", served.runs[0])
+    assert "residuals on validation data: failed" in text
+    assert "independence" in text
+    asked = json.loads(command(served, monkeypatch, "residuals", served.runs[1], "--json"))
+    assert asked["passed"] is True
+
+
+def test_the_command_line_compares_and_says_what_depends_on_the_model(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = command(served, monkeypatch, "compare", *served.runs)
+    assert text.index("sopdt") < text.index("fopdt")
+    assert "note: L depends on the model" in text
+
+
+def test_the_asynchronous_client_asks_the_same(served: Served) -> None:
+    async def asked() -> tuple[dict[str, Any], dict[str, Any]]:
+        transport = httpx.ASGITransport(served.server.app)
+        async with AsyncClient("http://testserver", transport=transport) as client:
+            return await client.residuals(served.runs[0]), await client.compare(*served.runs)
+
+    residuals, compared = asyncio.run(asked())
+    assert residuals["id"] == served.runs[0]
+    assert len(compared["runs"]) == 2
+
+
+def test_the_page_of_a_sweep_over_models_leads_to_their_comparison(served: Served) -> None:
+    page = served.server.get(f"/runs/{served.runs[0]}").text
+    link = re.search(r'href="(/compare[^"]+)"', page)
+    assert link is not None
+    compared = served.server.get(html.unescape(link[1]))
+    assert compared.status_code == 200
+    assert "L depends on the model" in compared.text
+    alone = served.server.get(f"/runs/{served.other}").text
+    assert "/compare" not in alone
+
+
+def test_figures_of_residuals_have_a_function_for_each_test(served: Served) -> None:
+    figure = served.server.get(f"/v1/runs/{served.runs[0]}/figures/residuals").json()
+    assert sum(one["type"] == "bar" for one in figure["data"]) == 2
+    beyond = served.server.get(f"/v1/runs/{served.runs[0]}/figures/residuals?experiment=1")
+    refused(beyond, 404, "not-found")
+
+
+def test_the_report_holds_tests_and_figures(served: Served) -> None:
+    job = served.server.get(f"/v1/runs/{served.runs[0]}").json()["job"]
+    text = served.server.get(f"/v1/jobs/{job}/report").text
+    assert "Correlation of the residuals: validation 1" in text
+    assert "Onset delay, y behind u" in text
