@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from service.paper import figures, noise, oscillators, published, study
+from service.paper import figures, forces, noise, oscillators, published, study
 from service.paper.bench import Found, Improvement, champions
 from service.paper.bound import cramer_rao
 from service.paper.parts import Check, Section, Table, markdown
 from service.schemas_datasets import SimulateIn
 from service.schemas_jobs import JobIn
-from sysid.models.library import load_model
+from sysid.models.library import document, load_model
+from sysid.models.spec import parse_model
 from sysid.records import Channel
 
 
@@ -143,3 +144,18 @@ def test_a_line_of_convergence_reaches_the_last_generation() -> None:
     assert drawn["simple"]["y"] == [1, 2, 2]
     assert drawn["true value"]["y"] == [2.5, 2.5]
     assert figure["layout"]["yaxis"]["title"]["text"] == "a [s]"
+
+
+def test_the_noise_enters_the_recursion_as_a_force_or_as_printed() -> None:
+    known = document("duffing-eq16")
+    force, printed = (str(forces.document(known, kind)["equations"]["x"]) for kind in forces.TERMS)
+    assert force.endswith("- q(k-2) - sigma*phi(k-2))/m")  # h² and 1/m stand before the bracket
+    assert printed.endswith("- q(k-2))/m + sigma*phi(k-2)")
+    for kind in forces.TERMS:
+        model = parse_model(forces.document(known, kind))
+        assert [one.name for one in model.inputs] == ["q", "phi"]
+
+
+def test_a_recursion_without_that_place_for_noise_is_refused() -> None:
+    with pytest.raises(ValueError, match="no 'q"):
+        forces.document({**document("duffing-eq16"), "equations": {"x": "x(k-1)"}}, "force")
