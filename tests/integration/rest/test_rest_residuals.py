@@ -30,6 +30,17 @@ SMALL = {"population": 20, "generations": 40, "islands": 1}
 BOUNDS = {"K": {"lower": 0, "upper": 5}, "L": {"upper": 2}}
 
 
+TWO_OUTPUTS = {
+    "name": "both", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "parameters": {
+        "K": {"lower": 0, "upper": 5}, "T": {"lower": 0.05, "upper": 5, "unit": "s"},
+        "L": {"lower": 0, "upper": 2, "unit": "s"}, "b": {"lower": -1, "upper": 1},
+    },
+    "equations": {"x": "(K*u(t - L) - x)/T"}, "outputs": {"y": "x", "z": "x + b"},
+    "initial": {"x": 0},
+}  # fmt: skip
+
+
 class Served(NamedTuple):
     """An application with a job of two models on the same data, and one on other data."""
 
@@ -238,3 +249,34 @@ def test_the_report_holds_tests_and_figures(served: Served) -> None:
     text = served.server.get(f"/v1/jobs/{job}/report").text
     assert "Correlation of the residuals: validation 1" in text
     assert "Onset delay, y behind u" in text
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"loss": {"kind": "soft-l1", "scale": 0.02}, "skip": 30, "validation": None},
+        {"loss": {"kind": "soft-l1", "scale": 0.05}, "skip": 7, "validation": {"fraction": 0.4}},
+        {"noise": {"sigma": 0.1, "seed": 4}, "validation": {"datasets": ["d2"]}, "skip": 11},
+        {"datasets": ["d1", "d2"], "validation": None},
+        {"datasets": ["d1", "d2"], "validation": {"fraction": 0.25}, "prediction": "one-step"},
+        {"model": TWO_OUTPUTS, "channels": {"z": "y"}, "weights": {"y": 2.0}, "skip": 3,
+         "loss": {"kind": "soft-l1", "scale": 0.1}, "parameters": {}},
+    ],
+    ids=["robust", "robust part", "noise, other data", "two records", "two parts", "two outputs"],
+)  # fmt: skip
+def test_what_is_computed_again_is_what_was_stored_whatever_the_job(
+    served: Served, changes: dict[str, Any]
+) -> None:
+    body = {
+        "model": "fopdt", "datasets": ["d1"], "hold": {"u": "zero"}, "algorithm": SMALL,
+        "parameters": BOUNDS, "validation": {"fraction": 0.3},
+    }  # fmt: skip
+    _, runs = identified(served.parts, {**body, **changes})
+    stored = result(served, runs[0])["residual_tests"]
+    asked = served.server.get(f"/v1/runs/{runs[0]}/residuals").json()
+    assert asked["data"] == stored["data"]
+    assert len(asked["tests"]) == len(stored["tests"]) >= 2
+    for one, kept in zip(asked["tests"], stored["tests"], strict=True):
+        assert one["outcome"] == kept["outcome"] != "not tested"
+        assert one["samples"] == kept["samples"]
+        assert one["statistic"] == pytest.approx(kept["statistic"], rel=1e-6)
