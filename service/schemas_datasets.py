@@ -69,19 +69,32 @@ InputIn = Annotated[
 
 
 class SimulateIn(Body):
-    """A dataset made from a model: its true parameters, its inputs, the noise on its outputs.
+    """A dataset made from a model or a plant: parameters, inputs, the noise on its outputs.
 
     A state's start may be given among the parameters as ``x(0)``; a state that the model does not
-    start itself starts at zero.
+    start itself starts at zero. A plant has values of its own for all that is not given:
+
+    - ``actuator``: the vane actuator with stick-slip friction, exact between its events; input P_a
+      in Pa, parameters J, F_c, F_max, k_a, k_b, k_c, A_m, B, theta_s in SI units.
+    - ``tube``: a pneumatic tube with a regulator before and a volume behind it; parameters
+      ``pattern`` (1 or 2, the excitation), length_m, bore_m, volume_m3, temperature, and
+      ``gauges`` (a seed: the pressures as gauges with noise and 12 bit tell them).
     """
 
     name: str | None = Field(default=None, max_length=200)
-    model: Any
+    model: Any = None
+    plant: Literal["actuator", "tube"] | None = None
     parameters: dict[str, float] = Field(default={})
     inputs: dict[str, InputIn] = Field(default={})
-    samples: int = Field(ge=2, le=MAX_SIMULATED_SAMPLES)
-    sample_time: float = Field(gt=0)
+    samples: int | None = Field(default=None, ge=2, le=MAX_SIMULATED_SAMPLES)
+    sample_time: float | None = Field(default=None, gt=0)
     noise: NoiseIn = NoiseIn()
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.model is None) == (self.plant is None):
+            raise PydanticCustomError("one_of", "give either 'model' or 'plant'")
+        return self
 
 
 class DeriveIn(Body):

@@ -1,4 +1,4 @@
-"""Use case: a dataset simulated from a model, its true parameters, inputs, and noise."""
+"""Use case: a dataset simulated from a model or a plant, with inputs and noise."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,6 +10,7 @@ from service import models
 from service.datasets import add_recording, key_of
 from service.errors import FieldError, InvalidRequest
 from service.inputs import Signals
+from service.plants import simulate_plant
 from service.schemas_datasets import InputIn, SimulateIn
 from service.storage.datasets import DatasetRepository, Stored
 from service.storage.objects import ObjectStore
@@ -21,23 +22,29 @@ from sysid.types import FloatArray
 
 
 def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored:
-    """Make a dataset of a model's inputs and outputs; the same body gives the same dataset.
+    """Make a dataset of a model's or plant's signals; the same body gives the same dataset.
 
     Raises
     ------
     InvalidRequest
         With every fault: unknown model, parameter or signal, a missing value, a bad expression.
     """
+    if body.plant is not None:
+        return simulate_plant(database, store, body)
     with database.read() as session:
         model, document = _model(session, body.model)
-        key = key_of({**body.model_dump(mode="json", exclude={"name"}), "model": document})
+        request = body.model_dump(mode="json", exclude={"name", "plant"})
+        key = key_of({**request, "model": document})
         known = DatasetRepository(session).by_source(key)
         if known is not None:
             return Stored(known, is_new=False)
         faults = [*_parameter_faults(model, body.parameters), *_input_faults(model, body.inputs)]
+        if body.samples is None or body.sample_time is None:
+            missing = "samples" if body.samples is None else "sample_time"
+            faults.append(FieldError(f"/{missing}", "is missing"))
         if faults:
             raise InvalidRequest(faults)
-        times = np.arange(body.samples, dtype=np.float64) * body.sample_time
+        times = np.arange(body.samples or 0, dtype=np.float64) * (body.sample_time or 0.0)
         signals = Signals(session, store, times)
         inputs = [
             Channel(
@@ -47,7 +54,7 @@ def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored
         ]
     recording = _simulated(model, inputs, body, times)
     details = {
-        "simulation": {**body.model_dump(mode="json", exclude={"model"}), "model": document},
+        "simulation": {**request, "name": body.name, "model": document},
         "true_parameters": body.parameters,
         "warnings": [],
     }

@@ -63,13 +63,30 @@ def add(
 
 @app.command()
 def simulate(
-    file: Annotated[Path, typer.Argument(help=DOCUMENT)],
+    file: Annotated[Path | None, typer.Argument(help=DOCUMENT)] = None,
+    plant: Annotated[
+        str | None, typer.Option(help="Reference plant instead of a model: actuator or tube.")
+    ] = None,
+    sets: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="A parameter, such as length_m=30."),
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the dataset.")] = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a recording from a model, its true parameters, inputs and noise."""
-    body = _object(read_yaml(read_file(file)), file)
+    """Make a recording from a model or a reference plant, its parameters, inputs and noise."""
+    if file is None and plant is None:
+        fail("give a file with the request, or --plant actuator or --plant tube")
+    body = {} if file is None else _object(read_yaml(read_file(file)), file)
+    if plant is not None:
+        body["plant"] = plant
+    if name is not None:
+        body["name"] = name
+    if sets:
+        given = dict(_parameter(one) for one in sets)
+        body["parameters"] = {**(body.get("parameters") or {}), **given}
     with connected(url, key) as client:
         _tell(client.simulate_dataset(body), as_json)
 
@@ -110,6 +127,14 @@ def _channels(dataset: dict[str, Any]) -> str:
         one["name"] if one["unit"] == "1" else f"{one['name']} [{one['unit']}]"
         for one in dataset["channels"]
     )
+
+
+def _parameter(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name.strip(), float(value)
+    except ValueError:
+        fail(f"--set {text}: need NAME=VALUE with a number, such as length_m=30")
 
 
 def _object(body: Any, file: Path) -> dict[str, Any]:

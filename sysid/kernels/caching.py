@@ -16,7 +16,7 @@ from numba.core.caching import FunctionCache
 
 _SOURCES = (
     "ga/*.py", "kernels/caching.py", "kernels/calls.py", "kernels/evaluation.py",
-    "kernels/evaluator.py",
+    "kernels/evaluator.py", "plants/*.py",
 )  # fmt: skip
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 

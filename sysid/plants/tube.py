@@ -1,0 +1,374 @@
+"""A long pneumatic tube that ends in a volume: one-dimensional gas dynamics with heat exchange.
+
+Staggered leapfrog: pressures and densities at nodes, mass flows on the faces between them. Wall
+friction is laminar (Hagen-Poiseuille) or turbulent (Blasius), and the gas exchanges heat with
+walls of constant temperature. Optional modes of the boundary layer make the laminar friction
+exact at all frequencies, for the check against the linear solution.
+
+Source: the equations are textbook ones (mass, momentum, energy; Blasius; Dittus-Boelter); the tube
+is that of Asakura and Guo, section 5.2: bore 8 mm, 40 m.
+"""
+
+from dataclasses import dataclass, replace
+from math import ceil, isfinite, pi, sqrt
+
+import numpy as np
+from scipy.special import jn_zeros
+
+from sysid.errors import InvalidRecord, InvalidSettings
+from sysid.kernels.caching import compiled
+from sysid.records import Channel, Recording
+from sysid.types import FloatArray
+
+ATMOSPHERE = 100_000.0
+"""Pa; pressures of the records are above it."""
+
+GAS = 287.05  # J/kg/K, dry air
+GAMMA = 1.4
+VISCOSITY = 1.82e-5  # Pa·s
+PRANDTL = 0.71
+
+MOST_WORK = 2e8
+"""Cells times steps of one simulation at most: about half a minute of one core."""
+
+_LAMINAR, _TURBULENT = 2000.0, 4000.0
+_COURANT = 0.8 / 1.15
+_WALL_OF_VOLUME = 20.0  # W/m²/K
+_PILOT = 0.05  # s
+_VALVE, _MOST_IN, _MOST_OUT = 4e-7, 0.025, 0.020  # kg/s/Pa, kg/s
+_VALVE_VOLUME = 30e-6  # m³
+
+
+@dataclass(frozen=True, slots=True)
+class Tube:
+    """A tube and the volume at its end.
+
+    Attributes
+    ----------
+    length_m, bore_m : float
+        In m.
+    volume_m3 : float
+        Volume at the end, m³.
+    temperature : float
+        Of the walls and of the gas that flows in, K.
+    cells : int
+        0: cells of 0.5 m, of 0.25 m below 20 m.
+    modes : int
+        Boundary-layer modes of laminar friction and heat exchange; 0: as in steady flow.
+    """
+
+    length_m: float = 40.0
+    bore_m: float = 0.008
+    volume_m3: float = 0.5e-3
+    temperature: float = 293.0
+    cells: int = 0
+    modes: int = 0
+
+    def __post_init__(self) -> None:
+        ranges = {"length_m": (0.5, 2000.0), "bore_m": (5e-4, 0.1), "volume_m3": (0.0, 1.0),
+                  "temperature": (150.0, 600.0), "cells": (0, 5000),
+                  "modes": (0, 50)}  # fmt: skip
+        for name, (least, most) in ranges.items():
+            value = getattr(self, name)
+            if not (isfinite(value) and least <= value <= most):
+                raise InvalidSettings(
+                    f"/parameters/{name}", f"found {value:g}; need from {least:g} to {most:g}"
+                )
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return self.cells or ceil(self.length_m / (0.5 if self.length_m >= 20 else 0.25) - 1e-9)
+
+    @property
+    def step(self) -> float:
+        """Longest step of the scheme in s."""
+        speed = sqrt(GAMMA * GAS * self.temperature)
+        return _COURANT * self.length_m / self.n_cells / speed
+
+
+def simulate_tube(tube: Tube, inlet: Channel, *, regulator: bool = False) -> Recording:
+    """Pressures at both ends of a tube, at the samples of its inlet; at rest before.
+
+    Parameters
+    ----------
+    tube : Tube
+    inlet : Channel
+        Pressure above atmosphere in Pa at regular times: at the inlet, on lines between samples;
+        or, with `regulator`, the command of a pressure regulator there, held.
+    regulator : bool
+        A pilot lag of 50 ms and a valve that saturates, filling 30 mL at the inlet.
+
+    Returns
+    -------
+    Recording
+        ``P1`` at the inlet and ``P2`` in the volume, in Pa above atmosphere.
+
+    Raises
+    ------
+    InvalidRecord
+        If the inlet is not regular, falls to vacuum, or the flow would become supersonic.
+    InvalidSettings
+        If the simulation would take too long.
+    """
+    times, values = inlet.times, inlet.values
+    period = _period(inlet)
+    substeps = _substeps(tube, times.size, period)
+    dx = tube.length_m / tube.n_cells
+    geometry = np.array([dx, tube.bore_m, tube.volume_m3, tube.temperature, period / substeps])
+    zeros = np.zeros((2, tube.modes))  # j² of the friction and of the heat exchange
+    if tube.modes:
+        zeros[0], zeros[1] = jn_zeros(2, tube.modes) ** 2, jn_zeros(0, tube.modes) ** 2
+    found = _tube(geometry, zeros, values + ATMOSPHERE, substeps, tube.n_cells, regulator)
+    if not np.all(np.isfinite(found)):
+        raise InvalidRecord(
+            "the flow in the tube becomes too fast for this scheme; give smaller or slower "
+            "changes of pressure"
+        )
+    ends = found - ATMOSPHERE
+    return Recording((
+        Channel("P1", times, ends[:, 0].copy(), "Pa"),
+        Channel("P2", times, ends[:, 1].copy(), "Pa"),
+    ))  # fmt: skip
+
+
+def _substeps(tube: Tube, samples: int, period: float) -> int:
+    """Steps in a period, if they are not too many in all."""
+    substeps = ceil(period / tube.step)
+    work = float(samples) * substeps * tube.n_cells * (1 + tube.modes / 4)
+    if work > MOST_WORK:
+        raise InvalidSettings(
+            "/samples",
+            f"{samples} samples of {tube.n_cells} cells take {work:.2g} cell steps, and may "
+            f"take {MOST_WORK:.2g}; ask for fewer samples or cells",
+        )
+    return substeps
+
+
+def _period(inlet: Channel) -> float:
+    times, values = inlet.times, inlet.values
+    if times.size < 2 or not inlet.sampling.is_regular:
+        raise InvalidRecord("the inlet pressure needs two samples or more at regular times")
+    lowest = float(np.min(values)) if np.all(np.isfinite(values)) else -np.inf
+    if not lowest > -0.9 * ATMOSPHERE:
+        raise InvalidRecord(
+            f"the inlet pressure falls to {lowest:g} Pa above atmosphere; need more than "
+            f"{-0.9 * ATMOSPHERE:g} Pa, at every sample"
+        )
+    return float(times[-1] - times[0]) / (times.size - 1)
+
+
+@compiled
+def _tube(
+    geometry: FloatArray, zeros: FloatArray, command: FloatArray, substeps: int, n: int,
+    regulator: bool,
+) -> FloatArray:  # fmt: skip
+    """Pressures (samples, 2) in Pa at both ends."""
+    bore, wall, dt = geometry[1], geometry[3], geometry[4]
+    gas = np.empty((3, n + 1))  # pressure, density, temperature at the nodes
+    gas[0], gas[2] = command[0], wall
+    gas[1] = command[0] / (GAS * wall)
+    flow, lagged = np.zeros(n), np.zeros((zeros.shape[1], n))
+    warmed = np.full((zeros.shape[1], n + 1), command[0])
+    found = np.empty((command.size, 2))
+    found[0, :] = command[0]
+    pilot = command[0]
+    filled = _VALVE_VOLUME + geometry[0] * pi * bore**2 / 8  # with half a cell of the tube
+    for k in range(command.size - 1):
+        for j in range(substeps):
+            if regulator:
+                pilot += dt / _PILOT * (command[k] - pilot)
+                given = min(max(_VALVE * (pilot - gas[0, 0]), -_MOST_OUT), _MOST_IN)
+                gas[0, 0] += dt * GAS * wall / filled * (given - flow[0])
+            else:
+                part = (j + 0.5) / substeps
+                gas[0, 0] = command[k] + part * (command[k + 1] - command[k])
+            gas[1, 0] = gas[0, 0] / (GAS * wall)
+            _momentum(geometry, zeros[0], gas, flow, lagged)
+            _balances(geometry, zeros[1], gas, flow, warmed)
+        found[k + 1, 0] = gas[0, 0] if regulator else command[k + 1]
+        found[k + 1, 1] = gas[0, n]
+    return found
+
+
+@compiled
+def _momentum(
+    geometry: FloatArray, zeros: FloatArray, gas: FloatArray, flow: FloatArray, lagged: FloatArray
+) -> None:
+    """One step of the mass flows; friction implicit, convection from the donor cell."""
+    dx, bore, dt = geometry[0], geometry[1], geometry[4]
+    area, n = pi * bore**2 / 4, flow.size
+    inertia = 1.0  # with the modes that are left out: the sum of 4/j² over all is 1/3
+    if zeros.size:
+        inertia += 1 / 3 - np.sum(4 / zeros)
+    before = flow[0] ** 2 / (0.5 * (gas[1, 0] + gas[1, 1]) * area)
+    carried = before  # momentum flux through the node on the left
+    for i in range(n):
+        density = 0.5 * (gas[1, i] + gas[1, i + 1])
+        following = before
+        if i + 1 < n:
+            following = flow[i + 1] ** 2 / (0.5 * (gas[1, i + 1] + gas[1, i + 2]) * area)
+        passes = before
+        if i + 1 < n and flow[i] + flow[i + 1] < 0:
+            passes = following
+        elif i + 1 == n and flow[i] < 0:
+            passes = 0.0  # what leaves the volume was at rest
+        force = -area * (gas[0, i + 1] - gas[0, i]) / dx - (passes - carried) / dx
+        friction = _friction(abs(flow[i]) * bore / (area * VISCOSITY)) / (density * bore**2)
+        rate = VISCOSITY / density / (bore / 2) ** 2
+        for mode in range(zeros.size):
+            force -= 4 * rate * (flow[i] - lagged[mode, i])
+        flow[i] = (inertia * flow[i] + dt * force) / (inertia + dt * friction)
+        for mode in range(zeros.size):
+            share = dt * rate * zeros[mode]
+            lagged[mode, i] = (lagged[mode, i] + share * flow[i]) / (1 + share)
+        before, carried = following, passes
+
+
+@compiled
+def _friction(reynolds: float) -> float:
+    """Friction times density and bore², Pa·s: laminar, then Blasius."""
+    return _blended(reynolds, 32 * VISCOSITY, 0.1582 * reynolds**0.75 * VISCOSITY)
+
+
+@compiled
+def _nusselt(reynolds: float) -> float:
+    """Laminar, then Dittus-Boelter."""
+    return _blended(reynolds, 8.0, 0.023 * reynolds**0.8 * PRANDTL**0.4)
+
+
+@compiled
+def _blended(reynolds: float, laminar: float, turbulent: float) -> float:
+    """The laminar value, the turbulent one, and between them a line."""
+    part = (reynolds - _LAMINAR) / (_TURBULENT - _LAMINAR)
+    return laminar + min(max(part, 0.0), 1.0) * (turbulent - laminar)
+
+
+@compiled
+def _balances(
+    geometry: FloatArray, zeros: FloatArray, gas: FloatArray, flow: FloatArray, warmed: FloatArray
+) -> None:
+    """One step of mass and energy in every cell, then of the heat exchanged with its walls."""
+    dx, bore, volume, wall, dt = geometry
+    area, n = pi * bore**2 / 4, flow.size
+    conductivity = VISCOSITY * GAMMA * GAS / (GAMMA - 1) / PRANDTL
+    entering = flow[0] * (gas[2, 0] if flow[0] >= 0 else gas[2, 1])
+    for i in range(1, n + 1):
+        is_last = i == n
+        leaving = 0.0 if is_last else flow[i]
+        donated = 0.0
+        if not is_last:
+            donated = flow[i] * (gas[2, i] if flow[i] >= 0 else gas[2, i + 1])
+        length = 0.5 * dx if is_last else dx
+        cell = area * length + (volume if is_last else 0.0)
+        gas[1, i] += dt / cell * (flow[i - 1] - leaving)
+        gain = dt * GAMMA * GAS / cell * (entering - donated)
+        reynolds = 0.5 * (abs(flow[i - 1]) + abs(leaving)) * bore / (area * VISCOSITY)
+        passed = _nusselt(reynolds) * conductivity * pi * length  # W/K
+        if zeros.size:
+            passed = 0.0
+            gain = _layered(zeros, gas, i, dt, bore, gain, warmed, area * length / cell)
+        if is_last:
+            passed += _WALL_OF_VOLUME * 4.84 * volume ** (2 / 3)
+        share = dt * passed / (gas[1, i] * cell * GAS / (GAMMA - 1))
+        temperature = ((gas[0, i] + gain) / (gas[1, i] * GAS) + share * wall) / (1 + share)
+        gas[2, i] = temperature
+        gas[0, i] = gas[1, i] * GAS * temperature
+        entering = donated
+
+
+@compiled
+def _layered(
+    zeros: FloatArray, gas: FloatArray, i: int, dt: float, bore: float, gain: float,
+    warmed: FloatArray, part: float,
+) -> float:  # fmt: skip
+    """Gain of pressure with the heat that a laminar boundary layer takes; part of a cell is tube.
+
+    With ζ² = Pr·s·r²/ν, 2 I₁(ζ)/(ζ I₀(ζ)) is the sum of 4/(ζ² + j²) over the zeros j of J₀.
+    """
+    rate = VISCOSITY / gas[1, i] / PRANDTL / (bore / 2) ** 2
+    slow, rest = 0.0, 1.0
+    for mode in range(zeros.size):
+        weight = 4 / zeros[mode]
+        share = dt * rate * zeros[mode]
+        change = share / (1 + share) * (gas[0, i] + gain - warmed[mode, i])
+        warmed[mode, i] += change
+        slow += weight * change
+        rest -= weight
+    return (gain - (GAMMA - 1) * part * slow) / (1 + (GAMMA - 1) * part * rest)
+
+
+def excitation(pattern: int, length_m: float, times: FloatArray) -> FloatArray:
+    """Command of the regulator in Pa above atmosphere, as in the paper's two patterns.
+
+    Pattern 1: ten holds of 3 s. Pattern 2: 0.25 ± 0.15 MPa, a pseudo-random binary sequence with
+    a clock of 0.6 s, from 18 s on a chirp from 0.05 to 0.8 Hz over 12 s. Above 40 m time is
+    stretched by length/40.
+
+    Raises
+    ------
+    InvalidSettings
+        If there is no such pattern.
+    """
+    clock = times / max(1.0, length_m / 40.0)
+    if pattern == 1:
+        levels = np.array([0.10, 0.30, 0.48, 0.20, 0.40, 0.05, 0.35, 0.25, 0.45, 0.15])
+        return np.asarray(1e6 * levels[np.clip((clock / 3).astype(np.int64), 0, 9)])
+    if pattern != 2:
+        raise InvalidSettings("/parameters/pattern", f"found {pattern}; need 1 or 2")
+    bits = _binary_sequence(32)
+    places = np.floor((clock - 0.5) / 0.6).astype(np.int64)
+    binary = np.where(places < 0, 0.0, bits[np.clip(places, 0, bits.size - 1)])
+    late = np.clip(clock - 18.0, 0.0, 12.0) / 12.0
+    chirp = np.sin(2 * pi * 0.05 * 12.0 / np.log(16.0) * (16.0**late - 1.0))
+    return np.asarray(1e6 * (0.25 + 0.15 * np.where(clock < 18.0, binary, chirp)))
+
+
+def tube_record(tube: Tube, pattern: int, samples: int, period: float) -> Recording:
+    """Pressures at both ends of a tube whose regulator follows one of the paper's patterns.
+
+    Parameters
+    ----------
+    tube : Tube
+    pattern : int
+        See `excitation`.
+    samples : int
+    period : float
+        In s; the command is followed at a tenth of it, but no finer than 0.5 ms.
+
+    Raises
+    ------
+    InvalidSettings, InvalidRecord
+        As `simulate_tube` and `excitation`.
+    """
+    finer = max(1, min(10, round(period / 5e-4)))
+    _substeps(tube, samples * finer, period / finer)
+    times = np.arange((samples - 1) * finer + 1, dtype=np.float64) * (period / finer)
+    command = Channel("P1", times, excitation(pattern, tube.length_m, times), "Pa")
+    whole = simulate_tube(tube, command, regulator=True)
+    return Recording(tuple(
+        replace(one, times=one.times[::finer].copy(), values=one.values[::finer].copy())
+        for one in whole.channels
+    ))  # fmt: skip
+
+
+def _binary_sequence(count: int) -> FloatArray:
+    """Bits ±1 of x⁷ + x⁶ + 1, from the second stage of a register that begins with ones."""
+    register = [1] * 7
+    bits = []
+    for _ in range(count):
+        bits.append(1.0 if register[5] else -1.0)
+        register = [register[6] ^ register[5], *register[:6]]
+    return np.array(bits)
+
+
+def measured(recording: Recording, seed: int) -> Recording:
+    """The pressures as gauges of 1 MPa with 12 bit and noise of 0.5 kPa tell them."""
+    draws = np.random.Generator(np.random.Philox(seed))
+    digit = 1e6 / 4096
+    channels = []
+    for one in recording.channels:
+        noisy = one.values + 500.0 * draws.standard_normal(one.values.size)
+        told = digit * np.round(np.clip(noisy, 0.0, 1e6) / digit)
+        channels.append(Channel(one.name, one.times, told, one.unit, one.hold))
+    return Recording(tuple(channels))
