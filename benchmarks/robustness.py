@@ -1,0 +1,148 @@
+"""Does the search always reach the optimum? Every system many times, beside other optimisers.
+
+Each search has its own noise draw and its own seed; none of them was used to develop the search.
+The method is `improved` with its defaults and a budget of 20,000 simulations. A search succeeds
+if its result lies within 0.01 % of the RMS of the least-squares optimum of its record, which SciPy
+finds from the true values or from what the search found, whichever is lower (noise-free records:
+0.01 % of the output's RMS).
+
+Evaluations and CPU time *to the target* count all islands up to the first generation in which one
+of them is within 1.01 times the optimum's RMS (noise-free: the errors of the paper's tables), from
+a repetition that ends there. The prorated time is that of a whole search, refinement and standard
+errors included, times the share of its simulations that came before the target, as `bench/peers`
+counts; failures cost their whole time. The peers stop at the target, so their time is direct.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from statistics import median
+from time import perf_counter
+from typing import Literal
+
+import numpy as np
+
+from benchmarks.peer_searches import HAS_PYGMO, PEERS, run_peer
+from benchmarks.searches import NEAR, Goal, Search, search
+from benchmarks.systems import OTHERS, PAPER, System
+from benchmarks.table import Row, Skipped, parser, report
+from sysid.settings import METHODS
+
+FIRST_SEED = 10_000
+
+PROTOTYPE = {
+    "A/300/1": 241, "A/300/5": 236, "A/1500/1": 1219, "A/1500/5": 1798,
+    "B/300/1": 255, "B/300/5": 660, "B/1500/1": 3622, "B/1500/5": 4390,
+}  # fmt: skip
+"""Median evaluations to the target of the prototype that the design describes."""
+
+FASTEST_PEER = {"A0": 0.64, "A/300/1": 0.30, "B0": 0.76, "B/300/1": 2.5}
+"""CPU time to the target (ms) of the fastest optimiser in `bench/peers`."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """All searches of one system."""
+
+    system: System
+    searches: tuple[Search, ...]
+    goals: tuple[Goal, ...]
+
+    @property
+    def successes(self) -> int:
+        """Searches whose result is the optimum."""
+        return sum(one.distance <= NEAR for one in self.searches)
+
+    @property
+    def misses(self) -> list[int]:
+        """Seeds of the others."""
+        return [FIRST_SEED + i for i, s in enumerate(self.searches) if s.distance > NEAR]
+
+    def to_target(self) -> float:
+        """Median evaluations to the target; searches that never got there count as infinite."""
+        return median(np.inf if s.to_target is None else s.to_target for s in self.searches)
+
+    def milliseconds(self, which: Literal["direct", "prorated"]) -> float:
+        """CPU time per hit: that of all searches, failures in full, over the hits."""
+        total, hits = 0.0, 0
+        for one in self.searches:
+            hits += one.to_target is not None
+            if one.to_target is None:
+                total += one.seconds
+            else:
+                total += one.seconds_to_target if which == "direct" else one.prorated
+        return 1e3 * total / hits if hits else float("inf")
+
+
+def study(system: System, count: int) -> Study:
+    """Search a system's records `count` times; the first search, which compiles, is repeated."""
+    search(system, FIRST_SEED)
+    found = [search(system, FIRST_SEED + i) for i in range(count)]
+    return Study(system, tuple(s for s, _ in found), tuple(g for _, g in found))
+
+
+def own_rows(done: Study) -> Iterable[Row]:
+    """Figures of lagid on one system."""
+    name, count = done.system.name, len(done.searches)
+    yield Row(f"{name}: searches at the optimum", done.successes, f"of {count}", count, ">=")
+    reached = [s.distance for s in done.searches if s.distance <= NEAR]
+    yield Row(f"{name}: largest distance of these", max(reached, default=np.nan), "of RMS", NEAR)
+    bar = PROTOTYPE.get(name)
+    yield Row(f"{name}: median evaluations to the target", done.to_target(), "simulations", bar)
+    most = max(s.evaluations for s in done.searches)
+    yield Row(f"{name}: most evaluations of a search", most, "simulations", 20_000)
+    bar_ms = FASTEST_PEER.get(name)
+    yield Row(f"{name}: CPU to target, prorated", done.milliseconds("prorated"), "ms", bar_ms)
+    yield Row(f"{name}: CPU to target, direct", done.milliseconds("direct"), "ms")
+    whole = 1e3 * median(s.seconds for s in done.searches)
+    yield Row(f"{name}: whole search with standard errors", whole, "ms CPU")
+
+
+def peer_rows(done: Study, count: int) -> Iterable[Row]:
+    """Figures of the peers on the same records."""
+    count = min(count, len(done.searches))
+    for peer in PEERS:
+        run_peer(peer, done.system, FIRST_SEED, done.goals[0])
+        found = [run_peer(peer, done.system, FIRST_SEED + i, done.goals[i]) for i in range(count)]
+        hits = [evaluations for evaluations, _ in found if evaluations is not None]
+        seconds = sum(cost for _, cost in found)
+        yield Row(f"{done.system.name}: {peer}, target hit", len(hits), f"of {count}")
+        if hits:
+            middle = median(e or np.inf for e, _ in found)
+            yield Row(f"{done.system.name}: {peer}, median evaluations", middle, "simulations")
+            cost = 1e3 * seconds / len(hits)
+            yield Row(f"{done.system.name}: {peer}, CPU to target", cost, "ms")
+
+
+def paper_rows(count: int) -> Iterable[Row]:
+    """How the paper's two methods do beside `improved`, all as the search left them."""
+    for system in PAPER[2:]:
+        if system.samples > 300:
+            continue
+        for method in METHODS:
+            found = [search(system, FIRST_SEED + i, method)[0] for i in range(count)]
+            middle = median(1 + one.distance for one in found)
+            yield Row(f"{system.name}: {method}, median RMS", middle, "of the optimum's")
+
+
+def main() -> None:
+    """Print the table."""
+    options = parser(__doc__ or "").parse_args()
+    count, peers = (4, 1) if options.quick else (50, 20)
+    rows: list[Row] = []
+    start = perf_counter()
+    for system in (*PAPER, *OTHERS):
+        done = study(system, count)
+        rows += own_rows(done)
+        if done.misses:
+            print(f"{system.name}: not at the optimum with seeds {done.misses}")
+        if not options.quick or system.samples <= 300:
+            rows += peer_rows(done, peers)
+        print(f"{system.name}: done after {perf_counter() - start:.0f} s", flush=True)
+    rows += paper_rows(count)
+    reason = "pip install -r benchmarks/requirements-peers.txt"
+    skipped = [] if HAS_PYGMO else [Skipped("pygmo de1220, sade, cmaes", reason)]
+    report("Robustness: is the optimum always reached?", rows, skipped, options)
+
+
+if __name__ == "__main__":
+    main()
