@@ -1,14 +1,18 @@
 """Runs simulated on new inputs and in closed loops, over REST, the client and the command line."""
 
+import json
 from collections.abc import Iterator
 from math import degrees, pi
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from starlette.testclient import TestClient
+from typer.testing import CliRunner
 
 from service.app import create_app
+from service.cli import runs as program
 from service.client import Client
 from service.signals.reader import read_recording
 from tests.identified import identified
@@ -185,3 +189,18 @@ def test_the_client_simulates_a_run(served: Served) -> None:
     client = Client("http://testserver", transport=Through(served.server))
     found = client.simulate_run(served.arm, LOOP, max_points=50)
     assert len(found["outputs"][0]["times"]) <= 50
+
+
+def test_the_command_line_tells_the_measures_of_the_step(
+    served: Served, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    client = Client("http://testserver", transport=Through(served.server))
+    monkeypatch.setattr(program, "connected", lambda url, key: client)
+    file = tmp_path / "loop.json"
+    file.write_text(json.dumps({**LOOP, "store": True}))
+    done = CliRunner().invoke(program.app, ["simulate", served.arm, str(file)])
+    assert done.exit_code == 0, done.output
+    for part in ("theta [rad]: 601 samples", "overshoot: ", "settling time (2 %): 1.", "stored as"):
+        assert part in done.output
+    told = CliRunner().invoke(program.app, ["simulate", served.arm, str(file), "--json"])
+    assert json.loads(told.output)["metrics"]["output"] == "theta"
