@@ -58,7 +58,10 @@ def _rows(run: dict[str, Any], model: str) -> list[Row]:
         for (name, bar), value in zip(BARS_MV[model].items(), rms, strict=True)
     ]
     lag = parameter(run, "L")
-    return [*rows, Row(f"L over its standard error, {words}", abs(lag["value"]) / lag["stderr"], "1", 1)]
+    return [
+        *rows,
+        Row(f"L over its standard error, {words}", abs(lag["value"]) / lag["stderr"], "1", 1),
+    ]
 
 
 if __name__ == "__main__":
