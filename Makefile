@@ -62,6 +62,8 @@ bench-full: $(READY)
 	@mkdir -p benchmarks/results
 	$(BIN)/python benchmarks/kernels.py --json benchmarks/results/kernels.json
 	$(BIN)/python benchmarks/mcap.py --json benchmarks/results/mcap.json
+	$(BIN)/python -m benchmarks.robustness --json benchmarks/results/robustness.json
+	$(BIN)/python benchmarks/efficiency.py --json benchmarks/results/efficiency.json
 
 real-data: $(READY)
 	@mkdir -p benchmarks/results

@@ -148,7 +148,9 @@ def _annealing(task: Task) -> None:
 def _starts(task: Task) -> None:
     rng = np.random.default_rng(task.seed)
     while True:  # until the counter says that it is enough
-        leastsq(task.residuals, rng.random(task.lower.size), epsfcn=1e-10, maxfev=500)
+        leastsq(
+            task.residuals, rng.random(task.lower.size), epsfcn=1e-10, maxfev=500, full_output=True
+        )
 
 
 class _Pygmo:

@@ -126,8 +126,11 @@ def paper_rows(count: int) -> Iterable[Row]:
 
 def main() -> None:
     """Print the table."""
-    options = parser(__doc__ or "").parse_args()
+    made = parser(__doc__ or "")
+    made.add_argument("--peers", type=int, metavar="N", help="searches of each peer (20)")
+    options = made.parse_args()
     count, peers = (4, 1) if options.quick else (50, 20)
+    peers = peers if options.peers is None else options.peers
     rows: list[Row] = []
     start = perf_counter()
     for system in (*PAPER, *OTHERS):
@@ -135,7 +138,7 @@ def main() -> None:
         rows += own_rows(done)
         if done.misses:
             print(f"{system.name}: not at the optimum with seeds {done.misses}")
-        if not options.quick or system.samples <= 300:
+        if peers and (not options.quick or system.samples <= 300):
             rows += peer_rows(done, peers)
         print(f"{system.name}: done after {perf_counter() - start:.0f} s", flush=True)
     rows += paper_rows(count)

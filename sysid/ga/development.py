@@ -18,16 +18,18 @@ from sysid.ga.random import DEVELOPMENT, below, draws, unit
 from sysid.ga.state import (
     DAMPING,
     DEVELOPMENTS,
-    DIFFERENCE,
     EVALUATIONS,
     FAILED,
     GENERATION,
+    GROWTH,
     HORIZON,
     OLD,
     POINT,
     PROBES,
+    ROUGH,
     SEQUENCE,
     SETTLED,
+    STAGNATION,
     STEP,
     Plan,
 )  # fmt: skip
@@ -40,7 +42,8 @@ TRIALS = 3
 FINE = 1e-6  # of the range: far above rounding, far below what curvature needs
 FACTOR = 10.0  # between the dampings of two trials
 FIRST_DAMPING = 1e-2
-N_HORIZONS = 5
+LONGEST_GROWTH = 4.0  # doublings
+N_GROWTHS = 3
 MOST_STEPS = 12
 ENOUGH = 1e-4  # relative gain of a step below which a full-record search ends
 ENOUGH_PART = 1e-2
@@ -77,17 +80,18 @@ def start_development(
     counters[SEQUENCE], counters[STEP], counters[FAILED] = 1, 0, 0
     memory[DAMPING], memory[HORIZON] = FIRST_DAMPING, 1.0
     word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
-    # The first searches take derivatives, the others slopes over some of the range: where switches
-    # (dry friction) make the fitness rough, these tell what lies behind the next ripple.
-    coarse = counters[SETTLED] == 1 or counters[DEVELOPMENTS] % 2 == 0
-    memory[DIFFERENCE] = 10.0 ** (-2.0 - 4.0 * unit(word[2])) if coarse else FINE
+    grows = counters[DEVELOPMENTS] % 2 == 0
+    memory[ROUGH] = counters[SETTLED] == 1 or grows
     chosen, counters[PROBES] = 0, 0
-    if counters[DEVELOPMENTS] % 2 == 0:
-        memory[HORIZON] = 0.5 ** below(word[0], N_HORIZONS)
-        chosen = below(word[1], 2 * words.shape[0])
+    if grows:
+        memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
+        memory[GROWTH] = 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
+        chosen = below(word[1], 3 * words.shape[0]) - words.shape[0]
+        counters[PROBES] = words.shape[0] // 3  # in lanes that would idle
     elif counters[SETTLED]:
         counters[PROBES] = words.shape[0]
-    if chosen < words.shape[0]:
+    if chosen >= 0:
+        chosen = chosen if chosen < words.shape[0] else 0
         memory[OLD] = fitness[chosen]
         begin = decoded(words[chosen : chosen + 1], plan.bits)[0]
     else:
@@ -114,12 +118,30 @@ def _keep(words: WordArray, fitness: FloatArray, memory: FloatArray, word: WordA
 
 
 @compiled
+def _scatter(
+    words: WordArray, fitness: FloatArray, counters: IntArray, proposals: WordArray,
+    reached: FloatArray, best: int,
+) -> None:  # fmt: skip
+    """Let the probes take the places of all but the champion: the genetic search goes on there."""
+    if counters[PROBES] < fitness.size:  # those of a growing record go on with each step
+        return
+    counters[PROBES], counters[STAGNATION] = 0, 0
+    for p in range(1, min(fitness.size, reached.size - TRIALS + 1)):
+        t = TRIALS + p - 1
+        if t != best:
+            fitness[p] = reached[t]
+            for d in range(words.shape[1]):
+                words[p, d] = proposals[t, d]
+    rank(words, fitness)
+
+
+@compiled
 def _next_part(counters: IntArray, memory: FloatArray, fitness: FloatArray) -> None:
     """Take in more of the record; at its end, the development ends."""
     counters[FAILED] = 0
     memory[DAMPING] = FIRST_DAMPING
     if memory[HORIZON] < 1.0:
-        memory[HORIZON] *= 2.0
+        memory[HORIZON] = min(memory[HORIZON] * memory[GROWTH], 1.0)
         return
     counters[SEQUENCE], counters[STEP] = 0, 0
     if memory[OLD] == fitness[0]:
@@ -149,6 +171,20 @@ def _trials(plan: Plan, counters: IntArray, memory: FloatArray, matrix: FloatArr
 
 
 @compiled
+def _difference(plan: Plan, counters: IntArray, memory: FloatArray) -> float:
+    """Distance (of the range) over which the next slopes are taken.
+
+    The first searches take derivatives, the others slopes over a distance that each step draws
+    anew: where switches (dry friction) make the fitness rough, these tell what lies behind the
+    next ripple, and no ripple stops them all.
+    """
+    if memory[ROUGH] == 0.0:
+        return FINE
+    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    return float(10.0 ** (-2.0 - 4.0 * unit(word[2])))
+
+
+@compiled
 def adaptive_sequence(
     evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray,
     counters: IntArray, memory: FloatArray,
@@ -157,7 +193,8 @@ def adaptive_sequence(
     point, horizon = memory[POINT:], memory[HORIZON]
     counters[STEP] += 1
     counters[EVALUATIONS] += point.size + 1 + TRIALS + counters[PROBES]
-    matrix, gradient, base = normal_equations(evaluator, plan, point, horizon, memory[DIFFERENCE])
+    difference = _difference(plan, counters, memory)
+    matrix, gradient, base = normal_equations(evaluator, plan, point, horizon, difference)
     proposals = coded(_trials(plan, counters, memory, matrix, gradient, base), plan.bits)
     places = decoded(proposals, plan.bits)
     if horizon < 1.0:
@@ -168,6 +205,7 @@ def adaptive_sequence(
     else:
         reached = population_fitness(evaluator, located(evaluator, places))
     best = np.argmin(reached)
+    _scatter(words, fitness, counters, proposals, reached, int(best))
     enough = ENOUGH if horizon == 1.0 else ENOUGH_PART
     if reached[best] < base:
         for d in range(point.size):

@@ -50,25 +50,43 @@ def _sensed(
 
 
 @compiled
+def _product(one: FloatArray, other: FloatArray) -> float:
+    """Inner product, as four sums that do not wait for each other."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    whole = one.size // 4 * 4
+    for m in range(0, whole, 4):
+        a += one[m] * other[m]
+        b += one[m + 1] * other[m + 1]
+        c += one[m + 2] * other[m + 2]
+        d += one[m + 3] * other[m + 3]
+    for m in range(whole, one.size):
+        a += one[m] * other[m]
+    return (a + b) + (c + d)
+
+
+@compiled
 def normal_equations(
     evaluator: Evaluator, plan: Plan, point: FloatArray, horizon: float, difference: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """JᵀJ, Jᵀe and the fitness at a point, over the samples up to `horizon`: D + 1 simulations."""
     n = point.size
     predicted, steps = _sensed(evaluator, point, difference)
-    matrix, gradient, row = np.zeros((n, n)), np.zeros(n), np.empty(n)
+    matrix, gradient, rows = np.zeros((n, n)), np.zeros(n), np.zeros((n + 1, predicted.shape[1]))
     for m in range(predicted.shape[1]):
         weight = evaluator.weight[m] if plan.progress[m] <= horizon else 0.0
         if weight == 0.0:
             continue
-        error, share = weight * (predicted[0, m] - evaluator.measured[m]), 1.0
+        error = weight * (predicted[0, m] - evaluator.measured[m])
         if plan.loss_scale > 0.0:
-            share = 1.0 / np.sqrt(1.0 + (error / plan.loss_scale) ** 2)
+            share = (1.0 + (error / plan.loss_scale) ** 2) ** -0.25
+            error, weight = share * error, share * weight
+        rows[n, m] = error
         for d in range(n):
-            row[d] = weight * (predicted[d + 1, m] - predicted[0, m]) / steps[d]
-            gradient[d] += share * row[d] * error
-            for e in range(d + 1):
-                matrix[d, e] += share * row[d] * row[e]
+            rows[d, m] = weight * (predicted[d + 1, m] - predicted[0, m])
+    for d in range(n):
+        gradient[d] = _product(rows[d], rows[n]) / steps[d]
+        for e in range(d + 1):
+            matrix[d, e] = _product(rows[d], rows[e]) / (steps[d] * steps[e])
     return matrix, gradient, partial_fitness(evaluator, plan, predicted[0], horizon)
 
 

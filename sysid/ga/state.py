@@ -15,7 +15,7 @@ GENERATION, EVALUATIONS, STAGNATION, SEQUENCE, STEP, FAILED, DEVELOPMENTS, SETTL
 N_COUNTERS = 9
 
 # Places in an island's memory of the sequence search; the point's D places follow.
-DAMPING, HORIZON, DIFFERENCE, OLD, POINT = range(5)
+DAMPING, HORIZON, GROWTH, ROUGH, OLD, POINT = range(6)
 
 # Columns of an improvement; the D physical values follow.
 AT_GENERATION, AT_EVALUATIONS, RMS, PHASE, VALUES = range(5)

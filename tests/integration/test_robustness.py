@@ -1,0 +1,27 @@
+"""The search reaches the optimum where dry friction and a wide lag box hide it."""
+
+import numpy as np
+import pytest
+
+from sysid.models.library import load_model
+from sysid.problem import Problem
+from sysid.refinement import refine
+from sysid.run import advance, begin, conclude
+from sysid.settings import GeneticAlgorithm, Stop
+from tests.searching import COULOMB, noisy, record
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20_000, 20_005))
+def test_a_lag_box_of_five_seconds_with_dry_friction_ends_at_the_optimum(seed: int) -> None:
+    measured = [record(noisy("coulomb-eq16", seed=seed))]
+    problem = Problem.build(load_model("coulomb-eq16"), measured, parameters={"L": {"upper": 5.0}})
+    truth = np.array([COULOMB[p.name] for p in problem.space])
+    optimum = refine(problem, [truth])[0]
+    assert optimum is not None
+    algorithm = GeneticAlgorithm(stop=Stop(evaluations=20_000))
+    found = conclude(
+        problem, algorithm, advance(problem, algorithm, begin(problem, algorithm, seed))
+    )
+    assert found.rms <= optimum.rms * 1.0001
+    assert found.evaluations <= 20_000
