@@ -176,8 +176,9 @@ def _parameters(
         if pair is not None:
             note = _note(name, unit, [(titles[found[i][0].run.id], found[i][1]) for i in pair],
                          same_model=len({one.name for one, _ in found}) == 1)  # fmt: skip
+        known = sum(_has_ends(estimate["interval95"]) for _, estimate in found)
         yield ComparedParameter(
-            name=name, unit=unit, differs=pair is not None, note=note,
+            name=name, unit=unit, differs=None if known < 2 else pair is not None, note=note,
             values=[
                 ComparedValue(run=one.run.id, value=e["value"], stderr=e["stderr"],
                               interval95=e["interval95"], status=e["status"])

@@ -46,12 +46,15 @@ class ComparedValue(Answer):
 
 
 class ComparedParameter(Answer):
-    """A parameter that two runs or more have; `differs` if two of its 95 % intervals are apart."""
+    """A parameter that two runs or more have.
+
+    `differs` if two of its 95 % intervals are apart; null where fewer than two have one.
+    """
 
     name: str
     unit: str
     values: list[ComparedValue]
-    differs: bool
+    differs: bool | None
     note: str
 
 

@@ -1,0 +1,36 @@
+"""When two estimates of one name are told apart."""
+
+import pytest
+
+from service.comparison import _furthest, _plus_minus
+
+
+def estimate(value: float, stderr: float | None) -> dict[str, object]:
+    ends = None if stderr is None else [value - 2 * stderr, value + 2 * stderr]
+    return {"value": value, "stderr": stderr, "interval95": ends}
+
+
+def test_intervals_that_meet_tell_nothing_apart() -> None:
+    assert _furthest([estimate(1.0, 0.1), estimate(1.3, 0.1)]) is None
+    assert _furthest([estimate(1.0, 0.1), estimate(9.0, None)]) is None
+
+
+def test_of_several_the_two_furthest_apart_are_named() -> None:
+    three = [estimate(1.0, 0.01), estimate(1.5, 0.01), estimate(1.2, 0.01)]
+    assert _furthest(three) == (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("value", "stderr", "text"),
+    [
+        (0.2213, 0.0021, "0.2213 ± 0.0021"),
+        (0.159, 0.0047, "0.1590 ± 0.0047"),
+        (3.0, 0.0997, "3.00 ± 0.10"),
+        (12345.0, 250.0, "12345 ± 2.5e+02"),
+        (0.5, None, "0.5"),
+    ],
+)
+def test_values_are_cut_at_the_second_digit_of_their_error(
+    value: float, stderr: float | None, text: str
+) -> None:
+    assert _plus_minus(estimate(value, stderr)) == text
