@@ -27,10 +27,9 @@ SECOND = {"k_b": {"lower": 5, "upper": 500, "scale": "log"}}
 
 
 def dataset() -> dict[str, Any]:
-    """Body of the record: the catalogue's actuator with the paper's parameters."""
+    """Body of the record: the reference plant, exact between its events, not the model fitted."""
     return {
-        "name": "paper Table 4: actuator", "model": "actuator",
-        "parameters": {**TRUE, "theta(0)": 0.0},
+        "name": "paper Table 4: actuator", "plant": "actuator", "parameters": dict(TRUE),
         "inputs": {"P_a": {"kind": "expression", "expression": WAVES}},
         "samples": SAMPLES, "sample_time": SAMPLE_TIME, "noise": {"sigma": SIGMA, "seed": 1},
     }  # fmt: skip
@@ -72,10 +71,10 @@ def _corrected(bench: Bench, record: str) -> Section:
     return Section(
         f"{TITLE}, k_b = k_a and A_m given",
         "Model `actuator` (Eq. 23 to 25) from the pressure difference to the angle of the arm. "
-        "The paper's records are not published, so the record is made with its own estimates as "
-        f"the truth, {SAMPLES} samples and noise of {1e3 * SIGMA:g} mrad. It gives neither A_m "
-        "nor B; ours are 5e-6 m³/rad and 1e-3 N·m·s/rad. Its k_b differs from k_a, which no "
-        "record of P_a and θ can show apart from A_m (next section).",
+        "The paper's records are not published, so the reference plant makes one with its own "
+        f"estimates as the truth, {SAMPLES} samples and noise of {1e3 * SIGMA:g} mrad. The "
+        "paper gives neither A_m nor B; ours are 5e-6 m³/rad and 1e-3 N·m·s/rad. Its k_b differs "
+        "from k_a, which no record of P_a and θ can show apart from A_m (next section).",
         [_table(found, "Table 4"), _step_table(steps, exact)],
         _plots(found, steps, exact),
         _checks(found, steps, exact),

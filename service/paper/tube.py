@@ -2,9 +2,11 @@
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from service.calls import ProblemError
 from service.paper import figures, published
 from service.paper.bench import METHODS, Bench, Found
 from service.paper.oscillators import estimate_text
@@ -18,21 +20,53 @@ L_AGREES_S, T_AGREES = 0.010, 0.03
 
 
 def folder() -> Path | None:
-    """The folder of reference records below LAGID_DATA; None where it is absent."""
+    """The folder below LAGID_DATA that has the reference records; None where they are absent."""
     data = os.environ.get("LAGID_DATA")
     found = Path(data or Path("..") / "shared" / "data") / "tube_reference"
-    return found if found.is_dir() else None
+    return found if all(one.is_file() for one in _files(found)) else None
 
 
-def job(records: list[str]) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Records:
+    """One dataset for each pattern, the names of their channels, and where they come from."""
+
+    datasets: list[str]
+    inlet: str
+    outlet: str
+    origin: str
+
+
+def stored(bench: Bench) -> Records:
+    """The reference records of LAGID_DATA, or, where they are absent, the plant's own."""
+    source = folder()
+    if source is not None:
+        ids = [bench.client.add_dataset(one, name=one.stem)["id"] for one in _files(source)]
+        return Records(ids, "P1_meas_Pa", "P2_meas_Pa", "The records are those of LAGID_DATA")
+    bench.say("paper Table 3: the reference plant makes the records, as LAGID_DATA has none")
+    made = [
+        bench.client.simulate_dataset({
+            "name": f"paper Table 3: tube {LENGTH} m, pattern {pattern}", "plant": "tube",
+            "parameters": {"length_m": LENGTH, "pattern": pattern, "gauges": pattern},
+        })["id"]
+        for pattern in (1, 2)
+    ]  # fmt: skip
+    return Records(made, "P1", "P2", "LAGID_DATA has no records, so the service made them")
+
+
+def _files(source: Path) -> list[Path]:
+    return [source / f"tube_{LENGTH:03d}m_pattern{n}.csv" for n in (1, 2)]
+
+
+def job(records: Records) -> dict[str, Any]:
     """Body of the job: both patterns, each by itself, with every method."""
-    labels = [{"pattern": float(n)} for n in range(1, len(records) + 1)]
+    labels = [{"pattern": float(n)} for n in (1, 2)]
     return {
-        "name": f"paper Table 3: tube {LENGTH} m", "model": "tube", "datasets": records[:1],
-        "channels": {"u": "P1_meas_Pa", "y": "P2_meas_Pa"},
+        "name": f"paper Table 3: tube {LENGTH} m", "model": "tube",
+        "datasets": records.datasets[:1],
+        "channels": {"u": records.inlet, "y": records.outlet},
         "algorithm": dict(published.SETTINGS),
         "sweep": {"axes": [
-            {"path": "/datasets", "values": [[one] for one in records], "labels": labels},
+            {"path": "/datasets", "values": [[one] for one in records.datasets], "labels": labels},
             {"path": "/algorithm/method", "values": list(METHODS)},
         ]},
     }  # fmt: skip
@@ -40,16 +74,12 @@ def job(records: list[str]) -> dict[str, Any]:
 
 def sections(bench: Bench) -> list[Section]:
     """The section, or why it was skipped."""
-    source = folder()
-    if source is None:
-        reason = "no folder tube_reference; set LAGID_DATA to the folder of the measured records"
+    try:
+        records = stored(bench)
+    except ProblemError as problem:  # an older server knows no plants
+        reason = f"LAGID_DATA has no tube_reference, and the server makes no tube: {problem}"
         return [Section(TITLE, skipped=reason)]
-    files = [source / f"tube_{LENGTH:03d}m_pattern{n}.csv" for n in (1, 2)]
-    absent = [one.name for one in files if not one.is_file()]
-    if absent:
-        return [Section(TITLE, skipped=f"LAGID_DATA lacks {', '.join(absent)}")]
-    stored = [bench.client.add_dataset(one, name=one.stem) for one in files]
-    runs = bench.runs(job([one["id"] for one in stored]))
+    runs = bench.runs(job(records))
     found: list[dict[str, Found]] = [{}, {}]
     for run in runs:
         pattern = int(run["labels"]["pattern"]) - 1
@@ -57,11 +87,10 @@ def sections(bench: Bench) -> list[Section]:
     return [Section(
         TITLE,
         "Model `tube`, K e^(−Ls)/(Ts + 1) (Eq. 21), from the pressure at one gauge to that at the "
-        "other. The records are of a gas-dynamic model of the paper's tube with gauges of 12 bit "
+        f"other. {records.origin}: a gas-dynamic model of the paper's tube with gauges of 12 bit "
         "and noise of 0.5 kPa, not of the paper's own tube, whose records are not published.",
         [_table(found)],
-        [plot for n, one in enumerate(found, 1) for plot in _plots(bench, n, one,
-                                                                   stored[n - 1]["id"])],
+        [plot for n, one in enumerate(found) for plot in _plots(bench, n, one, records)],
         checks(found),
         links=[runs[0]["job"]],
     )]  # fmt: skip
@@ -90,10 +119,12 @@ def _table(found: list[dict[str, Found]]) -> Table:
     )  # fmt: skip
 
 
-def _plots(bench: Bench, pattern: int, found: Mapping[str, Found], record: str) -> list[Plot]:
+def _plots(bench: Bench, number: int, found: Mapping[str, Found], records: Records) -> list[Plot]:
+    pattern = number + 1
     rms = ", ".join(f"{m} ends at {found[m].run['rms'] / 1e3:.2f} kPa" for m in METHODS)
     return [
-        Plot(f"Figure 17: input and output, pattern {pattern}", _signals(bench, found, record),
+        Plot(f"Figure 17: input and output, pattern {pattern}",
+             _signals(bench, found, records, number),
              "Paper: the outlet follows the inlet late and rounded. Ours: the same, with the "
              "response of the model that `improved` found."),
         Plot(f"Figure 18: RMS of the best individual, pattern {pattern}",
@@ -102,9 +133,12 @@ def _plots(bench: Bench, pattern: int, found: Mapping[str, Found], record: str) 
     ]  # fmt: skip
 
 
-def _signals(bench: Bench, found: Mapping[str, Found], record: str) -> dict[str, Any]:
-    channels = {one["name"]: one for one in bench.client.signals(record, 900)["channels"]}
-    looks = {"P1_meas_Pa": (theme.GREEN, "inlet (1)"), "P2_meas_Pa": (theme.GREY, "outlet (2)")}
+def _signals(
+    bench: Bench, found: Mapping[str, Found], records: Records, number: int
+) -> dict[str, Any]:
+    answer = bench.client.signals(records.datasets[number], 900)
+    channels = {one["name"]: one for one in answer["channels"]}
+    looks = {records.inlet: (theme.GREEN, "inlet (1)"), records.outlet: (theme.GREY, "outlet (2)")}
     data = [
         figures.line(text, channels[name]["times"], _kilo(channels[name]["values"]),
                      line={"color": colour, "width": 1.6})

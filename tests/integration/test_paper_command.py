@@ -49,12 +49,12 @@ def test_the_tables_hold_the_estimates_of_the_jobs(url: str, tmp_path: Path) -> 
     assert all(json.loads(text)["data"] for text in figures)
 
 
-def test_without_its_data_the_tube_is_skipped_with_the_reason(url: str, tmp_path: Path) -> None:
+def test_without_its_data_the_tube_is_that_of_the_plant(url: str, tmp_path: Path) -> None:
     report = tmp_path / "paper.html"
     done = lagid("--only", "table3", "--url", url, "--output", report, LAGID_DATA=str(tmp_path))
     assert done.returncode == 0, done.stderr
-    assert "skipped: no folder tube_reference; set LAGID_DATA" in done.stdout
-    assert "no folder tube_reference" in report.read_text(encoding="utf-8")
+    assert "LAGID_DATA has no records, so the service made them" in done.stdout
+    assert "L of the two patterns agrees" in report.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
