@@ -6,12 +6,14 @@ from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
 
-import httpx
+if TYPE_CHECKING:
+    import httpx
 
 Document: TypeAlias = dict[str, Any]
 
+DEFAULT_URL = "http://127.0.0.1:8000"
 TERMINAL = frozenset({"succeeded", "failed", "cancelled"})
 PIECE = 1 << 20
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -109,7 +111,7 @@ def pieces(content: bytes | Path | None) -> bytes | AsyncIterator[bytes] | None:
     return _read_pieces(content) if isinstance(content, Path) else content
 
 
-def checked(answer: httpx.Response) -> httpx.Response:
+def checked(answer: "httpx.Response") -> "httpx.Response":
     """The answer, unless it is an error.
 
     Raises
@@ -163,4 +165,6 @@ def _fault(entry: Mapping[str, Any]) -> str:
 
 
 def _quoted(part: str) -> str:
+    import httpx  # whoever quotes has a client; a command without one starts sooner
+
     return httpx.URL("/").copy_with(path="/" + part).raw_path.decode().removeprefix("/")

@@ -13,11 +13,18 @@ from typing import Any, Self, TypedDict
 import httpx
 
 from service import calls
-from service.calls import TERMINAL, Call, ClientError, Document, ProblemError, ServerUnreachable
+from service.calls import (
+    DEFAULT_URL,
+    TERMINAL,
+    Call,
+    ClientError,
+    Document,
+    ProblemError,
+    ServerUnreachable,
+)
 
 __all__ = ["AsyncClient", "Client", "ClientError", "ProblemError", "ServerUnreachable"]
 
-DEFAULT_URL = "http://127.0.0.1:8000"
 POLL_S = 0.3
 TIMEOUT_S = 60.0
 PAGE = 500

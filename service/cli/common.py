@@ -5,13 +5,16 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from service.client import DEFAULT_URL, Client
+from service.calls import DEFAULT_URL
+
+if TYPE_CHECKING:
+    from service.client import Client
 
 WIDE = 200  # where nobody looks, a line is not folded at 80 columns
 out = Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
@@ -34,8 +37,10 @@ __all__ = ["DEFAULT_URL", "AsJson", "Key", "SampleTime", "Segments", "Url", "con
 
 
 @contextmanager
-def connected(url: str, key: str | None = None) -> Iterator[Client]:
+def connected(url: str, key: str | None = None) -> "Iterator[Client]":
     """A client for the length of a command."""
+    from service.client import Client  # commands without a server start sooner
+
     with Client(url, key) as client:
         yield client
 

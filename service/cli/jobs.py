@@ -1,7 +1,7 @@
 """`lagid submit`, `watch`, `jobs`, `runs`, `cancel`, `resume`, `report`."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,8 +21,10 @@ from service.cli.common import (
     read_file,
 )
 from service.cli.watching import follow
-from service.client import Client
 from service.documents import read_yaml
+
+if TYPE_CHECKING:
+    from service.client import Client
 
 JobName = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.")]
 FILE_SUFFIXES = (".yaml", ".yml", ".json")
@@ -155,7 +157,7 @@ def print_runs(runs: list[dict[str, Any]]) -> None:
     print_table(headings, rows, empty="no runs")
 
 
-def _finish(client: Client, job: dict[str, Any], as_json: bool) -> None:
+def _finish(client: "Client", job: dict[str, Any], as_json: bool) -> None:
     found = client.runs(job["id"])
     if as_json:
         print_json({**job, "runs": found})
@@ -171,7 +173,7 @@ def _finish(client: Client, job: dict[str, Any], as_json: bool) -> None:
         raise typer.Exit(1)
 
 
-def _latest(client: Client) -> str:
+def _latest(client: "Client") -> str:
     found = client.jobs(limit=1)
     if not found:
         fail("there are no jobs; submit one: lagid submit job.yaml")

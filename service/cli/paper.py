@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from service.cli.common import Key, err, fail, out
-from service.client import Client
-from service.embedded import embedded_service
+
+if TYPE_CHECKING:
+    from service.client import Client
 
 
 def paper(
@@ -52,8 +53,11 @@ def paper(
 
 
 @contextmanager
-def _client(url: str | None, key: str | None) -> Iterator[Client]:
+def _client(url: str | None, key: str | None) -> "Iterator[Client]":
     """A client of the given server, or of one that lives as long as the command."""
+    from service.client import Client
+    from service.embedded import embedded_service
+
     if url is not None:
         with Client(url, key) as client:
             yield client

@@ -1,5 +1,6 @@
 """`lagid runs`: list the runs of a job, and what can be asked of single ones."""
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -12,11 +13,14 @@ from service.cli.common import (
     Url,
     connected,
     estimate,
+    fail,
     out,
     print_json,
     print_table,
+    read_file,
 )
 from service.cli.jobs import runs as listing
+from service.documents import read_yaml
 
 LISTING = "list"
 
@@ -59,6 +63,36 @@ def residuals(
 
 
 @app.command()
+def simulate(
+    run: RunName,
+    file: Annotated[Path, typer.Argument(help="YAML or JSON file with the body of the request.")],
+    max_points: Annotated[int, typer.Option(min=2, help="Points a line, at most.")] = 1000,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate the identified model on a new input or under proportional control."""
+    body = read_yaml(read_file(file))
+    if not isinstance(body, dict):
+        fail(f"{file} does not hold an object (name: value)")
+    with connected(url, key) as client:
+        found = client.simulate_run(run, body, max_points)
+    if as_json:
+        print_json(found)
+        return
+    for one in found["outputs"]:
+        values = [value for value in one["values"] if value is not None]
+        out.print(f"{one['name']} [{one['unit']}]: {one['samples']} samples, from {min(values):.6g}"
+                  f" to {max(values):.6g}, at the end {values[-1]:.6g}",
+                  markup=False, soft_wrap=True)  # fmt: skip
+    _print_step(found["metrics"])
+    for note in found["notes"]:
+        out.print(f"note: {note}", markup=False, soft_wrap=True)
+    if found["dataset"]:
+        out.print(f"stored as {found['dataset']['id']}", markup=False)
+
+
+@app.command()
 def compare(
     runs: Annotated[list[str], typer.Argument(metavar="RUN RUN…", help="Ids of two runs or more.")],
     url: Url = DEFAULT_URL,
@@ -78,6 +112,20 @@ def compare(
                 empty="no runs")  # fmt: skip
     for note in found["notes"]:
         out.print(f"note: {note}", markup=False, soft_wrap=True)
+
+
+def _print_step(metrics: dict[str, Any] | None) -> None:
+    if metrics is None:
+        return
+    told = (
+        ("rise time (10 to 90 %)", metrics["rise_time"], "s"),
+        ("overshoot", metrics["overshoot_percent"], "%"),
+        ("settling time (2 %)", metrics["settling_time"], "s"),
+        ("steady error", metrics["steady_error"], metrics["unit"]),
+    )
+    for name, value, unit in told:
+        shown = "never" if value is None else f"{value:.4g} {unit}"
+        out.print(f"{name}: {shown}", markup=False)
 
 
 def _tested(one: dict[str, Any]) -> tuple[object, ...]:

@@ -1,11 +1,12 @@
 """Live progress of a job: one bar a run, with its RMS; one bar for all where there are many."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from service.client import Client
+if TYPE_CHECKING:
+    from service.client import Client
 
 MANY = 12
 COLUMNS = (
@@ -18,7 +19,7 @@ COLUMNS = (
 )
 
 
-def follow(client: Client, job_id: str, *, quiet: bool = False) -> dict[str, Any]:
+def follow(client: "Client", job_id: str, *, quiet: bool = False) -> dict[str, Any]:
     """Show a job until it ends; its last state."""
     if quiet:
         return client.wait(job_id)
@@ -32,7 +33,7 @@ def follow(client: Client, job_id: str, *, quiet: bool = False) -> dict[str, Any
 class _Bars:
     """The bars of one job, brought up to date at every look."""
 
-    def __init__(self, client: Client, progress: Progress, *, many: bool) -> None:
+    def __init__(self, client: "Client", progress: Progress, *, many: bool) -> None:
         self._client, self._progress, self._many = client, progress, many
         self._bars: dict[str, TaskID] = {}
 
