@@ -151,7 +151,7 @@ def _told(model: Model, version: int, document: Mapping[str, Any] | None) -> Mod
         outputs={output.name: output.unit for output in model.outputs},
         parameters={
             p.name: {"lower": p.lower, "upper": p.upper, "unit": p.unit, "scale": p.scale,
-                     "fixed": p.fixed}
+                     "fixed": p.fixed, "tied": p.tied}
             for p in model.parameters
         },
         document=None if document is None else dict(document),

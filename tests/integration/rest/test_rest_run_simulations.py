@@ -194,8 +194,10 @@ def test_the_client_simulates_a_run(served: Served) -> None:
 def test_the_command_line_tells_the_measures_of_the_step(
     served: Served, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    client = Client("http://testserver", transport=Through(served.server))
-    monkeypatch.setattr(program, "connected", lambda url, key: client)
+    def connected(url: str, key: str | None) -> Client:
+        return Client("http://testserver", transport=Through(served.server))
+
+    monkeypatch.setattr(program, "connected", connected)
     file = tmp_path / "loop.json"
     file.write_text(json.dumps({**LOOP, "store": True}))
     done = CliRunner().invoke(program.app, ["simulate", served.arm, str(file)])
