@@ -100,11 +100,10 @@ def test_functions_that_are_asked_for_have_the_verdicts_that_were_stored(served:
         assert asked["data"] == stored["data"] == "validation"
         assert asked["note"] == ""
         for one, kept in zip(asked["tests"], stored["tests"], strict=True):
-            assert {name: one[name] for name in kept if name not in ("statistic", "p")} == {
-                name: value for name, value in kept.items() if name not in ("statistic", "p")
-            }
-            assert one["statistic"] == pytest.approx(kept["statistic"], rel=1e-9)
-            assert one["p"] == pytest.approx(kept["p"], rel=1e-6, abs=1e-12)
+            for name, value in kept.items():
+                # The two processes may add up in another order: the last bits differ.
+                close = isinstance(value, float)
+                assert one[name] == (pytest.approx(value, rel=1e-6, abs=1e-9) if close else value)
             assert len(one["lags"]) == len(one["values"]) == len(one["band99"])
 
 
