@@ -20,6 +20,7 @@ from sysid.ga.state import (
     SIMPLE,
     Plan,
 )  # fmt: skip
+from sysid.kernels.calls import LANES
 from sysid.problem import Problem
 from sysid.settings import GeneticAlgorithm, Loss
 from sysid.types import FloatArray
@@ -52,13 +53,16 @@ def of_island(algorithm: GeneticAlgorithm, index: int) -> GeneticAlgorithm:
 def search_budget(algorithm: GeneticAlgorithm, n: int) -> int:
     """Simulations that the islands may run: all but a tenth kept for the refinement.
 
-    At least a few steps of the refinement (of n + 1 simulations) and at most half are kept.
+    At least a few steps of the refinement (of n + 1 simulations) and at most half are kept, and
+    what the last step of each island may take beyond its share.
     """
     limit = algorithm.stop.evaluations
     if limit is None:
         return _UNLIMITED
-    kept = min(max(limit // 10, 4 * (n + 2)), limit // 2) if algorithm.refine else 0
-    return limit - kept
+    if not algorithm.refine:
+        return limit
+    beyond = algorithm.n_islands * (n + LANES)
+    return limit - min(max(limit // 10, 4 * (n + 2)) + beyond, limit // 2)
 
 
 def plans(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> tuple[Plan, ...]:
