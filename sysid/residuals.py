@@ -22,15 +22,17 @@ all the same, and nothing is resampled. With soft-l1 the residuals are those tha
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from scipy.special import gammaincc
 
 from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, lagged_sums, laid_out
-from sysid.problem import Problem
 from sysid.records import Channel
 from sysid.types import BoolArray, FloatArray
+
+if TYPE_CHECKING:  # the pages read these results without a compiler
+    from sysid.problem import Problem
 
 LEVEL = 0.05
 """Chance that a true model with white noise fails one of its tests, all of them together."""
@@ -122,7 +124,7 @@ class Series(NamedTuple):
 
 
 def residual_tests(
-    problem: Problem, simulated: FloatArray, data: Literal["estimation", "validation"]
+    problem: "Problem", simulated: FloatArray, data: Literal["estimation", "validation"]
 ) -> ResidualTests:
     """Test the residuals of simulated values (M,) on the records of a problem."""
     found = correlations(series_of(problem, simulated), both_sides=False)
@@ -139,7 +141,7 @@ def verdict(
     return ResidualTests(data, passed, tests)
 
 
-def series_of(problem: Problem, simulated: FloatArray) -> list[Series]:
+def series_of(problem: "Problem", simulated: FloatArray) -> list[Series]:
     """The residuals of every output of every experiment, from simulated values (M,)."""
     loss = problem.arguments[4]
     scale = loss.scale if loss.kind == "soft-l1" else 0.0
