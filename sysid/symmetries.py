@@ -13,12 +13,13 @@ rational coefficients, and they are solved exactly.
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
+from functools import lru_cache
 
 import numpy as np
 
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
 from sysid.models.initial import initial_name
-from sysid.models.model import EstimatedInitial, FixedInitial, MeasuredInitial, Model
+from sysid.models.model import EstimatedInitial, FixedInitial, Initial, MeasuredInitial, Model
 from sysid.parameters import Parameter
 from sysid.types import FloatArray
 
@@ -41,27 +42,40 @@ def scalings(model: Model, parameters: Sequence[Parameter]) -> FloatArray:
     FloatArray, shape (k, D)
         A basis in reduced echelon form; k = 0 where there is no such symmetry.
     """
+    states = tuple(state.name for state in model.states)
+    outputs = tuple(output.expression for output in model.outputs)
+    return _scalings(states, model.equations, outputs, model.initial, tuple(parameters))
+
+
+@lru_cache(maxsize=64)
+def _scalings(
+    states: tuple[str, ...], equations: tuple[Expression, ...], outputs: tuple[Expression, ...],
+    initial: tuple[Initial, ...], parameters: tuple[Parameter, ...],
+) -> FloatArray:  # fmt: skip
+    """The same, kept for the many runs of one model; not to be written to."""
     free = [p.name for p in parameters if p.is_free]
     walk = _Weights(
         {p.name for p in parameters if not p.is_free and p.fixed != 0.0},
         {p.name for p in parameters if p.fixed == 0.0},
     )
-    for state, equation in zip(model.states, model.equations, strict=True):
-        walk.equal({state.name: Fraction(1)}, walk.of(equation))
-    for output in model.outputs:
-        walk.equal({}, walk.of(output.expression))
-    _initial(walk, model, parameters)
-    others = [state.name for state in model.states]
-    null = _null_space(walk.equations, [*others, *free])
+    for state, equation in zip(states, equations, strict=True):
+        walk.equal({state: Fraction(1)}, walk.of(equation))
+    for output in outputs:
+        walk.equal({}, walk.of(output))
+    _start(walk, states, initial, {p.name for p in parameters})
+    null = _null_space(walk.equations, [*states, *free])
     kept = [[row.get(name, Fraction(0)) for name in free] for row in null]
-    return _echelon(kept, len(free))
+    found = _echelon(kept, len(free))
+    found.flags.writeable = False
+    return found
 
 
-def _initial(walk: "_Weights", model: Model, parameters: Sequence[Parameter]) -> None:
+def _start(
+    walk: "_Weights", states: Sequence[str], initial: Sequence[Initial], known: set[str]
+) -> None:
     """A state that starts at a known value other than 0 cannot be scaled."""
-    known = {p.name for p in parameters}
-    for state, start in zip(model.states, model.initial, strict=True):
-        own = {state.name: Fraction(1)}
+    for state, start in zip(states, initial, strict=True):
+        own = {state: Fraction(1)}
         match start:
             case FixedInitial(value) if value != 0.0:
                 walk.equal({}, own)
@@ -69,7 +83,7 @@ def _initial(walk: "_Weights", model: Model, parameters: Sequence[Parameter]) ->
                 walk.equal({}, own)
             case EstimatedInitial():
                 experiment = 0
-                while (name := initial_name(state.name, experiment)) in known:
+                while (name := initial_name(state, experiment)) in known:
                     walk.equal(own, walk.of(Symbol(name, "parameter")))
                     experiment += 1
 
