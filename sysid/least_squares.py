@@ -69,7 +69,7 @@ def solve(
     loss: Loss,
     *,
     steps: int,
-    tolerance: float = 1e-12,
+    tolerance: float = 1e-10,
 ) -> Solution:
     """The local minimum that Levenberg-Marquardt finds from a place (D,).
 
