@@ -12,29 +12,40 @@ from the best of fresh individuals, and take in the rest by and by.
 import numpy as np
 
 from sysid.ga.chromosome import coded, decoded, located
-from sysid.ga.gauss_newton import damped_step, normal_equations, partial_fitness, spread
+from sysid.ga.gauss_newton import (
+    damped_step,
+    factored,
+    normal_equations,
+    partial_fitness,
+    spread,
+)
 from sysid.ga.operators import rank
 from sysid.ga.random import DEVELOPMENT, below, draws, unit
 from sysid.ga.state import (
+    CONFIRMED,
     DAMPING,
     DEVELOPMENTS,
     EVALUATIONS,
     FAILED,
+    FRESH,
     GENERATION,
     GROWTH,
     HORIZON,
     OLD,
     POINT,
     PROBES,
+    REACHED,
     ROUGH,
+    SAME,
     SEQUENCE,
     SETTLED,
     STAGNATION,
     STEP,
+    TRIED,
     Plan,
 )  # fmt: skip
 from sysid.kernels.caching import compiled
-from sysid.kernels.evaluation import population_fitness, population_predictions
+from sysid.kernels.evaluation import partial_predictions, population_fitness
 from sysid.kernels.evaluator import Evaluator
 from sysid.types import FloatArray, IntArray, WordArray
 
@@ -61,13 +72,9 @@ def _fresh(
             word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
             places[p, d] = unit(word[0])
     counters[EVALUATIONS] += shape[0]
-    predicted = population_predictions(evaluator, located(evaluator, places))
-    best, least = 0, np.inf
-    for p in range(shape[0]):
-        value = partial_fitness(evaluator, plan, predicted[p], horizon)
-        if value < least:
-            best, least = p, value
-    return np.asarray(places[best])
+    predicted = partial_predictions(evaluator, located(evaluator, places), horizon)
+    reached = partial_fitness(evaluator, plan, predicted, horizon)
+    return np.asarray(places[np.argmin(reached[: shape[0]])])
 
 
 @compiled
@@ -82,7 +89,8 @@ def start_development(
     word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
     grows = counters[DEVELOPMENTS] % 2 == 0
     memory[ROUGH] = counters[SETTLED] == 1 or grows
-    chosen, counters[PROBES] = 0, 0
+    chosen, counters[PROBES], counters[FRESH] = 0, 0, 0
+    memory[REACHED] = np.inf
     if grows:
         memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
         memory[GROWTH] = 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
@@ -95,7 +103,7 @@ def start_development(
         memory[OLD] = fitness[chosen]
         begin = decoded(words[chosen : chosen + 1], plan.bits)[0]
     else:
-        memory[OLD] = np.inf
+        memory[OLD], counters[FRESH] = np.inf, 1
         begin = _fresh(evaluator, plan, words.shape, counters, memory[HORIZON])
     for d in range(begin.size):
         memory[POINT + d] = begin[d]
@@ -146,6 +154,9 @@ def _next_part(counters: IntArray, memory: FloatArray, fitness: FloatArray) -> N
     counters[SEQUENCE], counters[STEP] = 0, 0
     if memory[OLD] == fitness[0]:
         counters[SETTLED] = 1
+    if counters[FRESH]:
+        counters[TRIED] += 1
+        counters[CONFIRMED] += memory[REACHED] <= fitness[0] * (1.0 + SAME)
 
 
 @compiled
@@ -157,7 +168,7 @@ def _trials(plan: Plan, counters: IntArray, memory: FloatArray, matrix: FloatArr
     for t in range(TRIALS):
         damping = memory[DAMPING] * FACTOR ** (t - 1)
         damped_step(matrix, gradient, point, damping, places[t])
-    deviation = np.empty(point.size)
+    deviation, factor = np.empty(point.size), factored(matrix, gradient, point, 0.0)
     for t in range(TRIALS, places.shape[0]):
         for d in range(point.size):
             draw = 1 + t * point.size + d
@@ -166,7 +177,7 @@ def _trials(plan: Plan, counters: IntArray, memory: FloatArray, matrix: FloatArr
             deviation[d] = (
                 size * np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(2.0 * np.pi * unit(word[1]))
             )
-        spread(matrix, gradient, point, deviation, places[t])
+        spread(factor, point, deviation, places[t])
     return places
 
 
@@ -198,10 +209,8 @@ def adaptive_sequence(
     proposals = coded(_trials(plan, counters, memory, matrix, gradient, base), plan.bits)
     places = decoded(proposals, plan.bits)
     if horizon < 1.0:
-        predicted = population_predictions(evaluator, located(evaluator, places))
-        reached = np.empty(places.shape[0])
-        for t in range(places.shape[0]):
-            reached[t] = partial_fitness(evaluator, plan, predicted[t], horizon)
+        predicted = partial_predictions(evaluator, located(evaluator, places), horizon)
+        reached = partial_fitness(evaluator, plan, predicted, horizon)[: places.shape[0]]
     else:
         reached = population_fitness(evaluator, located(evaluator, places))
     best = np.argmin(reached)
@@ -212,6 +221,7 @@ def adaptive_sequence(
             point[d] = places[best, d]
         memory[DAMPING] *= FACTOR ** float(min(int(best), TRIALS) - 2)
         if horizon == 1.0:
+            memory[REACHED] = reached[best]
             _keep(words, fitness, memory, proposals[best], reached[best])
         if reached[best] > base * (1.0 - enough) or counters[STEP] >= MOST_STEPS:
             _next_part(counters, memory, fitness)

@@ -10,6 +10,7 @@ from sysid.ga.sequence import fixed_sequence
 from sysid.ga.state import (
     AT_EVALUATIONS,
     AT_GENERATION,
+    CONFIRMED,
     DEVELOPMENTS,
     EVALUATIONS,
     GENERATION,
@@ -19,6 +20,7 @@ from sysid.ga.state import (
     MIGRATION,
     PHASE,
     RMS,
+    SAME,
     SEQUENCE,
     SETTLED,
     SIMPLE,
@@ -228,6 +230,8 @@ def generations(
         counters[STAGNATION] += 1
         if fitness[0] < best:
             counters[STAGNATION] = 0
+            if fitness[0] < best * (1.0 - SAME):
+                counters[CONFIRMED] = 0
             if phase == GENETIC:
                 counters[SETTLED] = 0
             _note(evaluator, plan, words, fitness, counters, phase, improvements[written])

@@ -9,7 +9,7 @@ import numpy as np
 from sysid.ga.chromosome import located
 from sysid.ga.state import Plan
 from sysid.kernels.caching import compiled
-from sysid.kernels.evaluation import population_predictions
+from sysid.kernels.evaluation import partial_predictions
 from sysid.kernels.evaluator import Evaluator
 from sysid.types import FloatArray
 
@@ -17,28 +17,32 @@ from sysid.types import FloatArray
 @compiled
 def partial_fitness(
     evaluator: Evaluator, plan: Plan, predicted: FloatArray, horizon: float
-) -> float:
-    """Fitness of one row of predictions over the samples up to `horizon` (1: all of them)."""
-    total, count = 0.0, 0
-    for m in range(predicted.size):
-        weight = evaluator.weight[m]
-        if weight > 0.0 and plan.progress[m] <= horizon:
-            error = weight * (predicted[m] - evaluator.measured[m])
-            count += 1
+) -> FloatArray:
+    """Fitness of each column of predictions (M, P) by the samples up to `horizon` (1: all)."""
+    totals, count = np.zeros(predicted.shape[1]), 0
+    for m in range(predicted.shape[0]):
+        weight, measured = evaluator.weight[m], evaluator.measured[m]
+        if weight == 0.0 or plan.progress[m] > horizon:
+            continue
+        count += 1
+        for p in range(totals.size):
+            error = weight * (predicted[m, p] - measured)
             if plan.loss_scale > 0.0:
                 z = error / plan.loss_scale
-                total += 2.0 * plan.loss_scale**2 * (np.sqrt(1.0 + z * z) - 1.0)
+                totals[p] += 2.0 * plan.loss_scale**2 * (np.sqrt(1.0 + z * z) - 1.0)
             else:
-                total += error * error
-    value = np.sqrt(total / max(count, 1))
-    return value if np.isfinite(value) else np.inf
+                totals[p] += error * error
+    for p in range(totals.size):
+        value = np.sqrt(totals[p] / max(count, 1))
+        totals[p] = value if np.isfinite(value) else np.inf
+    return totals
 
 
 @compiled
 def _sensed(
-    evaluator: Evaluator, point: FloatArray, difference: float
+    evaluator: Evaluator, point: FloatArray, horizon: float, difference: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Predictions at a point and at its D neighbours, (D + 1, M), and the distances of these."""
+    """Predictions at a point and its D neighbours, (M, D + 1 or more), and these' distances."""
     n = point.size
     places, steps = np.empty((n + 1, n)), np.empty(n)
     for d in range(n):
@@ -46,20 +50,20 @@ def _sensed(
             places[p, d] = point[d]
         steps[d] = difference if point[d] < 0.5 else -difference
         places[d + 1, d] += steps[d]
-    return population_predictions(evaluator, located(evaluator, places)), steps
+    return partial_predictions(evaluator, located(evaluator, places), horizon), steps
 
 
 @compiled
-def _product(one: FloatArray, other: FloatArray) -> float:
-    """Inner product, as four sums that do not wait for each other."""
+def _product(one: FloatArray, other: FloatArray, count: int) -> float:
+    """Inner product of the first `count` entries, as four sums that do not wait for each other."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
-    whole = one.size // 4 * 4
+    whole = count // 4 * 4
     for m in range(0, whole, 4):
         a += one[m] * other[m]
         b += one[m + 1] * other[m + 1]
         c += one[m + 2] * other[m + 2]
         d += one[m + 3] * other[m + 3]
-    for m in range(whole, one.size):
+    for m in range(whole, count):
         a += one[m] * other[m]
     return (a + b) + (c + d)
 
@@ -70,24 +74,26 @@ def normal_equations(
 ) -> tuple[FloatArray, FloatArray, float]:
     """JᵀJ, Jᵀe and the fitness at a point, over the samples up to `horizon`: D + 1 simulations."""
     n = point.size
-    predicted, steps = _sensed(evaluator, point, difference)
-    matrix, gradient, rows = np.zeros((n, n)), np.zeros(n), np.zeros((n + 1, predicted.shape[1]))
-    for m in range(predicted.shape[1]):
-        weight = evaluator.weight[m] if plan.progress[m] <= horizon else 0.0
-        if weight == 0.0:
+    predicted, steps = _sensed(evaluator, point, horizon, difference)
+    rows, count = np.empty((n + 1, predicted.shape[0])), 0
+    for m in range(predicted.shape[0]):
+        weight = evaluator.weight[m]
+        if weight == 0.0 or plan.progress[m] > horizon:
             continue
-        error = weight * (predicted[0, m] - evaluator.measured[m])
+        error = weight * (predicted[m, 0] - evaluator.measured[m])
         if plan.loss_scale > 0.0:
             share = (1.0 + (error / plan.loss_scale) ** 2) ** -0.25
             error, weight = share * error, share * weight
-        rows[n, m] = error
+        rows[n, count] = error
         for d in range(n):
-            rows[d, m] = weight * (predicted[d + 1, m] - predicted[0, m])
+            rows[d, count] = weight * (predicted[m, d + 1] - predicted[m, 0])
+        count += 1
+    matrix, gradient = np.zeros((n, n)), np.zeros(n)
     for d in range(n):
-        gradient[d] = _product(rows[d], rows[n]) / steps[d]
+        gradient[d] = _product(rows[d], rows[n], count) / steps[d]
         for e in range(d + 1):
-            matrix[d, e] = _product(rows[d], rows[e]) / (steps[d] * steps[e])
-    return matrix, gradient, partial_fitness(evaluator, plan, predicted[0], horizon)
+            matrix[d, e] = _product(rows[d], rows[e], count) / (steps[d] * steps[e])
+    return matrix, gradient, partial_fitness(evaluator, plan, predicted[:, :1], horizon)[0]
 
 
 @compiled
@@ -148,11 +154,10 @@ def damped_step(matrix: FloatArray, gradient: FloatArray, point: FloatArray, dam
 
 
 @compiled
-def spread(matrix: FloatArray, gradient: FloatArray, point: FloatArray, deviation: FloatArray,
-           place: FloatArray) -> None:  # fmt: skip
+def spread(factor: FloatArray, point: FloatArray, deviation: FloatArray, place: FloatArray) -> None:
     """Write a place whose distance from `point` has covariance A⁻¹, for normal `deviation`.
 
-    Long where the output is insensitive, short across the valley.
+    Long where the output is insensitive, short across the valley. `factor` is that of A.
     """
-    _back(factored(matrix, gradient, point, 0.0), deviation)
+    _back(factor, deviation)
     _shift(point, deviation, place)

@@ -9,18 +9,21 @@ SIMPLE, PAPER, IMPROVED, IMPROVED_PAPER_STEPS = 0, 1, 2, 3
 """Methods: simple GA; with the fixed sequence; improved with adaptive, with fixed sequence."""
 
 # Places in an island's counters.
-GENERATION, EVALUATIONS, STAGNATION, SEQUENCE, STEP, FAILED, DEVELOPMENTS, SETTLED, PROBES = range(
-    9
-)
-N_COUNTERS = 9
+(
+    GENERATION, EVALUATIONS, STAGNATION, SEQUENCE, STEP, FAILED, DEVELOPMENTS, SETTLED, PROBES,
+    FRESH, TRIED, CONFIRMED,
+) = range(12)  # fmt: skip
+N_COUNTERS = 12
 
 # Places in an island's memory of the sequence search; the point's D places follow.
-DAMPING, HORIZON, GROWTH, ROUGH, OLD, POINT = range(6)
+DAMPING, HORIZON, GROWTH, ROUGH, OLD, REACHED, POINT = range(7)
 
 # Columns of an improvement; the D physical values follow.
 AT_GENERATION, AT_EVALUATIONS, RMS, PHASE, VALUES = range(5)
 START, GENETIC, LOCAL, MIGRATION = range(4)
 PHASES: tuple[Phase, ...] = ("start", "genetic", "sequence", "migration")
+
+SAME = 1e-4  # relative: champions this near in fitness are one optimum
 
 
 class Plan(NamedTuple):

@@ -114,13 +114,11 @@ def _method(algorithm: GeneticAlgorithm) -> int:
 
 
 def record_progress(problem: Problem) -> FloatArray:
-    """How far in its record (0 … 1) each of the M measured values lies."""
-    numbers = np.arange(problem.evaluator.n_measured, dtype=np.float64)
-    progress = np.empty(numbers.size)
-    for experiment in problem.split(numbers):
-        for places in experiment.values():
-            progress[places.astype(np.int64)] = np.arange(1, places.size + 1) / places.size
-    return progress
+    """Part of its experiment (0 … 1) that has to be simulated for each of the M measured values."""
+    return np.concatenate([
+        np.ceil(samples.places) / max(experiment.grid.points - 1, 1)
+        for experiment in problem.experiments for samples in experiment.outputs
+    ])  # fmt: skip
 
 
 def found(

@@ -1,16 +1,14 @@
 """Migration: copies of the best of one island replace the worst of another, all at once."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from sysid.ga.chromosome import coded, decoded
 from sysid.ga.island import Island
-from sysid.ga.state import SETTLED, STAGNATION
+from sysid.ga.state import CONFIRMED, SAME, SETTLED, STAGNATION
 from sysid.islands.topology import edges
 from sysid.result import Improvement, Migrant
 from sysid.settings import Migration
-from sysid.types import WordArray
+from sysid.types import IntArray, WordArray
 
 
 def migrate(
@@ -43,8 +41,10 @@ def migrate(
 
 def _arrives(island: Island, word: WordArray, fitness: float) -> bool:
     """Whether a migrant is fitter than the worst, and new here."""
-    worst = np.max(island.fitness)  # nan, not evaluated yet, is never replaced
-    return bool(fitness < worst) and not bool(np.any(np.all(island.words == word, axis=1)))
+    if not fitness < island.fitness[-1]:  # nan, not evaluated yet, comes last and is kept
+        return False
+    sought, there = word.tobytes(), island.words.tobytes()
+    return all(there[i : i + len(sought)] != sought for i in range(0, len(there), len(sought)))
 
 
 def _with(
@@ -54,10 +54,19 @@ def _with(
     words, reached = island.words.copy(), island.fitness.copy()
     words[-1], reached[-1] = word, fitness
     order = np.argsort(reached, kind="stable")
-    moved = replace(island, words=words[order], fitness=reached[order])
-    if values is None or not fitness < island.champion_rms:
-        return moved
+    counters, history = island.counters, island.history
+    if values is not None and fitness < island.champion_rms:
+        better = Improvement(island.generation, island.evaluations, fitness, "migration", values)
+        history, counters = (*history, better), _of_another(island, fitness)
+    return Island(
+        island.index, island.seed, words[order], reached[order], counters, island.memory, history
+    )
+
+
+def _of_another(island: Island, fitness: float) -> IntArray:
+    """The counters of an island whose champion has come from another."""
     counters = island.counters.copy()
     counters[STAGNATION], counters[SETTLED] = 0, 0
-    better = Improvement(island.generation, island.evaluations, fitness, "migration", values)
-    return replace(moved, counters=counters, history=(*island.history, better))
+    if fitness < island.champion_rms * (1.0 - SAME):
+        counters[CONFIRMED] = 0
+    return counters

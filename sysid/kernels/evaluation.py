@@ -9,7 +9,10 @@ import numpy as np
 from sysid.kernels.caching import compiled
 from sysid.kernels.calls import LANES, call_kernel
 from sysid.kernels.evaluator import Evaluator
-from sysid.types import FloatArray
+from sysid.kernels.layout import HEAD
+from sysid.types import FloatArray, IntArray
+
+_LAST = HEAD.index("last")
 
 
 @compiled
@@ -28,7 +31,9 @@ def expanded(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 
 
 @compiled
-def _run(evaluator: Evaluator, full: FloatArray, predictions: FloatArray) -> FloatArray:
+def _run(
+    evaluator: Evaluator, ints: IntArray, full: FloatArray, predictions: FloatArray
+) -> FloatArray:
     loss = np.zeros(full.shape[1])
     if full.shape[1] == 0:
         return loss
@@ -36,7 +41,7 @@ def _run(evaluator: Evaluator, full: FloatArray, predictions: FloatArray) -> Flo
     for e in range(evaluator.plans.shape[0]):
         call_kernel(
             evaluator.kernel, full,
-            evaluator.ints, evaluator.plans[e, 0], evaluator.floats, evaluator.plans[e, 1],
+            ints, evaluator.plans[e, 0], evaluator.floats, evaluator.plans[e, 1],
             work, predictions, evaluator.plans[e, 2], loss,
         )  # fmt: skip
     return loss
@@ -45,7 +50,7 @@ def _run(evaluator: Evaluator, full: FloatArray, predictions: FloatArray) -> Flo
 @compiled
 def population_fitness(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """J of each individual (Eq. 10; smaller is better): (P, D) → (P,), inf where it diverges."""
-    loss = _run(evaluator, expanded(evaluator, theta), np.empty((0, 1)))
+    loss = _run(evaluator, evaluator.ints, expanded(evaluator, theta), np.empty((0, 1)))
     fitness = np.empty(theta.shape[0])
     for p in range(theta.shape[0]):
         value = np.sqrt(loss[p] / evaluator.n_weight)
@@ -58,5 +63,22 @@ def population_predictions(evaluator: Evaluator, theta: FloatArray) -> FloatArra
     """Simulated value at each measured time: (P, D) → (P, M); not finite where it diverges."""
     full = expanded(evaluator, theta)
     predictions = np.empty((evaluator.n_measured, full.shape[1]))
-    _run(evaluator, full, predictions)
+    _run(evaluator, evaluator.ints, full, predictions)
     return np.ascontiguousarray(predictions[:, : theta.shape[0]].T)
+
+
+@compiled
+def partial_predictions(evaluator: Evaluator, theta: FloatArray, horizon: float) -> FloatArray:
+    """Simulated values (M, P rounded up) of each experiment up to a part of its time.
+
+    The simulation ends `horizon` (0 … 1) of the steps after its beginning, and costs that part.
+    Values of later samples and in columns from P on are arbitrary.
+    """
+    ints = evaluator.ints.copy()
+    for e in range(evaluator.plans.shape[0]):
+        last = evaluator.plans[e, 0] + _LAST
+        ints[last] = int(np.ceil(horizon * ints[last]))
+    full = expanded(evaluator, theta)
+    predictions = np.empty((evaluator.n_measured, full.shape[1]))
+    _run(evaluator, ints, full, predictions)
+    return predictions
