@@ -53,17 +53,15 @@ format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+BENCHES := kernels search latency noise_sweep memory mcap
+
 bench: $(READY)
 	@mkdir -p benchmarks/results
-	$(BIN)/python benchmarks/kernels.py --quick --json benchmarks/results/kernels.json
-	$(BIN)/python benchmarks/mcap.py --quick --json benchmarks/results/mcap.json
+	@for name in $(BENCHES); do $(BIN)/python -m benchmarks.$$name --quick --json benchmarks/results/$$name.json; done
 
 bench-full: $(READY)
 	@mkdir -p benchmarks/results
-	$(BIN)/python benchmarks/kernels.py --json benchmarks/results/kernels.json
-	$(BIN)/python benchmarks/mcap.py --json benchmarks/results/mcap.json
-	$(BIN)/python -m benchmarks.robustness --json benchmarks/results/robustness.json
-	$(BIN)/python benchmarks/efficiency.py --json benchmarks/results/efficiency.json
+	@for name in $(BENCHES) robustness efficiency; do $(BIN)/python -m benchmarks.$$name --json benchmarks/results/$$name.json; done
 
 real-data: $(READY)
 	@mkdir -p benchmarks/results
