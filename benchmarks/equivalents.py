@@ -46,15 +46,21 @@ class Example:
     upper: Sequence[float]
     stages: int
     hold: Hold = "first"
+    input_scale: float = 0.1
+    steps: int = 1  # of the simulation in a sample
 
 
 EXAMPLES = {
     "tube (RK4)": Example("tube", "tube", 0.01, [0.9, 0.2, 0.0], [1.1, 0.5, 0.3], 4),
     "silverbox (RK4, 2 steps a sample)": Example(
         "silverbox", "silverbox", 1 / 610.35, [1e5, 20, 1e5, -1e4, 0, -1e3, 0],
-        [3e5, 80, 3e5, 1e4, 1e6, 1e3, 3e-3], 8, "band-limited",
+        [3e5, 80, 3e5, 1e4, 1e6, 1e3, 3e-3], 8, "band-limited", steps=2,
     ),
     "coulomb-eq16": Example("coulomb", "coulomb-eq16", 0.02, [0] * 4, [1, 0.9, 10, 2], 1),
+    "actuator (8 steps a sample)": Example(
+        "actuator", "actuator", 0.01, [3e-4, 1e-2, 2e-2, 60, 3e5, -0.1],
+        [4e-4, 2e-2, 5e-2, 100, 6e5, 0.1], 8, input_scale=2e5, steps=8,
+    ),
     "narx, 13 terms": Example(
         "narx", NARX, 1.0, [0.5, -0.5, *[-0.01] * 11], [0.9, 0.05, *[0.01] * 11], 1
     ),
@@ -70,7 +76,7 @@ def problem_of(example: Example, samples: int) -> Problem:
     times = example.sample_time * np.arange(samples)
     phase = np.arange(samples) / 8
     inputs = [
-        Channel(one.name, times, 0.1 * np.cos(phase), one.unit, hold=example.hold)
+        Channel(one.name, times, example.input_scale * np.cos(phase), one.unit, hold=example.hold)
         for one in model.inputs
     ]
     output = model.outputs[0]

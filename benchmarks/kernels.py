@@ -132,8 +132,7 @@ def against_own_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
         for _ in range(3):
             ours = min(ours, microseconds(lambda e=built, t=theta: e.fitness(t), repeats))
             c = min(c, microseconds(call, repeats))
-        steps = 2 * 300 if "2 steps" in name else 300
-        share = operations_a_step(built) * 48 * steps / ours / 1000 / peak
+        share = operations_a_step(built) * 48 * 300 * example.steps / ours / 1000 / peak
         rows += [
             Row(f"{name}: time ÷ C by hand", ours / c, "", 1.5),
             Row(f"{name}: per individual, sample and stage", ours * 1000 / 48 / 300

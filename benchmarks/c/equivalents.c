@@ -194,6 +194,54 @@ void mackey(ARGUMENTS) {
   }
 }
 
+/* Stick-slip actuator (Eq. 23-25), 8 steps a sample, the instants of stopping and breaking away inside a step; rows
+ * J, F_c, F_max, k_a = k_b, k_c and the first angle; volume swept, viscous friction and end stop as in the catalogue. */
+void actuator(ARGUMENTS) {
+  (void)work;
+  const double swept = 5e-6, viscous = 1e-3, stop = 2.356194490192345, s = h / 8;
+  for (long p0 = 0; p0 < P; p0 += W) {
+    double inertia[W], coulomb[W], breakaway[W], rate[W], gain[W], sum[W], angle[W], speed[W], pressure[W];
+    LANES {
+      inertia[j] = ROW(0), coulomb[j] = ROW(1), breakaway[j] = ROW(2), rate[j] = ROW(3), gain[j] = ROW(4);
+      angle[j] = ROW(5), speed[j] = pressure[j] = 0;
+      sum[j] = (y[0] - angle[j]) * (y[0] - angle[j]);
+    }
+    for (long k = 0; k < 8 * (N - 1); k++) {
+      double supply = u[zero + k * points + points / 2];
+      LANES {
+        double J2 = 2 * inertia[j], Fc = coulomb[j], Fm = breakaway[j], ka = rate[j], kc = gain[j], w = speed[j];
+        double p = pressure[j], fed = ka * supply, lag = 1 + s * ka / 2, sign = (w > 0) - (w < 0);
+        double w1 = (J2 * w + s * (swept * (p + s * fed / 2) / lag - Fc * sign)) /
+                    (J2 + s * viscous + swept * s * s * kc / (2 * lag));
+        double slid = w * (2 * w1 - w) > 0 ? 0 : s - s * w / (2 * (w - w1));
+        double rest = w == 0 ? s : slid;
+        double stopped = p + (s - rest) * ((2 * p + s * (fed - kc * w1)) / lag - 2 * p) / s;
+        double rested = (stopped * (1 - rest * ka / 2) + rest * fed) / (1 + rest * ka / 2);
+        double way = (rested > 0) - (rested < 0);
+        double go = fabs(swept * stopped) > Fm ? stopped : way * Fm / swept;
+        double to = (go > 0) - (go < 0);
+        double broke = fabs(swept * rested) > Fm ? rest * (fabs(rested) - Fm / swept) / fabs(rested - stopped) : 0;
+        double slip = fabs(swept * stopped) > Fm ? rest : broke;
+        slip = (to * angle[j] >= stop || rest == 0) ? 0 : slip;
+        double late = 1 + slip * ka / 2;
+        double push = slip * (to * swept * (go + slip * fed / 2) / late - Fc);
+        double w2 = to * (push > 0 ? push : 0) / (J2 + slip * viscous + swept * slip * slip * kc / (2 * late));
+        double next = angle[j] + (rest > 0 ? (s - rest) * w / 2 : s * w1) + slip * w2;
+        next = next < stop ? next : stop;
+        next = next > -stop ? next : -stop;
+        double moving = rest > 0 ? 2 * w2 : 2 * w1 - w;
+        angle[j] = next, speed[j] = fabs(next) >= stop ? 0 : moving;
+        pressure[j] = slip > 0 ? (2 * go + slip * (fed - kc * w2)) / late - go : rested;
+      }
+      if ((k & 7) == 7) LANES {
+        double e = y[(k + 1) / 8] - angle[j];
+        sum[j] += e * e;
+      }
+    }
+    LANES J[p0 + j] = sqrt(sum[j] / N);
+  }
+}
+
 /* Multiply-adds a call, for the machine's peak: 2 * W * 8 * turns operations in independent chains. */
 double peak(long turns) {
   double x[8][W], total = 0;
