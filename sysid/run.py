@@ -85,12 +85,16 @@ def _has_ended(algorithm: GeneticAlgorithm, state: RunState) -> bool:
         return True
     if algorithm.stop.rms is not None and state.rms <= algorithm.stop.rms:
         return True
+    if algorithm.stop.settled is not None and state.confirmed >= max(
+        algorithm.stop.settled, state.independent / 2
+    ):
+        return True
     # Below the border only those islands stay that have used up their evaluations.
     return all(island.generation < state.generation for island in state.islands)
 
 
 def is_finished(algorithm: GeneticAlgorithm, state: RunState) -> bool:
-    """Whether an end condition holds: generations, evaluations, target RMS, seconds."""
+    """Whether an end condition holds: generations, evaluations, target RMS, settled, seconds."""
     limit = algorithm.stop.seconds
     return state.ended or (limit is not None and state.seconds >= limit)
 

@@ -56,14 +56,20 @@ class Migration:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """End conditions besides the generations; whichever comes first. None: not used."""
+    """End conditions besides the generations; whichever comes first. None: not used.
+
+    `settled`: the best individual was found that often, each time from new random places, and by
+    at least half of all such searches. Only the adaptive sequence search makes these, so that the
+    paper's methods never end by it.
+    """
 
     evaluations: int | None = None
     seconds: float | None = None
     rms: float | None = None
+    settled: int | None = 3
 
     def __post_init__(self) -> None:
-        for name in ("evaluations", "seconds", "rms"):
+        for name in ("evaluations", "seconds", "rms", "settled"):
             value = getattr(self, name)
             _require(value is None or value > 0, f"stop/{name}", value, "positive")
         _require(self.evaluations is None or self.evaluations <= MOST_EVALUATIONS,

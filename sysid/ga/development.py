@@ -95,6 +95,7 @@ def start_development(
         memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
         memory[GROWTH] = 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
         chosen = below(word[1], 3 * words.shape[0]) - words.shape[0]
+        chosen = -1 if counters[DEVELOPMENTS] == 2 else chosen
         counters[PROBES] = words.shape[0] // 3  # in lanes that would idle
     elif counters[SETTLED]:
         counters[PROBES] = words.shape[0]

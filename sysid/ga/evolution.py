@@ -186,7 +186,7 @@ def _turn(
     if counters[SEQUENCE] or plan.method == SIMPLE:
         return
     if plan.method == IMPROVED:
-        if counters[DEVELOPMENTS] == 0 or counters[STEP] >= max(1, plan.stagnation // 10):
+        if counters[DEVELOPMENTS] < 2 or counters[STEP] >= max(1, plan.stagnation // 10):
             start_development(evaluator, plan, words, fitness, counters, memory)
     elif counters[STAGNATION] >= plan.stagnation:
         counters[SEQUENCE], counters[STAGNATION] = 1, 0

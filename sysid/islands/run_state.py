@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from sysid.ga.island import Island
+from sysid.ga.state import CONFIRMED, SAME, TRIED
 from sysid.result import Improvement, Migrant
 
 
@@ -43,6 +44,17 @@ class RunState:
     def rms(self) -> float:
         """Fitness of the best champion."""
         return min(island.champion_rms for island in self.islands)
+
+    @property
+    def independent(self) -> int:
+        """How many searches began at new random places."""
+        return sum(int(island.counters[TRIED]) for island in self.islands)
+
+    @property
+    def confirmed(self) -> int:
+        """How many searches from new random places led to the best champion's fitness."""
+        most = self.rms * (1.0 + SAME)
+        return sum(int(i.counters[CONFIRMED]) for i in self.islands if i.champion_rms <= most)
 
     @property
     def history(self) -> tuple[tuple[Improvement, ...], ...]:

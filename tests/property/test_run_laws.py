@@ -200,3 +200,24 @@ def test_islands_may_differ_in_method_and_bits() -> None:
     while not is_finished(algorithm, cut):
         cut = advance(problem(), algorithm, cut, 0.0)
     assert bits(cut) == bits(state)
+
+
+def test_a_run_settles_where_searches_from_anywhere_agree() -> None:
+    once = GeneticAlgorithm(stop=Stop(settled=3))
+    settled = advance(example(), once, begin(example(), once, 1))
+    assert settled.confirmed >= 3
+    assert 2 * settled.confirmed >= settled.independent
+    assert settled.generation < once.generations
+    twice = GeneticAlgorithm(stop=Stop(settled=2 * settled.confirmed))
+    longer = advance(example(), twice, begin(example(), twice, 1))
+    assert longer.generation > settled.generation
+    assert longer.rms == pytest.approx(settled.rms, rel=1e-4)
+
+
+@pytest.mark.parametrize("method", ["simple", "improved-paper"])
+def test_the_papers_methods_and_those_told_so_never_settle(method: SearchMethod) -> None:
+    algorithm = small(method, generations=60, stop=Stop(settled=1))
+    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
+    assert (state.generation, state.independent) == (60, 0)
+    never = small(generations=60, stop=Stop(settled=None))
+    assert advance(problem(), never, begin(problem(), never, 1)).generation == 60

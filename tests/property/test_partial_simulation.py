@@ -1,0 +1,71 @@
+"""Laws of simulating a part of the record: it is the beginning of the whole."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sysid.ga.chromosome import located
+from sysid.ga.gauss_newton import partial_fitness
+from sysid.islands.archipelago import plans, record_progress
+from sysid.kernels.evaluation import partial_predictions
+from sysid.models.library import load_model
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+from sysid.settings import GeneticAlgorithm
+from sysid.types import FloatArray
+from tests.searching import example, record
+
+
+def irregular(n: int, seed: int) -> Record:
+    """A first-order plant's record with samples at times of their own."""
+    times = np.sort(np.random.default_rng(seed).uniform(0.0, 4.0, n))
+    held = Channel("u", np.array([0.0, 1.0, 2.5]), np.array([0.0, 1.0, -1.0]), "1", hold="zero")
+    return Record((held,), (Channel("y", times, np.sin(times)),))
+
+
+def problems() -> dict[str, Problem]:
+    plant = load_model("fopdt")
+    bounds = {"L": {"upper": 0.5}}
+    short, long = example(n=60), np.zeros(140)
+    two = Problem.build(short.model, [record(short.evaluator.measured), record(long)])
+    between = [irregular(30, 1), irregular(45, 2)]
+    return {"two": two, "between": Problem.build(plant, between, parameters=bounds)}
+
+
+POSED = problems()
+
+
+def candidates(problem: Problem, seed: int) -> FloatArray:
+    places = np.random.default_rng(seed).random((5, len(problem.space)))
+    return np.asarray(located(problem.evaluator, places))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sampled_from(sorted(POSED)), st.floats(0.01, 1.0), st.integers(0, 99))
+def test_a_part_of_the_simulation_is_the_beginning_of_the_whole(
+    name: str, horizon: float, seed: int
+) -> None:
+    problem = POSED[name]
+    theta = candidates(problem, seed)
+    part = partial_predictions(problem.evaluator, theta, horizon)[:, :5].T
+    reached = record_progress(problem) <= horizon
+    whole = problem.predictions(theta)[:, reached]
+    assert np.array_equal(part[:, reached], whole, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", sorted(POSED))
+def test_fitness_by_the_whole_part_is_fitness(name: str) -> None:
+    problem = POSED[name]
+    theta = candidates(problem, 3)
+    plan = plans(problem, GeneticAlgorithm(), 1)[0]
+    predicted = partial_predictions(problem.evaluator, theta, 1.0)
+    found = partial_fitness(problem.evaluator, plan, predicted, 1.0)[:5]
+    assert found == pytest.approx(problem.fitness(theta), rel=1e-12)
+
+
+def test_progress_rises_to_one_in_each_experiment() -> None:
+    for problem in POSED.values():
+        for part in problem.split(record_progress(problem)):
+            assert np.all(np.diff(part["y"]) >= 0)
+            assert part["y"][-1] == 1.0
