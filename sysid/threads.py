@@ -1,7 +1,8 @@
 """One thread for the linear algebra, so that sums are made in the same order everywhere.
 
 NumPy and SciPy each bring or load an OpenBLAS. It deals long arrays over as many threads as the
-machine has, and the last digits of a sum depend on how many those are.
+machine has, and the last digits of a sum depend on how many those are. What runs inside uses that
+of NumPy; SciPy's is told too where it is loaded before the first use, and takes long to load.
 """
 
 import ctypes
@@ -14,7 +15,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg  # noqa: F401 - its OpenBLAS must be loaded before it can be told anything
 
 _MAPS = Path("/proc/self/maps")
 _BUNDLED = ("numpy.libs", "numpy/.dylibs", "scipy.libs", "scipy/.dylibs")
