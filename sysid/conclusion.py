@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.errors import DivergedEverywhere
+from sysid.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.islands.archipelago import of_island
 from sysid.islands.run_state import RunState
 from sysid.metrics import Metrics
@@ -35,6 +35,8 @@ def conclude(
     ------
     DivergedEverywhere
         If no candidate of the search gave a finite simulation.
+    NothingIdentifiable
+        If no free parameter has an effect on the scored outputs.
     """
     if not np.isfinite(state.rms):
         raise DivergedEverywhere(state.evaluations)
@@ -54,9 +56,12 @@ def _concluded(
     best = min(range(len(ends)), key=lambda i: ends[i][1])
     theta = ends[best][0]
     analysis = analyse(problem, theta)
+    if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
+        raise NothingIdentifiable(p.name for p in problem.space)
     simulated = problem.predictions(theta[None])[0]
     metrics = metrics_of(problem, simulated)
     kept = None if validation is None else _validated(validation, problem, analysis.estimates)
+    tests = _tests(problem, simulated, kept)
     limit = algorithm.safe_limit
     return Identification(
         estimates=analysis.estimates,
@@ -75,10 +80,10 @@ def _concluded(
         simulated_validation=() if kept is None else kept.simulated,
         agreement=metrics.channels,
         agreement_validation=() if kept is None else kept.metrics.channels,
-        warnings=warnings_of(problem, algorithm, analysis, simulated, metrics.rms),
+        warnings=warnings_of(problem, algorithm, analysis, simulated, metrics.rms, tests),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         criteria=analysis.criteria,
-        residual_tests=_tests(problem, simulated, kept),
+        residual_tests=tests,
         onset_delays=onset_delays(problem.model, problem.records),
     )
 
@@ -96,7 +101,9 @@ def _polished(
     if not algorithm.refine or "improved" not in methods:
         return (None,) * len(champions)
     limit = algorithm.stop.evaluations
-    left = None if limit is None else max(0, limit - state.evaluations - 2 * len(champions[0]) - 1)
+    # Standard errors take two simulations a parameter, a look at what cannot be told two more.
+    kept = 4 * len(champions[0]) + 1
+    left = None if limit is None else max(0, limit - state.evaluations - kept)
     return refine(problem, champions, left)
 
 
@@ -180,7 +187,7 @@ def _validated(
     )  # fmt: skip
 
 
-def _known(estimate: Estimate) -> dict[str, float]:
+def _known(estimate: Estimate) -> dict[str, float | str]:
     """An estimate as a fixed value; that of a tie may lie outside its parameter's bounds."""
     value = estimate.value
     bounds = {"lower": min(estimate.lower, value), "upper": max(estimate.upper, value)}

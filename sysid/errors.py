@@ -8,6 +8,7 @@
     - RecordTooShort       a record is shorter than the model's memory
     - InvalidSettings      a setting of the search or of the problem is not usable
     - DivergedEverywhere   no candidate of a search gave a finite simulation
+    - NothingIdentifiable  no free parameter has an effect on the output
 
 A message says what was wrong, what was found, and what would be right. Numerical kernels never
 raise: they return ``nan`` or ``inf``, and the caller decides.
@@ -102,6 +103,16 @@ class DivergedEverywhere(SysidError, ArithmeticError):
             "narrow the bounds, use a smaller step or check the equations and units"
         )
         self.evaluations = evaluations
+
+
+class NothingIdentifiable(SysidError, ValueError):
+    """No free parameter has an effect on the output."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        super().__init__(
+            f"none of {', '.join(names)} has an effect on the output in these data; look at the "
+            "inputs: one that is zero excites nothing"
+        )
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -101,23 +101,23 @@ def _resolve(
         )
     if name in resolved:
         return
-    for other in sorted(_names(written[name]) & set(written)):
+    for other in sorted(names_in(written[name]) & set(written)):
         _resolve(other, written, resolved, (*path, name))
     resolved[name] = _replaced(written[name], resolved)
 
 
-def _names(tree: Expression) -> set[str]:
-    """The parameters in an expression without signals."""
+def names_in(tree: Expression) -> set[str]:
+    """Names of the parameters in an expression, and in the lags of its past values."""
     match tree:
         case Symbol(name, "parameter"):
             return {name}
         case Unary(_, operand):
-            return _names(operand)
+            return names_in(operand)
         case Binary(_, left, right):
-            return _names(left) | _names(right)
+            return names_in(left) | names_in(right)
         case Call(_, arguments):
-            return set().union(*(_names(one) for one in arguments))
+            return set().union(*(names_in(one) for one in arguments))
         case Past(lag=lag) if lag is not None:
-            return _names(lag)
+            return names_in(lag)
         case _:
             return set()

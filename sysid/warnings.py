@@ -3,16 +3,21 @@
 import numpy as np
 
 from sysid.islands.archipelago import of_island
-from sysid.kernels.demand import is_difference
+from sysid.kernels.demand import is_difference, lags
 from sysid.problem import Problem
-from sysid.result import Estimate, Uncertainty
+from sysid.residuals import ResidualTests
+from sysid.result import Estimate, Group, Uncertainty
 from sysid.settings import GeneticAlgorithm
+from sysid.ties import names_in
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis
 
-_STRONG = 0.9
+_RIDGE, _STRONG = 0.9, 0.95  # of correlations, of a lag that may as well be 0, and of others
 _HELD = 0.5  # of an input's neighbouring samples are equal, where it is taken for one of steps
 _NOTABLE_GAIN = 0.01
+_SEPARABLE = 2.0  # standard errors: a lag on a ridge that is less than that
+_VAGUE = 0.5  # of its value: standard error of a group of which next to nothing is known
+_CHANCE = 1e-3  # that a true model's residuals look as little white: below, it is worth a sentence
 _ROUNDING = 1e-9  # of the output: below, the residual is rounding and has no optimum
 
 
@@ -22,19 +27,28 @@ def warnings_of(
     analysis: Analysis,
     simulated: FloatArray,
     rms: float,
+    tests: ResidualTests | None = None,
 ) -> tuple[str, ...]:
-    """All warnings, the weightiest first."""
+    """All warnings, the weightiest first; `tests` are those of the residuals."""
     found = []
     limit = algorithm.safe_limit
     if limit is not None and rms > limit:
         found.append(f"the RMS error {rms:.4g} is above the safe limit {limit:g}: not valid")
     found += _worse_than_a_line(problem, simulated)
+    found += _without_excitation(problem, analysis.estimates)
     found += _steps_read_as_ramps(problem)
     found += [text for e in analysis.estimates if (text := _of_estimate(e))]
+    lagged = lag_parameters(problem)
     if analysis.uncertainty is not None:
-        found += _correlated(analysis.uncertainty)
+        found += [text for e in analysis.estimates if (text := _vague(e))]
+        found += [text for group in analysis.uncertainty.groups if (text := _of_group(group))]
+        found += _correlated(analysis.uncertainty, analysis.estimates, lagged)
+    if tests is not None:
+        found += _coloured(tests, lag_parameters(problem))
     if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING * problem.output_scale:
         found.append(_not_an_optimum(algorithm, analysis.possible_gain))
+    elif tests is not None and lagged:
+        found += _coloured(tests, lagged)
     return tuple(found)
 
 
@@ -106,16 +120,104 @@ def _of_estimate(estimate: Estimate) -> str:
     return ""
 
 
-def _correlated(uncertainty: Uncertainty) -> list[str]:
+def _vague(estimate: Estimate) -> str:
+    """Of a quantity that cannot be negative, and that may as well be 0.
+
+    Where both signs are allowed (an offset, an initial state) 0 is a value like any other.
+    """
+    if estimate.status != "identified" or not estimate.stderr or estimate.lower < 0:
+        return ""
+    if estimate.stderr < estimate.value:
+        return ""
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    return (
+        f"the standard error of {estimate.name}, {estimate.stderr:.3g}{unit}, is as large as its "
+        f"value, {estimate.value:.3g}{unit}"
+    )
+
+
+def _of_group(group: Group) -> str:
+    if not group.stderr or group.stderr < _VAGUE * abs(group.value):
+        return ""
+    return (
+        f"{group.expression} is practically unidentifiable: {group.value:.3g} with a standard "
+        f"error of {group.stderr:.3g}"
+    )
+
+
+def lag_parameters(problem: Problem) -> set[str]:
+    """Names of the parameters that lags are made of."""
+    past = [*lags(problem.model, "input"), *lags(problem.model, "state")]
+    found: set[str] = set()
+    for one in past:
+        if one.lag is not None:
+            found |= names_in(one.lag)
+    return found & {p.name for p in problem.space}
+
+
+def _correlated(
+    uncertainty: Uncertainty, estimates: tuple[Estimate, ...], lagged: set[str]
+) -> list[str]:
+    """Ridges; a lag on one that may as well be 0 is not separable from the other parameter.
+
+    Of parameters that have no standard error their groups tell.
+    """
+    blind = {e.name for e in estimates if e.stderr is None}
+    vague = {e.name for e in estimates if e.name in lagged and _is_vague_lag(e)}
     found = []
     for i, first in enumerate(uncertainty.names):
         for j in range(i + 1, len(uncertainty.names)):
-            r = float(uncertainty.correlation[i, j])
-            if abs(r) > _STRONG:
+            second, r = uncertainty.names[j], float(uncertainty.correlation[i, j])
+            if {first, second} & blind:
+                continue
+            if {first, second} & vague and abs(r) > _RIDGE:
                 found.append(
-                    f"{first} and {uncertainty.names[j]} are strongly correlated (r = {r:.3f}): "
+                    f"{first} and {second} not separable (r = {r:.3f}): the data fix a combination "
+                    "of them, and the lag is less than two of its standard errors"
+                )
+            elif abs(r) > _STRONG:
+                found.append(
+                    f"{first} and {second} are strongly correlated (r = {r:.3f}): "
                     "the data fix a combination of them better than each alone"
                 )
+    return found
+
+
+def _is_vague_lag(estimate: Estimate) -> bool:
+    return estimate.stderr is not None and abs(estimate.value) < _SEPARABLE * estimate.stderr
+
+
+def _coloured(tests: ResidualTests, lagged: set[str]) -> list[str]:
+    """Residuals that are clearly not white: the model lacks something, most often an order.
+
+    A lag makes up for an order that is missing. Of whether the tests are passed the result tells
+    by itself; a true model fails them often enough that a warning asks for more.
+    """
+    if all(one.kind != "whiteness" or one.p is None or one.p > _CHANCE for one in tests.tests):
+        return []
+    return [
+        f"the residuals are not white (on the {tests.data} data): something of the dynamics is "
+        f"not in the model, the estimate of {', '.join(sorted(lagged))} depends on the order of "
+        "the model, and the standard errors are too small"
+    ]
+
+
+def _without_excitation(problem: Problem, estimates: tuple[Estimate, ...]) -> list[str]:
+    """Inputs that stay constant in every record, and what they leave open."""
+    blind = ", ".join(
+        e.name for e in estimates if e.status in ("group", "unidentifiable") and e.stderr is None
+    )
+    found = []
+    for quantity in problem.model.inputs:
+        values = [
+            one.values for record in problem.records for one in record.inputs
+            if one.name == quantity.name
+        ]  # fmt: skip
+        if blind and all(float(np.ptp(one)) == 0.0 for one in values):
+            found.append(
+                f"input {quantity.name!r} is constant, so it excites nothing; these data leave "
+                f"unidentified: {blind}"
+            )
     return found
 
 

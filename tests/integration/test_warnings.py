@@ -1,0 +1,93 @@
+"""What a result says of itself: each warning where it belongs, and not where it does not."""
+
+import numpy as np
+import pytest
+
+from sysid.errors import NothingIdentifiable
+from sysid.identify import identify
+from sysid.models.model import Model
+from sysid.models.spec import parse_model
+from sysid.records import Channel, Record
+from sysid.result import Identification
+from sysid.settings import GeneticAlgorithm
+from sysid.simulation import simulate
+from sysid.types import FloatArray
+
+QUICK = GeneticAlgorithm(population=30, generations=120)
+STEP, N = 0.02, 300
+FIRST = {
+    "name": "one", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "parameters": {
+        "K": {"lower": -5, "upper": 5}, "T": {"lower": 0.02, "upper": 2},
+        "L": {"lower": 0, "upper": 1}, "y0": {"lower": -5, "upper": 5},
+    },
+    "equations": {"x": "(K*u(t - L) - x)/T"}, "outputs": {"y": "x + y0"}, "initial": {"x": 0},
+}  # fmt: skip
+SECOND = {
+    "name": "two", "form": "differential", "inputs": {"u": "1"}, "states": {"a": "1", "b": "1"},
+    "parameters": {"L": {"lower": 0, "upper": 1}}, "outputs": {"y": "b"},
+    "equations": {"a": "(u(t - L) - a)/0.3", "b": "(a - b)/0.3"}, "initial": {"a": 0, "b": 0},
+}  # fmt: skip
+
+
+def steps(seed: int = 0) -> FloatArray:
+    return np.repeat(np.random.default_rng(seed).standard_normal(N // 20), 20)
+
+
+def record(u: FloatArray, y: FloatArray) -> Record:
+    times = STEP * np.arange(N)
+    return Record((Channel("u", times, u, "1", hold="zero"),), (Channel("y", times, y, "1"),))
+
+
+def response(model: Model, u: FloatArray, sd: float = 0.01, **values: float) -> FloatArray:
+    times = STEP * np.arange(N)
+    inputs = (Channel("u", times, u, "1", hold="zero"),)
+    found = simulate(model, inputs, values, times=times).channel("y").values
+    return found + sd * np.random.default_rng(1).standard_normal(N)
+
+
+def told(found: Identification, words: str) -> bool:
+    return any(words in warning for warning in found.warnings)
+
+
+def test_a_true_model_with_white_noise_has_no_warning() -> None:
+    model = parse_model(FIRST)
+    y = response(model, steps(), K=1.5, T=0.3, L=0.2, y0=0.3)
+    assert identify(model, record(steps(), y), QUICK).warnings == ()
+
+
+def test_a_model_of_too_low_an_order_is_told_that_its_lag_depends_on_it() -> None:
+    y = response(parse_model(SECOND), steps(), L=0.1)
+    found = identify(parse_model(FIRST), record(steps(), y), QUICK)
+    assert told(found, "the estimate of L depends on the order of the model")
+    assert told(found, "standard errors are too small")
+
+
+def test_an_estimate_that_may_as_well_be_zero_is_told() -> None:
+    model = parse_model(FIRST)
+    y = response(model, steps(), sd=0.05, K=1.5, T=0.3, L=0.2, y0=0.0)
+    found = identify(model, record(steps(), y), QUICK)
+    vague = {e.name for e in found.estimates if e.stderr and e.stderr >= abs(e.value)}
+    for estimate in found.estimates:
+        expected = estimate.name in vague
+        assert told(found, f"the standard error of {estimate.name},") is expected
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_an_input_that_does_not_excite_names_what_it_leaves_open(level: float) -> None:
+    u = np.full(N, level)
+    model = parse_model(FIRST)
+    y = response(model, u, K=1.5, T=0.3, L=0.0, y0=0.2)
+    found = identify(model, record(u, y), QUICK)
+    open_ = {e.name for e in found.estimates if e.stderr is None}
+    assert open_
+    (text,) = (w for w in found.warnings if "excites nothing" in w)
+    assert text.startswith("input 'u' is constant")
+    assert all(name in text.rpartition(": ")[2] for name in open_)
+    assert ("K" in open_) or level
+
+
+def test_where_nothing_has_an_effect_the_run_fails_and_says_so() -> None:
+    model = parse_model(SECOND)
+    with pytest.raises(NothingIdentifiable, match="none of L has an effect on the output"):
+        identify(model, record(np.zeros(N), np.sin(np.arange(N))), QUICK)
