@@ -1,0 +1,234 @@
+"""Profile likelihood: how far a parameter may move while all others follow it.
+
+For each value v of the parameter the others are estimated anew. With Gaussian noise of unknown
+variance the likelihood ratio against the estimate is n ln(S(v)/S₀), S the sum of squares; the
+interval is where it stays below the 95 % quantile of χ² with one degree of freedom (Venzon and
+Moolgavkar 1988; Raue et al. 2009). Where the model is linear in its parameters this is the
+interval of the t distribution, but for a part of order 1/n. Where it is not, the profile shows
+what the covariance cannot: ends that are open, more than one valley, a bound.
+
+With the soft-l1 loss its sum stands in place of S, and the interval is a guide.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid.errors import InvalidSettings, nearest
+from sysid.ga.chromosome import located, placed
+from sysid.problem import Problem
+from sysid.refinement import refine
+from sysid.sensitivities import sensitivities
+from sysid.types import FloatArray
+
+QUANTILE = 3.841458820694124
+"""95 % of χ² with one degree of freedom."""
+
+_SPAN = 1.5  # of the half width that the covariance promises: where the outermost value lies
+_BEYOND = 1.3  # growth of a step that does not reach the threshold, and how often
+_MOST, _LEAST = 40, 3
+_ROOTS = 6  # halvings of the gap in which the ratio crosses the threshold
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profile:
+    """The profile of one parameter.
+
+    Attributes
+    ----------
+    name, unit : str
+    values : FloatArray, shape (V,)
+        Rising; the estimate among them.
+    ratio : FloatArray, shape (V,)
+        n ln(S(v)/S₀), S₀ the least sum of all; 0 at the best value.
+    rms : FloatArray, shape (V,)
+    others : FloatArray, shape (V, D - 1)
+        The other free parameters, in the problem's order.
+    interval : tuple of (float or None)
+        Ends of the 95 % interval; None where the ratio stays below the threshold up to the bound
+        or as far as was looked.
+    estimate : float
+    evaluations : int
+    is_complete : bool
+        False if `should_stop` ended it.
+    """
+
+    name: str
+    unit: str
+    values: FloatArray
+    ratio: FloatArray
+    rms: FloatArray
+    others: FloatArray
+    interval: tuple[float | None, float | None]
+    estimate: float
+    evaluations: int
+    is_complete: bool
+
+
+def profile(
+    problem: Problem,
+    theta: FloatArray,
+    name: str,
+    points: int = 21,
+    should_stop: Callable[[], bool] | None = None,
+) -> Profile:
+    """Profile of a free parameter from an estimate (D,).
+
+    Parameters
+    ----------
+    points : int
+        About how many values, 3 or more; every one takes a least-squares search.
+    should_stop : callable
+        Asked before each of them.
+
+    Raises
+    ------
+    InvalidSettings
+        If there is no such free parameter, or there are fewer than 3 points.
+    """
+    names = [p.name for p in problem.space]
+    if name not in names:
+        raise InvalidSettings("/parameters", f"no free parameter {name!r}{nearest(name, names)}")
+    if points < _LEAST:
+        raise InvalidSettings("/points", f"found {points}; need {_LEAST} or more")
+    walk = _Walk(problem, np.array(theta, dtype=np.float64), names.index(name), should_stop)
+    step = _SPAN * walk.half_width / (points // 2)
+    walk.go(-step, points // 2)
+    walk.go(step, points // 2)
+    low, high = walk.end(-1.0), walk.end(1.0)
+    return walk.told(low, high)
+
+
+class _Walk:
+    """Values of one parameter, as places in [0, 1], with the others estimated anew at each."""
+
+    def __init__(
+        self, problem: Problem, theta: FloatArray, d: int,
+        should_stop: Callable[[], bool] | None,
+    ) -> None:  # fmt: skip
+        self._problem, self._d, self._should_stop = problem, d, should_stop
+        self.stopped, self.evaluations = False, 1
+        self._place = float(placed(problem.evaluator, theta[None])[0, d])
+        rms = float(problem.fitness(theta[None])[0])
+        self._known = {self._place: (theta, rms)}
+        self.half_width = self._half_width(theta)
+
+    def go(self, step: float, count: int) -> None:
+        """Walk from the estimate to one side, until the threshold is passed or a bound is met."""
+        place, taken = self._place, 0
+        while taken < _MOST and not self._is_over(place, taken, count):
+            nearer, place = place, min(max(place + step, 0.0), 1.0)
+            if place == nearer:
+                return  # at the bound
+            self._try(place, nearer)
+            taken += 1
+            step *= _BEYOND if taken >= count else 1.0
+
+    def end(self, side: float) -> float | None:
+        """Place at which the ratio crosses the threshold; None if it does not."""
+        inside = self._place
+        places = sorted((p for p in self._known if side * (p - inside) > 0), key=lambda p: side * p)
+        for outside in places:
+            if self._ratio(outside) >= QUANTILE:
+                return self._crossing(inside, outside)
+            inside = outside
+        return None
+
+    def told(self, low: float | None, high: float | None) -> Profile:
+        """What was found, in the parameter's unit."""
+        parameter = self._problem.space[self._d]
+        order = sorted(self._known)
+        found = np.array([self._known[place][0] for place in order])
+        low_, high_ = (None if end is None else self._value(end) for end in (low, high))
+        return Profile(
+            name=parameter.name,
+            unit=parameter.unit,
+            values=found[:, self._d],
+            ratio=np.array([self._ratio(place) for place in order]),
+            rms=np.array([self._known[place][1] for place in order]),
+            others=np.delete(found, self._d, axis=1),
+            interval=(low_, high_),
+            estimate=self._value(self._place),
+            evaluations=self.evaluations,
+            is_complete=not self.stopped,
+        )
+
+    def _half_width(self, theta: FloatArray) -> float:
+        """What the covariance promises, at most the range and at least what can be told apart."""
+        columns, error = (sensed := sensitivities(self._problem, theta)).columns, sensed.error
+        self.evaluations += sensed.evaluations
+        others = np.delete(columns, self._d, axis=1)
+        own = columns[:, self._d]
+        if others.shape[1]:
+            own = own - others @ np.linalg.lstsq(others, own, rcond=1e-7)[0]
+        slope = float(np.linalg.norm(own))
+        spread = float(np.linalg.norm(error)) / np.sqrt(max(error.size - columns.shape[1], 1))
+        wide = np.sqrt(QUANTILE) * spread / slope if slope > 0 else 1.0
+        return float(min(max(wide, 1e-9), 1.0))
+
+    def _is_over(self, place: float, taken: int, count: int) -> bool:
+        self.stopped = self.stopped or bool(self._should_stop and self._should_stop())
+        return self.stopped or (taken >= count and self._ratio(place) > QUANTILE)
+
+    def _try(self, place: float, nearer: float) -> None:
+        """Estimate the others at a place, beginning with what they were at a nearer one."""
+        d, start = self._d, self._known[nearer][0].copy()
+        start[d] = self._value(place)
+        held = _holding(self._problem, d, float(start[d]))
+        rest = np.delete(start, d)
+        rms = float(self._problem.fitness(start[None])[0])
+        self.evaluations += 1
+        if rest.size:
+            end = refine(held, [rest])[0]
+            if end is not None:
+                rest, rms = end.theta, end.rms
+                self.evaluations += end.evaluations
+        self._known[place] = (np.insert(rest, d, start[d]), rms)
+
+    def _crossing(self, inside: float, outside: float) -> float:
+        """Where the ratio, nearly a parabola, reaches the threshold."""
+        for _ in range(_ROOTS):
+            if self.stopped or abs(outside - inside) < 1e-3 * self.half_width:
+                break
+            middle = self._between(inside, outside)
+            nearer = min(self._known, key=lambda p: abs(p - middle))
+            if middle in self._known:
+                break
+            self._try(middle, nearer)
+            if self._ratio(middle) >= QUANTILE:
+                outside = middle
+            else:
+                inside = middle
+        return self._between(inside, outside)
+
+    def _between(self, inside: float, outside: float) -> float:
+        a, b = (np.sqrt(min(self._ratio(p), 1e12)) for p in (inside, outside))
+        share = (np.sqrt(QUANTILE) - a) / (b - a) if b > a else 0.5
+        return float(inside + min(max(share, 0.02), 0.98) * (outside - inside))
+
+    def _ratio(self, place: float) -> float:
+        best = min(rms for _, rms in self._known.values())
+        rms = self._known[place][1]
+        if rms == best:
+            return 0.0
+        return 2.0 * self._problem.n_scored * float(np.log(rms / best)) if best > 0 else np.inf
+
+    def _value(self, place: float) -> float:
+        if place in self._known:
+            return float(self._known[place][0][self._d])
+        every = np.full((1, len(self._problem.space)), place)
+        return float(located(self._problem.evaluator, every)[0, self._d])
+
+
+def _holding(problem: Problem, d: int, value: float) -> Problem:
+    """The problem with one free parameter held at a value; nothing else changes."""
+    old = problem.evaluator
+    template = old.template.copy()
+    template[old.rows[d]] = value
+    evaluator = old._replace(
+        template=template, rows=np.delete(old.rows, d), lower=np.delete(old.lower, d),
+        upper=np.delete(old.upper, d), log=np.delete(old.log, d),
+    )  # fmt: skip
+    space = (*problem.space[:d], *problem.space[d + 1 :])
+    return replace(problem, space=space, evaluator=evaluator)

@@ -1,0 +1,99 @@
+"""Profile likelihood: against the t interval where the model is linear, and where it is not."""
+
+import numpy as np
+import pytest
+
+from sysid.errors import InvalidSettings
+from sysid.models.spec import parse_model
+from sysid.problem import Problem
+from sysid.profiles import QUANTILE, profile
+from sysid.records import Channel, Record
+from sysid.refinement import refine
+from sysid.types import FloatArray
+from sysid.uncertainty import analyse
+from tests.searching import DUFFING, example
+
+
+def linear(n: int = 400, sd: float = 0.3, **bounds: float) -> tuple[Problem, FloatArray]:
+    """A straight line in sin and cos of the sample number, and its estimate."""
+    rng = np.random.default_rng(5)
+    times = 0.1 * np.arange(n)
+    interval = {"lower": -5.0, "upper": 5.0} | bounds
+    model = parse_model({
+        "name": "line", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
+        "parameters": {"p": interval, "q": {"lower": -5, "upper": 5}},
+        "equations": {"x": "p*u(k) + q*sin(k) + q*u(k)"}, "outputs": {"y": "x"},
+        "initial": {"x": 0},
+    })  # fmt: skip
+    u = rng.standard_normal(n)
+    y = u + 0.5 * np.sin(np.arange(n)) + 0.5 * u + sd * rng.standard_normal(n)
+    data = Record((Channel("u", times, u),), (Channel("y", times, y),))
+    problem = Problem.build(model, [data], skip=1)
+    end = refine(problem, [np.array([0.5, 0.5])])[0]
+    assert end is not None
+    return problem, end.theta
+
+
+@pytest.mark.parametrize("name", ["p", "q"])
+def test_where_the_model_is_linear_the_interval_is_that_of_the_t_distribution(name: str) -> None:
+    problem, theta = linear()
+    found = profile(problem, theta, name)
+    estimate = next(e for e in analyse(problem, theta).estimates if e.name == name)
+    assert estimate.interval95 is not None
+    assert estimate.stderr is not None
+    for end, expected in zip(found.interval, estimate.interval95, strict=True):
+        assert end == pytest.approx(expected, abs=0.02 * estimate.stderr)
+
+
+def test_the_ratio_is_that_of_the_sums_of_squares_with_the_others_at_their_best() -> None:
+    problem, theta = linear()
+    found = profile(problem, theta, "p", points=7)
+    u = problem.records[0].inputs[0].values[1:]
+    y = problem.records[0].outputs[0].values[1:]
+    other = np.sin(np.arange(1, y.size + 1)) + u
+    left = np.array([y - v * u for v in found.values])
+    best = left @ other / (other @ other)
+    sums = np.sum((left - best[:, None] * other) ** 2, axis=1)
+    np.testing.assert_allclose(found.others[:, 0], best, rtol=1e-5)
+    expected = y.size * np.log(sums / sums.min())
+    np.testing.assert_allclose(found.ratio, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["c", "L", "b", "a"])
+def test_intervals_of_example_1_cover_the_truth(name: str) -> None:
+    problem = example()
+    end = refine(problem, [np.array([DUFFING[p.name] for p in problem.space])])[0]
+    assert end is not None
+    found = profile(problem, end.theta, name, points=11)
+    low, high = found.interval
+    assert low is not None
+    assert high is not None
+    assert low < DUFFING[name] < high
+    assert low < found.estimate < high
+    assert found.is_complete
+    assert np.all(np.diff(found.values) > 0)
+    assert found.ratio.min() == 0.0
+    assert found.ratio[0] > QUANTILE < found.ratio[-1]
+
+
+def test_an_end_beyond_the_bound_is_open() -> None:
+    problem, theta = linear(upper=1.001)
+    found = profile(problem, theta, "p")
+    assert found.interval[0] is not None
+    assert found.interval[1] is None
+    assert found.values[-1] == 1.001
+
+
+def test_a_profile_that_is_stopped_says_so() -> None:
+    problem, theta = linear()
+    found = profile(problem, theta, "p", should_stop=lambda: True)
+    assert not found.is_complete
+    assert found.interval == (None, None)
+
+
+def test_what_cannot_be_profiled_is_refused() -> None:
+    problem, theta = linear()
+    with pytest.raises(InvalidSettings, match="no free parameter 'r'"):
+        profile(problem, theta, "r")
+    with pytest.raises(InvalidSettings, match="need 3 or more"):
+        profile(problem, theta, "p", points=2)
