@@ -81,7 +81,7 @@ def test_an_end_beyond_the_bound_is_open() -> None:
     found = profile(problem, theta, "p")
     assert found.interval[0] is not None
     assert found.interval[1] is None
-    assert found.values[-1] == 1.001
+    assert found.values[-1] == pytest.approx(1.001)
 
 
 def test_a_profile_that_is_stopped_says_so() -> None:
