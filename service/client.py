@@ -260,6 +260,11 @@ class Client:
         """Correlation functions of the residuals with their bands and tests."""
         return self._json(calls.read("runs", run, "residuals"))
 
+    def export(self, run: str, format: str = "json", pade_order: int = 3) -> str:
+        """The identified model as text: json, python, c or control."""
+        call = calls.read("runs", run, "export", format=format, pade_order=pade_order)
+        return self.send(call).text
+
     def compare(self, *runs: str) -> Document:
         """Runs on the same data side by side, the best first."""
         return self._json(calls.create("runs:compare", {"runs": runs}))
@@ -377,6 +382,11 @@ class AsyncClient:
     async def residuals(self, run: str) -> Document:
         """Correlation functions of the residuals with their bands and tests."""
         return await self._json(calls.read("runs", run, "residuals"))
+
+    async def export(self, run: str, format: str = "json", pade_order: int = 3) -> str:
+        """The identified model as text: json, python, c or control."""
+        call = calls.read("runs", run, "export", format=format, pade_order=pade_order)
+        return (await self.send(call)).text
 
     async def compare(self, *runs: str) -> Document:
         """Runs on the same data side by side, the best first."""

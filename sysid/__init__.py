@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sysid.errors import SysidError
+    from sysid.export.exporting import export
     from sysid.identify import identify
     from sysid.models.library import catalogue, load_model
     from sysid.noise import Noise
@@ -24,11 +25,12 @@ if TYPE_CHECKING:
 __all__ = [
     "Channel", "Estimate", "GeneticAlgorithm", "Identification", "IslandChange", "Loss",
     "Migration", "Noise", "Parameter", "Problem", "Record", "Recording", "SequenceSearch", "Stop",
-    "SysidError", "catalogue", "identify", "load_model", "simulate",
+    "SysidError", "catalogue", "export", "identify", "load_model", "simulate",
 ]  # fmt: skip
 
 _PLACES = {
     "errors": ("SysidError",),
+    "export.exporting": ("export",),
     "identify": ("identify",),
     "models.library": ("catalogue", "load_model"),
     "noise": ("Noise",),

@@ -1,14 +1,17 @@
 """Routes of runs."""
 
-from fastapi import APIRouter, Request, Response
+from typing import Annotated
 
-from service import residuals, responses, run_simulations, runs
+from fastapi import APIRouter, Query, Request, Response
+
+from service import exports, residuals, responses, run_simulations, runs
 from service.api.content import content_of
 from service.api.deps import MaxPoints, PartsDep, ReadSession
 from service.errors import NotFound
 from service.schemas_runs import HistoryOut, MigrationsOut, ResidualsOut, ResponseOut, RunOut
 from service.schemas_simulations import RunSimulateIn, RunSimulationOut
 from service.storage.runs import RunRepository
+from sysid.export.exporting import MOST_PADE, Format
 
 router = APIRouter(prefix="/v1/runs", tags=["runs"])
 
@@ -43,6 +46,19 @@ def response(
 def residual_tests(run_id: str, session: ReadSession, parts: PartsDep) -> ResidualsOut:
     """Auto- and cross-correlation of the residuals with 95 and 99 % bands, and their tests."""
     return residuals.residuals(session, parts.store, run_id)
+
+
+@router.get("/{run_id}/export", response_class=Response)
+def export(
+    run_id: str,
+    session: ReadSession,
+    format: Format = "json",
+    pade_order: Annotated[int, Query(ge=1, le=MOST_PADE)] = 3,
+) -> Response:
+    """The identified model as text: json, python, c (C99), or control (python-control)."""
+    found = exports.exported(session, run_id, format, pade_order)
+    headers = {"Content-Disposition": f'attachment; filename="{found.name}"'}
+    return Response(found.text, media_type=found.media_type, headers=headers)
 
 
 @router.post("/{run_id}:simulate")

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from service.calls import ClientError
-from service.cli import datasets, jobs, models, runs, serving, upkeep
+from service.cli import datasets, exporting, jobs, models, runs, serving, upkeep
 from service.cli.common import err, out
 from service.cli.identify import identify
 from service.cli.paper import paper
@@ -30,6 +30,7 @@ app.command()(jobs.submit)
 app.command()(jobs.watch)
 app.command("jobs")(jobs.listing)
 app.add_typer(runs.app, name="runs")
+app.command()(exporting.export)
 app.command()(jobs.cancel)
 app.command()(jobs.resume)
 app.command()(jobs.report)

@@ -11,15 +11,15 @@ from sysid.export.identifiers import Identifiers, in_c_comment
 from sysid.export.program import Kind, Place, Program, lag_steps
 from sysid.models.model import MeasuredInitial
 
-_TAKEN = (
+_WORDS = (
     "auto break case char const continue default do double else enum extern float for goto if "
     "inline int long register restrict return short signed sizeof static struct switch typedef "
     "union unsigned void volatile while _Bool _Complex _Imaginary asm main errno "
     "sin cos tan exp log sqrt fabs pow tanh atan floor ceil fmin fmax isnan isfinite NAN INFINITY "
     "HUGE_VAL NULL size_t malloc free sign least greatest between held sample past lately n t p "
-    "step steps part stage slope work points grid ratio ramp sample_time dt h k now y0 y1 yn j0 "
+    "step steps i part stage slope work points grid ratio ramp sample_time dt h k now y0 y1 yn j0 "
     "j1 jn gamma signgam unix linux i386 EOF stdin stdout stderr assert BUFSIZ RAND_MAX"
-).split()
+)
 _WIDTH = 92
 
 
@@ -36,7 +36,7 @@ def c_source(identified: Identified) -> str:
         If a value is missing.
     """
     language = CLanguage()
-    names = Identifiers(_TAKEN)
+    names = Identifiers(_WORDS.split())
     stem = names.of(identified.model.name)
     for suffix in ("parameters", "identified", "simulate"):
         names.of(f"{stem}_{suffix}")
@@ -79,14 +79,17 @@ def _size(program: Program, name: str) -> str:
 def _defaults(program: Program, stem: str) -> str:
     found = program.identified
     lines = [f"{stem}_parameters {stem}_identified(void)", "{", f"    {stem}_parameters p;"]
-    for one in found.model.parameters:
-        lines.append(f"    p.{program.parameters[one.name]} = {number(found.numbers[one.name])};")
+    numbers = found.numbers
+    lines += [
+        f"    p.{program.parameters[one.name]} = {number(numbers[one.name])};"
+        for one in found.model.parameters
+    ]
     for i, state in enumerate(found.model.states):
         start, name = program.start(i), program.starts[state.name]
         value = number(0.0 if start is None else start)
         note = " /* give the measured value */" if start is None else ""
-        for element in _elements(_size(program, name)):
-            lines.append(f"    p.{name}{element} = {value};{note}")
+        elements = _elements(_size(program, name))
+        lines += [f"    p.{name}{element} = {value};{note}" for element in elements]
     return "\n".join([*lines, "    return p;", "}", ""])
 
 
@@ -99,7 +102,7 @@ def _about_simulate(program: Program) -> str:
     lines = ["Free run of the model at n regular times t (s)."]
     lines += [f"Input {program.inputs[q.name]}: {q.name}, {q.unit}." for q in model.inputs]
     lines += [f"Output {program.outputs[q.name]}: {q.name}, {q.unit}." for q in model.outputs]
-    lines += ["Gives 0; 1 if n, the times or a lag cannot be used; 2 without memory for the states."]
+    lines += ["Gives 0; 1 if n, the times or a lag cannot be used; 2 if memory is short."]
     told = "\n".join(f" * {in_c_comment(line)}" for line in lines)
     return f"/*\n{told}\n */"
 

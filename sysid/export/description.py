@@ -5,11 +5,10 @@ import re
 import textwrap
 from collections.abc import Iterator, Mapping
 
-from sysid.export.identifiers import one_line
 from sysid.export.identified import Identified, Value
+from sysid.export.identifiers import one_line
 from sysid.models.initial import initial_name
 from sysid.models.model import MeasuredInitial
-
 
 _JOINED = "\N{NO-BREAK SPACE}"
 
@@ -30,16 +29,15 @@ def facts(identified: Identified) -> list[str]:
     """Title, source, sampling, hold and provenance, one line each."""
     model = identified.model
     lines = [model.title or model.name, f"Model {model.name!r}, {model.form} form."]
-    for key in ("source", "description"):
-        if model.document.get(key):
-            lines.append(f"{key.capitalize()}: {model.document[key]}")
+    about = {key: model.document.get(key) for key in ("source", "description")}
+    lines += [f"{key.capitalize()}: {text}" for key, text in about.items() if text]
     if identified.sample_time is not None:
         lines.append(f"The data had a sampling period of {identified.sample_time:.10g} s.")
     if model.form == "polynomial":
         lines.append("The coefficients hold for that sampling period only.")
     lines += [_hold(identified, one.name) for one in model.inputs]
     if identified.version:
-        lines.append(f"Identified by lagid {identified.version}.")
+        lines.append(f"Written by lagid {identified.version}.")
     for key, value in identified.provenance.items():
         told = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
         lines.append(f"{key}: {told}")
@@ -77,7 +75,8 @@ def value_lines(
         if value is not None:
             yield starts[state.name], head + _told(value)
         elif isinstance(initial, MeasuredInitial):
-            yield starts[state.name], f"{head}{unit_text(state.unit)}; measured: give its first value."
+            about = f"{head}{unit_text(state.unit)}; measured: give its first value."
+            yield starts[state.name], about
         else:
             yield starts[state.name], f"{head}{unit_text(state.unit)}."
 

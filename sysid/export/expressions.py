@@ -76,10 +76,8 @@ def _written(expression: Expression, language: Language, scope: Scope) -> tuple[
             return scope.symbol(expression), ATOM
         case Past():
             return scope.past(expression), ATOM
-        case Unary("-", operand):
-            return f"-{source(operand, language, scope, _SIGN + 1)}", _SIGN
-        case Unary(_, operand):
-            return language.negation(source(operand, language, scope)), ATOM
+        case Unary():
+            return _prefix(expression, language, scope)
         case Binary("**", base, exponent):
             return language.power(
                 source(base, language, scope, ATOM), source(exponent, language, scope),
@@ -87,11 +85,22 @@ def _written(expression: Expression, language: Language, scope: Scope) -> tuple[
             )  # fmt: skip
         case Binary():
             return _infix(expression, language, scope), _LEVEL[expression.operator]
-        case Call("where", (condition, first, second)):
-            parts = (source(one, language, scope) for one in (condition, first, second))
-            return language.choice(*parts), ATOM
-        case Call(function, arguments):
-            return language.function(function, [source(a, language, scope) for a in arguments]), ATOM
+        case Call():
+            return _call(expression, language, scope), ATOM
+
+
+def _prefix(tree: Unary, language: Language, scope: Scope) -> tuple[str, int]:
+    if tree.operator == "-":
+        return f"-{source(tree.operand, language, scope, _SIGN + 1)}", _SIGN
+    return language.negation(source(tree.operand, language, scope)), ATOM
+
+
+def _call(tree: Call, language: Language, scope: Scope) -> str:
+    arguments = [source(one, language, scope) for one in tree.arguments]
+    if tree.function == "where":
+        condition, first, second = arguments
+        return language.choice(condition, first, second)
+    return language.function(tree.function, arguments)
 
 
 def _infix(tree: Binary, language: Language, scope: Scope) -> str:

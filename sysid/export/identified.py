@@ -43,7 +43,7 @@ class Identified:
     holds : mapping of str to {"zero", "first", "band-limited"}
         How the inputs were held between their samples; ``first`` where nothing is said.
     version : str
-        Version of the program that found the values.
+        Version of the program that writes the text.
     provenance : mapping
         Run, data sets with their hashes, dates: JSON values, told as they are.
     """

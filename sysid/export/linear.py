@@ -1,11 +1,8 @@
 """Whether a model is linear with constant coefficients, found from its trees, and its matrices."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import floor
 from typing import NamedTuple
-
-import numpy as np
 
 from sysid.errors import SysidError
 from sysid.export.identified import Identified
@@ -82,15 +79,15 @@ def linear_form(identified: Identified, period: float | None) -> Linear:
                 return Number(period)
         return None
 
-    def read(tree: Expression, where: str) -> Affine:
-        return _Reader(where, clock).affine(substitute(tree, known))
-
     return Linear(
         tuple(
-            read(tree, f"the equation of {state.name}")
+            _Reader(f"the equation of {state.name}", clock, known).affine(tree)
             for state, tree in zip(model.states, model.equations, strict=True)
         ),
-        tuple(read(one.expression, f"the output {one.name}") for one in model.outputs),
+        tuple(
+            _Reader(f"the output {one.name}", clock, known).affine(one.expression)
+            for one in model.outputs
+        ),
     )
 
 
@@ -98,56 +95,57 @@ def linear_form(identified: Identified, period: float | None) -> Linear:
 class _Reader:
     where: str
     clock: str
+    known: Callable[[Expression], Expression | None]
 
     def affine(self, tree: Expression) -> Affine:
-        """The tree, in which parameters are numbers already, as an affine form."""
+        """The tree as an affine form; what it says of parameters is computed."""
+        if not self._has_signals(tree):
+            return Affine({}, self._number(tree))
         match tree:
-            case Number(value):
-                return Affine({}, value)
             case Past(name, kind, offset, lag):
-                delay = offset + (0.0 if lag is None else max(number_of(lag, {}), 0.0))
+                delay = offset + (0.0 if lag is None else max(self._number(lag), 0.0))
                 return Affine({Signal(name, kind, float(delay)): 1.0})
-            case Symbol(name):
-                raise NotLinear(f"{self.where} changes with {name}, so it has no transfer function")
             case Unary("-", operand):
                 return self.affine(operand).times(-1.0)
             case Binary("+" | "-" as sign, left, right):
                 return self.affine(left).plus(self.affine(right), 1.0 if sign == "+" else -1.0)
             case Binary("*", left, right):
-                return self._product(tree, self.affine(left), self.affine(right))
-            case Binary("/", left, right):
-                return self._quotient(tree, self.affine(left), self.affine(right))
-            case _:
-                return self._other(tree)
-
-    def _product(self, tree: Expression, left: Affine, right: Affine) -> Affine:
-        if left.terms and right.terms:
-            raise self._refusal(tree)
-        return left.times(right.constant) if left.terms else right.times(left.constant)
-
-    def _quotient(self, tree: Expression, left: Affine, right: Affine) -> Affine:
-        if right.terms:
-            raise self._refusal(tree)
-        if right.constant == 0.0:
-            raise NotLinear(f"{self.where} divides by zero in {text(tree, self.clock)}")
-        return left.times(1.0 / right.constant)
+                return self._product(tree, left, right)
+            case Binary("/", left, right) if not self._has_signals(right):
+                return self._quotient(tree, left, right)
+        return self._other(tree)
 
     def _other(self, tree: Expression) -> Affine:
-        """Functions, powers and conditions: of numbers only, or a choice that numbers decide."""
+        """A first power, or a choice that numbers decide; nothing else is linear."""
         match tree:
             case Binary("**", base, Number(1.0)):
                 return self.affine(base)
             case Call("where", (condition, first, second)) if not self._has_signals(condition):
-                return self.affine(first if number_of(condition, {}) else second)
-        if self._has_signals(tree):
-            raise self._refusal(tree)
-        return Affine({}, number_of(tree, {}))
+                return self.affine(first if self._number(condition) else second)
+        raise self._refusal(tree)
+
+    def _number(self, tree: Expression) -> float:
+        return number_of(substitute(tree, self.known), {})
+
+    def _product(self, tree: Expression, left: Expression, right: Expression) -> Affine:
+        """A factor that is 0 takes its term away, whatever that is."""
+        for one, other in ((left, right), (right, left)):
+            if not self._has_signals(one):
+                factor = self._number(one)
+                return self.affine(other).times(factor) if factor != 0.0 else Affine({})
+        raise self._refusal(tree)
+
+    def _quotient(self, tree: Expression, left: Expression, right: Expression) -> Affine:
+        divisor = self._number(right)
+        if divisor == 0.0:
+            raise NotLinear(f"{self.where} divides by zero in {text(tree, self.clock)}")
+        return self.affine(left).times(1.0 / divisor)
 
     def _has_signals(self, tree: Expression) -> bool:
         match tree:
             case Past():
                 return True
-            case Symbol(name):
+            case Symbol(name, "time" | "index"):
                 raise NotLinear(f"{self.where} changes with {name}, so it has no transfer function")
             case Unary(_, operand):
                 return self._has_signals(operand)
@@ -162,33 +160,3 @@ class _Reader:
             f"{self.where} is not linear in states and inputs: {text(tree, self.clock)}; "
             "only a linear model has a transfer function"
         )
-
-
-def taps(identified: Identified, signal: Signal, ramp: float) -> dict[int, float]:
-    """Weights of whole samples that give a signal between them, as the simulation reads it."""
-    solver, delay = identified.model.solver, signal.delay
-    if delay == floor(delay):
-        return {int(delay): 1.0}
-    if solver.interpolation == "nearest":
-        return {floor(delay + 0.5): 1.0}
-    if signal.kind == "input" and identified.hold(signal.name) == "zero":
-        return _held_taps(delay, ramp)
-    place = -delay
-    i = floor(place)
-    part = place - i
-    nodes: tuple[int, ...] = (0, 1)
-    if signal.kind == "state" and solver.interpolation == "cubic":
-        nodes = (-1, 0, 1, 2) if i <= -3 else (-1, 0, 1)
-    return {
-        -(i + a): float(np.prod([(part - b) / (a - b) for b in nodes if b != a])) for a in nodes
-    }
-
-
-def _held_taps(delay: float, ramp: float) -> dict[int, float]:
-    place = -delay + ramp
-    nearest = floor(place + 0.5)
-    part = min(max((place - nearest + ramp) / (2 * ramp), 0.0), 1.0)
-    found = {-(nearest - 1): 1.0 - part, -nearest: part}
-    return {back: weight for back, weight in found.items() if weight != 0.0}
-
-

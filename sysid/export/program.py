@@ -191,7 +191,7 @@ class Place(Scope):
         return f"({place})/{number(program.substeps)}"
 
     def _beside(self, past: Past) -> str:
-        """A recursion reads just behind a jump; a solver from behind one jump to before the next."""
+        """A recursion reads just behind a jump; a solver from behind one to before the next."""
         if self.program.is_recursion:
             return " + ramp"
         if past.lag is not None:

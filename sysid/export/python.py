@@ -9,14 +9,15 @@ from sysid.export.identified import Identified
 from sysid.export.identifiers import Identifiers, in_docstring
 from sysid.export.program import Kind, Place, Program, lag_steps
 from sysid.export.python_helpers import HELPERS, PythonLanguage, with_needed
+from sysid.models.model import Output, Quantity
 
-_TAKEN = (
+_WORDS = (
     "False None True and as assert async await break class continue def del elif else except "
     "finally for from global if import in is lambda nonlocal not or pass raise return try while "
     "with match case type np t simulate rates step steps part dt h k now slope_1 slope_2 slope_3 "
     "slope_4 every points ratio ramp sample_time lag range zip map max min int float abs len y "
     "before between held past lately sign signal array grid print math ValueError"
-).split()
+)
 _WIDTH = 96
 
 
@@ -33,7 +34,7 @@ def python_source(identified: Identified) -> str:
         If a value is missing.
     """
     names = [output.name for output in identified.model.outputs]
-    taken = [word for word in _TAKEN if word not in names]
+    taken = [word for word in _WORDS.split() if word not in names]
     program = Program(identified, PythonLanguage(), Identifiers(taken))
     loop = [*_loop(program), *_outputs(program)]
     head = [*_arrays(program), *_steps(program), *_lags(program), *_starts(program)]
@@ -78,13 +79,18 @@ def _inner_docstring(program: Program) -> list[str]:
     lines = ['"""Free run of the model from its start.', "", "Parameters", "----------",
              "t : array (N,)", "    Times in s, one sampling period apart."]  # fmt: skip
     for one in model.inputs:
-        lines += [f"{program.inputs[one.name]} : array (N,)", f"    Input {one.name}, {unit_text(one.unit)}."]
+        lines += _described(program.inputs[one.name], "Input", one)
     for name, line in value_lines(program.identified, program.parameters, program.starts):
         lines += [f"{name} : float", f"    {line}"]
     lines += ["", "Returns", "-------"]
     for output in model.outputs:
-        lines += [f"{program.outputs[output.name]} : array (N,)", f"    Output {output.name}, {unit_text(output.unit)}."]
-    return [in_docstring(lines[0][3:]).join(['"""', ""]), *(_kept(line) for line in lines[1:]), '"""']
+        lines += _described(program.outputs[output.name], "Output", output)
+    return [lines[0], *map(_kept, lines[1:]), '"""']
+
+
+def _described(identifier: str, kind: str, signal: Quantity | Output) -> list[str]:
+    about = f"    {kind} {signal.name}, {unit_text(signal.unit)}."
+    return [f"{identifier} : array (N,)", about]
 
 
 def _kept(line: str) -> str:
@@ -94,9 +100,9 @@ def _kept(line: str) -> str:
 
 def _arrays(program: Program) -> list[str]:
     lines = ["t = np.asarray(t, dtype=np.float64)"]
-    for name in program.inputs.values():
-        lines.append(f"{name} = np.asarray({name}, dtype=np.float64)")
-    shapes = [f"{name}.shape != t.shape" for name in program.inputs.values()]
+    signals = program.inputs.values()
+    lines += [f"{name} = np.asarray({name}, dtype=np.float64)" for name in signals]
+    shapes = [f"{name}.shape != t.shape" for name in signals]
     wrong = " or ".join(["t.ndim != 1", "t.size < 2", *shapes])
     lines += [*_statement("if ", wrong, ":"),
               '    raise ValueError("t and the inputs must have one shape (N,), N > 1")',
@@ -164,7 +170,8 @@ def _recursion(program: Program) -> list[str]:
     lines = [f"for k in range({program.memory}, steps + 1):"]
     for i in model.order:
         name = model.states[i].name
-        lines += _indented(_statement(f"{program.now[name]} = ", _equation(program, "recursion", i)))
+        text = _equation(program, "recursion", i)
+        lines += _indented(_statement(f"{program.now[name]} = ", text))
         lines.append(f"    {program.every[name]}[k] = {program.now[name]}")
     return lines
 

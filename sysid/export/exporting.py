@@ -1,0 +1,136 @@
+"""`sysid.export`: an identified model in a format for other programs."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from sysid.errors import InvalidSettings, nearest
+from sysid.export.c import c_source
+from sysid.export.control import control_source
+from sysid.export.document import json_source
+from sysid.export.identified import Covariance, Identified, Value
+from sysid.export.python import python_source
+from sysid.models.initial import initial_name
+from sysid.models.model import Model
+from sysid.records import HOLDS, Hold
+from sysid.result import Identification
+
+Format = Literal["json", "python", "c", "control"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+MOST_PADE = 20
+
+_WRITERS: Mapping[str, Callable[[Identified], str]] = {
+    "json": json_source, "python": python_source, "c": c_source,
+}  # fmt: skip
+
+
+def export(
+    model: Model,
+    found: Identification | Mapping[str, float],
+    format: Format = "python",
+    *,
+    sample_time: float | None = None,
+    hold: Mapping[str, Hold] | None = None,
+    version: str = "",
+    provenance: Mapping[str, Any] | None = None,
+    pade_order: int = 3,
+) -> str:
+    """An identified model as text.
+
+    Parameters
+    ----------
+    model : Model
+    found : Identification or mapping of str to float
+        A result, or every parameter's value; with initial values such as ``x(0)`` where the
+        model estimates them.
+    format : {"json", "python", "c", "control"}
+    sample_time : float, optional
+        Sampling period of the data in s; a transfer function in z needs it.
+    hold : mapping of str to {"zero", "first", "band-limited"}, optional
+        How inputs are held between their samples; ``first`` where nothing is said.
+    version, provenance : optional
+        Told in the text: version of the program, run, data sets.
+    pade_order : int
+        Order of the approximation of dead times in format ``control``, 1 to 20.
+
+    Raises
+    ------
+    InvalidSettings
+        If a value is missing or unknown, or an option cannot be used.
+    NotLinear
+        If the format is ``control`` and the model has no transfer function.
+    """
+    values, covariance = _values(model, found)
+    _check(model, values, sample_time, hold or {})
+    identified = Identified(
+        model, values, covariance, sample_time, dict(hold or {}), version, dict(provenance or {})
+    )
+    return written(identified, format, pade_order)
+
+
+def written(identified: Identified, format: str, pade_order: int = 3) -> str:
+    """An identified model in one of `FORMATS`.
+
+    Raises
+    ------
+    InvalidSettings
+        If there is no such format, or the order is out of its range.
+    NotLinear
+        If the format is ``control`` and the model has no transfer function.
+    """
+    if format not in FORMATS:
+        detail = f"{format!r} is not a format{nearest(format, FORMATS)}"
+        raise InvalidSettings("/format", detail)
+    if not 1 <= pade_order <= MOST_PADE:
+        raise InvalidSettings(
+            "/pade_order", f"{pade_order!r} is not an order from 1 to {MOST_PADE}"
+        )
+    if identified.model.rule is not None:
+        raise InvalidSettings("/model/terms", "the terms are not selected yet; there is no model")
+    if format == "control":
+        return control_source(identified, pade_order)
+    return _WRITERS[format](identified)
+
+
+def _values(
+    model: Model, found: Identification | Mapping[str, float]
+) -> tuple[tuple[Value, ...], Covariance | None]:
+    if isinstance(found, Identification):
+        values = tuple(
+            Value(one.name, one.value, one.unit, one.stderr, one.status) for one in found.estimates
+        )
+        known = found.uncertainty
+        return values, None if known is None else Covariance(known.names, known.covariance)
+    units = {one.name: one.unit for one in model.parameters}
+    units |= {initial_name(state.name, 0): state.unit for state in model.states}
+    return tuple(Value(n, float(v), units.get(n, "1")) for n, v in found.items()), None
+
+
+def _check(
+    model: Model, values: tuple[Value, ...], sample_time: float | None, hold: Mapping[str, Hold]
+) -> None:
+    _check_values(model, {one.name: one.value for one in values})
+    if sample_time is not None and not 0.0 < sample_time < float("inf"):
+        raise InvalidSettings("/sample_time", f"{sample_time!r} is not a period in s")
+    inputs = [one.name for one in model.inputs]
+    for name, kind in hold.items():
+        if name not in inputs:
+            detail = f"the model has no input {name!r}{nearest(name, inputs)}"
+            raise InvalidSettings(f"/hold/{name}", detail)
+        if kind not in HOLDS:
+            raise InvalidSettings(f"/hold/{name}", f"{kind!r} is not one of {', '.join(HOLDS)}")
+
+
+def _check_values(model: Model, numbers: Mapping[str, float]) -> None:
+    names = [one.name for one in model.parameters]
+    starts = {state.name for state in model.states}
+    for name in names:
+        if name not in numbers:
+            raise InvalidSettings(f"/values/{name}", "a value is missing")
+    for name, value in numbers.items():
+        if name not in names and name.partition("(0)")[0] not in starts:
+            detail = f"the model has no parameter {name!r}{nearest(name, names)}"
+            raise InvalidSettings(f"/values/{name}", detail)
+        if not np.isfinite(value):
+            raise InvalidSettings(f"/values/{name}", f"{value!r} is not a finite number")
