@@ -1,4 +1,9 @@
-"""How the simulated output moves with each free parameter, also where it moves in jumps only.
+"""How the simulated output moves with each free parameter, also where it moves in jumps.
+
+Where the sign of a velocity flips one sample earlier, the output jumps. A difference across such a
+jump is as large as its step is small, and a standard error made of it far too small; searches end
+beside jumps, since the loss jumps too. So where the slopes to both sides disagree, each side is cut
+into segments from 1e-6 to 1e-2 of the range, and the slopes of two neighbours that agree are taken.
 
 A lag that is rounded to whole samples (nearest interpolation) leaves the output unchanged on a
 *plateau* and changes it at the plateau's ends. A small difference says nothing there: it is zero,
@@ -15,6 +20,8 @@ from sysid.problem import Problem
 from sysid.types import BoolArray, FloatArray, IntArray
 
 _DIFFERENCE = 1e-5  # of the range
+_ALIKE = 0.1  # of a slope: two that differ by less do not straddle a jump
+_EDGES = np.array([1e-6, _DIFFERENCE, 1e-4, 1e-3, 1e-2])  # of segments, of the range
 _GROWTH, _LARGEST = 4.0, 0.7  # of the step of the search for a jump; the largest, of the range
 _HALVINGS = 6  # a jump's place is then known to about 1 % of its distance
 
@@ -54,8 +61,10 @@ def sensitivities(problem: Problem, theta: FloatArray) -> Sensitivities:
     moves = (np.any(below != here, axis=0) | (low == 0.0)) & (
         np.any(above != here, axis=0) | (high == 0.0)
     )
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         columns[:, moves] = ((above - below) / (high - low))[:, moves]
+        for d in np.flatnonzero(moves & _differ(here, low, below, high, above)).tolist():
+            columns[:, d] = _slope_beside_jumps(probe, d)
         jumping = np.flatnonzero(~moves)
         if jumping.size:
             down, below = probe.jumps(jumping, -1.0)
@@ -68,6 +77,43 @@ def sensitivities(problem: Problem, theta: FloatArray) -> Sensitivities:
         columns = probe.weight[:, None] * np.where(np.isfinite(columns), columns, 0.0)
         error = probe.weight * (probe.predicted - probe.measured)
     return Sensitivities(error, columns, plateau, one_sided, probe.evaluations)
+
+
+def _differ(
+    here: FloatArray, low: FloatArray, below: FloatArray, high: FloatArray, above: FloatArray
+) -> BoolArray:
+    """Whether the slopes to both sides differ (D,); also where there is one side only."""
+    left, right = (here - below) / -low, (above - here) / high
+    size = np.minimum(_squares(left), _squares(right))
+    return np.asarray(~(_squares(right - left) <= _ALIKE**2 * size))
+
+
+def _squares(columns: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("nd,nd->d", columns, columns))
+
+
+def _slope_beside_jumps(probe: "_Probe", d: int) -> FloatArray:
+    """Slope (n,) in one parameter: the mean of those sides of the estimate that show one."""
+    sides = [_slope_of_side(probe, d, side) for side in (-1.0, 1.0)]
+    best = min(doubt for doubt, _ in sides)
+    kept = [slope for doubt, slope in sides if doubt <= max(best, _ALIKE)]
+    return np.asarray(np.mean(kept, axis=0))
+
+
+def _slope_of_side(probe: "_Probe", d: int, side: float) -> tuple[float, FloatArray]:
+    """How far the two neighbouring segments that agree best differ, and their slope (n,)."""
+    room = 1.0 - probe.place[d] if side > 0 else probe.place[d]
+    ends = side * _EDGES[room >= _EDGES]
+    if ends.size < 2:
+        return np.inf, np.zeros(probe.predicted.size)
+    steps, outputs = probe.at(np.full(ends.size, d), ends)
+    lengths = np.diff(steps, prepend=0.0)
+    slopes = (np.diff(outputs, prepend=probe.predicted[:, None]) / lengths).T
+    sizes = np.linalg.norm(slopes, axis=1)
+    apart = np.linalg.norm(np.diff(slopes, axis=0), axis=1)
+    doubt = apart / np.maximum(np.minimum(sizes[1:], sizes[:-1]), np.finfo(float).tiny)
+    best = int(np.argmin(np.where(np.isfinite(doubt), doubt, np.inf)))
+    return float(doubt[best]), slopes[best + 1]
 
 
 class _Probe:

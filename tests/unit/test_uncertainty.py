@@ -11,7 +11,7 @@ from sysid.result import Estimate
 from sysid.settings import Loss
 from sysid.types import FloatArray
 from sysid.uncertainty import analyse
-from tests.searching import DUFFING, example, force, noisy, record
+from tests.searching import COULOMB, DUFFING, example, force, noisy, record
 
 # Cramér-Rao bound of Example 1, measurement noise of sd 0.01, 300 samples (from theory).
 BOUND = {"c": 0.0049, "L": 0.0025, "b": 0.0198, "a": 0.0268}
@@ -44,6 +44,22 @@ def test_estimates_scatter_as_their_standard_errors_say() -> None:
             assert estimate.stderr is not None
             scores.append((estimate.value - DUFFING[estimate.name]) / estimate.stderr)
     assert np.mean(np.square(scores)) == pytest.approx(1.0, abs=0.35)
+
+
+def test_standard_errors_beside_the_jumps_of_coulomb_friction_are_those_of_repetition() -> None:
+    values, errors = [], []
+    for seed in range(40):
+        problem = Problem.build(
+            load_model("coulomb-eq16"), [record(noisy("coulomb-eq16", seed=seed))]
+        )
+        end = refine(problem, [np.array([COULOMB[p.name] for p in problem.space])])[0]
+        assert end is not None
+        values.append([end.theta])
+        errors.append([e.stderr for e in analyse(problem, end.theta).estimates])
+    spread = np.std(np.concatenate(values), axis=0, ddof=1)
+    found = np.array(errors, dtype=float)
+    assert np.all(found > spread / 2)
+    assert np.all(found < spread * 2)
 
 
 def test_intervals_are_of_the_t_distribution() -> None:
