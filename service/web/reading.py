@@ -85,7 +85,9 @@ def sought_parameters(run: Run, body: Body) -> list[SoughtParameter]:
     result = (run.result or {}).get("parameters")
     if result:
         scales = {one.name: one.scale for one in known}
-        return [_estimated(one, scales) for one in result if one.get("status") not in ("fixed", "tied")]
+        return [
+            _estimated(one, scales) for one in result if one.get("status") not in ("fixed", "tied")
+        ]
     if model is not None and model.rule is not None:
         return []  # which of the candidates are sought is told with the result
     return [_sought(one) for one in known if one.is_free]

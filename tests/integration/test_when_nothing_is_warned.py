@@ -1,0 +1,76 @@
+"""A good result warns of nothing, and of a doubtful one no sentence is superfluous."""
+
+import numpy as np
+import pytest
+
+from sysid.identify import identify
+from sysid.models.library import load_model
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+from sysid.result import Identification
+from sysid.settings import GeneticAlgorithm
+from sysid.types import FloatArray
+from tests.searching import DUFFING as TRUTH
+from tests.searching import noisy, record
+
+DUFFING, FOPDT = load_model("duffing-eq16"), load_model("fopdt")
+TIMES = 0.02 * np.arange(300)
+
+
+def driven(name: str, u: FloatArray, y: FloatArray) -> Record:
+    return Record((Channel(name, TIMES, u, hold="zero"),), (Channel("y", TIMES, y),))
+
+
+def noise(sd: float = 0.01) -> FloatArray:
+    return sd * np.random.default_rng(0).standard_normal(300)
+
+
+def told(found: Identification, words: str) -> bool:
+    return any(words in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("model", ["duffing-eq16", "coulomb-eq16"])
+@pytest.mark.parametrize("seed", range(4))
+def test_the_papers_examples_are_warned_of_nothing(model: str, seed: int) -> None:
+    assert identify(load_model(model), record(noisy(model, seed=seed)), seed=seed).warnings == ()
+
+
+def test_residuals_of_an_estimate_that_is_no_optimum_say_nothing_of_the_model() -> None:
+    found = identify(DUFFING, record(noisy()), GeneticAlgorithm(method="simple"))
+    assert told(found, "not a local optimum")
+    assert not told(found, "not white")
+
+
+def test_an_input_that_is_constant_in_one_record_only_is_not_told() -> None:
+    at_rest = Record(
+        (Channel("q", TIMES, 0.0 * TIMES, "N", hold="zero"),), (Channel("y", TIMES, noise(), "m"),)
+    )
+    assert not told(identify(DUFFING, [record(noisy()), at_rest]), "excites nothing")
+
+
+def test_of_parameters_without_a_standard_error_only_their_groups_are_told() -> None:
+    found = identify(FOPDT, driven("u", 0.0 * TIMES + 2.0, 3.0 + noise()))
+    assert told(found, "input 'u' is constant, so it excites nothing")
+    assert not told(found, "correlated")
+
+
+@pytest.mark.parametrize(("sd", "vague"), [(0.01, False), (2.0, True)])
+def test_only_a_quantity_of_one_sign_is_told_to_be_no_more_than_its_error(
+    sd: float, vague: bool
+) -> None:
+    fixed = {name: {"fixed": TRUTH[name]} for name in ("a", "b", "L")}
+    positive = identify(DUFFING, record(noisy(sd=sd, seed=3)), parameters=fixed)
+    assert told(positive, "the standard error of c") is vague
+    either = fixed | {"c": {"lower": -2.0, "upper": 5.0}}
+    found = identify(DUFFING, record(noisy(sd=sd, seed=3)), parameters=either)
+    assert not told(found, "the standard error of c")
+
+
+def test_a_lag_that_may_as_well_be_zero_is_not_separable_from_what_it_is_on_a_ridge_with() -> None:
+    """On a slow ramp a lag and a time constant do the same to the output."""
+    known = {"K": {"fixed": 1.0}, "y0": {"fixed": 0.0}, "x(0)": {"fixed": 0.0}}
+    sought = known | {"T": {"lower": 0.01, "upper": 2.0}, "L": {"lower": 0.0, "upper": 0.4}}
+    problem = Problem.build(FOPDT, [driven("u", TIMES / 6, 0.0 * TIMES)], parameters=sought)
+    y = problem.predictions(np.array([[0.2, 0.05]]))[0] + noise(0.02)
+    found = identify(FOPDT, driven("u", TIMES / 6, y), parameters=sought)
+    assert told(found, "T and L not separable")
