@@ -56,7 +56,11 @@ class Goal:
 
 @dataclass(frozen=True)
 class Search:
-    """What one search gave: distance to the optimum, cost to the target, cost of the whole."""
+    """What one search gave: distance to the optimum, cost to the target, cost of the whole.
+
+    `seconds` are those of the search, `after` those of the refinement, the standard errors and
+    the tests of the residuals that follow it.
+    """
 
     distance: float
     evaluations: int
@@ -64,6 +68,8 @@ class Search:
     seconds_to_target: float
     prorated: float
     seconds: float
+    after: float
+    is_settled: bool
 
 
 def optimum(problem: Problem, starts: list[FloatArray]) -> float:
@@ -108,8 +114,9 @@ def search(system: System, seed: int, method: SearchMethod = "improved") -> tupl
     algorithm = GeneticAlgorithm(method=method, stop=Stop(evaluations=BUDGET))
     start = time.process_time()
     state = advance(problem, algorithm, begin(problem, algorithm, seed))
+    searched = time.process_time()
     found = conclude(problem, algorithm, state)
-    seconds = time.process_time() - start
+    seconds, after = searched - start, time.process_time() - searched
     values = {estimate.name: estimate.value for estimate in found.estimates}
     best = np.array([values[p.name] for p in problem.space])
     goal = goal_of(system, problem, best)
@@ -117,11 +124,16 @@ def search(system: System, seed: int, method: SearchMethod = "improved") -> tupl
     if generation is None:
         hit, took = None, np.nan
         if found.rms <= goal.rms and goal.tolerances is None:  # by the refinement alone
-            hit, took = found.evaluations, seconds
+            hit, took = found.evaluations, seconds + after
     else:
         hit, took = _replay(problem, algorithm, seed, generation)
-    share = np.nan if hit is None else seconds * hit / found.evaluations
-    made = Search(goal.distance(found.rms), found.evaluations, hit, took, share, seconds)
+    share = np.nan if hit is None else seconds * hit / state.evaluations
+    settled = state.generation < algorithm.generations and all(
+        island.generation == state.generation for island in state.islands
+    )
+    made = Search(
+        goal.distance(found.rms), found.evaluations, hit, took, share, seconds, after, settled
+    )
     return made, goal
 
 

@@ -110,6 +110,14 @@ def switching(level: float, least: int, seed: int) -> Callable[[FloatArray], Flo
     return signal
 
 
+def _supply(times: FloatArray) -> FloatArray:
+    """Pressure difference of the actuator: levels with twelve sines on them (Pa)."""
+    rates = np.linspace(1.0, 20.0, 12)
+    phases = np.random.default_rng(7).uniform(0.0, 2.0 * np.pi, 12)
+    sines = np.sin(np.outer(times, rates) + phases).sum(axis=1)
+    return np.asarray(switching(8e3, 10, 7)(times) + 2e3 * sines)
+
+
 def paper(example: str, samples: int = 300, lag: float = 1.0, noise: float = 0.01) -> System:
     """Example 1 (``A``, Duffing) or 2 (``B``, Coulomb) of the paper, as its recursion (Eq. 16)."""
     last, model = ("a", "duffing-eq16") if example == "A" else ("mu", "coulomb-eq16")
@@ -151,6 +159,14 @@ OTHERS = (
         "SOPDT, lag to half the record", "sopdt", 400, 0.05,
         {"K": 2.0, "T1": 0.8, "r": 0.5, "L": 2.3, "y0": 1.0, "w(0)": 0.0, "x(0)": 0.0},
         switching(1.0, 30, 3), parameters={"L": {"upper": 10.0}},
+    ),
+    System(
+        "actuator with stick-slip", "actuator", 800, 0.01,
+        {
+            "J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3,
+            "theta(0)": 0.0,
+        },
+        _supply,
     ),
     System(
         "NARX, two unknown lags", NARX, 400, 1.0,
