@@ -2,7 +2,7 @@
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -72,6 +72,12 @@ def read(*parts: str, **params: Any) -> Call:
 def act(what: str, name: str, verb: str, body: Any = None, **params: Any) -> Call:
     """POST of an action upon one thing, such as ``/v1/jobs/job_…:cancel``."""
     return Call("POST", f"/v1/{what}/{_quoted(name)}:{verb}", params, json=body)
+
+
+def profile(run: str, parameters: Sequence[str], points: int) -> Call:
+    """POST that asks for the profiles of a run's parameters, of all free ones if none is named."""
+    names = list(parameters) or None
+    return act("runs", run, "profile", {"parameters": names, "points": points})
 
 
 def create(what: str, body: Any, headers: Mapping[str, str] | None = None) -> Call:

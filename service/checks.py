@@ -79,6 +79,9 @@ class JobChecker:
             _tried(check_samples, found, len(model[0].terms), self._samples(body))
         found += self._repeated(body)
         found += self._data(body, tied, own)
+        scored = self._samples(body) - body["skip"] * len(body["datasets"])
+        found += _sample_faults(parameters, scored)
+        found += self._unit_faults(body, model[0])
         return found + list(_signal_faults(body, model[0]))
 
     def resolved(self, body: Body) -> Body:
@@ -172,6 +175,26 @@ class JobChecker:
                     pointer, f"{reference!r} is the same recording as {name!r} at {first}; "
                     "name another, or leave it out",
                 )  # fmt: skip
+
+    def _unit_faults(self, body: Body, model: Model) -> Iterator[FieldError]:
+        """Validation data that are in other units than the data that are fitted."""
+        kept = (body["validation"] or {}).get("datasets") or []
+        first = self.dataset(body["datasets"][0])
+        if isinstance(first, str):
+            return
+        known = {channel["name"]: channel.get("unit") for channel in first.channels}
+        inputs, outputs = signals_of(model)
+        for index, reference in enumerate(kept):
+            dataset = self.dataset(reference)
+            for channel in [] if isinstance(dataset, str) else dataset.channels:
+                name, unit = channel["name"], channel.get("unit")
+                used = name in {body["channels"].get(s, s) for s in (*inputs, *outputs)}
+                if used and _differ(unit, known.get(name)):
+                    yield FieldError(
+                        f"/validation/datasets/{index}",
+                        f"channel {name!r} is in {unit}, but in {first.name} it is in "
+                        f"{known[name]}; convert one of them",
+                    )
 
     def _data(
         self, body: Body, model: Model, parameters: tuple[Parameter, ...]
@@ -296,6 +319,21 @@ def _length_faults(
             pointer,
             f"{piece.words}the record has {piece.samples} samples; the model's memory "
             f"({model.memory}) and 'skip' ({skip}) need more",
+        )
+
+
+def _differ(unit: str | None, other: str | None) -> bool:
+    """Whether two units are known and not the same; 1 is that of a channel without one."""
+    return unit not in (None, "", "1") and other not in (None, "", "1") and unit != other
+
+
+def _sample_faults(parameters: tuple[Parameter, ...] | None, samples: int) -> Iterator[FieldError]:
+    free = sum(one.is_free for one in parameters or ())
+    if 0 < samples < free:
+        yield FieldError(
+            "/datasets",
+            f"the records have {samples} scored samples in all for {free} free parameters; need "
+            "at least as many samples, or fix some of the parameters",
         )
 
 

@@ -256,6 +256,10 @@ class Client:
         """The migration log."""
         return self._json(calls.read("runs", run, "migrations"))
 
+    def profile(self, run: str, *parameters: str, points: int = 21) -> Document:
+        """Profile likelihood of some free parameters, of all if none is named."""
+        return self._json(calls.profile(run, parameters, points))
+
     def residuals(self, run: str) -> Document:
         """Correlation functions of the residuals with their bands and tests."""
         return self._json(calls.read("runs", run, "residuals"))
@@ -354,9 +358,7 @@ class AsyncClient:
                 return state
             await asyncio.sleep(poll)
 
-    async def simulate_run(
-        self, run: str, body: Mapping[str, Any], max_points: int = 1000
-    ) -> Document:
+    async def simulate_run(self, run: str, body: Document, max_points: int = 1000) -> Document:
         """Simulate the identified model on a new input or under proportional control."""
         return await self._json(calls.act("runs", run, "simulate", body, max_points=max_points))
 
@@ -378,6 +380,10 @@ class AsyncClient:
     async def history(self, run: str) -> Document:
         """Improvements of each island's champion."""
         return await self._json(calls.read("runs", run, "history"))
+
+    async def profile(self, run: str, *parameters: str, points: int = 21) -> Document:
+        """Profile likelihood of some free parameters, of all if none is named."""
+        return await self._json(calls.profile(run, parameters, points))
 
     async def residuals(self, run: str) -> Document:
         """Correlation functions of the residuals with their bands and tests."""

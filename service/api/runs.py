@@ -4,10 +4,11 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from service import exports, residuals, responses, run_simulations, runs
+from service import exports, profiles, residuals, responses, run_simulations, runs
 from service.api.content import content_of
 from service.api.deps import MaxPoints, PartsDep, ReadSession
 from service.errors import NotFound
+from service.schemas_profiles import ProfileIn, ProfilesOut
 from service.schemas_runs import HistoryOut, MigrationsOut, ResidualsOut, ResponseOut, RunOut
 from service.schemas_simulations import RunSimulateIn, RunSimulationOut
 from service.storage.runs import RunRepository
@@ -67,6 +68,12 @@ def simulate(
 ) -> RunSimulationOut:
     """Simulate the identified model on new inputs or under proportional control."""
     return run_simulations.simulate(parts.database, parts.store, run_id, body, max_points)
+
+
+@router.post("/{run_id}:profile")
+def profile(run_id: str, body: ProfileIn, parts: PartsDep) -> ProfilesOut:
+    """Profile likelihood of some free parameters, the others estimated anew at every value."""
+    return profiles.profiles(parts.database, parts.store, run_id, body)
 
 
 @router.head("/{run_id}/signals.mcap", include_in_schema=False)

@@ -93,6 +93,31 @@ def simulate(
 
 
 @app.command()
+def profile(
+    run: RunName,
+    parameters: Annotated[
+        list[str] | None, typer.Argument(metavar="PARAMETER…", help="All free ones if none.")
+    ] = None,
+    points: Annotated[int, typer.Option(min=3, max=101, help="Values a parameter.")] = 21,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Profile likelihood: 95 % intervals with all other parameters estimated anew."""
+    with connected(url, key) as client:
+        found = client.profile(run, *(parameters or ()), points=points)
+    if as_json:
+        print_json(found)
+        return
+    rows = [
+        [one["name"], one["unit"], f"{one['estimate']:.6g}",
+         *("open" if end is None else f"{end:.6g}" for end in one["interval95"])]
+        for one in found["profiles"]
+    ]  # fmt: skip
+    print_table(("parameter", "unit", ">estimate", ">from", ">to"), rows, empty="no parameters")
+
+
+@app.command()
 def compare(
     runs: Annotated[list[str], typer.Argument(metavar="RUN RUN…", help="Ids of two runs or more.")],
     url: Url = DEFAULT_URL,

@@ -14,6 +14,12 @@ MODEL: dict[str, Any] = {
 }  # fmt: skip
 
 
+FEW = {**MODEL, "parameters": {name: {"lower": 0.1, "upper": 0.5} for name in "abcd"},
+       "equations": {"x": "a*u - b*x + c + d*x**2"}}  # fmt: skip
+POLYNOMIAL = {"name": "narx", "form": "polynomial", "inputs": {"u": "V"}, "output": "y",
+              "coefficients": {"lower": -1, "upper": 1}}  # fmt: skip
+
+
 def with_changes(dataset: str, changes: dict[str, Any]) -> dict[str, Any]:
     return {"model": "fopdt", "datasets": [dataset], **changes}
 
@@ -59,6 +65,20 @@ JOBS: list[tuple[dict[str, Any], str, str]] = [
     ({"validation": {"fraction": 0.9}, "skip": 30}, "/datasets/0", "30 samples"),
     ({"validation": {"fraction": 0.001}}, "/validation/fraction", "would be empty"),
     ({"validation": {"fraction": 0.999}}, "/validation/fraction", "would be empty"),
+    ({"parameters": {"L": {"fixed": 40}}}, "/parameters/L/fixed", "40 lies outside the bounds"),
+    ({"parameters": {"K": {"tied": "2*K"}}}, "/parameters/K/tied", "circle, K → K"),
+    (
+        {"parameters": {"K": {"tied": "T"}, "T": {"tied": "K"}}},
+        "/parameters/K/tied",
+        "circle, K → T → K",
+    ),
+    ({"parameters": {"K": {"tied": "2*Q"}}}, "/parameters/K/tied", "'Q' is not declared"),
+    ({"parameters": {"K": {"tied": "2*"}}}, "/parameters/K/tied", "column 3"),
+    ({"parameters": {"K": {"tied": 2}}}, "/parameters/K/tied", "found 2"),
+    ({"parameters": {"L": {"tied": "T - 20"}}}, "/parameters", "as small as"),
+    ({"parameters": {"K": {"tied": "T", "lower": 0}}}, "/parameters/K", "leave out 'lower'"),
+    ({"skip": 297, "model": FEW}, "/datasets", "3 scored samples in all for 4 free parameters"),
+    ({"model": {**POLYNOMIAL, "terms": ["y(k-1)", "u(k-"]}}, "/model/terms/1", "expression ends"),
     (
         {"parameters": {name: {"fixed": 1} for name in ("K", "T", "L", "y0", "x(0)")}},
         "/parameters",
@@ -353,3 +373,20 @@ def test_an_unknown_channel_names_those_that_are_there(own: TestClient) -> None:
     faults = refused(own.post("/v1/jobs", json=body), 422, "invalid")
     assert faults[0]["pointer"] == "/channels"
     assert "P1, P2" in faults[0]["detail"]
+
+
+def test_validation_data_in_other_units_or_with_other_channels_are_refused(own: TestClient) -> None:
+    def stored(columns: str) -> str:
+        text = recording().decode().replace("t,u,y", columns)
+        answer = own.post(f"/v1/datasets?name={len(columns)}", content=text.encode(), headers=CSV)
+        assert answer.status_code == 201, answer.text
+        return str(answer.json()["id"])
+
+    fitted, other, alien = stored("t,u [V],y [m]"), stored("t,u [V],y [mm]"), stored("t,u,z")
+    body = {"model": "fopdt", "datasets": [fitted], "validation": {"datasets": [other]}}
+    fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
+    assert fault["pointer"] == "/validation/datasets/0"
+    assert "channel 'y' is in mm" in fault["detail"]
+    body["validation"] = {"datasets": [alien]}
+    fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
+    assert "has no channel 'y'" in fault["detail"]

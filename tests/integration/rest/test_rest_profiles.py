@@ -1,0 +1,115 @@
+"""Ties, groups, criteria and profiles of a run that was identified, over REST."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import pytest
+from starlette.testclient import TestClient
+from typer.testing import CliRunner
+
+import service.profiles
+from service.app import create_app
+from service.cli.runs import app as runs_app
+from service.client import Client
+from tests.identified import identified
+from tests.integration.rest.test_client import Through
+from tests.rest import CSV, recording, refused, settings_of
+
+SMALL = {"population": 20, "generations": 60, "islands": 1}
+MODEL: dict[str, Any] = {
+    "name": "products", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
+    "parameters": {name: {"lower": 0.1, "upper": 5} for name in ("k", "A", "J", "T", "r")}
+    | {"L": {"lower": 0, "upper": 2, "unit": "s"}},
+    "equations": {"x": "(k*A*u(t - L)/J - r*x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
+}  # fmt: skip
+
+
+class Served(NamedTuple):
+    server: TestClient
+    run: str
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    app = create_app(settings_of(tmp_path_factory.mktemp("profiles")))
+    with TestClient(app) as server:
+        data = server.post("/v1/datasets?name=s", content=recording(), headers=CSV).json()["id"]
+        body = {
+            "model": MODEL, "datasets": [data], "algorithm": SMALL, "noise": {"sigma": 0.02},
+            "parameters": {"r": {"fixed": 1}, "T": {"tied": "r"}}, "hold": {"u": "zero"},
+            "validation": {"fraction": 0.2},
+        }  # fmt: skip
+        parts = server.app.state.parts  # type: ignore[attr-defined]
+        _, runs = identified(parts, body)
+        yield Served(server, runs[0])
+
+
+def result(served: Served) -> dict[str, Any]:
+    document: dict[str, Any] = served.server.get(f"/v1/runs/{served.run}").json()
+    assert document["state"] == "succeeded", document["error"]
+    return document
+
+
+def test_groups_ties_and_criteria_are_in_the_result(served: Served) -> None:
+    document = result(served)
+    (group,) = document["identifiability"]["groups"]
+    assert group["expression"] == "k*A/J"
+    assert group["members"] == ["k", "A", "J"]
+    assert group["value"] == pytest.approx(2.0, rel=0.05)
+    assert group["stderr"] < 0.05
+    states = {one["name"]: one["status"] for one in document["parameters"]}
+    assert states == {"k": "group", "A": "group", "J": "group", "T": "tied", "r": "fixed",
+                      "L": "identified"}  # fmt: skip
+    assert set(document["criteria"]) == {"aic", "aicc", "bic", "samples", "parameters"}
+    assert document["criteria"]["parameters"] == 4
+    history = served.server.get(f"/v1/runs/{served.run}/history").json()
+    assert history["names"] == ["k", "A", "J", "L"]
+
+
+def test_a_profile_has_the_interval_and_its_figure(served: Served) -> None:
+    body = {"parameters": ["L"], "points": 9}
+    answer = served.server.post(f"/v1/runs/{served.run}:profile", json=body).json()
+    (one,) = answer["profiles"]
+    estimate = next(e for e in result(served)["parameters"] if e["name"] == "L")
+    low, high = one["interval95"]
+    assert low < estimate["value"] < high
+    assert one["estimate"] == pytest.approx(estimate["value"])
+    assert one["ratio"][0] > answer["threshold"]
+    trace = answer["figure"]["data"][0]
+    assert trace["x"] == one["values"]
+    assert trace["y"] == one["ratio"]
+
+
+def test_a_member_of_a_group_has_an_open_profile(served: Served) -> None:
+    body = {"parameters": ["J"], "points": 5}
+    answer = served.server.post(f"/v1/runs/{served.run}:profile", json=body).json()
+    assert answer["profiles"][0]["interval95"] == [None, None]
+
+
+def test_a_profile_that_cannot_be_had_is_refused(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = f"/v1/runs/{served.run}:profile"
+    fault = refused(served.server.post(url, json={"parameters": ["LL"]}), 422, "invalid")[0]
+    assert fault["pointer"] == "/parameters/0"
+    assert "did you mean 'L'?" in fault["detail"]
+    fault = refused(served.server.post(url, json={"points": 2}), 422, "invalid")[0]
+    assert fault["pointer"] == "/points"
+    refused(served.server.post("/v1/runs/run_0:profile", json={}), 404, "not-found")
+    monkeypatch.setattr(service.profiles, "SECONDS", -1.0)
+    fault = refused(served.server.post(url, json={"parameters": ["L"]}), 422, "invalid")[0]
+    assert "were stopped at 'L'" in fault["detail"]
+    monkeypatch.setattr(service.profiles, "MOST_WORK", 10)
+    fault = refused(served.server.post(url, json={}), 422, "invalid")[0]
+    assert "need at most 10" in fault["detail"]
+
+
+def test_the_command_tells_intervals(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        "service.cli.runs.connected",
+        lambda *_: Client("http://testserver", transport=Through(served.server)),
+    )
+    told = CliRunner().invoke(runs_app, ["profile", served.run, "L", "--points", "7"])
+    assert told.exit_code == 0, told.output
+    assert "estimate" in told.output
+    assert "L" in told.output
