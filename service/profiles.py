@@ -69,7 +69,8 @@ def profiles(database: Database, store: ObjectStore, run_id: str, body: ProfileI
         found = list(_computed(problem, theta, names, body.points))
     finally:
         _one_at_a_time.release()
-    return ProfilesOut(id=run_id, threshold=QUANTILE, profiles=found, figure=figure_of(found, QUANTILE))
+    figure = figure_of(found, QUANTILE)
+    return ProfilesOut(id=run_id, threshold=QUANTILE, profiles=found, figure=figure)
 
 
 def _names(problem: Problem, body: ProfileIn) -> list[str]:
