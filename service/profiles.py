@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from math import isfinite
 from threading import Lock
 from time import monotonic
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from sqlalchemy.orm import Session
@@ -30,8 +30,10 @@ from sysid.errors import InvalidSettings, nearest
 from sysid.models.initial import initial_parameters
 from sysid.models.model import Model
 from sysid.noise import Noise, with_noise
-from sysid.problem import Problem
 from sysid.records import Record, split_record
+
+if TYPE_CHECKING:
+    from sysid.problem import Problem
 
 MOST_WORK = 300_000_000  # measured values times parameters, points and profiles
 SECONDS = 60.0
@@ -73,7 +75,7 @@ def profiles(database: Database, store: ObjectStore, run_id: str, body: ProfileI
     return ProfilesOut(id=run_id, threshold=QUANTILE, profiles=found, figure=figure)
 
 
-def _names(problem: Problem, body: ProfileIn) -> list[str]:
+def _names(problem: "Problem", body: ProfileIn) -> list[str]:
     free = [p.name for p in problem.space]
     for place, name in enumerate(body.parameters or ()):
         if name not in free:
@@ -84,7 +86,9 @@ def _names(problem: Problem, body: ProfileIn) -> list[str]:
     return list(dict.fromkeys(body.parameters or free))
 
 
-def _computed(problem: Problem, theta: Any, names: list[str], points: int) -> Iterator[ProfileOut]:
+def _computed(
+    problem: "Problem", theta: Any, names: list[str], points: int
+) -> Iterator[ProfileOut]:
     # The compiler comes with this import, and most requests never need it.
     from sysid.profiles import profile
 
@@ -108,8 +112,10 @@ def _finite(values: Any) -> list[float | None]:
     return [float(value) if isfinite(value) else None for value in values]
 
 
-def _problem(session: Session, store: ObjectStore, run_id: str) -> tuple[Problem, Any]:
+def _problem(session: Session, store: ObjectStore, run_id: str) -> "tuple[Problem, Any]":
     """The problem that the run solved, and its estimate."""
+    from sysid.problem import Problem
+
     run = RunRepository(session).get(run_id)
     if run.result is None or not run.result.get("parameters"):
         raise Conflict(f"run {run_id} is {run.state.value} and has no estimates to profile")
@@ -129,7 +135,7 @@ def _problem(session: Session, store: ObjectStore, run_id: str) -> tuple[Problem
     return problem, _estimate(problem, run)
 
 
-def _estimate(problem: Problem, run: Run) -> Any:
+def _estimate(problem: "Problem", run: Run) -> Any:
     values = {one["name"]: one["value"] for one in (run.result or {})["parameters"]}
     return np.array([values[p.name] for p in problem.space])
 
