@@ -7,7 +7,12 @@ Moolgavkar 1988; Raue et al. 2009). Where the model is linear in its parameters 
 interval of the t distribution, but for a part of order 1/n. Where it is not, the profile shows
 what the covariance cannot: ends that are open, more than one valley, a bound.
 
-With the soft-l1 loss its sum stands in place of S, and the interval is a guide.
+With the soft-l1 loss its sum R stands in place of S, and the ratio is scaled so that it is again
+one of χ²: by R₀ ΣK / (n Σψ²), ψ and K as in `sysid.uncertainty` (the ratio test of an M-estimator,
+Hampel et al. 1986, ch. 7), which is 1 where no residual is an outlier.
+
+The others are found by least squares from a neighbour: a lag that is rounded to samples, whose
+output moves in jumps only, stays as it is while another parameter is profiled.
 """
 
 from collections.abc import Callable
@@ -15,10 +20,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.errors import InvalidSettings, nearest
+from sysid.errors import InvalidRecord, InvalidSettings, nearest
 from sysid.ga.chromosome import located, placed
+from sysid.islands.archipelago import loss_scale
 from sysid.problem import Problem
-from sysid.refinement import refine
+from sysid.refinement import Refined, refine
 from sysid.sensitivities import sensitivities
 from sysid.types import FloatArray
 
@@ -28,6 +34,7 @@ QUANTILE = 3.841458820694124
 _SPAN = 1.5  # of the half width that the covariance promises: where the outermost value lies
 _BEYOND = 1.3  # growth of a step that does not reach the threshold, and how often
 _MOST, _LEAST = 40, 3
+_EXACT = 1e-9  # of the outputs' size: residuals that are rounding
 _ROOTS = 6  # halvings of the gap in which the ratio crosses the threshold
 
 
@@ -41,7 +48,7 @@ class Profile:
     values : FloatArray, shape (V,)
         Rising; the estimate among them.
     ratio : FloatArray, shape (V,)
-        n ln(S(v)/S₀), S₀ the least sum of all; 0 at the best value.
+        n ln(S(v)/S₀), S₀ the least sum of all; 0 at the best value. ``inf``: it diverges.
     rms : FloatArray, shape (V,)
     others : FloatArray, shape (V, D - 1)
         The other free parameters, in the problem's order.
@@ -49,6 +56,7 @@ class Profile:
         Ends of the 95 % interval; None where the ratio stays below the threshold up to the bound
         or as far as was looked.
     estimate : float
+        The best value.
     evaluations : int
     is_complete : bool
         False if `should_stop` ended it.
@@ -73,7 +81,7 @@ def profile(
     points: int = 21,
     should_stop: Callable[[], bool] | None = None,
 ) -> Profile:
-    """Profile of a free parameter from an estimate (D,).
+    """Profile of a free parameter from an estimate (D,), which is refined first.
 
     Parameters
     ----------
@@ -86,18 +94,38 @@ def profile(
     ------
     InvalidSettings
         If there is no such free parameter, or there are fewer than 3 points.
+    InvalidRecord
+        If there are not more samples than parameters, if the simulation diverges, or if it equals
+        the records but for rounding.
     """
     names = [p.name for p in problem.space]
     if name not in names:
         raise InvalidSettings("/parameters", f"no free parameter {name!r}{nearest(name, names)}")
     if points < _LEAST:
         raise InvalidSettings("/points", f"found {points}; need {_LEAST} or more")
-    walk = _Walk(problem, np.array(theta, dtype=np.float64), names.index(name), should_stop)
+    best = _best(problem, np.array(theta, dtype=np.float64))
+    walk = _Walk(problem, best.theta, names.index(name), should_stop)
+    walk.evaluations += best.evaluations
     step = _SPAN * walk.half_width / (points // 2)
     walk.go(-step, points // 2)
     walk.go(step, points // 2)
     low, high = walk.end(-1.0), walk.end(1.0)
     return walk.told(low, high)
+
+
+def _best(problem: Problem, theta: FloatArray) -> Refined:
+    """The optimum beside an estimate, if intervals can be measured from it."""
+    samples, free = problem.n_scored, len(problem.space)
+    if samples <= free:
+        raise InvalidRecord(f"{samples} samples are not more than {free} parameters; need more")
+    found = refine(problem, [theta])[0]
+    if found is None:
+        raise InvalidRecord("the simulation diverges at the estimate, so it has no profile")
+    if found.rms <= _EXACT * problem.output_scale:
+        raise InvalidRecord(
+            "the simulation equals the records but for rounding; a profile needs residuals"
+        )
+    return found
 
 
 class _Walk:
@@ -127,7 +155,7 @@ class _Walk:
 
     def end(self, side: float) -> float | None:
         """Place at which the ratio crosses the threshold; None if it does not."""
-        inside = self._place
+        inside = min(self._known, key=lambda place: self._known[place][1])
         places = sorted((p for p in self._known if side * (p - inside) > 0), key=lambda p: side * p)
         for outside in places:
             if self._ratio(outside) >= QUANTILE:
@@ -140,6 +168,7 @@ class _Walk:
         parameter = self._problem.space[self._d]
         order = sorted(self._known)
         found = np.array([self._known[place][0] for place in order])
+        best = min(self._known, key=lambda place: self._known[place][1])
         low_, high_ = (None if end is None else self._value(end) for end in (low, high))
         return Profile(
             name=parameter.name,
@@ -149,7 +178,7 @@ class _Walk:
             rms=np.array([self._known[place][1] for place in order]),
             others=np.delete(found, self._d, axis=1),
             interval=(low_, high_),
-            estimate=self._value(self._place),
+            estimate=self._value(best),
             evaluations=self.evaluations,
             is_complete=not self.stopped,
         )
@@ -157,6 +186,7 @@ class _Walk:
     def _half_width(self, theta: FloatArray) -> float:
         """What the covariance promises, at most the range and at least what can be told apart."""
         columns, error = (sensed := sensitivities(self._problem, theta)).columns, sensed.error
+        self._factor = _factor(error, loss_scale(self._problem))
         self.evaluations += sensed.evaluations
         others = np.delete(columns, self._d, axis=1)
         own = columns[:, self._d]
@@ -212,13 +242,22 @@ class _Walk:
         rms = self._known[place][1]
         if rms == best:
             return 0.0
-        return 2.0 * self._problem.n_scored * float(np.log(rms / best)) if best > 0 else np.inf
+        return 2.0 * self._factor * self._problem.n_scored * float(np.log(rms / best))
 
     def _value(self, place: float) -> float:
         if place in self._known:
             return float(self._known[place][0][self._d])
         every = np.full((1, len(self._problem.space)), place)
         return float(located(self._problem.evaluator, every)[0, self._d])
+
+
+def _factor(error: FloatArray, scale: float) -> float:
+    """What makes n ln(R/R₀) a ratio of χ²: 1 for squares."""
+    if scale == 0.0:
+        return 1.0
+    root = 1.0 + (error / scale) ** 2
+    least = 2.0 * scale**2 * float(np.mean(np.sqrt(root) - 1.0))
+    return least * float(np.mean(root**-1.5)) / float(np.mean(error**2 / root))
 
 
 def _holding(problem: Problem, d: int, value: float) -> Problem:

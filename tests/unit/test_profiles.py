@@ -3,15 +3,19 @@
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidSettings
+from sysid.errors import InvalidRecord, InvalidSettings
+from sysid.models.library import load_model
 from sysid.models.spec import parse_model
 from sysid.problem import Problem
 from sysid.profiles import QUANTILE, profile
 from sysid.records import Channel, Record
 from sysid.refinement import refine
+from sysid.settings import Loss
 from sysid.types import FloatArray
 from sysid.uncertainty import analyse
-from tests.searching import DUFFING, example
+from tests.searching import DUFFING, STEP, example, noisy, record
+
+TRUTH = np.array([DUFFING[name] for name in ("c", "L", "b", "a")])
 
 
 def linear(n: int = 400, sd: float = 0.3, **bounds: float) -> tuple[Problem, FloatArray]:
@@ -97,3 +101,77 @@ def test_what_cannot_be_profiled_is_refused() -> None:
         profile(problem, theta, "r")
     with pytest.raises(InvalidSettings, match="need 3 or more"):
         profile(problem, theta, "p", points=2)
+
+
+@pytest.mark.parametrize("name", ["c", "L", "b", "a"])
+def test_intervals_of_example_1_are_nearly_those_of_the_covariance(name: str) -> None:
+    found = profile(example(), TRUTH, name)
+    end = refine(example(), [TRUTH])[0]
+    assert end is not None
+    [error] = [e.stderr for e in analyse(example(), end.theta).estimates if e.name == name]
+    assert error is not None
+    expected = (found.estimate - 1.96 * error, found.estimate + 1.96 * error)
+    assert found.interval == pytest.approx(expected, abs=0.1 * error)
+
+
+def test_where_the_profile_is_begun_does_not_matter() -> None:
+    problem, theta = linear()
+    beside = profile(problem, theta + np.array([0.3, -0.2]), "p")
+    there = profile(problem, theta, "p")
+    assert beside.interval == pytest.approx(there.interval, rel=1e-4)
+    assert beside.estimate == pytest.approx(there.estimate, rel=1e-6)
+
+
+def test_factors_of_one_product_have_open_ends() -> None:
+    times = STEP * np.arange(100)
+    u = np.cos(times)
+    model = parse_model({
+        "name": "product", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
+        "parameters": {"g": {"lower": 0.5, "upper": 2}, "h2": {"lower": 0.1, "upper": 10}},
+        "equations": {"x": "g*h2*u(k)"}, "outputs": {"y": "x"}, "initial": {"x": 0},
+    })  # fmt: skip
+    y = u + 0.1 * np.random.default_rng(1).standard_normal(times.size)
+    data = Record((Channel("u", times, u),), (Channel("y", times, y),))
+    found = profile(Problem.build(model, [data], skip=1), np.array([1.0, 1.0]), "g")
+    assert found.interval == (None, None)
+    assert found.values[[0, -1]] == pytest.approx([0.5, 2.0])
+    assert np.all(found.ratio < 1e-6)
+    assert found.values * found.others[:, 0] == pytest.approx(np.ones(found.values.size), abs=0.1)
+
+
+def test_the_interval_of_a_rounded_lag_holds_its_plateau() -> None:
+    solver = {"history": "constant", "interpolation": "nearest"}
+    model = load_model({**load_model("duffing-eq16").document, "solver": solver})
+    problem = Problem.build(model, [record(noisy())])
+    low, high = profile(problem, TRUTH, "L").interval
+    assert low is not None
+    assert high is not None
+    assert low <= 0.49 + 1e-3
+    assert high >= 0.51 - 1e-3
+    assert high - low < 3 * STEP
+
+
+def test_the_ratio_of_a_robust_loss_is_scaled_to_its_standard_errors() -> None:
+    y = noisy()
+    y[::20] += 0.2
+    problem = Problem.build(load_model("duffing-eq16"), [record(y)], loss=Loss("soft-l1", 0.01))
+    end = refine(problem, [TRUTH])[0]
+    assert end is not None
+    found = profile(problem, end.theta, "b")
+    [error] = [e.stderr for e in analyse(problem, end.theta).estimates if e.name == "b"]
+    low, high = found.interval
+    assert low is not None
+    assert high is not None
+    assert error is not None
+    assert high - low == pytest.approx(2 * 1.96 * error, rel=0.15)
+
+
+def test_a_record_without_residuals_has_no_profile() -> None:
+    with pytest.raises(InvalidRecord, match="needs residuals"):
+        profile(example(sd=0.0), TRUTH, "b")
+
+
+def test_as_many_samples_as_parameters_have_no_profile() -> None:
+    problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], skip=296)
+    with pytest.raises(InvalidRecord, match="4 samples are not more than 4"):
+        profile(problem, TRUTH, "b")
