@@ -20,7 +20,8 @@ class ProfileOut(Answer):
     """The profile likelihood of one parameter.
 
     `ratio` is n ln(S(v)/S₀) at `values`; an end of `interval95` is null where the ratio stays
-    below the threshold up to the bound, or as far as was looked.
+    below the threshold up to the bound, or as far as was looked. `others` are the free parameters
+    besides, estimated anew at each of `values`.
     """
 
     name: str
@@ -30,6 +31,7 @@ class ProfileOut(Answer):
     values: list[float]
     ratio: list[float | None]
     rms: list[float | None]
+    others: dict[str, list[float]]
     evaluations: int
 
 

@@ -75,6 +75,11 @@ def test_a_profile_has_the_interval_and_its_figure(served: Served) -> None:
     assert low < estimate["value"] < high
     assert one["estimate"] == pytest.approx(estimate["value"])
     assert one["ratio"][0] > answer["threshold"]
+    assert set(one["others"]) == {"k", "A", "J"}
+    gains = [
+        k * a / j for k, a, j in zip(*(one["others"][p] for p in ("k", "A", "J")), strict=True)
+    ]
+    assert gains == pytest.approx([2.0] * len(one["values"]), rel=0.05)
     trace = answer["figure"]["data"][0]
     assert trace["x"] == one["values"]
     assert trace["y"] == one["ratio"]
