@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from sysid.export.expressions import ATOM, Language
-from sysid.export.identified import Identified
+from sysid.export.identified import Identified, variants_of
 
 _FUNCTIONS = {
     "sin": "sin", "cos": "cos", "tan": "tan", "exp": "exp", "log": "log", "sqrt": "sqrt",
@@ -82,6 +82,21 @@ static double held(const double *signal, long n, double place, double ramp)
     return before + part*(after - before);
 }
 """
+_HELD_ON_GRID = """\
+/* Signal at a place in samples, held after each; on lines between points `ramp` apart. */
+static double held(const double *signal, long n, double place, double ramp)
+{
+    const double inside = fmin(fmax(place, -1.0), (double)n);
+    const double first = floor(inside/ramp), part = inside/ramp - first;
+    double value = 0.0;
+    for (int j = 0; j < 2; ++j)
+        for (int side = -1; side < 2; side += 2) { /* at a jump the mean of both sides */
+            const long k = (long)floor((first + j)*ramp + 1e-6*side);
+            value += 0.5*(j == 0 ? 1.0 - part : part)*signal[k < 0 ? 0 : k < n ? k : n - 1];
+        }
+    return value;
+}
+"""
 _SAMPLE = """\
 /* Value at a step that may lie before the start. */
 static double sample(const double *array, double before, long step)
@@ -146,6 +161,7 @@ static double greatest(double a, double b)
 """
 HELPERS: Mapping[str, str] = {
     "sign": _SIGN, "least": _LEAST, "greatest": _GREATEST, "between": _BETWEEN, "held": _HELD,
+    "held on grid": _HELD_ON_GRID,
     "sample": _SAMPLE, "past": _PAST, "past cubic": _PAST_CUBIC, "lately": _LATELY,
 }  # fmt: skip
 
@@ -157,6 +173,5 @@ def with_needed(used: Iterable[str], identified: Identified) -> list[str]:
         wanted.add("past")
     if "past" in wanted:
         wanted.add("sample")
-    cubic = identified.model.solver.interpolation == "cubic"
-    found = [name for name in HELPERS if name in wanted]
-    return ["past cubic" if name == "past" and cubic else name for name in found]
+    variants = variants_of(identified)
+    return [variants.get(name, name) for name in HELPERS if name in wanted]

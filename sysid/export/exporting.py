@@ -1,6 +1,7 @@
 """`sysid.export`: an identified model in a format for other programs."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -11,10 +12,12 @@ from sysid.export.control import control_source
 from sysid.export.document import json_source
 from sysid.export.identified import Covariance, Identified, Value
 from sysid.export.python import python_source
+from sysid.language.evaluation import value as value_of
 from sysid.models.initial import initial_name
 from sysid.models.model import Model
 from sysid.records import HOLDS, Hold
 from sysid.result import Identification
+from sysid.ties import ties_of
 
 Format = Literal["json", "python", "c", "control"]
 FORMATS: tuple[Format, ...] = get_args(Format)
@@ -43,7 +46,7 @@ def export(
     model : Model
     found : Identification or mapping of str to float
         A result, or every parameter's value; with initial values such as ``x(0)`` where the
-        model estimates them.
+        model estimates them. One that is tied to others may be left out.
     format : {"json", "python", "c", "control"}
     sample_time : float, optional
         Sampling period of the data in s; a transfer function in z needs it.
@@ -104,7 +107,17 @@ def _values(
         return values, None if known is None else Covariance(known.names, known.covariance)
     units = {one.name: one.unit for one in model.parameters}
     units |= {initial_name(state.name, 0): state.unit for state in model.states}
-    return tuple(Value(n, float(v), units.get(n, "1")) for n, v in found.items()), None
+    numbers = _with_ties(model, found)
+    return tuple(Value(n, float(v), units.get(n, "1")) for n, v in numbers.items()), None
+
+
+def _with_ties(model: Model, found: Mapping[str, float]) -> dict[str, float]:
+    """The values, and those of tied parameters that are not among them."""
+    free = [replace(p, tied=None) if p.name in found else p for p in model.parameters]
+    for one in free:
+        if one.tied is None and one.name not in found:
+            raise InvalidSettings(f"/values/{one.name}", "a value is missing")
+    return {**{name: value_of(tie, found) for name, tie in ties_of(model, free).items()}, **found}
 
 
 def _check(
@@ -125,9 +138,6 @@ def _check(
 def _check_values(model: Model, numbers: Mapping[str, float]) -> None:
     names = [one.name for one in model.parameters]
     starts = {state.name for state in model.states}
-    for name in names:
-        if name not in numbers:
-            raise InvalidSettings(f"/values/{name}", "a value is missing")
     for name, value in numbers.items():
         if name not in names and name.partition("(0)")[0] not in starts:
             detail = f"the model has no parameter {name!r}{nearest(name, names)}"

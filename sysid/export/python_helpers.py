@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 
 from sysid.export.expressions import ATOM, Language
-from sysid.export.identified import Identified
+from sysid.export.identified import Identified, variants_of
 
 _FUNCTIONS = {
     "sin": "np.sin", "cos": "np.cos", "tan": "np.tan", "exp": "np.exp", "log": "np.log",
@@ -71,6 +71,17 @@ _HELD = '''def held(signal, place, ramp):
     before = signal[min(max(i - 1, 0), signal.size - 1)]
     return before + part*(signal[min(max(i, 0), signal.size - 1)] - before)
 '''
+_HELD_ON_GRID = '''def held(signal, place, ramp):
+    """Signal at a place in samples, held after each; on lines between points `ramp` apart."""
+    i = int(np.floor(place/ramp))
+    part = place/ramp - i
+    value = 0.0
+    for j, weight in ((i, 1.0 - part), (i + 1, part)):
+        for side in (-1e-6, 1e-6):  # at a jump the mean of both sides
+            k = int(np.floor(j*ramp + side))
+            value += 0.5*weight*signal[min(max(k, 0), signal.size - 1)]
+    return value
+'''
 _PAST = '''def past(array, before, step, lag):
     """Value `lag` >= 0 steps before a finished step, on a line between two; `before` the start."""
     i = int(np.floor(-lag))
@@ -99,7 +110,8 @@ _LATELY = '''def lately(array, before, step, part, there, lag):
     return past(array, before, step, lag - part)
 '''
 HELPERS: Mapping[str, str] = {
-    "between": _BETWEEN, "held": _HELD, "past": _PAST, "past cubic": _PAST_CUBIC,
+    "between": _BETWEEN, "held": _HELD, "held on grid": _HELD_ON_GRID,
+    "past": _PAST, "past cubic": _PAST_CUBIC,
     "lately": _LATELY,
 }  # fmt: skip
 
@@ -109,7 +121,6 @@ def with_needed(used: Iterable[str], identified: Identified) -> list[str]:
     wanted = set(used)
     if "lately" in wanted:
         wanted.add("past")
-    cubic = identified.model.solver.interpolation == "cubic"
     order = ("between", "held", "past", "lately")
-    found = [name for name in order if name in wanted]
-    return ["past cubic" if name == "past" and cubic else name for name in found]
+    variants = variants_of(identified)
+    return [variants.get(name, name) for name in order if name in wanted]

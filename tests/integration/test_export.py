@@ -1,0 +1,310 @@
+"""An exported program does what `sysid.simulate` does, for every model of the catalogue."""
+
+import ast
+import ctypes
+import json
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import yaml
+
+import sysid
+from sysid.errors import InvalidSettings
+from sysid.models.library import catalogue, load_model
+from sysid.models.model import Model
+from sysid.models.spec import parse_model, with_terms
+from sysid.records import Hold
+from sysid.types import FloatArray
+from tests.exporting import compiled, in_c, in_python, simulated, with_entry
+
+N = 240
+
+
+class Case(NamedTuple):
+    """A model with values; its inputs are steps of this amplitude, its period `h` is in s."""
+
+    values: dict[str, float]
+    h: float = 0.05
+    amplitude: float = 1.0
+
+
+NARX = {p.name: 0.02 for p in load_model("narx").parameters} | {"dh": 2.4, "dk": 1.7}
+CASES = {
+    "actuator": Case({"J": 6e-4, "F_c": 0.01, "F_max": 0.03, "k_a": 60, "k_b": 60, "k_c": 8e5,
+                      "A_m": 5e-6, "B": 1e-3, "theta_s": 2.36, "theta(0)": 0.3}, 0.01, 3e4),
+    "coulomb-delay": Case({"c": 0.2, "L": 0.3337, "b": 5, "mu": 0.5}, 0.02, 10),
+    "coulomb-eq16": Case({"c": 0.2, "L": 0.3337, "b": 5, "mu": 0.5}, 0.02, 10),
+    "delayed-logistic": Case({"r": 1.2, "K": 2, "L": 1.237, "x(0)": 0.3}, 0.1),
+    "delayed-van-der-pol": Case({"mu": 0.7, "w": 2, "g": -0.5, "L": 0.4337, "x(0)": 0.3,
+                                 "v(0)": -0.2}),
+    "duffing-delay": Case({"c": 0.2, "L": 0.5137, "b": 5, "a": 1}, 0.02, 10),
+    "duffing-eq16": Case({"c": 0.2, "L": 0.5137, "b": 5, "a": 1}, 0.02, 10),
+    "emps": Case({"M": 95, "Fv": 200, "Fc": 20, "o": -3, "y(0)": 0.1}, 0.01),
+    "exponential": Case({"L": 0.8}, 0.02),
+    "fopdt": Case({"K": 2, "T": 0.8, "L": 0.4337, "y0": 0.3, "x(0)": 0.3}),
+    "mackey-glass": Case({"beta": 0.2, "gamma": 0.1, "n": 10, "L": 17.3, "x(0)": 0.9}, 0.5),
+    "narx": Case({**NARX, "y(0)": 0.3}),
+    "silverbox": Case({"b": 1e5, "d": 50, "k1": 2e5, "k2": 1e4, "k3": 5e5, "c": 10, "L": 0.0013,
+                       "y(0)": 0.02, "v(0)": 1.0}, 0.001, 0.1),
+    "silverbox-9": Case({"b": 1e5, "d": 50, "d1": 5, "d2": 20, "k1": 2e5, "k2": 1e4, "k3": 5e5,
+                         "k5": 1e4, "c": 10, "L": 0.0013, "y(0)": 0.02, "v(0)": 1.0}, 0.001, 0.1),
+    "sopdt": Case({"K": 2, "T1": 0.8, "r": 0.4, "L": 0.4337, "y0": 0.3, "x(0)": 0.3, "w(0)": 0}),
+    "tube": Case({"K": 1, "T": 0.3, "L": 0.2137, "y(0)": 0.3}),
+    "tube-second-order": Case({"K": 1, "w": 5, "z": 0.5, "L": 0.4337, "y(0)": 0.3}),
+}  # fmt: skip
+
+# What the catalogue does not have: methods, grids, interpolation, names that a program needs
+# itself, two inputs and outputs, states before they are updated, time itself.
+TWO = """
+name: double
+form: differential
+inputs: {i: N, q: N}
+states: {int: m, ω: m/s}
+parameters:
+  lambda: {lower: 0, upper: 5, unit: s}
+  n: {lower: 0, upper: 9}
+  p: {lower: 0, upper: 9, tied: 2*n}
+  np: {lower: 0, upper: 9}
+equations:
+  int: ω(t - lambda/2)
+  ω: >-
+    i(t - lambda) + 0.5*q - p*int - np*ω(t - 0.013)
+    + 0.1*min(q, t)*where(int > 0 and not q < 0, 1, -2)
+outputs: {int: int + i, step: "max(ω(t - lambda), -abs(int))**2"}
+initial: {int: {lower: -1, upper: 1}, ω: 0.5}
+"""
+RECURSION = """
+name: while
+form: difference
+inputs: {u: "1"}
+states: {x: "1", w: "1"}
+parameters: {L: {lower: 0, upper: 1, unit: s}, d: {lower: 0, upper: 3}}
+equations:
+  x: 0.4*w(k-1 - L/h) + 0.3*x(k - 1.25) + 0.1*u(k - d) + 0.01*sin(t)
+  w: 0.5*x + 0.2*x(k - L/h) - 0.1*x(k-2 - L/h) - 0.1*where(k > 20, u(k-1), 0) + (-0.3)**2/7
+outputs: {y: x(k - 1.6), z: w}
+initial: {x: 0.2, w: 0.1}
+"""
+LINEAR_NARX = {
+    "name": "chosen", "form": "polynomial", "output": "y", "inputs": {"u": "1"}, "degree": 2,
+    "lags": {"y": [1, 2], "u": [1, "1 + d"]}, "parameters": {"d": {"lower": 0, "upper": 4}},
+    "coefficients": {"lower": -2, "upper": 2}, "terms": {"select": "frols", "keep": 3},
+}  # fmt: skip
+
+
+def written(text: str, **solver: Any) -> Model:
+    document = yaml.safe_load(text)
+    return parse_model({**document, "solver": solver} if solver else document)
+
+
+def selected() -> Model:
+    """A polynomial whose terms were selected."""
+    labels = [term.label for term in parse_model(LINEAR_NARX).terms]
+    return with_terms(parse_model(LINEAR_NARX), [labels[0], labels[1], labels[-1]])
+
+
+COEFFICIENTS = dict(
+    zip([p.name for p in selected().parameters if p.name != "d"], (0.6, 0.2, 0.1), strict=True)
+)
+_TWO = Case({"lambda": 0.1337, "n": 2.5, "np": 0.7, "int(0)": 0.2})
+_RECURSION = Case({"L": 0.0712, "d": 1.3})
+WRITTEN: dict[str, tuple[Model, Case]] = {
+    "rk4": (written(TWO), _TWO),
+    "rk4_substeps_cubic": (written(TWO, substeps=3, interpolation="cubic"), _TWO),
+    "rk4_own_step": (written(TWO, step=0.017, history="zero"), _TWO),
+    "euler_nearest": (written(TWO, method="euler", substeps=2, interpolation="nearest"), _TWO),
+    "semi_implicit": (written(TWO, method="semi-implicit", history="zero", step=0.03), _TWO),
+    "selected": (selected(), Case({"d": 1.6, **COEFFICIENTS, "y(0)": 0.1})),
+    "recursion": (written(RECURSION), _RECURSION),
+    "recursion_cubic": (written(RECURSION, interpolation="cubic", history="zero"), _RECURSION),
+    "recursion_substeps": (written(RECURSION, substeps=3), _RECURSION),
+    "recursion_nearest": (written(RECURSION, interpolation="nearest"), _RECURSION),
+}
+MODELS = {
+    name.replace("-", "_"): (load_model(name), case) for name, case in CASES.items()
+} | WRITTEN
+
+
+def excitation(model: Model, case: Case) -> tuple[FloatArray, dict[str, FloatArray]]:
+    draw = np.random.default_rng(7)
+    times = 1.5 + case.h * np.arange(N)
+    levels = case.amplitude * np.array([0.0, 1.0, 0.4, -1.0])
+    return times, {one.name: np.repeat(draw.choice(levels, N // 12), 12) for one in model.inputs}
+
+
+def test_every_model_of_the_catalogue_has_a_case() -> None:
+    assert set(CASES) == set(catalogue())
+
+
+@pytest.fixture(scope="module", params=["zero", "first"])
+def built(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Hold, ctypes.CDLL]:
+    """All models as C in one library, for one hold of the inputs."""
+    hold: Hold = request.param
+    sources = {}
+    for name, (model, case) in MODELS.items():
+        holds = {one.name: hold for one in model.inputs}
+        text = sysid.export(model, case.values, "c", hold=holds)
+        plain = with_entry(text, f"run_{name}", len(model.inputs), len(model.outputs))
+        stem = text.split("_identified(void)")[0].split()[-1]
+        sources[name] = plain.replace(f"{stem}_", f"{name}_own_")
+    return hold, compiled(tmp_path_factory.mktemp("exported"), sources)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MODELS)
+def test_exported_programs_compute_what_the_simulation_does(
+    name: str, built: tuple[Hold, ctypes.CDLL]
+) -> None:
+    hold, library = built
+    model, case = MODELS[name]
+    times, inputs = excitation(model, case)
+    expected = simulated(model, case.values, times, inputs, hold)
+    text = sysid.export(model, case.values, "python", hold=dict.fromkeys(inputs, hold))
+    python = in_python(text, times, list(inputs.values()))
+    c = in_c(library, f"run_{name}", times, list(inputs.values()), len(model.outputs))
+    for told, *found in zip(expected, python, c, strict=True):
+        assert np.ptp(told) > 0
+        for one in found:
+            np.testing.assert_allclose(one, told, rtol=1e-9, atol=1e-9 * np.max(np.abs(told)))
+
+
+def case_of(name: str) -> tuple[Model, Case]:
+    return load_model(name), CASES[name]
+
+
+def test_the_document_has_all_that_is_needed_to_simulate_again() -> None:
+    model, case = MODELS["rk4"]
+    text = sysid.export(model, case.values, "json", sample_time=0.05, hold={"i": "zero"})
+    document = json.loads(text)
+    again = parse_model(document["model"])
+    values = {one["name"]: one["value"] for one in document["values"]}
+    units = {one["name"]: one["unit"] for one in document["values"]}
+    assert values == {**case.values, "p": 2 * case.values["n"]}
+    assert units["lambda"] == "s"
+    assert units["int(0)"] == "m"
+    assert document["data"] == {"sample_time": 0.05, "hold": {"i": "zero", "q": "first"}}
+    times, inputs = excitation(model, case)
+    for one, other in zip(
+        simulated(again, values, times, inputs, "first"),
+        simulated(model, case.values, times, inputs, "first"), strict=True,
+    ):  # fmt: skip
+        np.testing.assert_array_equal(one, other)
+
+
+def test_an_identification_is_exported_with_its_uncertainty() -> None:
+    model = load_model("tube")
+    times = 0.05 * np.arange(200)
+    u = np.where(times % 3 < 1.5, 0.0, 1.0)
+    truth = {"K": 1.0, "T": 0.3, "L": 0.21, "y(0)": 0.0}
+    noise = np.random.default_rng(1).normal(0, 0.01, times.size)
+    y = simulated(model, truth, times, {"u": u}, "zero")[0] + noise
+    record = sysid.Record(
+        (sysid.Channel("u", times, u, hold="zero"),), (sysid.Channel("y", times, y),)
+    )
+    small = sysid.GeneticAlgorithm(population=16, generations=20, islands=1)
+    found = sysid.identify(model, [record], small, parameters={"L": {"upper": 1.0}})
+    document = json.loads(sysid.export(model, found, "json", provenance={"made": "here"}))
+    stderr = {one["name"]: one["stderr"] for one in document["values"]}
+    covariance = document["covariance"]
+    variances = dict(zip(covariance["names"], np.diag(covariance["matrix"]), strict=True))
+    for name, variance in variances.items():
+        assert stderr[name] ** 2 == pytest.approx(variance)
+    assert document["provenance"] == {"made": "here"}
+    text = sysid.export(model, found, "python", hold={"u": "zero"})
+    assert f"standard error {stderr['T']:.3g}" in text
+    # The tube starts where it was measured, so that is to be given.
+    expected = simulated(
+        model, {one.name: one.value for one in found.estimates} | {"y(0)": y[0]}, times,
+        {"u": u}, "zero",
+    )  # fmt: skip
+    np.testing.assert_allclose(in_python(text, times, [u], y_0=y[0]), expected, rtol=1e-9)
+    with pytest.raises(TypeError, match="y_0"):
+        in_python(text, times, [u])
+
+
+# ---- what is refused, and what names and titles may hold ------------------------------------
+@pytest.mark.parametrize(
+    ("change", "pointer"),
+    [
+        ({"format": "pascal"}, "/format"),
+        ({"format": "control", "pade_order": 0}, "/pade_order"),
+        ({"hold": {"u": "second"}}, "/hold/u"),
+        ({"hold": {"v": "zero"}}, "/hold/v"),
+        ({"sample_time": float("nan")}, "/sample_time"),
+    ],
+)
+def test_an_option_that_cannot_be_used_is_named(change: dict[str, Any], pointer: str) -> None:
+    with pytest.raises(InvalidSettings) as caught:
+        sysid.export(*case_of("tube")[:1], CASES["tube"].values, **change)
+    assert caught.value.pointer == pointer
+
+
+@pytest.mark.parametrize(
+    ("values", "name"),
+    [({"K": 1.0, "T": 0.3}, "L"), ({"K": 1.0, "T": 0.3, "L": 0.1, "W": 1.0}, "W"),
+     ({"K": 1.0, "T": float("inf"), "L": 0.1}, "T")],
+)  # fmt: skip
+def test_a_value_that_is_missing_unknown_or_not_finite_is_named(
+    values: dict[str, float], name: str
+) -> None:
+    with pytest.raises(InvalidSettings) as caught:
+        sysid.export(load_model("tube"), values, "python")
+    assert caught.value.pointer == f"/values/{name}"
+
+
+def test_a_model_whose_terms_are_not_selected_yet_is_refused() -> None:
+    model = parse_model(LINEAR_NARX)
+    with pytest.raises(InvalidSettings, match="not selected"):
+        sysid.export(model, {one.name: 0.1 for one in model.parameters}, "c")
+
+
+HOSTILE = (
+    '"""\nimport os\nos.abort()\n"""', "*/ int main(void) { abort(); } /*", "\\", 'end\\"""', "'''",
+    "// \\\nint x;", "??/\n#error", "\u202e\u2028\u0085#error", "%s {x} @PAIRS@ @ORDER@",
+    "\\N{x}\\u",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_no_text_of_a_model_gets_out_of_comments(text: str, tmp_path: Path) -> None:
+    document = dict(load_model("tube").document)
+    document |= {"title": text, "source": text, "description": f"{text} {text[::-1]}"}
+    document["inputs"] = {"u": text}
+    document["parameters"] = {
+        name: {**one, "description": text, "unit": "s" if name == "L" else text}
+        for name, one in document["parameters"].items()
+    }
+    plain, model, values = load_model("tube"), parse_model(document), CASES["tube"].values
+    provenance = {text: text, "list": [text, {"a": text}]}
+    for format in ("python", "control"):
+        found = sysid.export(model, values, format, provenance=provenance)
+        # As a tree, the program is that of the model without these texts.
+        told, expected = (
+            without_docstrings(one) for one in (found, sysid.export(plain, values, format))
+        )
+        assert told == expected
+    found = sysid.export(model, values, "c", provenance=provenance)
+    assert without_comments(found) == without_comments(sysid.export(plain, values, "c"))
+    assert json.loads(sysid.export(model, values, "json"))["model"]["title"] == model.title
+
+
+def without_docstrings(source: str) -> str:
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.FunctionDef):
+            first = node.body[0]
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
+                del node.body[0]
+    return ast.unparse(tree)
+
+
+def without_comments(source: str) -> str:
+    """As a C compiler sees it: lines are joined before comments are taken out."""
+    assert "??" not in source
+    joined = source.replace("\\\n", "")
+    return " ".join(re.sub(r"/\*.*?\*/", " ", joined, flags=re.S).split())
