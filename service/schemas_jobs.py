@@ -80,14 +80,14 @@ class MigrationIn(Body):
 class StopIn(Body):
     """End conditions besides the generations.
 
-    `settled`: `improved` ends when that many searches from new random places, and at least half of
+    `settled`: `improved` ends when that many searches from new random places, and two thirds of
     all, have led to the best individual; null: never.
     """
 
     evaluations: Evaluations | None = None
     seconds: float | None = Field(default=None, gt=0)
     rms: float | None = Field(default=None, gt=0)
-    settled: int | None = Field(default=3, ge=1, le=1_000_000)
+    settled: int | None = Field(default=6, ge=1, le=1_000_000)
 
 
 class IslandIn(Body):

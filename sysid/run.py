@@ -29,6 +29,7 @@ CALL_SECONDS = 0.1
 """Aimed at for one compiled call, by measured cost, so that a cancel is heard in time."""
 
 _TARGET_ROUND = 5  # generations between two looks at the target RMS
+_AGREE = 2 / 3  # of the searches from random places: a false optimum seldom draws so many
 
 
 def begin(
@@ -86,7 +87,7 @@ def _has_ended(algorithm: GeneticAlgorithm, state: RunState) -> bool:
     if algorithm.stop.rms is not None and state.rms <= algorithm.stop.rms:
         return True
     if algorithm.stop.settled is not None and state.confirmed >= max(
-        algorithm.stop.settled, state.independent / 2
+        algorithm.stop.settled, _AGREE * state.independent
     ):
         return True
     # Below the border only those islands stay that have used up their evaluations.

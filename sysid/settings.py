@@ -59,14 +59,14 @@ class Stop:
     """End conditions besides the generations; whichever comes first. None: not used.
 
     `settled`: the best individual was found that often, each time from new random places, and by
-    at least half of all such searches. Only the adaptive sequence search makes these, so that the
+    at least two thirds of all such searches. Only the adaptive sequence search makes these, so that the
     paper's methods never end by it.
     """
 
     evaluations: int | None = None
     seconds: float | None = None
     rms: float | None = None
-    settled: int | None = 3
+    settled: int | None = 6
 
     def __post_init__(self) -> None:
         for name in ("evaluations", "seconds", "rms", "settled"):

@@ -8,7 +8,7 @@ from sysid.models.library import document
 from sysid.records import Channel, Record
 from sysid.result import Identification
 from sysid.run import RunState
-from sysid.settings import GeneticAlgorithm
+from sysid.settings import GeneticAlgorithm, Stop
 from sysid.types import FloatArray
 from workers.feeding import Feeder
 from workers.ports import (
@@ -43,9 +43,15 @@ RECORDS: Mapping[str, Records] = {"short": (step_record(),), "long": (step_recor
 def spec(
     seed: int = 1, records: str = "short", generations: int = 60, **settings: object
 ) -> RunSpec:
-    """A small search with two islands."""
+    """A small search with two islands, as long as it is told to be."""
     algorithm = GeneticAlgorithm(
-        **{"population": 16, "generations": generations, "islands": 2, **settings}  # type: ignore[arg-type]
+        **{
+            "population": 16,
+            "generations": generations,
+            "islands": 2,
+            "stop": Stop(settled=None),
+            **settings,
+        }  # type: ignore[arg-type]
     )
     parameters = {"T": {"upper": 10.0}, "L": {"upper": 2.0}}
     problem = ProblemSpec(document("fopdt"), records, parameters=parameters)

@@ -96,6 +96,8 @@ def start_development(
         memory[GROWTH] = 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
         chosen = below(word[1], 3 * words.shape[0]) - words.shape[0]
         chosen = -1 if counters[DEVELOPMENTS] == 2 else chosen
+        if counters[EVALUATIONS] + words.shape[0] > plan.evaluations:
+            chosen = max(chosen, 0)  # the places of a fresh start would pass the budget
         counters[PROBES] = words.shape[0] // 3  # in lanes that would idle
     elif counters[SETTLED]:
         counters[PROBES] = words.shape[0]
