@@ -1,0 +1,171 @@
+"""The identified model of a run as JSON, Python, C and python-control: REST, clients, commands."""
+
+import asyncio
+import json
+from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import httpx
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+from typer.testing import CliRunner
+
+from service.app import create_app
+from service.cli.main import app as commands
+from service.client import AsyncClient, Client, ProblemError
+from tests.exporting import in_control, in_python
+from tests.identified import identified
+from tests.integration.rest.test_client import Through
+from tests.rest import CSV, recording, refused, settings_of
+
+SMALL = {"population": 16, "generations": 20, "islands": 1}
+POLYNOMIAL = {
+    "name": "chosen", "form": "polynomial", "output": "y", "inputs": {"u": "1"}, "degree": 2,
+    "lags": {"y": [1], "u": [6]}, "coefficients": {"lower": -1, "upper": 1},
+    "terms": {"select": "frols", "keep": 3},
+}  # fmt: skip
+FORMATS = {
+    "json": ("application/json", "fopdt.json"),
+    "python": ("text/x-python; charset=utf-8", "fopdt_model.py"),
+    "c": ("text/x-c; charset=utf-8", "fopdt.c"),
+    "control": ("text/x-python; charset=utf-8", "fopdt_control.py"),
+}
+
+
+class Served(NamedTuple):
+    """An application with a finished run of a linear model, one of a polynomial, one that waits."""
+
+    server: TestClient
+    dataset: str
+    run: str
+    polynomial: str
+    waiting: str
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    app = create_app(settings_of(tmp_path_factory.mktemp("exports")))
+    with TestClient(app) as server:
+        data = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
+        parts = server.app.state.parts  # type: ignore[attr-defined]
+        body = {
+            "model": "fopdt", "datasets": [data], "algorithm": SMALL, "hold": {"u": "zero"},
+            "parameters": {"K": {"lower": 0, "upper": 5}, "L": {"upper": 2}, "x(0)": {"fixed": 0}},
+        }  # fmt: skip
+        _, (run,) = identified(parts, body)
+        _, (polynomial,) = identified(parts, {**body, "model": POLYNOMIAL, "parameters": {}})
+        waiting = server.post("/v1/jobs", json=body).json()["id"]
+        (queued,) = server.get(f"/v1/jobs/{waiting}/runs").json()["items"]
+        yield Served(server, data, run, polynomial, queued["id"])
+
+
+def export(served: Served, run: str, **given: Any) -> httpx.Response:
+    return served.server.get(f"/v1/runs/{run}/export", params=given)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_every_format_is_a_file_with_its_type_and_name(served: Served, format: str) -> None:
+    answer = export(served, served.run, format=format)
+    assert answer.status_code == 200, answer.text
+    media_type, name = FORMATS[format]
+    assert answer.headers["content-type"] == media_type
+    assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
+    assert served.run in answer.text
+
+
+def test_the_document_tells_estimates_and_where_they_come_from(served: Served) -> None:
+    document = export(served, served.run).json()
+    result = served.server.get(f"/v1/runs/{served.run}").json()
+    for told, known in zip(document["values"], result["parameters"], strict=True):
+        assert told == {name: known[name] for name in told}
+    correlation = result["correlation"]
+    assert document["covariance"]["names"] == correlation["names"]
+    errors = {one["name"]: one["stderr"] for one in result["parameters"]}
+    deviations = np.array([errors[name] for name in correlation["names"]])
+    expected = np.array(correlation["matrix"]) * np.outer(deviations, deviations)
+    np.testing.assert_allclose(document["covariance"]["matrix"], expected)
+    assert document["model"]["name"] == "fopdt"
+    assert document["data"] == {"sample_time": pytest.approx(0.1), "hold": {"u": "zero"}}
+    origin = document["provenance"]
+    stored = served.server.get(f"/v1/datasets/{served.dataset}").json()
+    assert origin["run"] == served.run
+    assert origin["job"] == result["job"]
+    assert origin["datasets"] == [
+        {"id": served.dataset, "name": "steps", "sha256": stored["sha256"]}
+    ]
+
+
+@pytest.mark.parametrize("which", ["run", "polynomial"])
+def test_the_exported_program_gives_the_response_that_the_run_has(
+    served: Served, which: str
+) -> None:
+    run = getattr(served, which)
+    text = export(served, run, format="python").text
+    answer = served.server.get(f"/v1/runs/{run}/response").json()
+    told = answer["experiments"][0]["simulated"][0]["values"]
+    rows = np.loadtxt(recording().decode().splitlines(), delimiter=",", skiprows=1)
+    start = {} if which == "run" else {"y_0": rows[0, 2]}
+    (y,) = in_python(text, rows[:, 0], [rows[:, 1]], **start)
+    np.testing.assert_allclose(y, told, rtol=1e-6, atol=1e-9)
+
+
+def test_a_linear_model_has_a_transfer_function_and_the_order_is_chosen(served: Served) -> None:
+    script = in_control(export(served, served.run, format="control", pade_order=5).text)
+    assert len(script["systems"]["u", "y"].denominator) == 2 + 5
+    values = {one["name"]: one["value"] for one in export(served, served.run).json()["values"]}
+    (gain,) = script["response"](script["pairs"]["u", "y"], [0.0])
+    assert gain == pytest.approx(values["K"])
+
+
+def test_what_cannot_be_exported_says_why(served: Served) -> None:
+    refused(export(served, "run_0"), 404, "not-found")
+    refused(export(served, served.waiting), 409, "conflict")
+    refused(export(served, served.run, format="pascal"), 422, "invalid")
+    refused(export(served, served.run, format="control", pade_order=0), 422, "invalid")
+    (fault,) = refused(export(served, served.polynomial, format="control"), 422, "invalid")
+    assert fault["pointer"] == "?format"
+    assert "not linear" in fault["detail"]
+
+
+def test_both_clients_give_the_text_that_rest_gives(served: Served) -> None:
+    client = Client("http://testserver", transport=Through(served.server))
+    assert json.loads(client.export(served.run)) == export(served, served.run).json()
+    told = export(served, served.run, format="c").text
+    assert client.export(served.run, "c") == told
+    with pytest.raises(ProblemError, match="not linear"):
+        client.export(served.polynomial, "control")
+
+    async def work() -> str:
+        transport = httpx.ASGITransport(served.server.app)  # type: ignore[arg-type]
+        async with AsyncClient("http://testserver", transport=transport) as opened:
+            return await opened.export(served.run, "c")
+
+    assert asyncio.run(work()) == told
+
+
+def test_the_command_writes_a_file_or_to_stdout(
+    served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = Client("http://testserver", transport=Through(served.server))
+    monkeypatch.setattr("service.cli.exporting.connected", lambda *_: nullcontext(client))
+    told = export(served, served.run, format="python").text
+    run = CliRunner().invoke
+    shown = run(commands, ["export", served.run, "--format", "python"])
+    assert (shown.exit_code, shown.stdout) == (0, told)
+    file = tmp_path / "model.py"
+    done = run(commands, ["export", served.run, "--format", "python", "--output", str(file)])
+    assert done.exit_code == 0, done.output
+    assert file.read_text(encoding="utf-8") == told
+    failed = run(commands, ["export", served.run, "--output", str(tmp_path / "no" / "file")])
+    assert failed.exit_code == 1
+    assert run(commands, ["export", served.run, "--format", "pascal"]).exit_code == 2
+
+
+def test_the_page_of_a_finished_run_links_to_every_format(served: Served) -> None:
+    job = served.server.get(f"/v1/runs/{served.run}").json()["job"]
+    page = served.server.get(f"/jobs/{job}").text
+    for format in FORMATS:
+        assert f"/v1/runs/{served.run}/export?format={format}" in page
