@@ -101,8 +101,9 @@ def _polished(
     if not algorithm.refine or "improved" not in methods:
         return (None,) * len(champions)
     limit = algorithm.stop.evaluations
-    # Standard errors take two simulations a parameter, a look at what cannot be told two more.
-    kept = 4 * len(champions[0]) + 1
+    # Standard errors take two simulations a parameter, beside jumps of the output ten more, and a
+    # look at what cannot be told two more.
+    kept = 14 * len(champions[0]) + 1
     left = None if limit is None else max(0, limit - state.evaluations - kept)
     return refine(problem, champions, left)
 
