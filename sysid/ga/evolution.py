@@ -214,8 +214,10 @@ def generations(
     """
     written = 0
     if np.any(np.isnan(fitness)):  # the beginning, or migrants from an island of other bits
-        best = np.inf if counters[EVALUATIONS] == 0 else np.nanmin(fitness)
-        phase = START if counters[EVALUATIONS] == 0 else MIGRATION
+        # Not by the evaluations: finding the starts of a polynomial may have taken some.
+        begins = np.all(np.isnan(fitness))
+        best = np.inf if begins else np.nanmin(fitness)
+        phase = START if begins else MIGRATION
         evaluate(evaluator, plan, words, fitness, counters)
         if fitness[0] < best:
             _note(evaluator, plan, words, fitness, counters, phase, improvements[0])

@@ -112,6 +112,7 @@ def test_a_fixed_coefficient_is_kept_and_the_others_are_solved_for() -> None:
     assert best == pytest.approx(rest, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["simple", "improved-paper"])
 def test_the_methods_of_the_paper_begin_without_starts(method: Any) -> None:
     posed = problem(narx_record(3.0, 7.0))
@@ -132,7 +133,8 @@ def test_a_model_that_is_no_polynomial_has_no_starts() -> None:
     assert equation_error_starts(posed, GeneticAlgorithm()).values == ()
 
 
-@pytest.mark.parametrize("evaluations", [100, 1000])
+@pytest.mark.slow
+@pytest.mark.parametrize("evaluations", [200, 1000])
 def test_simulations_of_the_starts_count(evaluations: int) -> None:
     algorithm = GeneticAlgorithm(stop=Stop(evaluations=evaluations))
     posed = problem(narx_record(3.0, 7.0, noise=0.05))
@@ -177,3 +179,25 @@ def test_the_same_selection_repeats_bit_for_bit() -> None:
     one, other = (identify(selecting(), record, SMALL) for _ in range(2))
     assert one.selection == other.selection
     assert values(one) == values(other)
+
+
+@pytest.mark.parametrize("islands", [1, 4])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_start_that_is_the_optimum_already_is_found_and_told(seed: int, islands: int) -> None:
+    rng = np.random.default_rng(seed)
+    u, y = rng.normal(size=200), np.zeros(200)
+    for k in range(2, 200):
+        y[k] = 0.6 * y[k - 1] - 0.2 * y[k - 2] + 0.5 * u[k - 1] + 0.02 * rng.normal()
+    times = np.arange(200.0)
+    model = load_model(
+        {
+            "name": "arx", "form": "polynomial", "output": "y", "inputs": {"u": "1"},
+            "coefficients": {"lower": -2, "upper": 2}, "terms": ["y(k-1)", "y(k-2)", "u(k-1)"],
+        }
+    )  # fmt: skip
+    record = Record((Channel("u", times, u, "1"),), (Channel("y", times, y, "1"),))
+    algorithm = GeneticAlgorithm(islands=islands, generations=30)
+    found = identify(model, [record], algorithm, seed=seed, prediction="one-step")
+    assert all(history and history[0].phase == "start" for history in found.history)
+    values = [one.value for one in found.estimates[:3]]
+    np.testing.assert_allclose(values, [0.6, -0.2, 0.5], atol=0.02)
