@@ -46,7 +46,14 @@ def problem(record: Record, **fields: Any) -> Problem:
     return Problem.build(load_model("narx"), [record], **fields)
 
 
-@pytest.mark.parametrize(("dh", "dk"), [(3.0, 7.0), (4.3, 12.6), (1.5, 30.2)])
+@pytest.mark.parametrize(
+    ("dh", "dk"),
+    [
+        (3.0, 7.0),
+        pytest.param(4.3, 12.6, marks=pytest.mark.slow),
+        pytest.param(1.5, 30.2, marks=pytest.mark.slow),
+    ],
+)
 def test_all_coefficients_and_both_lags_of_the_catalogue_model_are_recovered(
     dh: float, dk: float
 ) -> None:
