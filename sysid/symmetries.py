@@ -7,7 +7,8 @@ leaves A/J and B/J.
 
 The powers are found as in dimensional analysis. Every expression gets a weight, the power of r by
 which it is multiplied; the terms of a sum must have equal weights, what a function such as sin is
-taken of has weight 0, and so have inputs, outputs, time and lags. These are linear equations with
+taken of has weight 0, and so have inputs, outputs, time, lags, and both sides of a power whose
+exponent is no plain number. These are linear equations with
 rational coefficients, and they are solved exactly.
 """
 
@@ -142,19 +143,23 @@ class _Weights:
             case "/":
                 return None if a is None else _sum(a, b or {}, -1)
             case "**":
-                return self._power(a, tree.right)
+                return self._power(a, tree.right, b)
             case "and" | "or":
                 return {}
         self.equal(a, b)  # a comparison holds as before if both sides are scaled alike
         return {}
 
-    def _power(self, base: Weight | None, exponent: Expression) -> Weight | None:
+    def _power(
+        self, base: Weight | None, exponent: Expression, weight: Weight | None
+    ) -> Weight | None:
+        """Of a power; one whose exponent is no plain number pins the base and the exponent."""
         match exponent:
             case Number(value):
                 power = Fraction(value).limit_denominator(1000)
             case Unary("-", Number(value)):
                 power = -Fraction(value).limit_denominator(1000)
             case _:
+                self.equal({}, weight)
                 return self._pure(base)
         if base is None:
             return None if power > 0 else {}
