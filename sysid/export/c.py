@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Sequence
 
 from sysid.export.c_helpers import HELPERS, CLanguage, with_needed
-from sysid.export.description import facts, value_lines, wrapped
+from sysid.export.description import facts, unit_text, value_lines, wrapped
 from sysid.export.expressions import number, source
 from sysid.export.identified import Identified
 from sysid.export.identifiers import Identifiers, in_c_comment
@@ -100,8 +100,11 @@ def _elements(size: str) -> list[str]:
 def _about_simulate(program: Program) -> str:
     model = program.identified.model
     lines = ["Free run of the model at n regular times t (s)."]
-    lines += [f"Input {program.inputs[q.name]}: {q.name}, {q.unit}." for q in model.inputs]
-    lines += [f"Output {program.outputs[q.name]}: {q.name}, {q.unit}." for q in model.outputs]
+    for kind, names, signals in (
+        ("Input", program.inputs, model.inputs),
+        ("Output", program.outputs, model.outputs),
+    ):
+        lines += [f"{kind} {names[q.name]}: {q.name}, {unit_text(q.unit)}." for q in signals]
     lines += ["Gives 0; 1 if n, the times or a lag cannot be used; 2 if memory is short."]
     told = "\n".join(f" * {in_c_comment(line)}" for line in lines)
     return f"/*\n{told}\n */"
@@ -132,10 +135,10 @@ def _checks(program: Program) -> list[str]:
 def _steps(program: Program) -> list[str]:
     period, substeps = program.period, program.substeps
     if program.own_step is None:
-        times = f"*{substeps}" if substeps > 1 else ""
+        count = f"(n - 1)*{substeps}" if substeps > 1 else "n - 1"
         divided = f"/{number(substeps)}" if substeps > 1 else ""
         lines = [f"const double {period} = sample_time{divided};",
-                 f"const long steps = (n - 1){times};"]  # fmt: skip
+                 f"const long steps = {count};"]  # fmt: skip
     else:
         own = number(program.own_step)
         lines = [f"const double dt = {own}/{number(substeps)};",

@@ -87,7 +87,8 @@ def control_source(identified: Identified, pade_order: int = PADE_ORDER) -> str:
         pairs = [_entry(one, *_falling(one)) for one in found.pairs]
     body = body.replace("@PAIRS@", "\n".join(pairs))
     lines = [*facts(identified), *_deviations(identified, found)]
-    told = "\n".join(in_docstring(line) for line in lines)
+    title, *others = map(in_docstring, lines)
+    told = "\n".join([title, "", *others])
     return f'"""{told}\n"""\n\nimport control\nimport numpy as np\n\n{body}'
 
 
