@@ -79,8 +79,7 @@ class JobChecker:
             _tried(check_samples, found, len(model[0].terms), self._samples(body))
         found += self._repeated(body)
         found += self._data(body, tied, own)
-        scored = self._samples(body) - body["skip"] * len(body["datasets"])
-        found += _sample_faults(parameters, scored)
+        found += _sample_faults(parameters, self._scored(body, model[0]))
         found += self._unit_faults(body, model[0])
         return found + list(_signal_faults(body, model[0]))
 
@@ -149,6 +148,13 @@ class JobChecker:
         if not all(isinstance(one, Dataset) for one in found):
             return MOST_GENES
         return sum(one.n_samples for one in found if isinstance(one, Dataset))
+
+    def _scored(self, body: Body, model: Model) -> int:
+        """Samples of all outputs that are fitted, if none is missing."""
+        kept: float = (body["validation"] or {}).get("fraction") or 0.0
+        samples = self._samples(body)
+        skipped = body["skip"] * len(body["datasets"])
+        return (samples - round(kept * samples) - skipped) * len(model.outputs)
 
     def _conversions(self, body: Body) -> Iterator[FieldError]:
         found: list[FieldError] = []

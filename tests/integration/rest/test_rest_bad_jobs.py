@@ -1,0 +1,113 @@
+"""Jobs whose data cannot tell what is asked: refused when sent, or said with the run."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+from typer.testing import CliRunner
+
+from service.api.deps import Parts
+from service.app import create_app
+from service.cli.main import app as lagid
+from tests.identified import identified
+from tests.rest import CSV, recording, refused, settings_of
+
+SMALL = {"population": 20, "generations": 20, "islands": 1}
+FIRST: dict[str, Any] = {
+    "name": "first", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "parameters": {
+        "K": {"lower": 0.1, "upper": 5}, "T": {"lower": 0.1, "upper": 5},
+        "L": {"lower": 0, "upper": 2},
+    },
+    "equations": {"x": "(K*u(t - L) - x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
+}  # fmt: skip
+
+
+def constant(u: float | None = None, y: float | None = None) -> bytes:
+    """The usual recording with a constant in the place of its input or its output."""
+    head, *rows = recording().decode().split()
+    cells = [row.split(",") for row in rows]
+    kept = [(t, a if u is None else str(u), b if y is None else str(y)) for t, a, b in cells]
+    return "\n".join([head, *(",".join(row) for row in kept)]).encode()
+
+
+@pytest.fixture(scope="module")
+def parts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TestClient, Parts]]:
+    app = create_app(settings_of(tmp_path_factory.mktemp("bad")))
+    with TestClient(app, raise_server_exceptions=False) as client:
+        yield client, app.state.parts
+
+
+def stored(client: TestClient, content: bytes) -> str:
+    answer = client.post("/v1/datasets?name=one", content=content, headers=CSV)
+    assert answer.status_code in (200, 201), answer.text
+    return str(answer.json()["id"])
+
+
+def ended(parts: tuple[TestClient, Parts], content: bytes, **fields: Any) -> dict[str, Any]:
+    """The one run of a job on that recording, carried out."""
+    client, inside = parts
+    body = {"model": FIRST, "datasets": [stored(client, content)], "algorithm": SMALL, **fields}
+    _, (run,) = identified(inside, body)
+    answer = client.get(f"/v1/runs/{run}")
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
+
+
+def test_an_input_that_is_zero_fails_the_run_with_one_line_that_says_why(
+    parts: tuple[TestClient, Parts],
+) -> None:
+    run = ended(parts, constant(u=0.0))
+    assert run["state"] == "failed"
+    assert "none of K, T, L has an effect on the output" in str(run["error"])
+    assert "Traceback" not in str(run["error"])
+
+
+def test_an_input_that_is_constant_is_told_with_what_it_leaves_open(
+    parts: tuple[TestClient, Parts],
+) -> None:
+    run = ended(parts, constant(u=1.0), model="fopdt")
+    assert run["state"] == "succeeded"
+    (text,) = (one for one in run["warnings"] if "excites nothing" in one)
+    left = text.partition("unidentified: ")[2].split(", ")
+    status = {one["name"]: one["status"] for one in run["parameters"]}
+    assert left
+    assert all(status[name] in ("group", "unidentifiable") for name in left)
+
+
+def test_a_constant_output_is_fitted_and_the_fit_is_said_to_be_none(
+    parts: tuple[TestClient, Parts],
+) -> None:
+    run = ended(parts, constant(y=1.5))
+    assert run["state"] == "succeeded"
+    assert any("worse than a straight line" in one for one in run["warnings"])
+
+
+@pytest.mark.parametrize("fields", [{"skip": 298}, {"skip": 208, "validation": {"fraction": 0.3}}])
+def test_fewer_scored_samples_than_parameters_are_refused(
+    parts: tuple[TestClient, Parts], fields: dict[str, Any]
+) -> None:
+    client, _ = parts
+    body = {"model": FIRST, "datasets": [stored(client, recording())], **fields}
+    (fault,) = refused(client.post("/v1/jobs", json=body), 422, "invalid")
+    assert fault["pointer"] == "/datasets"
+    assert "2 scored samples in all for 3 free parameters" in fault["detail"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--set", "parameters.L.fixed=9"], "9 lies outside the bounds [0, 5] of 'L'"),
+        (["--set", "parameters.K.tied=T", "--set", "parameters.T.tied=K"], "circle, K → T → K"),
+        (["--set", "weights.z=1"], "no output 'z'"),
+    ],
+)
+def test_the_command_line_says_the_same_in_one_line(
+    tmp_path: Any, options: list[str], words: str
+) -> None:
+    path = tmp_path / "steps.csv"
+    path.write_bytes(recording())
+    found = CliRunner().invoke(lagid, ["identify", str(path), "--model", "fopdt", *options])
+    assert found.exit_code != 0
+    assert words in " ".join((found.output + str(found.exception or "")).split())
