@@ -12,6 +12,8 @@ from service.schemas_profiles import ProfileIn, ProfilesOut
 from service.schemas_runs import HistoryOut, MigrationsOut, ResidualsOut, ResponseOut, RunOut
 from service.schemas_simulations import RunSimulateIn, RunSimulationOut
 from service.storage.runs import RunRepository
+from service.web.figures import in_theme
+from service.web.theme import Theme
 from sysid.export.exporting import MOST_PADE, Format
 
 router = APIRouter(prefix="/v1/runs", tags=["runs"])
@@ -71,9 +73,10 @@ def simulate(
 
 
 @router.post("/{run_id}:profile")
-def profile(run_id: str, body: ProfileIn, parts: PartsDep) -> ProfilesOut:
+def profile(run_id: str, body: ProfileIn, parts: PartsDep, theme: Theme = "light") -> ProfilesOut:
     """Profile likelihood of some free parameters, the others estimated anew at every value."""
-    return profiles.profiles(parts.database, parts.store, run_id, body)
+    found = profiles.profiles(parts.database, parts.store, run_id, body)
+    return found.model_copy(update={"figure": in_theme(found.figure, theme)})
 
 
 @router.head("/{run_id}/signals.mcap", include_in_schema=False)

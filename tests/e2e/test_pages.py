@@ -78,6 +78,13 @@ def test_residual_tests_show_their_bands_and_verdicts(site: Site, page: Page) ->
     expect(page.locator("dl.findings")).to_contain_text("Onset delay, p behind u")
 
 
+def test_profiles_are_computed_and_drawn_on_request(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    page.get_by_role("button", name="compute").click()
+    page.wait_for_selector("[data-profile-plot] .main-svg")
+    assert page.locator(f"[data-profile-plot] {LINES}").count() == len(TRUE)
+
+
 def test_runs_are_compared_side_by_side(site: Site, page: Page) -> None:
     page.goto(f"{site.url}/jobs/{site.filled.sweep}")
     links = page.locator("table.runs tbody a")

@@ -1,6 +1,6 @@
 // Draws the figures that the server defines. Only what is on the screen is fetched and drawn.
 
-import { Problem, ask, element } from './live.js';
+import { Problem, ask, element, post } from './live.js';
 
 const dark = matchMedia('(prefers-color-scheme: dark)');
 const CONFIG = {
@@ -45,6 +45,24 @@ export async function draw(plot, extra = {}) {
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     if (latest.get(plot) === turn && !plot.classList.contains('js-plotly-plot')) tell(plot, error.message);
+  }
+}
+
+/** Have the profiles of a run computed, and draw them. */
+export async function profile(button) {
+  const plot = button.closest('section').querySelector('[data-profile-plot]');
+  const url = `${button.dataset.profile}?theme=${dark.matches ? 'dark' : 'light'}`;
+  button.disabled = true;
+  tell(plot, '…');
+  try {
+    const { figure } = await post(url, {});
+    plot.querySelector('.plot-empty')?.remove();
+    plot.style.height = `${figure.layout.height}px`;
+    await window.Plotly.react(plot, figure.data, figure.layout, CONFIG);
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    tell(plot, error.message);
+    button.disabled = false;
   }
 }
 

@@ -1,6 +1,6 @@
 // A job's page: plots, live regions while the job is open, and its actions.
 
-import { begin, choose, plots, redraw } from './figures.js';
+import { begin, choose, plots, profile, redraw } from './figures.js';
 import { Problem, element, post, refresh, throttled } from './live.js';
 
 const job = document.getElementById('job').dataset.job;
@@ -38,6 +38,7 @@ document.addEventListener('click', async ({ target }) => {
   else if ('close' in button.dataset) button.closest('dialog').close();
   else if ('copy' in button.dataset) await copy(button);
   else if (button.dataset.abscissa) abscissa(button);
+  else if (button.dataset.profile) await profile(button);
 });
 
 async function act(button) {
