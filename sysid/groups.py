@@ -8,7 +8,8 @@ R of the directions with the pivots i: for every other parameter j
     e_j - Σ_i R_ij e_i        is orthogonal to all directions.
 
 Taken of ln θ with rational entries this is a product of powers (``A_m*k_b/J``), taken of θ a sum
-(``T + L``); where neither is rational it is the sum that holds near the estimate.
+(``T + L``); where neither is rational, or a fractional power would be of a negative estimate, it
+is the sum that holds near the estimate.
 """
 
 from collections.abc import Iterator, Sequence
@@ -86,7 +87,7 @@ def written(
     entries = np.array(list(_orthogonal(rows)))
     sums = entries / (value if has_logarithm else unit)
     sums = sums / _leading(sums)
-    powers = _rational(entries) if has_logarithm else None
+    powers = _powers(entries, value) if has_logarithm else None
     terms = _rational(sums)
     if powers is not None and (terms is None or powers[1] <= terms[1]):
         texts = [(e, _product([names[d] for d in block.members], e)) for e in powers[0]]
@@ -162,6 +163,15 @@ def _rational(entries: FloatArray) -> tuple[FloatArray, float] | None:
     )
     off = float(np.max(np.abs(nearest - entries)))
     return (nearest, off) if off < _RATIONAL and np.max(np.abs(nearest)) <= _LARGEST else None
+
+
+def _powers(entries: FloatArray, value: FloatArray) -> tuple[FloatArray, float] | None:
+    """The same for powers of `value` (M,); None too where one of them is not a real number."""
+    found = _rational(entries)
+    if found is None:
+        return None
+    fractional = found[0] != np.rint(found[0])
+    return None if np.any(fractional & (value < 0)) else found
 
 
 def _product(names: Sequence[str], powers: FloatArray) -> str:

@@ -111,6 +111,28 @@ def test_powers_other_than_one_are_written() -> None:
     assert set(told(analyse(problem, theta))) == {"a**2*b"}
 
 
+@pytest.mark.parametrize(
+    ("form", "a", "text"),
+    [
+        ("a**3*b**2", 0.7, "a**1.5*b"),
+        ("a**3*b**2", -0.7, "a - 0.2029*b"),  # a/1.5 per b: a fractional power would be no number
+        ("a**2*b", -0.7, "a**2*b"),
+        ("a*b", -0.7, "a*b"),
+    ],
+)
+def test_a_power_of_a_negative_estimate_is_written_only_where_it_is_a_number(
+    form: str, a: float, text: str
+) -> None:
+    written = document({"x": f"{form}*u - c*x"}, ("a", "b", "c"))
+    written["parameters"]["a"] = {"lower": -2, "upper": 2}
+    problem, theta = posed(written, {"a": a, "b": 2.3, "c": 1.1})
+    ((found, group),) = told(analyse(problem, theta)).items()
+    assert found == text
+    assert np.isfinite(group.value)
+    assert group.stderr is not None
+    assert np.isfinite(group.stderr)
+
+
 def test_a_parameter_without_effect_belongs_to_no_group() -> None:
     written = document({"x": "a*u - c*x + 0*d"}, ("a", "c", "d"))
     problem, theta = posed(written, {"a": 0.7, "c": 1.1, "d": 2.0})
