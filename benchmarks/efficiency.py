@@ -49,7 +49,12 @@ class Draws:
         size = np.sqrt(np.mean(error**2, axis=0)) / self.bound
         bias = np.abs(np.mean(error, axis=0)) / np.std(error, axis=0)
         held = 100 * np.mean((self.low <= self.truth) & (self.truth <= self.high), axis=0)
-        made = []
+        draws = error.shape[0]
+        made = [
+            Row(f"{label}: sampling error of an RMS error", 1 / np.sqrt(2 * draws), "of itself"),
+            Row(f"{label}: sampling error of a bias", 1 / np.sqrt(draws), "sd"),
+            Row(f"{label}: binomial error of 95 %", 100 * np.sqrt(0.05 * 0.95 / draws), "%"),
+        ]
         for i, name in enumerate(self.names):
             what = f"{label}, {name}"
             made += [

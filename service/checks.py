@@ -79,7 +79,8 @@ class JobChecker:
             _tried(check_samples, found, len(model[0].terms), self._samples(body))
         found += self._repeated(body)
         found += self._data(body, tied, own)
-        found += _sample_faults(parameters, self._scored(body, model[0]))
+        if model[0].rule is None:  # of candidates not all are kept; `check_samples` looks at them
+            found += _sample_faults(parameters, self._scored(body, model[0]))
         found += self._unit_faults(body, model[0])
         return found + list(_signal_faults(body, model[0]))
 
@@ -154,7 +155,7 @@ class JobChecker:
         kept: float = (body["validation"] or {}).get("fraction") or 0.0
         samples = self._samples(body)
         skipped = body["skip"] * len(body["datasets"])
-        return (samples - round(kept * samples) - skipped) * len(model.outputs)
+        return int(samples - round(kept * samples) - skipped) * len(model.outputs)
 
     def _conversions(self, body: Body) -> Iterator[FieldError]:
         found: list[FieldError] = []
