@@ -89,7 +89,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_help_names_every_command() -> None:
     text = lagid("--help").stdout
     for command in ("serve", "identify", "submit", "watch", "jobs", "runs", "datasets", "models",
-                    "dataset", "cancel", "db", "doctor", "demo", "dispatcher"):  # fmt: skip
+                    "dataset", "cancel", "export", "db", "doctor", "demo",
+                    "dispatcher"):  # fmt: skip
         assert command in text
 
 
