@@ -59,8 +59,8 @@ class Stop:
     """End conditions besides the generations; whichever comes first. None: not used.
 
     `settled`: the best individual was found that often, each time from new random places, and by
-    at least two thirds of all such searches. Only the adaptive sequence search makes these, so that the
-    paper's methods never end by it.
+    at least two thirds of all such searches. Only the adaptive sequence search makes these, so
+    that the paper's methods never end by it.
     """
 
     evaluations: int | None = None

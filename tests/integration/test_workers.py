@@ -41,7 +41,7 @@ def test_one_large_run_spread_by_islands_gives_the_bits_of_the_plain_loop(
 
 
 def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(ray_crew) -> None:
-    one = spec(3, "long", generations=120)
+    one = spec(3, "long", generations=4000)
     whole = carry_out(ray_crew, {"r": one})
     middle = whole.states["r"][0]
     feeder, notebook = Feeder(ray_crew), Notebook()
