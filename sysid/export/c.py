@@ -17,8 +17,9 @@ _WORDS = (
     "union unsigned void volatile while _Bool _Complex _Imaginary asm main errno "
     "sin cos tan exp log sqrt fabs pow tanh atan floor ceil fmin fmax isnan isfinite NAN INFINITY "
     "HUGE_VAL NULL size_t malloc free sign least greatest between held sample past lately n t p "
-    "step steps i part stage slope work points grid ratio ramp sample_time dt h k now y0 y1 yn j0 "
-    "j1 jn gamma signgam unix linux i386 EOF stdin stdout stderr assert BUFSIZ RAND_MAX"
+    "step steps i part stage slope work points grid ratio ramp half averaged sample_time "
+    "dt h k now y0 y1 yn j0 j1 jn gamma signgam unix linux i386 EOF stdin stdout stderr assert "
+    "BUFSIZ RAND_MAX"
 )
 _WIDTH = 92
 
@@ -145,10 +146,12 @@ def _steps(program: Program) -> list[str]:
                  f"const long points = (long)ceil((t[n - 1] - t[0])/{own} - 0.01);",
                  "if (points < 1)", "    return 1;",
                  f"const long steps = points*{substeps};"]  # fmt: skip
-        if program.helpers & {"between", "held"}:
+        if program.helpers & {"between", "held", "averaged"}:
             lines.append("const double ratio = dt/sample_time;")
     if "held" in program.helpers:
         lines.append(f"const double ramp = {program.ramp()}; /* samples: half a jump's width */")
+    if "averaged" in program.helpers:
+        lines.append(f"const double half = {program.half()}; /* samples: half a step */")
     return [*lines, f"(void){period};"]
 
 

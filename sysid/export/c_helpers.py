@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from sysid.export.expressions import ATOM, Language
+from sysid.export.expressions import ATOM, WIDTHS, Language
 from sysid.export.identified import Identified, variants_of
 
 _FUNCTIONS = {
@@ -48,8 +48,8 @@ class CLanguage(Language):
         return f"{array}[{f'({index})' if '-' in index else index}/{divisor}]"
 
     def read(self, helper: str, signal: str, place: str) -> str:
-        """A call of ``between`` or ``held``."""
-        return f"{helper}({signal}, n, {place}{', ramp' if helper == 'held' else ''})"
+        """A call of ``between``, ``held`` or ``averaged``."""
+        return f"{helper}({signal}, n, {place}{WIDTHS[helper]})"
 
     def limited(self, value: str, least: int, most: int) -> str:
         """A number held between two others."""
@@ -95,6 +95,20 @@ static double held(const double *signal, long n, double place, double ramp)
             value += 0.5*(j == 0 ? 1.0 - part : part)*signal[k < 0 ? 0 : k < n ? k : n - 1];
         }
     return value;
+}
+"""
+_AVERAGED = """\
+/* Mean of a held signal from `half` before a place, in samples, to `half` after it. */
+static double averaged(const double *signal, long n, double place, double half)
+{
+    const double inside = fmin(fmax(place, -1.0 - half), (double)n + half);
+    const double first = inside - half, last = inside + half;
+    double total = 0.0;
+    for (long k = (long)floor(first); (double)k < last; ++k) {
+        const double width = fmin((double)(k + 1), last) - fmax((double)k, first);
+        total += width*signal[k < 0 ? 0 : k < n ? k : n - 1];
+    }
+    return total/(2*half);
 }
 """
 _SAMPLE = """\
@@ -161,7 +175,7 @@ static double greatest(double a, double b)
 """
 HELPERS: Mapping[str, str] = {
     "sign": _SIGN, "least": _LEAST, "greatest": _GREATEST, "between": _BETWEEN, "held": _HELD,
-    "held on grid": _HELD_ON_GRID,
+    "held on grid": _HELD_ON_GRID, "averaged": _AVERAGED,
     "sample": _SAMPLE, "past": _PAST, "past cubic": _PAST_CUBIC, "lately": _LATELY,
 }  # fmt: skip
 

@@ -12,6 +12,9 @@ _LEVEL = {
 _SIGN = 7
 ATOM = 9
 
+WIDTHS = {"between": "", "held": ", ramp", "averaged": ", half"}
+"""What the functions that read inputs are told besides the place."""
+
 
 class Language(Protocol):
     """What two programming languages write differently."""

@@ -13,7 +13,7 @@ from sysid.errors import InvalidSettings
 from sysid.export.expressions import Language, Scope, number, source
 from sysid.export.identified import Identified
 from sysid.export.identifiers import Identifiers
-from sysid.kernels.demand import is_difference
+from sysid.kernels.demand import averaged_inputs, is_difference
 from sysid.kernels.inputs import DENSE, MOST_POINTS
 from sysid.language.tree import Expression, Past, Symbol
 from sysid.models.initial import initial_name
@@ -127,6 +127,15 @@ class Program:
         points_ = min(max(2 * ceil(DENSE / self.substeps / 2 - 1e-3), 4), MOST_POINTS)
         return number(1.0 / (points_ * self.substeps))
 
+    def half(self) -> str:
+        """Half an integration step, in samples: a held input with a lag is a mean over a step."""
+        return "0.5*ratio" if self.own_step is not None else number(0.5 / self.substeps)
+
+    @property
+    def averaged(self) -> frozenset[str]:
+        """Inputs that are read as means over a step where they are held."""
+        return averaged_inputs(self.identified.model)
+
 
 @dataclass(frozen=True, slots=True)
 class Place(Scope):
@@ -176,6 +185,10 @@ class Place(Scope):
             if substeps == 1 and self.kind != "slope":
                 return program.language.element(name, self._back(past), 1)
         place = self._samples(past)
+        if held and past.name in program.averaged:
+            program.helpers.add("averaged")
+            after = " + half" if program.is_recursion else ""
+            return program.language.read("averaged", name, place + after)
         if not held:
             program.helpers.add("between")
             return program.language.read("between", name, place)

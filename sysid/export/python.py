@@ -15,8 +15,8 @@ _WORDS = (
     "False None True and as assert async await break class continue def del elif else except "
     "finally for from global if import in is lambda nonlocal not or pass raise return try while "
     "with match case type np t simulate rates step steps part dt h k now slope_1 slope_2 slope_3 "
-    "slope_4 every points ratio ramp sample_time lag range zip map max min int float abs len y "
-    "before between held past lately sign signal array grid print math ValueError"
+    "slope_4 every points ratio ramp half averaged sample_time lag range zip map max min int float "
+    "abs len y before between held past lately sign signal array grid print math ValueError"
 )
 _WIDTH = 96
 
@@ -130,6 +130,8 @@ def _steps(program: Program) -> list[str]:
                  f"steps = points*{substeps}", "ratio = dt/sample_time"]  # fmt: skip
     if "held" in program.helpers:
         lines.append(f"ramp = {program.ramp()}  # samples: half the width of a jump")
+    if "averaged" in program.helpers:
+        lines.append(f"half = {program.half()}  # samples: half an integration step")
     return lines
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
-from sysid.export.expressions import ATOM, Language
+from sysid.export.expressions import ATOM, WIDTHS, Language
 from sysid.export.identified import Identified, variants_of
 
 _FUNCTIONS = {
@@ -46,8 +46,8 @@ class PythonLanguage(Language):
         return f"{array}[{f'({index})' if '-' in index else index}//{divisor}]"
 
     def read(self, helper: str, signal: str, place: str) -> str:
-        """A call of ``between`` or ``held``."""
-        return f"{helper}({signal}, {place}{', ramp' if helper == 'held' else ''})"
+        """A call of ``between``, ``held`` or ``averaged``."""
+        return f"{helper}({signal}, {place}{WIDTHS[helper]})"
 
     def limited(self, value: str, least: int, most: int) -> str:
         """A number held between two others."""
@@ -82,6 +82,15 @@ _HELD_ON_GRID = '''def held(signal, place, ramp):
             value += 0.5*weight*signal[min(max(k, 0), signal.size - 1)]
     return value
 '''
+_AVERAGED = '''def averaged(signal, place, half):
+    """Mean of a held signal from `half` before a place, in samples, to `half` after it."""
+    first, last = place - half, place + half
+    total = 0.0
+    for k in range(int(np.floor(first)), int(np.ceil(last))):
+        width = min(k + 1.0, last) - max(float(k), first)
+        total += width*signal[min(max(k, 0), signal.size - 1)]
+    return total/(2*half)
+'''
 _PAST = '''def past(array, before, step, lag):
     """Value `lag` >= 0 steps before a finished step, on a line between two; `before` the start."""
     i = int(np.floor(-lag))
@@ -111,6 +120,7 @@ _LATELY = '''def lately(array, before, step, part, there, lag):
 '''
 HELPERS: Mapping[str, str] = {
     "between": _BETWEEN, "held": _HELD, "held on grid": _HELD_ON_GRID,
+    "averaged": _AVERAGED,
     "past": _PAST, "past cubic": _PAST_CUBIC,
     "lately": _LATELY,
 }  # fmt: skip
@@ -121,6 +131,6 @@ def with_needed(used: Iterable[str], identified: Identified) -> list[str]:
     wanted = set(used)
     if "lately" in wanted:
         wanted.add("past")
-    order = ("between", "held", "past", "lately")
+    order = ("between", "held", "averaged", "past", "lately")
     variants = variants_of(identified)
     return [variants.get(name, name) for name in order if name in wanted]

@@ -4,6 +4,7 @@ from math import floor, prod
 
 from sysid.export.identified import Identified
 from sysid.export.linear import Signal
+from sysid.kernels.demand import averaged_inputs
 from sysid.kernels.inputs import DENSE, MOST_POINTS
 
 
@@ -35,6 +36,8 @@ def _input_taps(identified: Identified, signal: Signal) -> dict[int, float]:
     delay = signal.delay
     if identified.model.solver.interpolation == "nearest":
         return {floor(delay + 0.5): 1.0}
+    if identified.hold(signal.name) == "zero" and signal.name in averaged_inputs(identified.model):
+        return _held_taps(delay, 0.5 / identified.model.solver.substeps)
     if identified.hold(signal.name) == "zero":
         return _held_taps(delay, 1.0 / min(max(_even(identified), 4), MOST_POINTS))
     return _through(delay, (0, 1))

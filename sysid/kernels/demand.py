@@ -79,6 +79,12 @@ def lags(model: Model, kind: str) -> list[Past]:
     return [*dict.fromkeys(r.past for r in reads(model) if r.past.kind == kind and r.past.lag)]
 
 
+def averaged_inputs(model: Model) -> frozenset[str]:
+    """Inputs that are read with unknown lags only: held ones are given as means over a step."""
+    whole = {r.past.name for r in reads(model) if r.past.kind == "input" and r.past.lag is None}
+    return frozenset(past.name for past in lags(model, "input")) - whole
+
+
 def with_history(model: Model) -> list[str]:
     """States whose past must be kept in memory, in the model's order."""
     needed = {

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from math import ceil
+from typing import Literal
 
 import numpy as np
 
@@ -48,8 +49,17 @@ class FineInput:
     cap: int
 
 
-def fine_input(channel: Channel, start: float, step: float, steps: int, lag: float) -> FineInput:
+def fine_input(
+    channel: Channel, start: float, step: float, steps: int, lag: float,
+    mean: Literal["around", "after"] | None = None,
+) -> FineInput:  # fmt: skip
     """Lay an input onto the fine grid.
+
+    A held input that is read with an unknown lag is given as its mean over one integration step,
+    `around` the time for a solver, `after` it for a recursion. Read as it is, its jumps would fall
+    between the places that a step looks at, and the response would be a staircase in the lag. The
+    mean over a step enters whole, however the jump lies: the response is as smooth in the lag as
+    the plant makes it, and at whole lags it is what it was.
 
     Parameters
     ----------
@@ -57,11 +67,17 @@ def fine_input(channel: Channel, start: float, step: float, steps: int, lag: flo
         First time of the simulation, its integration step, both in s, and how many steps follow.
     lag : float
         Largest lag with which the input is read, in steps.
+    mean : {"around", "after"} or None
+        How a held input is averaged; None: it is not.
     """
     points = _points(channel, start, step)
     cap = ceil(lag * points) + 2
     count = cap + (steps + 2) * points + 2
     times: FloatArray = start + (np.arange(count, dtype=np.float64) - cap) * (step / points)
+    if mean is not None and channel.hold == "zero" and channel.times.size > 1:
+        early = 0.5 * step if mean == "around" else 0.0
+        values = _mean_of_held(channel, times - early, step)
+        return FineInput(values, cap, points, 0, points, max(cap - 2, 0))
     jump = 1 if channel.hold == "zero" else 0
     return FineInput(
         between_samples(channel, times), cap, points, jump, points - jump, max(cap - 2, 0)
@@ -109,6 +125,18 @@ def _held(channel: Channel, times: FloatArray) -> FloatArray:
     before = np.searchsorted(channel.times, times - tolerance, side="right") - 1
     values = channel.values
     found: FloatArray = 0.5 * (values[np.clip(after, 0, last)] + values[np.clip(before, 0, last)])
+    return found
+
+
+def _mean_of_held(channel: Channel, times: FloatArray, width: float) -> FloatArray:
+    """Mean of a held channel over [t, t + width]: the difference of its integral, by `width`."""
+    values, far = channel.values, width + float(np.ptp(times)) + float(np.ptp(channel.times))
+    knots = np.concatenate([[channel.times[0] - far], channel.times, [channel.times[-1] + far]])
+    held = np.concatenate([values[:1], values])
+    # Counted from the first value, so that a constant stays exactly that.
+    integral = np.concatenate([[0.0], np.cumsum((held - values[0]) * np.diff(knots))])
+    rise = np.interp(times + width, knots, integral) - np.interp(times, knots, integral)
+    found: FloatArray = values[0] + rise / width
     return found
 
 

@@ -3,12 +3,13 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
+from typing import Literal
 
 import numpy as np
 
 from sysid.errors import RecordTooShort
 from sysid.kernels.calls import LANES
-from sysid.kernels.demand import furthest, is_difference, lags, with_history
+from sysid.kernels.demand import averaged_inputs, furthest, is_difference, lags, with_history
 from sysid.kernels.grid import Grid, is_on_grid
 from sysid.kernels.inputs import FineInput, fine_input
 from sysid.kernels.layout import Layout, Variant
@@ -78,12 +79,15 @@ def fine_inputs(
     """The inputs between their samples, as far back as the lags may reach."""
     reach = largest_lags(model, "input", parameters, grid)
     back = furthest(model)
-    return [
-        fine_input(
-            channel, grid.start, grid.integration_step, grid.last, reach.get(name, 0.0) + back + 1
-        )
-        for name, channel in zip((q.name for q in model.inputs), channels, strict=True)
-    ]
+    mean: Literal["around", "after"] = "after" if is_difference(model) else "around"
+    averaged = averaged_inputs(model)
+    laid = []
+    for quantity, channel in zip(model.inputs, channels, strict=True):
+        name = quantity.name
+        lag = reach.get(name, 0.0) + back + 1
+        how = mean if name in averaged else None
+        laid.append(fine_input(channel, grid.start, grid.integration_step, grid.last, lag, how))
+    return laid
 
 
 def numbers(
