@@ -27,6 +27,8 @@ from service.storage.tables import Job, Run
 from service.sweeps import body_of
 from sysid.errors import SysidError
 from sysid.models.model import Model
+from sysid.parameters import override
+from sysid.past_outputs import coefficients_on_past_outputs
 from sysid.records import Channel
 from sysid.residuals import (
     LEVEL,
@@ -80,11 +82,27 @@ def residuals_of(session: Session, store: ObjectStore, job: Job, run: Run) -> Te
     body = body_of(job.spec, run.cell)
     fits = read_fit(store.get(run.signals_sha256))
     kept = [fit for fit in fits if fit.experiment.startswith("validation")]
-    inputs, missing = _inputs(session, store, model_of_run(session, run, job), body, bool(kept))
-    found = correlations(list(_series(body, kept or list(fits), fits, inputs)))
+    model = model_of_run(session, run, job)
+    inputs, missing = _inputs(session, store, model, body, bool(kept))
+    counts = {} if kept else _coefficients(model, body)
+    found = correlations(
+        [
+            one._replace(coefficients=counts.get(one.output, 0))
+            for one in _series(body, kept or list(fits), fits, inputs)
+        ]
+    )
     names = [name for name, _ in groupby(fit.experiment for fit in kept or fits)]
     data = "validation" if kept else "estimation"
     return Tested(names, found, verdict(found, data), missing)  # type: ignore[arg-type]
+
+
+def _coefficients(model: Model, body: Body) -> dict[str, int]:
+    """Of each output, the coefficients on past outputs of a prediction one step ahead."""
+    if body["prediction"] != "one-step":
+        return {}
+    names = {one.name for one in model.parameters}
+    changes = {name: fields for name, fields in body["parameters"].items() if name in names}
+    return coefficients_on_past_outputs(model, override(model.parameters, changes))
 
 
 def _out(one: Correlation) -> CorrelationOut:

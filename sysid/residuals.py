@@ -3,9 +3,11 @@
 What MATLAB's ``resid`` shows (Ljung, System Identification, 2nd ed., ch. 16.6), with e = y - ŷ:
 
 whiteness
-    r(k) = Σ e(t) e(t+k) / Σ e², k = 1 … 25. For white e its variance is n_k/n², n_k pairs of n
-    samples. Q = Σ r(k)² n²/n_k is χ² with as many degrees of freedom as lags (Ljung and Box 1978,
-    for n_k = n - k). The mean is not removed: an offset of the model is a fault too.
+    r(k) = Σ e(t) e(t+k) / Σ e², k = 1 … 25. For white e its variance is n_k/(n(n + 2)), n_k pairs
+    of n samples. Q = Σ r(k)² n(n + 2)/n_k is χ² with as many degrees of freedom as lags (Ljung and
+    Box 1978, for n_k = n - k). Of predictions one step ahead, on the data of the estimate, the
+    estimated coefficients on past outputs are taken off, down to 1 (`sysid.past_outputs`). The
+    mean is not removed: an offset of the model is a fault too.
 independence
     c(k) = Σ e(t) u(t - kτ) / √(Σ e² Σ u²), both without their means. e may be coloured: given u,
     the covariance of two such sums is Σ R(i - j) u(i) u(j), R the autocovariance of e, from a
@@ -28,6 +30,7 @@ import numpy as np
 from scipy.special import gammaincc
 
 from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, lagged_sums, laid_out
+from sysid.past_outputs import coefficients_on_past_outputs
 from sysid.records import Channel
 from sysid.types import BoolArray, FloatArray
 
@@ -112,6 +115,7 @@ class Series(NamedTuple):
     """The residuals (N,) of one output in one experiment, as the loss sees them.
 
     `scored` tells which of them count; `size` is the largest measured value among those.
+    `coefficients` on past outputs were estimated on all series of the output together.
     """
 
     experiment: int
@@ -121,14 +125,18 @@ class Series(NamedTuple):
     scored: BoolArray
     size: float
     inputs: tuple[Channel, ...]
+    coefficients: int = 0
 
 
 def residual_tests(
     problem: "Problem", simulated: FloatArray, data: Literal["estimation", "validation"]
 ) -> ResidualTests:
     """Test the residuals of simulated values (M,) on the records of a problem."""
-    found = correlations(series_of(problem, simulated), both_sides=False)
-    return verdict(found, data)
+    found = series_of(problem, simulated)
+    if data == "estimation" and problem.arguments[3] == "one-step":
+        counts = coefficients_on_past_outputs(problem.model, problem.all_parameters)
+        found = [one._replace(coefficients=counts[one.output]) for one in found]
+    return verdict(correlations(found, both_sides=False), data)
 
 
 def verdict(
@@ -192,10 +200,20 @@ def correlations(
     """
     count = sum(1 + len(one.inputs) for one in found if not _untestable(one))
     each = level / max(count, 1)
-    return [curve for one in found for curve in _of_series(one, each, both_sides)]
+    return [
+        curve for one in found for curve in _of_series(one, each, both_sides, _lost(one, found))
+    ]
 
 
-def _of_series(one: Series, level: float, both_sides: bool) -> Iterator[Correlation]:
+def _lost(one: Series, found: Sequence[Series]) -> float:
+    """Degrees of freedom that a series loses: its share by samples of the coefficients."""
+    if not one.coefficients:
+        return 0.0
+    total = sum(np.count_nonzero(other.scored) for other in found if other.output == one.output)
+    return one.coefficients * np.count_nonzero(one.scored) / max(total, 1)
+
+
+def _of_series(one: Series, level: float, both_sides: bool, lost: float) -> Iterator[Correlation]:
     reason = _untestable(one)
     if reason:
         yield _not_tested(one, "whiteness", None, reason)
@@ -203,7 +221,7 @@ def _of_series(one: Series, level: float, both_sides: bool) -> Iterator[Correlat
             yield _not_tested(one, "independence", channel.name, reason)
         return
     laid = laid_out(one.times[one.scored], one.residual[one.scored])
-    yield _whiteness(one, laid, level)
+    yield _whiteness(one, laid, level, lost)
     for channel in one.inputs:
         yield _independence(one, laid, channel, level, both_sides=both_sides)
 
@@ -217,15 +235,16 @@ def _untestable(one: Series) -> str:
     return ""
 
 
-def _whiteness(one: Series, laid: Laid, level: float) -> Correlation:
+def _whiteness(one: Series, laid: Laid, level: float, lost: float) -> Correlation:
     n = np.count_nonzero(laid.present)
     power = float(laid.values @ laid.values)
     lags = range(1, laid.lags + 1)
     values = np.array([laid.values[k:] @ laid.values[:-k] for k in lags]) / power
     pairs = np.array([np.count_nonzero(laid.present[k:] & laid.present[:-k]) for k in lags])
-    deviation = np.sqrt(np.maximum(pairs, 1)) / n
+    deviation = np.sqrt(np.maximum(pairs, 1) / (n * (n + 2.0)))
     statistic = float(np.sum(np.square(values / deviation)))
-    test = _test(one, "whiteness", None, values / deviation, statistic, float(len(lags)), level)
+    degrees = max(len(lags) - lost, 1.0)
+    test = _test(one, "whiteness", None, values / deviation, statistic, degrees, level)
     band = np.concatenate([[0.0], deviation])
     return Correlation(
         test, laid.period if laid.is_regular else None, np.arange(0.0, len(lags) + 1),

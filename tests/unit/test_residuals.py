@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from sysid.models.library import load_model
+from sysid.parameters import override
+from sysid.past_outputs import coefficients_on_past_outputs
 from sysid.problem import Problem
 from sysid.records import Channel, Record
 from sysid.residuals import (
@@ -255,3 +257,66 @@ def test_a_problem_hands_its_skipped_samples_and_its_loss_on() -> None:
 def test_a_true_model_without_noise_is_not_tested() -> None:
     true, clean = problem(draws(13), 0.0)
     assert residual_tests(true, clean, "estimation").passed is None
+
+
+def whiteness(residual: FloatArray, coefficients: int = 0) -> tuple[float, float]:
+    """Statistic and degrees of freedom."""
+    n = residual.size
+    one = series(0, "y", STEP * np.arange(n), residual, np.zeros(n), np.ones(n, dtype=bool), ())
+    test = correlations([one._replace(coefficients=coefficients)])[0].test
+    assert test.statistic is not None
+    assert test.degrees is not None
+    return test.statistic, test.degrees
+
+
+@pytest.mark.parametrize("n", [24, 40, 100])
+def test_of_white_noise_the_statistic_has_the_mean_of_its_distribution(n: int) -> None:
+    drawn = [whiteness(draws(seed).normal(size=n)) for seed in range(2000)]
+    statistic, degrees = np.mean(np.array(drawn), axis=0)
+    assert statistic / degrees == pytest.approx(1.0, abs=0.03)  # with n²/n_k it would be 0.92
+
+
+def test_one_step_ahead_the_statistic_loses_a_degree_for_each_coefficient_on_the_output() -> None:
+    drawn = []
+    for seed in range(300):
+        y = coloured(draws(seed), 0.6)
+        past = np.column_stack([np.concatenate([np.zeros(k), y[:-k]]) for k in (1, 2, 3, 4)])
+        drawn.append(whiteness(y - past @ np.linalg.lstsq(past, y, rcond=None)[0], 4))
+    statistic, degrees = np.mean(np.array(drawn), axis=0)
+    assert degrees == 21
+    assert statistic == pytest.approx(degrees, abs=1.5)
+
+
+def test_a_degree_of_freedom_is_always_left_and_records_share_the_loss() -> None:
+    assert whiteness(draws(1).normal(size=40), 30)[1] == 1.0
+    one = series(0, "y", TIMES, draws(1).normal(size=N), np.zeros(N), np.ones(N, dtype=bool), ())
+    pair = [one._replace(experiment=k, coefficients=4) for k in (0, 1)]
+    assert [curve.test.degrees for curve in correlations(pair)] == [23.0, 23.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "fixed", "count"),
+    [("narx", (), 9), ("narx", ("a[y(k-1)]", "dh"), 8), ("fopdt", (), 1), ("duffing-eq16", (), 3),
+     ("tube-second-order", (), 2), ("exponential", (), 0), ("emps", (), 3)],
+)  # fmt: skip
+def test_coefficients_on_past_outputs_are_those_that_multiply_a_state(
+    name: str, fixed: tuple[str, ...], count: int
+) -> None:
+    model = load_model(name)
+    given = {one: {"fixed": 1.0} for one in fixed}
+    found = coefficients_on_past_outputs(model, override(model.parameters, given))
+    assert found == {"y": count}
+
+
+def test_only_predictions_one_step_ahead_of_the_estimation_data_lose_degrees() -> None:
+    draw = draws(14)
+    record = Record(
+        (Channel("u", TIMES, held(draw), hold="zero"),), (Channel("y", TIMES, draw.normal(size=N)),)
+    )
+    for prediction, data, degrees in (
+        ("simulation", "estimation", 25.0), ("one-step", "validation", 25.0),
+        ("one-step", "estimation", 24.0),
+    ):  # fmt: skip
+        one = Problem.build(load_model("fopdt"), (record,), prediction=prediction)  # type: ignore[arg-type]
+        tests = residual_tests(one, np.zeros(N), data).tests  # type: ignore[arg-type]
+        assert tests[0].degrees == degrees

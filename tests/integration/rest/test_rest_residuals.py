@@ -258,10 +258,12 @@ def test_the_report_holds_tests_and_figures(served: Served) -> None:
         {"noise": {"sigma": 0.1, "seed": 4}, "validation": {"datasets": ["d2"]}, "skip": 11},
         {"datasets": ["d1", "d2"], "validation": None},
         {"datasets": ["d1", "d2"], "validation": {"fraction": 0.25}, "prediction": "one-step"},
+        {"datasets": ["d1", "d2"], "validation": None, "prediction": "one-step", "skip": 9},
         {"model": TWO_OUTPUTS, "channels": {"z": "y"}, "weights": {"y": 2.0}, "skip": 3,
          "loss": {"kind": "soft-l1", "scale": 0.1}, "parameters": {}},
     ],
-    ids=["robust", "robust part", "noise, other data", "two records", "two parts", "two outputs"],
+    ids=["robust", "robust part", "noise, other data", "two records", "two parts", "one step ahead",
+         "two outputs"],
 )  # fmt: skip
 def test_what_is_computed_again_is_what_was_stored_whatever_the_job(
     served: Served, changes: dict[str, Any]
@@ -279,3 +281,4 @@ def test_what_is_computed_again_is_what_was_stored_whatever_the_job(
         assert one["outcome"] == kept["outcome"] != "not tested"
         assert one["samples"] == kept["samples"]
         assert one["statistic"] == pytest.approx(kept["statistic"], rel=1e-6)
+        assert one["degrees"] == pytest.approx(kept["degrees"], rel=1e-6)
