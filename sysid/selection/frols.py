@@ -204,6 +204,21 @@ def _number(left: Sequence[float], rule: TermRule, samples: int) -> int:
     number = min(enough, default=len(left))
     if rule.criterion == "none" or number == 0:
         return number
-    shares = np.maximum(np.array(left[:number]), _EXPLAINED)
-    values = samples * np.log(shares) + np.arange(1, number + 1) * np.log(max(samples, 1))
+    values = [_bic(share, k, samples) for k, share in enumerate(left[:number], 1)]
     return int(np.argmin(values)) + 1
+
+
+def _bic(share: float, terms: int, samples: int) -> float:
+    return float(samples * np.log(max(share, _EXPLAINED)) + terms * np.log(max(samples, 1)))
+
+
+def merit(rule: TermRule, share: float, terms: int, samples: int) -> tuple[float, ...]:
+    """How good a set of terms is by a rule, to be compared with another's; smaller is better.
+
+    With `criterion` that criterion; with `err` the fewest terms that leave less than it; else,
+    and of as many terms, what they leave.
+    """
+    if rule.criterion == "bic":
+        return (_bic(share, terms, samples),)
+    is_enough = share < max(_EXPLAINED, rule.err or 0.0)
+    return (0.0, float(terms), share) if is_enough else (1.0, share)

@@ -4,7 +4,8 @@ A term that helps to predict the next sample need not help a simulation, which n
 measured output again. Near a good model the free run is linear in the coefficients: its slopes
 with respect to those of all candidates, also of those that are zero now, are the columns of a
 regression on what the free run has not explained. Terms are selected from these columns, the
-coefficients refined, and so on until the selection stays.
+coefficients refined, and so on until the selection stays. Of all rounds the best by the rule's own
+criterion is taken: they may differ in the number of terms, and more terms nearly always leave less.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,7 @@ from sysid.models.terms import Selection, TermRule
 from sysid.problem import Problem
 from sysid.records import Record
 from sysid.refinement import refine
-from sysid.selection.frols import Forward, forward, select
+from sysid.selection.frols import Forward, forward, merit, select
 from sysid.selection.regression import BLOCK, fold, lag_parameters
 from sysid.selection.starts import equation_error_starts
 from sysid.settings import GeneticAlgorithm
@@ -61,6 +62,8 @@ def reselected(
     whole = Problem.build(candidates, records, parameters=changes, skip=skip)
     _check_size(whole)
     chosen, best = tuple(first), None
+    least: tuple[float, ...] = (np.inf,)
+    power = _power(whole)
     seen: set[frozenset[int]] = set()
     for _ in range(_ROUNDS):
         if frozenset(chosen) in seen:
@@ -71,10 +74,19 @@ def reselected(
             break
         values, rms = fitted
         triangle = _triangle(whole, values)
-        if best is None or rms < best.rms:
-            best = _told(whole, triangle, chosen, values, rms)
+        value = merit(rule, rms * rms / power, len(chosen), whole.n_scored)
+        if best is None or value < least:
+            best, least = _told(whole, triangle, chosen, values, rms), value
         chosen = select(triangle, rule, whole.n_scored).order
     return best
+
+
+def _power(problem: Problem) -> float:
+    """Mean square of the scored output, in the units of the RMS."""
+    weight = problem.evaluator.weight
+    scored = weight > 0
+    squares = np.square(weight[scored] * problem.evaluator.measured[scored])
+    return max(float(np.mean(squares)), np.finfo(float).tiny)
 
 
 def _check_size(problem: Problem) -> None:

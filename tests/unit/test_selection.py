@@ -10,10 +10,11 @@ from service.models import resolved
 from service.web.findings import findings_of
 from sysid.errors import InvalidSettings
 from sysid.models.spec import parse_model
+from sysid.models.terms import TermRule
 from sysid.problem import Problem
 from sysid.records import Channel, Record
 from sysid.selection import selected
-from sysid.selection.frols import exchanged, forward, solved
+from sysid.selection.frols import exchanged, forward, merit, solved
 from sysid.selection.lagsearch import search
 from sysid.selection.regression import Regression
 from sysid.types import FloatArray
@@ -246,6 +247,24 @@ def test_terms_selected_by_the_free_run_explain_it_no_worse() -> None:
         theta = np.array([[known[one.name] for one in problem.space]])
         reached[error] = float(problem.fitness(theta)[0])
     assert reached["simulation"] <= reached["one-step"]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_criterion_of_bayes_holds_for_the_free_run_too(seed: int) -> None:
+    record = record_of(TRUTH, noise=0.05, samples=600, seed=seed)
+    rule = {"select": "frols", "criterion": "bic", "error": "simulation"}
+    assert set(chosen(rule, record)) == set(TRUTH)  # by RMS alone a round with more would win
+    assert len(chosen(rule | {"error": "one-step"}, record)) > len(TRUTH)
+
+
+def test_sets_of_terms_are_ranked_by_the_rule() -> None:
+    bic = TermRule(9, criterion="bic")
+    for factor, less in ((0.99, False), (0.90, True)):  # ln n / n is 0.046 at 100 samples
+        assert (merit(bic, factor * 0.1, 6, 100) < merit(bic, 0.1, 5, 100)) is less
+    kept = TermRule(9)
+    assert merit(kept, 0.099, 9, 100) < merit(kept, 0.1, 5, 100)
+    enough = TermRule(9, err=0.05)
+    assert merit(enough, 0.049, 4, 100) < merit(enough, 0.01, 5, 100) < merit(enough, 0.06, 3, 100)
 
 
 def test_the_resolved_model_can_be_built_again_from_its_document_and_from_a_result() -> None:
