@@ -176,6 +176,7 @@ class JobIn(Body):
     algorithm: AlgorithmIn = AlgorithmIn()
     seed: Seed = 1
     priority: int = Field(default=0, ge=-100, le=100)
+    reuse: bool = Field(default=True, description="take results of runs that were computed before")
     sweep: SweepIn = SweepIn()
 
     def normal_form(self) -> dict[str, Any]:

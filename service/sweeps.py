@@ -12,7 +12,7 @@ from service.schemas_jobs import Axis, JobIn
 from sysid.errors import nearest
 
 # Fields that decide on the job as a whole; a cell of it cannot have its own.
-FIXED_FIELDS = ("name", "priority", "sweep")
+FIXED_FIELDS = ("name", "priority", "reuse", "sweep")
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from workers.ports import (
     Handle,
     Item,
     JobSource,
+    KnownRun,
     QueuedRun,
     RefusedRun,
     RunObserver,
@@ -24,6 +25,9 @@ from workers.progress import MAX_STRIKES, ActiveRun
 
 PREFETCH = 64
 """Runs read ahead of the workers, for each core."""
+
+AT_ONCE = 1000
+"""Runs taken from the source before others have their turn: known ones cost no worker's time."""
 
 KEPT_RECORDS = 16
 """Sets of records that a job keeps with the crew."""
@@ -42,7 +46,7 @@ class JobWork:
         self.observer = observer
         self.flying: dict[Handle, tuple[Item, ...]] = {}
         self._source, self._crew = source, crew
-        self._coming: Iterator[QueuedRun | RefusedRun] = iter(source.runs())
+        self._coming: Iterator[QueuedRun | RefusedRun | KnownRun] = iter(source.runs())
         self._ready: deque[ActiveRun] = deque()
         self._active: dict[str, ActiveRun] = {}
         self._shared: dict[str, Any] = {}
@@ -57,12 +61,16 @@ class JobWork:
     def read_ahead(self) -> bool:
         """Ask the source for as many runs as may be needed soon; whether a run waits now."""
         wanted = PREFETCH * self._crew.slots
-        while not self._exhausted and len(self._ready) < wanted:
+        for _ in range(AT_ONCE):
+            if self._exhausted or len(self._ready) >= wanted:
+                break
             queued = next(self._coming, None)
             if queued is None:
                 self._exhausted = True
             elif isinstance(queued, RefusedRun):
                 self.observer.failure(queued.run, queued.failure)
+            elif isinstance(queued, KnownRun):
+                self.observer.known(queued.run, queued.source)
             else:
                 run = ActiveRun.of(queued)
                 self._active[run.run] = run

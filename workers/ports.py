@@ -10,6 +10,7 @@ from typing import Any, Protocol, TypeAlias
 from sysid.ga.island import Island
 from sysid.islands.run_state import RunState
 from sysid.noise import Noise
+from sysid.program import program
 from sysid.records import Record
 from sysid.result import Identification
 from sysid.settings import GeneticAlgorithm, Loss, Prediction
@@ -71,6 +72,14 @@ class RunSpec:
     algorithm: GeneticAlgorithm
     seed: int = 1
     warm: tuple[Mapping[str, float], ...] = ()
+
+    @property
+    def key(self) -> str | None:
+        """Equal for runs of equal results; None where the clock has a say in the result."""
+        if self.algorithm.stop.seconds is not None:
+            return None
+        parts = (self.problem.key, repr(self.algorithm), self.seed, [*map(dict, self.warm)])
+        return blake2b(f"{parts}{program()}".encode(), digest_size=16).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +190,9 @@ class RunObserver(Protocol):
     def failure(self, run: str, failure: Failure) -> None:
         """The run cannot be carried out."""
 
+    def known(self, run: str, source: str) -> None:
+        """The run need not be computed: it is what the run `source` was."""
+
     def should_stop(self) -> bool:
         """Whether the job was cancelled or lost: asked between packs."""
 
@@ -202,10 +214,18 @@ class RefusedRun:
     failure: Failure
 
 
+@dataclass(frozen=True, slots=True)
+class KnownRun:
+    """A run whose specification has been carried out before, by the run `source`."""
+
+    run: str
+    source: str
+
+
 class JobSource(Protocol):
     """Where a job's runs and records come from, asked for as they are needed."""
 
-    def runs(self) -> Iterable[QueuedRun | RefusedRun]:
+    def runs(self) -> Iterable[QueuedRun | RefusedRun | KnownRun]:
         """The runs, in order; the iterable is read lazily."""
 
     def records(self, key: str) -> Records:

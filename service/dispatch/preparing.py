@@ -16,6 +16,7 @@ from service.storage.errors import LeaseLost, StorageError
 from service.storage.ledger import RunLedger
 from service.storage.objects import ObjectStore
 from service.storage.queue import Claim
+from service.storage.reuse import computed, mark
 from service.storage.sessions import Database
 from service.storage.tables import Run
 from service.storage.tally import forget_progress
@@ -27,7 +28,15 @@ from sysid.noise import Noise
 from sysid.records import Hold
 from sysid.result import Identification
 from workers.errors import RecordsUnavailable
-from workers.ports import Failure, ProblemSpec, QueuedRun, Records, RefusedRun, RunSpec
+from workers.ports import (
+    Failure,
+    KnownRun,
+    ProblemSpec,
+    QueuedRun,
+    Records,
+    RefusedRun,
+    RunSpec,
+)
 from workers.tasks import prepared
 
 _log = logging.getLogger(__name__)
@@ -62,7 +71,7 @@ class JobRuns:
         self._data: dict[str, DataKey] = {}
         self._read: OrderedDict[str, Records] = OrderedDict()
 
-    def runs(self) -> Iterator[QueuedRun | RefusedRun]:
+    def runs(self) -> Iterator[QueuedRun | RefusedRun | KnownRun]:
         """The unfinished runs in order, each from its checkpoint if it has one."""
         try:
             checkpoints = self._checkpoints()
@@ -70,8 +79,11 @@ class JobRuns:
             while rows:
                 states = {row.id: unpacked(checkpoints.pop(row.id, None)) for row in rows}
                 self._begin_anew([run for run, state in states.items() if state is None])
-                for row in rows:
-                    yield self._queued(row, states.pop(row.id))
+                queued = [self._queued(row, states.pop(row.id)) for row in rows]
+                sources = self._computed(queued)
+                for one in queued:
+                    source = sources.get(one.run)
+                    yield one if source is None else KnownRun(one.run, source)
                 rows = self._pending(rows[-1].number)
         except LeaseLost as error:  # the recorder will meet it too, and stop the job
             _log.warning("no more runs: %s", error)
@@ -178,6 +190,20 @@ class JobRuns:
             return RefusedRun(row.id, Failure(str(error), type(error).__name__))
         self._problems[row.id] = spec.problem
         return QueuedRun(row.id, spec, state)
+
+    def _computed(self, queued: list[QueuedRun | RefusedRun]) -> dict[str, str]:
+        """Runs that were computed before, each with the run that did; all are marked."""
+        hashes = {
+            one.run: one.spec.key
+            for one in queued
+            if isinstance(one, QueuedRun) and one.spec.key is not None
+        }
+        with self._database.write() as session:
+            mark(session, self._lease, hashes)
+            if not self._job.spec.get("reuse", True):
+                return {}
+            known = computed(session, set(hashes.values()), self._job.project_id)
+        return {run: known[one] for run, one in hashes.items() if one in known}
 
     def _model(self, reference: Any) -> Model:
         name = reference if isinstance(reference, str) else repr(reference)

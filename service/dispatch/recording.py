@@ -13,6 +13,7 @@ from service.dispatch.results import history_points, migrant_points, outcome_of
 from service.storage.errors import ObjectStoreFailed
 from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOutcome
 from service.storage.queue import Claim, Progress, Queue
+from service.storage.reuse import take_over
 from service.storage.sessions import Database
 from service.storage.tables import State
 from service.storage.tally import tally
@@ -49,6 +50,7 @@ class _Pending:
     """What the next transaction will write."""
 
     started: list[str] = field(default_factory=list)
+    known: dict[str, str] = field(default_factory=dict)
     outcomes: list[RunOutcome] = field(default_factory=list)
     history: list[HistoryPoint] = field(default_factory=list)
     migrants: list[MigrantPoint] = field(default_factory=list)
@@ -77,6 +79,7 @@ class Recorder:
         self._best = math.inf if claim.job.best_rms is None else claim.job.best_rms
         self._generations = max(1, int(claim.job.spec["algorithm"]["generations"]))
         self._n_begun, self._begun = claim.job.n_done, time.monotonic()
+        self._n_known = 0
         self._told = self._wrote = self._kept = 0.0
         self._news = False
 
@@ -130,6 +133,15 @@ class Recorder:
         self._n_done += 1
         self._news = True
 
+    def known(self, run: str, source: str) -> None:
+        """The run is what another run was."""
+        self._pending.known[run] = source
+        self._waiting.pop(run, None)
+        self._n_done += 1
+        self._n_begun += 1  # it tells nothing of how long the others take
+        self._n_known += 1
+        self._news = True
+
     def should_stop(self) -> bool:
         """Whether the job was cancelled or its lease lost."""
         return self.is_stopped
@@ -145,7 +157,7 @@ class Recorder:
         now = time.monotonic()
         tell = self._news and now - self._told > PROGRESS_SECONDS
         keep = bool(self._live) and now - self._kept > CHECKPOINT_SECONDS
-        some = bool(self._pending.outcomes or self._pending.started)
+        some = bool(self._pending.outcomes or self._pending.started or self._pending.known)
         if tell or keep or (some and now - self._wrote > RESULTS_SECONDS):
             with self._database.write() as session:
                 self._write(session, tell=tell, keep=keep)
@@ -165,6 +177,9 @@ class Recorder:
             job = queue.hold(self.lease)
             session.refresh(job)
             complaint = self._complaint(job.n_failed, job.n_runs)
+            if self._n_known:
+                text = f"{self._n_known} of {job.n_runs} runs had been computed before: reused"
+                queue.tell(self.lease, "log", {"message": text})
             if job.n_failed == job.n_runs:
                 queue.finish(self.lease, State.FAILED, complaint)
             else:
@@ -218,6 +233,9 @@ class Recorder:
 
     def _write(self, session: Session, *, tell: bool, keep: bool) -> None:
         ledger, pending = RunLedger(session, self.lease), self._pending
+        for one in take_over(session, self.lease, pending.known):
+            self._evaluations += one.evaluations
+            self._best = min(self._best, math.inf if one.best_rms is None else one.best_rms)
         ledger.start(pending.started)
         ledger.record(pending.outcomes, pending.history, pending.migrants)
         for run, reason in pending.complaints:

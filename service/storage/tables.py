@@ -190,8 +190,9 @@ class Job(Base):
 class Run(Base):
     """One identification: one cell of a job's sweep, and what it gave.
 
-    `number` is the cell's place in the sweep. `result` is the document of the run result;
-    `estimates` repeats {name: {"value", "stderr"}} of it for summaries over many runs.
+    `number` is the cell's place in the sweep, `spec_hash` names what is computed. `result` is the
+    document of the run result; `estimates` repeats {name: {"value", "stderr"}} of it for summaries
+    over many runs.
     """
 
     __tablename__ = "runs"
@@ -199,6 +200,7 @@ class Run(Base):
         UniqueConstraint("job_id", "number"),
         Index("ix_runs_job_id_state_number", "job_id", "state", "number"),
         Index("ix_runs_project_id_id", "project_id", "id"),
+        Index("ix_runs_project_id_spec_hash", "project_id", "spec_hash"),
     )
 
     id: Mapped[str] = mapped_column(primary_key=True)

@@ -1,0 +1,75 @@
+"""Runs that were computed before: found by the hash of their specification, and taken over."""
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+from sqlalchemy import func, select, update
+from sqlalchemy.orm import Session
+
+from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOutcome
+from service.storage.queue import Lease, Queue
+from service.storage.statements import chunks
+from service.storage.tables import DEFAULT_PROJECT, MigrationLog, Run, RunHistory, State
+
+_COPIED = (
+    "result", "valid", "best_rms", "fit_estimation", "fit_validation", "evaluations",
+    "generations", "seconds", "signals_sha256",
+)  # fmt: skip
+
+
+def mark(session: Session, lease: Lease, hashes: Mapping[str, str]) -> None:
+    """Write the hashes of runs' specifications, given by run; `LeaseLost` without the lease."""
+    Queue(session).hold(lease)
+    rows = [{"id": run, "spec_hash": digest} for run, digest in hashes.items()]
+    if rows:
+        session.execute(update(Run), rows)
+
+
+def computed(
+    session: Session, hashes: Collection[str], project_id: str = DEFAULT_PROJECT
+) -> dict[str, str]:
+    """For each hash that a run of the project has succeeded with, the first such run."""
+    found: dict[str, str] = {}
+    for chunk in chunks(hashes):
+        query = select(Run.spec_hash, func.min(Run.id)).where(
+            Run.project_id == project_id, Run.spec_hash.in_(chunk), Run.state == State.SUCCEEDED
+        )
+        found.update({str(one): run for one, run in session.execute(query.group_by(Run.spec_hash))})
+    return found
+
+
+def take_over(session: Session, lease: Lease, sources: Mapping[str, str]) -> list[RunOutcome]:
+    """End runs with the results of others, given by run; gives what was written of them.
+
+    History and migrations are copied, so that each run is complete by itself.
+    """
+    ledger, taken = RunLedger(session, lease), []
+    for chunk in chunks(sources.items()):
+        pairs = dict(chunk)
+        query = select(Run).where(Run.id.in_(set(pairs.values())))
+        known = {run.id: run for run in session.scalars(query)}
+        outcomes = [_outcome(run, known[source]) for run, source in pairs.items()]
+        ledger.record(
+            outcomes,
+            _copies(session, RunHistory, HistoryPoint, pairs),
+            _copies(session, MigrationLog, MigrantPoint, pairs),
+        )
+        taken += outcomes
+    return taken
+
+
+def _outcome(run: str, source: Run) -> RunOutcome:
+    values = {name: getattr(source, name) for name in _COPIED}
+    first = (source.result or {}).get("reused_from", source.id)
+    values["result"] = {**(source.result or {}), "reused_from": first}
+    return RunOutcome(run_id=run, state=State.SUCCEEDED, **values)
+
+
+def _copies(session: Session, table: Any, point: Any, sources: Mapping[str, str]) -> Iterator[Any]:
+    columns = [getattr(table, name) for name in point._fields]
+    rows: dict[str, list[Any]] = {}
+    for row in session.execute(select(*columns).where(table.run_id.in_(set(sources.values())))):
+        rows.setdefault(row.run_id, []).append(row)
+    for run, source in sources.items():
+        for row in rows.get(source, []):
+            yield point(*row)._replace(run_id=run)

@@ -1,0 +1,126 @@
+"""Runs that were computed before are taken over, whole, and say so."""
+
+import threading
+import time
+
+import pytest
+
+from service.dispatch.claiming import Leases
+from service.dispatcher import Dispatcher
+from service.storage.events import EventRepository
+from service.storage.tables import OPEN, State
+from tests.dispatching import Place
+from workers.inline import InlineCrew
+from workers.tasks import advance
+
+SMALL = {"population": 8, "generations": 5, "islands": 1}
+
+
+class CountingCrew(InlineCrew):
+    """A crew that remembers which runs it was given."""
+
+    def __init__(self):
+        super().__init__()
+        self.computed = []
+
+    def submit(self, pack, keys, shared):
+        self.computed += [item.run for item in pack]
+        return super().submit(pack, keys, shared)
+
+
+@pytest.fixture
+def place(tmp_path):
+    made = Place(tmp_path / "data")
+    yield made
+    made.database.dispose()
+
+
+def sweep(seeds, **changes):
+    axes = [{"path": "/seed", "range": [0, seeds]}]
+    return {"sweep": {"axes": axes}, "algorithm": SMALL, **changes}
+
+
+def carried_out(place, **body):
+    """The job's runs once it is over, and those that a worker computed."""
+    job, crew = place.submit(**body), CountingCrew()
+    dispatcher = Dispatcher(place.database, place.store, crew, Leases(place.database, 30))
+
+    def stop_at_the_end():
+        while place.job(job).state in OPEN:
+            time.sleep(0.01)
+        dispatcher.stopping.set()
+
+    watcher = threading.Thread(target=stop_at_the_end)
+    watcher.start()
+    dispatcher.run()
+    watcher.join()
+    return job, place.runs(job), list(dict.fromkeys(crew.computed))
+
+
+def test_more_replicates_of_a_sweep_compute_only_the_new_ones(place):
+    _, before, computed = carried_out(place, **sweep(3))
+    assert len(computed) == 3
+    job, after, computed = carried_out(place, **sweep(5))
+    assert computed == [run.id for run in after[3:]]
+    for old, new in zip(before, after[:3], strict=True):
+        assert new.result.pop("reused_from") == old.id
+        assert new.result == old.result
+        assert place.history(new.id) == place.history(old.id) != []
+        assert (new.best_rms, new.evaluations, new.signals_sha256) == (
+            old.best_rms, old.evaluations, old.signals_sha256,
+        )  # fmt: skip
+    with place.database.read() as session:
+        told = [one.data.get("message") for one in EventRepository(session).latest(job, 20)]
+    assert "3 of 5 runs had been computed before: reused" in told
+    assert place.job(job).evaluations == sum(run.evaluations for run in after)
+    assert place.job(job).n_done == 5
+
+
+def test_a_run_taken_over_twice_names_the_one_that_was_computed(place):
+    _, (first,), _ = carried_out(place, **sweep(1))
+    carried_out(place, **sweep(1))
+    _, (third,), computed = carried_out(place, **sweep(1))
+    assert third.result["reused_from"] == first.id
+    assert computed == []
+
+
+def test_reuse_can_be_declined(place):
+    carried_out(place, **sweep(2))
+    _, runs, computed = carried_out(place, **sweep(2), reuse=False)
+    assert computed == [run.id for run in runs]
+    assert all("reused_from" not in run.result for run in runs)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"noise": {"sigma": 0.1}}, {"skip": 1}, {"parameters": {"T": {"upper": 9.0}}},
+        {"algorithm": {**SMALL, "bits": 20}}, {"loss": {"kind": "soft-l1", "scale": 0.5}},
+    ],
+)  # fmt: skip
+def test_another_specification_is_computed(place, changes):
+    carried_out(place, **sweep(1))
+    _, _, computed = carried_out(place, **{**sweep(1), **changes})
+    assert len(computed) == 1
+
+
+def test_a_run_that_the_clock_may_end_is_computed_again(place):
+    body = sweep(1, algorithm={**SMALL, "stop": {"seconds": 60}})
+    carried_out(place, **body)
+    assert len(carried_out(place, **body)[2]) == 1
+
+
+def test_a_run_that_failed_is_tried_again(place, monkeypatch):
+    def broken(pack, keys, *shared):
+        done = advance(pack, keys, *shared)
+        raise MemoryError(f"{len(done)} lost")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("service.dispatch.preparing.prepared", lambda *_: ((), None))
+        patched.setattr("sysid.run.conclude", broken)
+        patched.setattr("workers.tasks.conclude", broken)
+        _, (run,), _ = carried_out(place, **sweep(1))
+    assert run.state is State.FAILED
+    _, (again,), computed = carried_out(place, **sweep(1))
+    assert computed == [again.id]
+    assert again.state is State.SUCCEEDED
