@@ -2,17 +2,25 @@
 
 import hashlib
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 
 from sysid.kernels.machine import machine_name
 
+_LIBRARIES = ("numpy", "scipy", "numba")
+
 
 @cache
-def program() -> str:
-    """Digest of the sources of this package and of what kernels depend on in the machine."""
-    folder = Path(__file__).parent
-    digest = hashlib.blake2b(machine_name().encode(), digest_size=16)
-    for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.yaml")]):
-        digest.update(str(path.relative_to(folder)).encode())
-        digest.update(path.read_bytes())
+def program(*packages: Path) -> str:
+    """Digest of all that a result depends on besides its specification.
+
+    The sources of this package and of those given as folders, the versions of the libraries, and
+    what kernels depend on in the machine.
+    """
+    parts = [machine_name(), *(f"{name} {version(name)}" for name in _LIBRARIES)]
+    digest = hashlib.blake2b("\n".join(parts).encode(), digest_size=16)
+    for folder in (Path(__file__).parent, *packages):
+        for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.yaml")]):
+            digest.update(str(path.relative_to(folder.parent)).encode())
+            digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -83,6 +83,8 @@ class JobRuns:
                 sources = self._computed(queued)
                 for one in queued:
                     source = sources.get(one.run)
+                    if source is None and isinstance(one, QueuedRun):
+                        self._problems[one.run] = one.spec.problem
                     yield one if source is None else KnownRun(one.run, source)
                 rows = self._pending(rows[-1].number)
         except LeaseLost as error:  # the recorder will meet it too, and stop the job
@@ -188,7 +190,6 @@ class JobRuns:
             spec = self.specification(row.cell)
         except (SysidError, ServiceError, StorageError) as error:
             return RefusedRun(row.id, Failure(str(error), type(error).__name__))
-        self._problems[row.id] = spec.problem
         return QueuedRun(row.id, spec, state)
 
     def _computed(self, queued: list[QueuedRun | RefusedRun]) -> dict[str, str]:

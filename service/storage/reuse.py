@@ -32,8 +32,9 @@ def computed(
     found: dict[str, str] = {}
     for chunk in chunks(hashes):
         query = select(Run.spec_hash, func.min(Run.id)).where(
-            Run.project_id == project_id, Run.spec_hash.in_(chunk), Run.state == State.SUCCEEDED
-        )
+            Run.project_id == project_id, Run.spec_hash.in_(chunk), Run.state == State.SUCCEEDED,
+            Run.signals_sha256.is_not(None),  # one whose signals could not be stored is not whole
+        )  # fmt: skip
         found.update({str(one): run for one, run in session.execute(query.group_by(Run.spec_hash))})
     return found
 

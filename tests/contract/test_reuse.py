@@ -124,3 +124,13 @@ def test_a_run_that_failed_is_tried_again(place, monkeypatch):
     _, (again,), computed = carried_out(place, **sweep(1))
     assert computed == [again.id]
     assert again.state is State.SUCCEEDED
+
+
+def test_a_run_without_its_signals_is_computed_again(place, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr("service.dispatch.preparing.save_fit", lambda *_: None)
+        _, (first,), _ = carried_out(place, **sweep(1))
+    assert first.signals_sha256 is None
+    _, (again,), computed = carried_out(place, **sweep(1))
+    assert computed == [again.id]
+    assert again.signals_sha256 is not None
