@@ -22,6 +22,9 @@ from sysid.errors import InvalidRecord, SysidError
 from sysid.records import Channel
 from sysid.types import FloatArray
 
+MOST_DRAWS = 10_000_000
+"""Values of one random binary signal at most."""
+
 
 class Signals:
     """Values of inputs at given times; remembers the datasets they came from.
@@ -42,7 +45,8 @@ class Signals:
         Raises
         ------
         InvalidRequest
-            If an expression cannot be used, or a dataset has no such channel.
+            If an expression cannot be used, a dataset has no such channel, or a binary signal
+            would be drawn more than `MOST_DRAWS` times.
         """
         t = self._times
         match signal:
@@ -53,7 +57,7 @@ class Signals:
             case StepInput():
                 return np.asarray(signal.offset + signal.amplitude * (t >= signal.time))
             case BinaryInput():
-                draws = _binary(t, signal.period, signal.seed)
+                draws = _binary(pointer, signal, t)
                 return np.asarray(signal.offset + signal.amplitude * draws)
             case ExpressionInput():
                 return _evaluated(pointer, signal.expression, t)
@@ -120,9 +124,17 @@ def _omega(wave: Wave) -> float:
     return wave.omega or 0.0
 
 
-def _binary(times: FloatArray, period: float, seed: int) -> FloatArray:
-    places = (times / period).astype(np.int64)
-    draws = np.random.Generator(np.random.Philox(seed)).integers(0, 2, int(places[-1]) + 1)
+def _binary(pointer: str, signal: BinaryInput, times: FloatArray) -> FloatArray:
+    duration = float(times[-1])
+    if not duration / signal.period < MOST_DRAWS:
+        raise InvalidRequest.at(
+            f"{pointer}/period",
+            f"found {signal.period:g} s, so that {duration:g} s need more than {MOST_DRAWS} "
+            f"draws; need more than {duration / MOST_DRAWS:g} s",
+        )
+    places = (times / signal.period).astype(np.int64)
+    source = np.random.Generator(np.random.Philox(signal.seed))
+    draws = source.integers(0, 2, int(places[-1]) + 1)
     return np.where(draws[places] == 1, 1.0, -1.0)
 
 

@@ -11,6 +11,9 @@ from service.schemas_jobs import NoiseIn, Seed
 
 MAX_SIMULATED_SAMPLES = 10_000_000
 
+SampleTime = Annotated[float, Field(ge=1e-9, le=1e9)]
+"""In s; the longest record then lasts a finite time, and no two of its samples share one."""
+
 
 class Wave(Body):
     """offset + amplitude · cos(omega·t + phase); `omega` in rad/s or `frequency` in Hz."""
@@ -87,7 +90,7 @@ class SimulateIn(Body):
     parameters: dict[str, float] = Field(default={})
     inputs: dict[str, InputIn] = Field(default={})
     samples: int | None = Field(default=None, ge=2, le=MAX_SIMULATED_SAMPLES)
-    sample_time: float | None = Field(default=None, gt=0)
+    sample_time: SampleTime | None = None
     noise: NoiseIn = NoiseIn()
 
     @model_validator(mode="after")

@@ -11,6 +11,7 @@ from service.schemas_datasets import (
     DatasetInput,
     DatasetOut,
     ExpressionInput,
+    SampleTime,
     Series,
     StepInput,
     Wave,
@@ -75,7 +76,7 @@ class RunSimulateIn(Body):
     control: ControlIn | None = None
     parameters: dict[str, float] = Field(default={})
     samples: int = Field(ge=2, le=MAX_SIMULATED)
-    sample_time: float | None = Field(default=None, gt=0)
+    sample_time: SampleTime | None = None
     store: bool = False
     name: str | None = Field(default=None, max_length=200)
 

@@ -18,6 +18,9 @@ from sysid.types import FloatArray
 MOST_SAMPLES = 200_000
 """Samples of one simulation at most: about ten seconds of work."""
 
+MOST_WORK = 300_000
+"""Advances of the state in one simulation at most: about half a minute of one core."""
+
 _LONGEST = 1e-3  # s between looks for an event
 _HALVINGS = 50
 _THETA, _OMEGA, _P, _SUPPLY, _SLOPE, _ONE = range(6)
@@ -86,24 +89,50 @@ def simulate_actuator(actuator: Actuator, supply: Channel) -> Recording:
     ------
     InvalidRecord
         If a sample is missing, times repeat, or there are more than `MOST_SAMPLES`.
+    InvalidSettings
+        If the simulation would take more than `MOST_WORK`, or diverges.
     """
     times, values = supply.times, supply.values
     if not 2 <= times.size <= MOST_SAMPLES:
         raise InvalidRecord(f"found {times.size} samples; need from 2 to {MOST_SAMPLES}")
     if not np.all(np.isfinite(values)) or np.any(np.diff(times) <= 0):
         raise InvalidRecord("the supply pressure needs a value at every time, and later times")
-    plant = _Plant(actuator)
-    found = np.zeros((times.size, 2))
-    for k in range(times.size - 1):
-        step = float(times[k + 1] - times[k])
-        slope = 0.0 if supply.hold == "zero" else float(values[k + 1] - values[k]) / step
-        plant.advance(float(values[k]), slope, step)
-        found[k + 1] = plant.state[_THETA], plant.state[_P]
+    _check_duration(float(times[-1]) - float(times[0]))
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told
+        found = _simulated(_Plant(actuator), supply)
     return Recording((
         Channel("P_a", times, values, "Pa", supply.hold),
         Channel("theta", times, found[:, 0].copy(), "rad"),
         Channel("P", times, found[:, 1].copy(), "Pa"),
     ))  # fmt: skip
+
+
+def _check_duration(duration: float) -> None:
+    """Refuse a record (s) whose pieces alone are more work than may be done."""
+    if not duration / _LONGEST <= MOST_WORK:
+        raise InvalidSettings(
+            "/sample_time",
+            f"the record lasts {duration:g} s; the actuator can be simulated for "
+            f"{MOST_WORK * _LONGEST:g} s at most: ask for fewer samples or a smaller sample_time",
+        )
+
+
+def _simulated(plant: "_Plant", supply: Channel) -> FloatArray:
+    """Angle and pressure, (samples, 2)."""
+    times, values = supply.times, supply.values
+    found = np.zeros((times.size, 2))
+    for k in range(times.size - 1):
+        step = float(times[k + 1] - times[k])
+        slope = 0.0 if supply.hold == "zero" else float(values[k + 1] - values[k]) / step
+        plant.advance(float(values[k]), slope, step)
+        if not np.all(np.isfinite(plant.state)):
+            raise InvalidSettings(
+                "/parameters",
+                f"with these values the actuator's state is not finite at t = {times[k + 1]:g} s; "
+                "choose others nearer to its own, or a smaller supply pressure",
+            )
+        found[k + 1] = plant.state[_THETA], plant.state[_P]
+    return found
 
 
 class _Plant:
@@ -116,6 +145,7 @@ class _Plant:
         self._way = 0
         self._systems = {way: self._system(way) for way in (-1, 0, 1)}
         self._known: dict[tuple[int, float], FloatArray] = {}
+        self._work = 0
 
     def advance(self, supply: float, slope: float, time: float) -> None:
         """Go on for a time (s) in which the supply begins with a value (Pa) and slope (Pa/s)."""
@@ -172,6 +202,13 @@ class _Plant:
 
     def _after(self, time: float, keep: bool = False) -> FloatArray:
         """The state after a time in the present mode."""
+        self._work += 1
+        if self._work > MOST_WORK:
+            raise InvalidSettings(
+                "/samples",
+                f"the arm stops and breaks away so often that the state would be advanced more "
+                f"than {MOST_WORK} times; ask for fewer samples, or parameters nearer to its own",
+            )
         key = (self._way, time)
         matrix = self._known.get(key)
         if matrix is None:

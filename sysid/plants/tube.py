@@ -31,6 +31,11 @@ PRANDTL = 0.71
 MOST_WORK = 2e8
 """Cells times steps of one simulation at most: about half a minute of one core."""
 
+MOST_SAMPLES = 5_000_000
+"""Samples of the command that a record's regulator follows, at most: about 400 MB."""
+
+_LONGEST_CELL = 5.0  # m; coarser ones carry no wave of the patterns
+
 _LAMINAR, _TURBULENT = 2000.0, 4000.0
 _COURANT = 0.8 / 1.15
 _WALL_OF_VOLUME = 20.0  # W/m²/K
@@ -74,6 +79,13 @@ class Tube:
                 raise InvalidSettings(
                     f"/parameters/{name}", f"found {value:g}; need from {least:g} to {most:g}"
                 )
+        if self.cells and self.length_m > _LONGEST_CELL * self.cells:
+            raise InvalidSettings(
+                "/parameters/cells",
+                f"found {self.cells}, each {self.length_m / self.cells:g} m long; need "
+                f"{ceil(self.length_m / _LONGEST_CELL)} or more for {self.length_m:g} m, or 0: "
+                "as many as are right for its length",
+            )
 
     @property
     def n_cells(self) -> int:
@@ -134,15 +146,15 @@ def simulate_tube(tube: Tube, inlet: Channel, *, regulator: bool = False) -> Rec
 
 def _substeps(tube: Tube, samples: int, period: float) -> int:
     """Steps in a period, if they are not too many in all."""
-    substeps = ceil(period / tube.step)
-    work = float(samples) * substeps * tube.n_cells * (1 + tube.modes / 4)
-    if work > MOST_WORK:
+    substeps = period / tube.step  # not finite for the longest periods
+    work = float(samples) * max(substeps, 1.0) * tube.n_cells * (1 + tube.modes / 4)
+    if not work <= MOST_WORK:
         raise InvalidSettings(
             "/samples",
             f"{samples} samples of {tube.n_cells} cells take {work:.2g} cell steps, and may "
             f"take {MOST_WORK:.2g}; ask for fewer samples or cells",
         )
-    return substeps
+    return ceil(substeps)
 
 
 def _period(inlet: Channel) -> float:
@@ -341,7 +353,13 @@ def tube_record(tube: Tube, pattern: int, samples: int, period: float) -> Record
     InvalidSettings, InvalidRecord
         As `simulate_tube` and `excitation`.
     """
-    finer = max(1, min(10, round(period / 5e-4)))
+    finer = max(1, round(min(10.0, period / 5e-4)))
+    if samples * finer > MOST_SAMPLES:
+        raise InvalidSettings(
+            "/samples",
+            f"found {samples}, whose command has {finer} times as many; need at most "
+            f"{MOST_SAMPLES // finer} at a sample_time of {period:g} s",
+        )
     _substeps(tube, samples * finer, period / finer)
     times = np.arange((samples - 1) * finer + 1, dtype=np.float64) * (period / finer)
     command = Channel("P1", times, excitation(pattern, tube.length_m, times), "Pa")

@@ -82,5 +82,26 @@ def test_what_cannot_be_simulated_is_told() -> None:
             simulate_actuator(ARM, Channel("P_a", times, values, "Pa"))
 
 
+@pytest.mark.parametrize("last", [1e6, 1e300])
+def test_the_work_of_a_record_grows_with_its_time_and_is_bounded(last: float) -> None:
+    with pytest.raises(InvalidSettings, match="300 s at most") as caught:
+        simulate_actuator(ARM, Channel("P_a", np.array([0.0, last]), np.zeros(2), "Pa"))
+    assert caught.value.pointer == "/sample_time"
+
+
+def test_an_arm_that_stops_too_often_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sysid.plants.actuator.MOST_WORK", 8_000)
+    simulate_actuator(ARM, Channel("P_a", TIMES, np.zeros(400), "Pa"))  # at rest: no event
+    with pytest.raises(InvalidSettings, match="so often"):
+        simulate_actuator(ARM, Channel("P_a", TIMES, 12e3 * np.sin(40 * TIMES), "Pa"))
+
+
+@pytest.mark.parametrize("changes", [{"k_a": 1e308}, {"J": 1e-308}, {"k_c": 1e200}, {"B": 1e308}])
+def test_a_state_that_is_not_finite_is_told(changes: dict[str, float]) -> None:
+    with pytest.raises(InvalidSettings, match="is not finite at t = ") as caught:
+        simulate_actuator(Actuator(**changes), supply(12e3))
+    assert caught.value.pointer == "/parameters"
+
+
 def test_the_default_stop_is_half_of_270_degrees() -> None:
     assert pytest.approx(0.75 * pi) == ARM.theta_s

@@ -122,7 +122,8 @@ def test_gauges_tell_whole_digits_with_noise() -> None:
 @pytest.mark.parametrize(
     ("changes", "pointer"),
     [({"length_m": 0.1}, "/parameters/length_m"), ({"bore_m": float("nan")}, "/parameters/bore_m"),
-     ({"cells": 9000}, "/parameters/cells"), ({"volume_m3": -1.0}, "/parameters/volume_m3")],
+     ({"cells": 9000}, "/parameters/cells"),
+     ({"cells": 7}, "/parameters/cells"), ({"volume_m3": -1.0}, "/parameters/volume_m3")],
 )  # fmt: skip
 def test_a_tube_that_cannot_be_is_told(changes: dict[str, Any], pointer: str) -> None:
     with pytest.raises(InvalidSettings) as caught:
@@ -138,3 +139,10 @@ def test_inlets_that_cannot_be_and_simulations_that_take_too_long_are_told() -> 
         simulate_tube(tube, pressure(np.array([0.0])))
     with pytest.raises(InvalidSettings, match="ask for fewer samples"):
         simulate_tube(Tube(cells=5000), pressure(np.zeros(10_000)))
+
+
+def test_a_record_s_memory_is_bounded_and_no_period_is_too_long_to_be_told() -> None:
+    with pytest.raises(InvalidSettings, match="need at most 500000 at a sample_time"):
+        tube_record(Tube(length_m=5.0, cells=1), 1, 10_000_000, 0.005)
+    with pytest.raises(InvalidSettings, match="ask for fewer samples"):
+        tube_record(Tube(length_m=5.0), 1, 2, 1e308)

@@ -76,7 +76,42 @@ def test_the_tube_has_a_record_of_its_own_length_and_sampling(server: TestClient
         ({**TUBE, "parameters": {"pattern": 1.5}}, "/parameters/pattern", "whole number"),
         ({**TUBE, "parameters": {"pattern": 3}}, "/parameters/pattern", "need 1 or 2"),
         ({**TUBE, "parameters": {"length_m": 1e5}}, "/parameters/length_m", "from 0.5 to 2000"),
-        ({**TUBE, "samples": 9_000_000}, "/samples", "ask for fewer samples"),
+        ({**TUBE, "samples": 9_000_000}, "/samples", "need at most 500000"),
+        (
+            {
+                "plant": "tube",
+                "parameters": {"cells": 1, "length_m": 5},
+                "samples": 9_000_000,
+                "sample_time": 0.005,
+            },
+            "/samples",
+            "need at most 500000",
+        ),
+        (
+            {**TUBE, "parameters": {"length_m": 20, "cells": 100}, "samples": 400_000},
+            "/samples",
+            "ask for fewer samples",
+        ),
+        (
+            {**TUBE, "parameters": {"length_m": 2000, "cells": 1}},
+            "/parameters/cells",
+            "need 400 or more",
+        ),
+        ({**TUBE, "sample_time": 1e308}, "/sample_time", "less than or equal to"),
+        ({**TUBE, "sample_time": 1e9}, "/samples", "ask for fewer samples"),
+        ({**ARM, "samples": 2, "sample_time": 1e6}, "/sample_time", "300 s at most"),
+        ({**ARM, "sample_time": 1e-12}, "/sample_time", "greater than or equal to"),
+        ({**ARM, "parameters": {"k_a": 1e308}}, "/parameters", "not finite at t = "),
+        (
+            {**ARM, "inputs": {"P_a": {**SUPPLY["P_a"], "period": 1e-9}}},
+            "/inputs/P_a/period",
+            "need more than 1.99e-07 s",
+        ),
+        (
+            {**ARM, "inputs": {"P_a": {**SUPPLY["P_a"], "period": 1e-300}}},
+            "/inputs/P_a/period",
+            "need more than 1.99e-07 s",
+        ),
     ],
 )
 def test_a_plant_that_cannot_be_is_told_where_it_is(
