@@ -14,6 +14,9 @@ from sysid.errors import nearest
 # Fields that decide on the job as a whole; a cell of it cannot have its own.
 FIXED_FIELDS = ("name", "priority", "reuse", "sweep")
 
+MOST_LABEL = 64
+"""Characters of the name of a label at most."""
+
 
 @dataclass(frozen=True, slots=True)
 class Cell:
@@ -160,12 +163,26 @@ def _faults(job: JobIn) -> Iterator[FieldError]:
         if axis.labels is not None and len(axis.labels) != n:
             found = f"found {len(axis.labels)} labels for {n} values; need one each"
             yield FieldError(f"{place}/labels", found)
+        yield from _bad_labels(axis, place)
         if axis.zip is not None and lengths.setdefault(axis.zip, n) != n:
             yield FieldError(
                 f"{place}/zip",
                 f"axes of zip {axis.zip!r} step together: found {n} values beside "
                 f"{lengths[axis.zip]}; need as many",
             )
+
+
+def _bad_labels(axis: Axis, place: str) -> Iterator[FieldError]:
+    """Names that a database cannot look up in a document, which would merge its groups."""
+    for position, labels in enumerate(axis.labels or ()):
+        for name in labels:
+            if not 1 <= len(name) <= MOST_LABEL or not name.isprintable() or set(name) & {*'"\\'}:
+                yield FieldError(
+                    f"{place}/labels/{position}",
+                    f"found the name {name!r:.80}; need 1 to {MOST_LABEL} printable characters "
+                    "without quotation marks and backslashes",
+                )
+                return  # the other positions mostly have the same names
 
 
 def _bad_spacing(axis: Axis) -> str | None:
