@@ -105,10 +105,12 @@ def _pair(number: int, first: Channel, then: Channel, others: Sequence[Channel])
         reason = "the input does not rest before it moves"
         return OnsetDelay(number, first.name, then.name, None, reason=reason)
     noise = (_noise(first.values), _noise(values))
+    notable = _NOTABLE * float(np.ptp(first.values))
+    still = [(one, _tolerance(one.values)) for one in others]
     found: list[tuple[float, float]] = []
     for event in events:
-        pair = _at_event(event, first, (times, values), noise)
-        if pair is not None and not any(_moves(o, event.rest, pair[1].time) for o in others):
+        pair = _at_event(event, first, (times, values), noise, notable)
+        if pair is not None and not any(_moves(*one, event.rest, pair[1].time) for one in still):
             found.append((pair[1].time - pair[0].time, pair[1].share))
     if not found:
         reason = "the output does not rest before any step of the input, or its step is not clear"
@@ -123,12 +125,12 @@ def _pair(number: int, first: Channel, then: Channel, others: Sequence[Channel])
 
 def _at_event(
     event: _Event, first: Channel, output: tuple[FloatArray, FloatArray],
-    noise: tuple[float, float],
+    noise: tuple[float, float], notable: float,
 ) -> tuple[_Onset, _Onset] | None:  # fmt: skip
     """Onsets of input and output at one event; None if one is not clear."""
     held = first.hold == "zero"
     moved = _onset(first.times, first.values, event, noise[0], held=held)
-    if moved is None or moved.excursion < _NOTABLE * float(np.ptp(first.values)):
+    if moved is None or moved.excursion < notable:
         return None
     answered = _onset(*output, event, noise[1], held=False)
     # What moves before its input does is not moved by it.
@@ -197,7 +199,7 @@ def _rests(values: FloatArray) -> list[tuple[int, int]]:
     """Stretches (first, beyond the last) of ten samples or more within the tolerance."""
     if values.size <= _REST:
         return []
-    tolerance = max(_TOLERANCE * float(np.ptp(values)), 2.0 * _NOISE * _noise(values))
+    tolerance = _tolerance(values)
     still = _running(values, np.maximum) - _running(values, np.minimum) <= tolerance
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
     return [(int(a), int(b) - 1 + _REST) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -210,15 +212,17 @@ def _running(values: FloatArray, extreme: np.ufunc) -> FloatArray:
     return values
 
 
-def _moves(channel: Channel, start: float, stop: float) -> bool:
+def _tolerance(values: FloatArray) -> float:
+    """Within which a signal rests; told once for a channel, as it reads every sample."""
+    return max(_TOLERANCE * float(np.ptp(values)), 2.0 * _NOISE * _noise(values))
+
+
+def _moves(channel: Channel, tolerance: float, start: float, stop: float) -> bool:
     """Whether an input leaves its tolerance between two times."""
     span = _span(channel.times, start, stop)
     part = channel.values[max(span.start - 1, 0) : span.stop]
     if part.size == 0:
         return False
-    tolerance = max(
-        _TOLERANCE * float(np.ptp(channel.values)), 2.0 * _NOISE * _noise(channel.values)
-    )
     return bool(np.ptp(part) > tolerance)
 
 
