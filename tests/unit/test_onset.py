@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from service.signals.csv_reader import read_csv
+from sysid import onset
 from sysid.models.library import load_model
 from sysid.onset import OnsetDelay, onset_delays
 from sysid.records import Channel, Hold, Record
@@ -131,3 +132,23 @@ def test_of_a_long_tube_it_is_about_3_46_ms_a_metre(length: int, pattern: int) -
     record = recording.record({"u": "P1_meas_Pa"}, {"y": "P2_meas_Pa"})
     found = onset_delays(load_model("fopdt"), (record,))[0]
     assert found.delay == pytest.approx(3.46e-3 * length, rel=0.1)
+
+
+def test_a_channel_s_noise_is_taken_as_often_for_many_events_as_for_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls: list[int] = []
+    noise = onset._noise
+
+    def counted(values: FloatArray) -> float:
+        calls.append(values.size)
+        return noise(values)
+
+    monkeypatch.setattr(onset, "_noise", counted)
+    counts = []
+    for u in (np.where(steps() > 0, 1.0, 0.0), steps()):
+        calls.clear()
+        other = Channel("v", TIMES, np.zeros(TIMES.size))
+        assert delays(u, response(TIMES), others=(other,)).events > 0
+        counts.append(len(calls))
+    assert counts[0] == counts[1]
