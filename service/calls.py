@@ -5,6 +5,7 @@ import json
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
 
@@ -21,7 +22,10 @@ MEDIA_TYPES = {".csv": "text/csv", ".txt": "text/csv", ".mcap": "application/x-m
 
 
 class ClientError(Exception):
-    """Base class of what a client raises on purpose: ProblemError, ServerUnreachable."""
+    """Base class of what a client raises on purpose.
+
+    It is a ProblemError, a ServerUnreachable or a NotFinite.
+    """
 
 
 class ProblemError(ClientError):
@@ -51,9 +55,29 @@ class ServerUnreachable(ClientError):
         )
 
 
+class NotFinite(ClientError):
+    """A body holds a number that JSON has no word for; it was not sent.
+
+    Attributes
+    ----------
+    pointer : str
+        Where it stands in the body.
+    """
+
+    def __init__(self, pointer: str, value: float) -> None:
+        super().__init__(f"{pointer or 'body'}: found {value}; need a finite number")
+        self.pointer = pointer
+
+
 @dataclass(frozen=True, slots=True)
 class Call:
-    """One request, not yet sent."""
+    """One request, not yet sent.
+
+    Raises
+    ------
+    NotFinite
+        If a number of the body is infinite or not a number.
+    """
 
     method: str
     path: str
@@ -61,6 +85,21 @@ class Call:
     json: Any = None
     content: bytes | Path | None = None
     headers: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _check_finite("", self.json)
+
+
+def _check_finite(pointer: str, value: Any) -> None:
+    if isinstance(value, float) and not isfinite(value):
+        raise NotFinite(pointer, value)
+    if isinstance(value, Mapping):
+        for name, one in value.items():
+            part = str(name).replace("~", "~0").replace("/", "~1")
+            _check_finite(f"{pointer}/{part}", one)
+    elif isinstance(value, list | tuple):
+        for index, one in enumerate(value):
+            _check_finite(f"{pointer}/{index}", one)
 
 
 def read(*parts: str, **params: Any) -> Call:

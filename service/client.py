@@ -19,11 +19,12 @@ from service.calls import (
     Call,
     ClientError,
     Document,
+    NotFinite,
     ProblemError,
     ServerUnreachable,
 )
 
-__all__ = ["AsyncClient", "Client", "ClientError", "ProblemError", "ServerUnreachable"]
+__all__ = ["AsyncClient", "Client", "ClientError", "NotFinite", "ProblemError", "ServerUnreachable"]
 
 POLL_S = 0.3
 TIMEOUT_S = 60.0
@@ -59,6 +60,8 @@ class Client:
         From every method, if the server refuses; it carries the problem document.
     ServerUnreachable
         From every method, if no server answers.
+    NotFinite
+        From every method that sends a body, if a number in it is infinite or not a number.
     """
 
     def __init__(

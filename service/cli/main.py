@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from service.calls import ClientError
+from service.calls import ClientError, NotFinite
 from service.cli import datasets, exporting, jobs, models, runs, serving, upkeep
 from service.cli.common import err, out
 from service.cli.identify import identify
@@ -57,7 +57,7 @@ def main() -> None:
     try:
         app()
     except (ServiceError, ClientError) as error:
-        _end(str(error))
+        _end(str(error), 2 if isinstance(error, NotFinite) else 1)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:
@@ -69,9 +69,9 @@ def main() -> None:
         _end(str(error))
 
 
-def _end(message: str) -> None:
+def _end(message: str, code: int = 1) -> None:
     err.print(f"lagid: {' '.join(message.split())}", markup=False)
-    sys.exit(1)
+    sys.exit(code)
 
 
 def _is_expected(error: Exception) -> bool:

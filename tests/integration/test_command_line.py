@@ -290,3 +290,10 @@ def test_the_doctor_finds_a_sound_installation(tmp_path: Path) -> None:
     done = lagid("doctor", "--data-dir", tmp_path, LAGID_PORT=str(free_port()))
     assert done.returncode == 0, done.stderr
     assert "compiled" in done.stdout
+
+
+def test_a_number_that_is_none_is_one_line_and_never_sent(tmp_path: Path) -> None:
+    job = tmp_path / "job.yaml"
+    job.write_text("model: fopdt\ndatasets: [a]\nparameters: {L: {upper: .inf}}\n")
+    said = refused(lagid("submit", job), 2)
+    assert said == "lagid: /parameters/L/upper: found inf; need a finite number"

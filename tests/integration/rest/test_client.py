@@ -9,7 +9,8 @@ import httpx
 import pytest
 from starlette.testclient import TestClient
 
-from service.client import AsyncClient, Client, ProblemError, ServerUnreachable
+from service import calls
+from service.client import AsyncClient, Client, NotFinite, ProblemError, ServerUnreachable
 from tests.rest import recording
 
 MANY = {"axes": [{"path": "/seed", "range": [0, 600]}]}
@@ -111,3 +112,14 @@ def test_the_asynchronous_client_does_the_same(server: TestClient, dataset: str)
     # A thread of its own: a browser test before may have left a loop running in this one.
     with ThreadPoolExecutor(1) as pool:
         pool.submit(lambda: asyncio.run(work())).result()
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+def test_a_number_that_json_cannot_tell_is_named_and_not_sent(
+    client: Client, dataset: str, value: float
+) -> None:
+    bounds = {"L": {"upper": value}}
+    with pytest.raises(NotFinite, match=r"^/parameters/L/upper: found -?(nan|inf); need a finite"):
+        client.submit(job_of(dataset, parameters=bounds))
+    with pytest.raises(NotFinite, match=r"^/0/noise/sigma: "):
+        calls.Call("POST", "/v1/x", json=[{"noise": {"sigma": value}}])
