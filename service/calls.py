@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypedDict
 
 if TYPE_CHECKING:
     import httpx
@@ -19,6 +19,25 @@ TERMINAL = frozenset({"succeeded", "failed", "cancelled"})
 PIECE = 1 << 20
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 MEDIA_TYPES = {".csv": "text/csv", ".txt": "text/csv", ".mcap": "application/x-mcap"}
+
+
+POLL_S = 0.3
+TIMEOUT_S = 60.0
+PAGE = 500
+
+
+class Options(TypedDict):
+    """What both clients tell httpx."""
+
+    base_url: str
+    headers: dict[str, str]
+    timeout: float
+
+
+def options(url: str, key: str | None) -> Options:
+    """The server's address and the key, as httpx takes them."""
+    headers = {"Authorization": f"Bearer {key}"} if key else {}
+    return Options(base_url=url, headers=headers, timeout=TIMEOUT_S)
 
 
 class ClientError(Exception):

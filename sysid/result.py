@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from sysid.metrics import ChannelMetrics
+from sysid.models.terms import SelectedTerm
 from sysid.onset import OnsetDelay
 from sysid.residuals import ResidualTests
-from sysid.models.terms import SelectedTerm
 from sysid.types import FloatArray
 
 EstimateStatus = Literal["identified", "group", "at bound", "unidentifiable", "fixed", "tied"]

@@ -235,5 +235,7 @@ def _without(problem: Problem, theta: FloatArray, reason: str) -> tuple[Estimate
     d = theta.size
     statuses: list[EstimateStatus] = ["unidentifiable"] * d
     blind = np.ones(d, dtype=np.bool_)
-    known = Known(theta, tuple(statuses), np.zeros((d, d)), 0.0, blind, (), np.eye(d), np.ones(d), reason)
+    known = Known(
+        theta, tuple(statuses), np.zeros((d, d)), 0.0, blind, (), np.eye(d), np.ones(d), reason
+    )
     return estimates_of(problem, known)

@@ -1,7 +1,10 @@
 """What tests of the REST interface share."""
 
+import asyncio
+from collections.abc import Callable, Coroutine
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,6 +25,15 @@ def recording(n: int = 300, period: float = 0.1, columns: tuple[str, ...] = ("u"
     rows = [",".join(["t", *columns])]
     rows += [f"{a:.6g},{b:.6g},{c:.6g}" for a, b, c in zip(t, u, y, strict=True)]
     return ("\n".join(rows) + "\n").encode()
+
+
+T = TypeVar("T")
+
+
+def awaited(work: Callable[[], Coroutine[Any, Any, T]]) -> T:
+    """What a coroutine gives, in a thread of its own: a browser test may have left a loop here."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(lambda: asyncio.run(work())).result()
 
 
 def settings_of(folder: Path, **changes: object) -> Settings:

@@ -7,6 +7,7 @@ Runge-Kutta step lie at 0, 1 and 2; the sample that a difference equation comput
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from sysid.language.lags import mentions_time
 from sysid.language.tree import Binary, Call, Expression, Past, Unary
 from sysid.models.model import Model
 
@@ -81,8 +82,13 @@ def lags(model: Model, kind: str) -> list[Past]:
 
 def averaged_inputs(model: Model) -> frozenset[str]:
     """Inputs that are read with unknown lags only: held ones are given as means over a step."""
-    whole = {r.past.name for r in reads(model) if r.past.kind == "input" and r.past.lag is None}
-    return frozenset(past.name for past in lags(model, "input")) - whole
+    inputs = [r.past for r in reads(model) if r.past.kind == "input"]
+    unknown = {past.name for past in inputs if _is_unknown(past)}
+    return frozenset(unknown - {past.name for past in inputs if not _is_unknown(past)})
+
+
+def _is_unknown(past: Past) -> bool:
+    return past.lag is not None and mentions_time(past.lag, "parameter")
 
 
 def with_history(model: Model) -> list[str]:

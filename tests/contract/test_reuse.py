@@ -37,7 +37,7 @@ def place(tmp_path):
 
 def sweep(seeds, **changes):
     axes = [{"path": "/seed", "range": [0, seeds]}]
-    return {"sweep": {"axes": axes}, "algorithm": SMALL, **changes}
+    return {"sweep": {"axes": axes}, "algorithm": SMALL, "reuse": True, **changes}
 
 
 def carried_out(place, **body):
@@ -86,7 +86,7 @@ def test_a_run_taken_over_twice_names_the_one_that_was_computed(place):
 
 def test_reuse_can_be_declined(place):
     carried_out(place, **sweep(2))
-    _, runs, computed = carried_out(place, **sweep(2), reuse=False)
+    _, runs, computed = carried_out(place, **sweep(2, reuse=False))
     assert computed == [run.id for run in runs]
     assert all("reused_from" not in run.result for run in runs)
 

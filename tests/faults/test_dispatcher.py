@@ -11,8 +11,8 @@ from tests.dispatching import Place, until
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(240)]
 
-LONG = {"generations": 6000}
-ENDLESS = {"generations": 10_000_000}
+LONG = {"generations": 6000, "stop": {"settled": None}}
+ENDLESS = {"generations": 10_000_000, "stop": {"settled": None}}
 
 
 def has_checkpoint(place: Place) -> bool:

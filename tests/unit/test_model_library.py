@@ -16,9 +16,9 @@ from sysid.parameters import override
 from tests.meaning import simulate
 
 BUILT_IN = (
-    "actuator", "coulomb-delay", "coulomb-eq16", "delayed-logistic", "delayed-van-der-pol", "duffing-delay",
-    "duffing-eq16", "emps", "exponential", "fopdt", "mackey-glass", "narx", "silverbox", "silverbox-9", "sopdt",
-    "tube", "tube-second-order",
+    "actuator", "coulomb-delay", "coulomb-eq16", "delayed-logistic", "delayed-van-der-pol",
+    "duffing-delay", "duffing-eq16", "emps", "exponential", "fopdt", "mackey-glass", "narx",
+    "silverbox", "silverbox-9", "sopdt", "tube", "tube-second-order",
 )  # fmt: skip
 
 FOLDER = Path(folder.__path__[0])

@@ -1,7 +1,5 @@
 """The light client against the application, without a socket."""
 
-import asyncio
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +9,7 @@ from starlette.testclient import TestClient
 
 from service import calls
 from service.client import AsyncClient, Client, NotFinite, ProblemError, ServerUnreachable
-from tests.rest import recording
+from tests.rest import awaited, recording
 
 MANY = {"axes": [{"path": "/seed", "range": [0, 600]}]}
 
@@ -109,9 +107,7 @@ def test_the_asynchronous_client_does_the_same(server: TestClient, dataset: str)
             with pytest.raises(ProblemError, match="no run"):
                 await client.run("run_0")
 
-    # A thread of its own: a browser test before may have left a loop running in this one.
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(lambda: asyncio.run(work())).result()
+    awaited(work)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])

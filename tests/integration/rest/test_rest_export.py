@@ -1,6 +1,5 @@
 """The identified model of a run as JSON, Python, C and python-control: REST, clients, commands."""
 
-import asyncio
 import json
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -19,7 +18,7 @@ from service.client import AsyncClient, Client, ProblemError
 from tests.exporting import in_control, in_python
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import CSV, recording, refused, settings_of
+from tests.rest import CSV, awaited, recording, refused, settings_of
 
 SMALL = {"population": 16, "generations": 20, "islands": 1}
 POLYNOMIAL = {
@@ -143,7 +142,7 @@ def test_both_clients_give_the_text_that_rest_gives(served: Served) -> None:
         async with AsyncClient("http://testserver", transport=transport) as opened:
             return await opened.export(served.run, "c")
 
-    assert asyncio.run(work()) == told
+    assert awaited(work) == told
 
 
 def test_the_command_writes_a_file_or_to_stdout(

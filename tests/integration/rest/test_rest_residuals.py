@@ -1,6 +1,5 @@
 """Residual tests, onset delays and comparisons of runs that were identified, over REST."""
 
-import asyncio
 import html
 import json
 import re
@@ -23,7 +22,7 @@ from service.storage.objects import ObjectStore
 from sysid.records import Recording
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
-from tests.rest import CSV, refused, settings_of
+from tests.rest import CSV, awaited, refused, settings_of
 
 N, STEP, NOISE = 500, 0.05, 0.02
 SMALL = {"population": 20, "generations": 40, "islands": 1}
@@ -220,7 +219,7 @@ def test_the_asynchronous_client_asks_the_same(served: Served) -> None:
         async with AsyncClient("http://testserver", transport=transport) as client:
             return await client.residuals(served.runs[0]), await client.compare(*served.runs)
 
-    residuals, compared = asyncio.run(asked())
+    residuals, compared = awaited(asked)
     assert residuals["id"] == served.runs[0]
     assert len(compared["runs"]) == 2
 

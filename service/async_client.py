@@ -1,0 +1,146 @@
+"""The asynchronous twin of the client; `service.client` gives both."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+
+from service import calls
+from service.calls import (
+    DEFAULT_URL,
+    PAGE,
+    POLL_S,
+    TERMINAL,
+    Call,
+    Document,
+    ServerUnreachable,
+    options,
+)
+
+
+class AsyncClient:
+    """The service from an asynchronous program; methods as those of `Client`, with ``await``.
+
+    Parameters and errors are those of `Client`.
+    """
+
+    def __init__(
+        self,
+        url: str = DEFAULT_URL,
+        key: str | None = None,
+        *,
+        transport: httpx.AsyncBaseTransport | None = None,
+    ) -> None:
+        self.url = url.rstrip("/")
+        self._http = httpx.AsyncClient(**options(self.url, key), transport=transport)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self._http.aclose()
+
+    async def send(self, call: Call) -> httpx.Response:
+        """Send one call; errors are raised."""
+        try:
+            answer = await self._http.request(
+                call.method, call.path, params=dict(call.params), json=call.json,
+                content=calls.pieces(call.content), headers=dict(call.headers),
+            )  # fmt: skip
+        except httpx.TransportError as error:
+            raise ServerUnreachable(self.url, str(error) or type(error).__name__) from error
+        return calls.checked(answer)
+
+    async def _json(self, call: Call) -> Document:
+        document: Document = (await self.send(call)).json()
+        return document
+
+    async def add_dataset(
+        self,
+        source: str | Path | bytes,
+        name: str | None = None,
+        *,
+        segments: str | None = None,
+        sample_time: float | None = None,
+    ) -> Document:
+        """Store a recording, CSV or MCAP, from a file or from bytes."""
+        return await self._json(calls.upload(source, name, segments, sample_time))
+
+    async def submit(
+        self, job: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a job."""
+        headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
+        return await self._json(calls.create("jobs", job, headers))
+
+    async def job(self, name: str) -> Document:
+        """One job with its state and progress."""
+        return await self._json(calls.read("jobs", name))
+
+    async def cancel(self, job: str) -> Document:
+        """Cancel a job; what it has found so far stays."""
+        return await self._json(calls.act("jobs", job, "cancel"))
+
+    async def wait(
+        self,
+        job: str,
+        progress: Callable[[Document], object] | None = None,
+        *,
+        poll: float = POLL_S,
+    ) -> Document:
+        """Wait until a job has ended; `progress` hears its state at every look."""
+        while True:
+            state = await self.job(job)
+            if progress is not None:
+                progress(state)
+            if state["state"] in TERMINAL:
+                return state
+            await asyncio.sleep(poll)
+
+    async def simulate_run(self, run: str, body: Document, max_points: int = 1000) -> Document:
+        """Simulate the identified model on a new input or under proportional control."""
+        return await self._json(calls.act("runs", run, "simulate", body, max_points=max_points))
+
+    async def runs(self, job: str) -> AsyncIterator[Document]:
+        """Runs of a job, page by page."""
+        cursor: str | None = None
+        while True:
+            page = await self._json(calls.read("jobs", job, "runs", cursor=cursor, limit=PAGE))
+            for item in page["items"]:
+                yield item
+            cursor = page["next"]
+            if cursor is None:
+                return
+
+    async def run(self, name: str) -> Document:
+        """One run's result."""
+        return await self._json(calls.read("runs", name))
+
+    async def history(self, run: str) -> Document:
+        """Improvements of each island's champion."""
+        return await self._json(calls.read("runs", run, "history"))
+
+    async def profile(self, run: str, *parameters: str, points: int = 21) -> Document:
+        """Profile likelihood of some free parameters, of all if none is named."""
+        return await self._json(calls.profile(run, parameters, points))
+
+    async def residuals(self, run: str) -> Document:
+        """Correlation functions of the residuals with their bands and tests."""
+        return await self._json(calls.read("runs", run, "residuals"))
+
+    async def export(self, run: str, format: str = "json", pade_order: int = 3) -> str:
+        """The identified model as text: json, python, c or control."""
+        call = calls.read("runs", run, "export", format=format, pade_order=pade_order)
+        return (await self.send(call)).text
+
+    async def compare(self, *runs: str) -> Document:
+        """Runs on the same data side by side, the best first."""
+        return await self._json(calls.create("runs:compare", {"runs": runs}))
