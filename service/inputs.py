@@ -19,7 +19,7 @@ from service.schemas_simulations import RunInputIn, SeriesInput
 from service.storage.datasets import DatasetRepository
 from service.storage.objects import ObjectStore
 from sysid.errors import InvalidRecord, SysidError
-from sysid.records import Channel
+from sysid.records import Channel, Hold
 from sysid.types import FloatArray
 
 MOST_DRAWS = 10_000_000
@@ -83,7 +83,7 @@ class Signals:
             case StepInput():
                 return self._stepped(pointer, name, unit, signal)
             case _:
-                return Channel(name, self._times, self.of(pointer, signal), unit)
+                return Channel(name, self._times, self.of(pointer, signal), unit, hold_of(signal))
 
     def _stepped(self, pointer: str, name: str, unit: str, signal: StepInput) -> Channel:
         start, stop = float(self._times[0]), float(self._times[-1])
@@ -106,6 +106,11 @@ class Signals:
         if row.id not in self.parents:
             self.parents.append(row.id)
         return channel
+
+
+def hold_of(signal: RunInputIn) -> Hold:
+    """What a signal that is laid on samples does between them: one that jumps is held."""
+    return "zero" if isinstance(signal, StepInput | BinaryInput) else "first"
 
 
 def sampled(channel: Channel, times: FloatArray) -> FloatArray:

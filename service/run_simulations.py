@@ -19,7 +19,7 @@ from service.schemas_simulations import (
     RunSimulationOut,
     StepMetricsOut,
 )
-from service.simulations import check_finite
+from service.simulations import check_finite, check_lags_at
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import StorageError
 from service.storage.jobs import JobRepository
@@ -99,6 +99,7 @@ def _asked(session: Session, store: ObjectStore, run_id: str, body: RunSimulateI
     faults = [*_parameter_faults(model, body.parameters), *_input_faults(model, body)]
     if faults:
         raise InvalidRequest(faults)
+    check_lags_at(model, body.parameters)
     period, notes = _period(session, model, body_of(job.spec, run.cell), body)
     times = np.arange(body.samples, dtype=np.float64) * period
     signals = Signals(session, store, times)

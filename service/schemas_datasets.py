@@ -42,7 +42,7 @@ class StepInput(Body):
 
 
 class BinaryInput(Body):
-    """A random binary signal: ± `amplitude` around `offset`, drawn anew every `period` (s)."""
+    """A held random binary signal: ± `amplitude` around `offset`, drawn every `period` (s)."""
 
     kind: Literal["binary"]
     amplitude: float = 1.0

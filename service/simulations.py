@@ -1,6 +1,7 @@
 """Use case: a dataset simulated from a model or a plant, with inputs and noise."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,14 @@ from sqlalchemy.orm import Session
 from service import models
 from service.datasets import add_recording, key_of
 from service.errors import FieldError, InvalidRequest
-from service.inputs import Signals
+from service.inputs import Signals, hold_of
 from service.plants import simulate_plant
 from service.schemas_datasets import InputIn, SimulateIn
 from service.storage.datasets import DatasetRepository, Stored
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from sysid.errors import nearest
+from sysid.errors import InvalidSettings, nearest
+from sysid.models.lags import check_lags
 from sysid.models.model import FixedInitial, Model
 from sysid.records import Channel, Recording
 from sysid.types import FloatArray
@@ -44,11 +46,16 @@ def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored
             faults.append(FieldError(f"/{missing}", "is missing"))
         if faults:
             raise InvalidRequest(faults)
+        check_lags_at(model, body.parameters)
         times = np.arange(body.samples or 0, dtype=np.float64) * (body.sample_time or 0.0)
         signals = Signals(session, store, times)
         inputs = [
             Channel(
-                one.name, times, signals.of(f"/inputs/{one.name}", body.inputs[one.name]), one.unit
+                one.name,
+                times,
+                signals.of(f"/inputs/{one.name}", body.inputs[one.name]),
+                one.unit,
+                hold_of(body.inputs[one.name]),
             )
             for one in model.inputs
         ]
@@ -110,6 +117,30 @@ def check_finite(outputs: Sequence[Channel], times: FloatArray) -> None:
                 f"with these values output {channel.name!r} diverges at "
                 f"t = {times[wrong[0]]:g} s; choose others, or a smaller sample_time",
             )
+
+
+def check_lags_at(model: Model, values: Mapping[str, float]) -> None:
+    """Refuse given values at which a lag would reach into the future.
+
+    Raises
+    ------
+    InvalidRequest
+        Naming the parameter.
+    """
+    for parameter in model.parameters:
+        value = values.get(parameter.name)
+        if value is None:
+            continue
+        # Only this one leaves its bounds: inside them the model's own lags are known to be past.
+        low, high = min(value, parameter.lower), max(value, parameter.upper)
+        wide = replace(parameter, lower=low, upper=high, fixed=None, tied=None, scale="linear")
+        others = [wide if p is parameter else p for p in model.parameters]
+        try:
+            check_lags(model, others)
+        except InvalidSettings as error:
+            at = f"/parameters/{parameter.name}"
+            detail = error.detail.removeprefix("inside these bounds ")
+            raise InvalidRequest.at(at, f"found {value:g}; with it {detail}") from None
 
 
 def _parameter_faults(model: Model, values: Mapping[str, float]) -> list[FieldError]:

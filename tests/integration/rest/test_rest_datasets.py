@@ -158,3 +158,24 @@ def test_metrics_count_jobs_by_state(server: TestClient) -> None:
     text = server.get("/metrics").text
     assert 'lagid_jobs{state="queued"}' in text
     assert server.get("/healthz").json() == {"status": "ok"}
+
+
+@pytest.mark.parametrize(("signal", "hold"), [
+    ({"kind": "step", "time": 1.05}, "zero"),
+    ({"kind": "binary", "period": 0.7, "seed": 1}, "zero"),
+    ({"kind": "cosine", "frequency": 0.5}, "first"),
+])  # fmt: skip
+def test_an_input_that_jumps_is_stored_as_held(
+    server: TestClient, signal: dict[str, Any], hold: str
+) -> None:
+    body = {"model": "fopdt", "parameters": {"K": 2, "T": 0.5, "L": 0, "y0": 0}, "samples": 40,
+            "inputs": {"u": {"amplitude": 1, **signal}}, "sample_time": 0.1}  # fmt: skip
+    made = server.post("/v1/datasets:simulate", json=body)
+    assert made.status_code == 201, made.text
+    assert [c["hold"] for c in made.json()["channels"] if c["name"] == "u"] == [hold]
+    if signal["kind"] == "step":  # no ramp leads to it
+        stored = read_recording(server.get(f"/v1/datasets/{made.json()['id']}/content").content)
+        values = stored.channel("y").values
+        assert not values[:11].any()
+        assert values[11] < 0.05  # a ramp from the sample before gives 0.2
+        assert values[12] > 0.3

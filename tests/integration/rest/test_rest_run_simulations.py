@@ -206,3 +206,16 @@ def test_the_command_line_tells_the_measures_of_the_step(
         assert part in done.output
     told = CliRunner().invoke(program.app, ["simulate", served.arm, str(file), "--json"])
     assert json.loads(told.output)["metrics"]["output"] == "theta"
+
+
+def test_a_lag_that_would_look_ahead_is_refused(served: Served) -> None:
+    inputs = {"u": {"kind": "step", "amplitude": 1}}
+    body = {"inputs": inputs, "samples": 20, "parameters": {"L": -1}}
+    for path in (f"/v1/runs/{served.lag}:simulate", "/v1/datasets:simulate"):
+        given = body
+        if path.startswith("/v1/datasets"):
+            values = {"K": 2, "T": 0.5, "y0": 0, "L": -1}
+            given = {**body, "model": "fopdt", "sample_time": 0.1, "parameters": values}
+        [fault] = refused(served.server.post(path, json=given), 422, "invalid")
+        assert fault["pointer"] == "/parameters/L"
+        assert "found -1; with it the lag of" in fault["detail"]
