@@ -47,7 +47,7 @@ check: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -q -m "$(FAST)"
+	$(BIN)/python -m pytest -q -m "$(FAST)" tests/unit tests/property tests/contract
 
 format: $(READY)
 	$(BIN)/ruff check --fix .

@@ -136,6 +136,7 @@ def test_a_job_dropped_because_the_heartbeat_was_late_is_taken_up_again(stand: S
     stand.turn_until(job, State.RUNNING, attempt=2)
 
 
+@pytest.mark.slow
 def test_a_job_claimed_back_while_its_old_packs_fly_ends_once_under_its_new_attempt(
     stand: Stand,
 ) -> None:

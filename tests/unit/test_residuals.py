@@ -60,6 +60,7 @@ def share_passed(passed: list[bool]) -> float:
     return sum(passed) / len(passed)
 
 
+@pytest.mark.slow
 def test_white_noise_passes_both_tests_together_in_about_95_of_100_draws() -> None:
     passed = []
     for seed in range(200):
@@ -147,6 +148,7 @@ def test_missing_and_skipped_samples_take_no_part() -> None:
     assert here.test.samples == np.count_nonzero(scored)
 
 
+@pytest.mark.slow
 def test_white_noise_with_gaps_or_at_irregular_times_passes_as_often() -> None:
     gaps, irregular = [], []
     for seed in range(120):
@@ -269,6 +271,7 @@ def whiteness(residual: FloatArray, coefficients: int = 0) -> tuple[float, float
     return test.statistic, test.degrees
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [24, 40, 100])
 def test_of_white_noise_the_statistic_has_the_mean_of_its_distribution(n: int) -> None:
     drawn = [whiteness(draws(seed).normal(size=n)) for seed in range(2000)]
