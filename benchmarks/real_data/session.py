@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from benchmarks.family import members, pss_bytes
 from benchmarks.table import Row, Skipped, parser, report
 from service.client import Client
 from service.embedded import embedded_service
@@ -91,31 +92,7 @@ class _Peak:
 
     def sample(self) -> None:
         """Look once."""
-        self.gigabytes = max(self.gigabytes, _family_pss_bytes() / 1e9)
+        self.gigabytes = max(self.gigabytes, sum(map(pss_bytes, members())) / 1e9)
 
 
 PEAK = _Peak()
-
-
-def _family_pss_bytes() -> float:
-    parents: dict[int, int] = {}
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                stat = (entry / "stat").read_text()
-            except OSError:
-                continue  # it ended meanwhile
-            parents[int(entry.name)] = int(stat.rpartition(")")[2].split()[1])
-    family = {os.getpid()}
-    for _ in range(8):  # generations of processes; Ray's depth is 4
-        family |= {child for child, parent in parents.items() if parent in family}
-    return sum(_pss_bytes(process) for process in family)
-
-
-def _pss_bytes(process: int) -> float:
-    try:
-        text = Path(f"/proc/{process}/smaps_rollup").read_text()
-    except OSError:
-        return 0.0
-    lines = (line.split() for line in text.splitlines())
-    return sum(1024.0 * float(line[1]) for line in lines if line[0] == "Pss:")
