@@ -207,7 +207,7 @@ def run_peer(name: str, system: System, seed: int, goal: Goal) -> tuple[int | No
     start = time.process_time()
     try:
         PEERS[name](task)
-    except Exception:
+    except Exception:  # each library wraps the counter's own way out in an error of its own
         if not (task.counter.is_hit or task.counter.count >= BUDGET):
             raise
     seconds = time.process_time() - start

@@ -63,7 +63,7 @@ def main() -> None:
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(1)
-    except Exception as error:
+    except Exception as error:  # the process border; what is no user's mistake goes on as it is
         if not _is_expected(error):
             raise
         _end(str(error))

@@ -195,9 +195,9 @@ class JobRuns:
     def _computed(self, queued: list[QueuedRun | RefusedRun]) -> dict[str, str]:
         """Runs that were computed before, each with the run that did; all are marked."""
         hashes = {
-            one.run: one.spec.key
+            one.run: key
             for one in queued
-            if isinstance(one, QueuedRun) and one.spec.key is not None
+            if isinstance(one, QueuedRun) and (key := one.spec.key) is not None
         }
         with self._database.write() as session:
             mark(session, self._lease, hashes)

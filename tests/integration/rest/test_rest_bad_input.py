@@ -274,27 +274,6 @@ def test_a_derivation_that_cannot_be_done_is_refused_at_its_step(
     assert refused(answer, 422, "invalid")[0]["pointer"] == pointer
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "/v1/nothing", "/v1/jobs/job_0", "/v1/jobs/job_0/runs", "/v1/jobs/job_0/events",
-        "/v1/runs/run_0", "/v1/runs/run_0/history", "/v1/runs/run_0/signals.mcap",
-        "/v1/datasets/ds_0", "/v1/datasets/ds_0/content", "/v1/models/nothing",
-    ],
-)  # fmt: skip
-def test_what_is_not_there_is_not_found(server: TestClient, path: str) -> None:
-    refused(server.get(path), 404, "not-found")
-
-
-def test_an_action_on_a_job_that_is_not_there_is_not_found(server: TestClient) -> None:
-    for verb in ("cancel", "resume", "clone"):
-        refused(server.post(f"/v1/jobs/job_0:{verb}"), 404, "not-found")
-
-
-def test_a_method_that_a_path_does_not_have_is_refused(server: TestClient) -> None:
-    refused(server.delete("/v1/jobs"), 405, "method-not-allowed")
-
-
 def test_a_body_that_is_not_json_is_refused(server: TestClient) -> None:
     json_type = {"content-type": "application/json"}
     answer = server.post("/v1/jobs", content=b'{"model": ', headers=json_type)
