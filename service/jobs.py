@@ -83,8 +83,8 @@ def told(job: Job, *, with_request: bool = False) -> JobOut:
         attempt=job.attempt, error=job.error,
         model=model["name"] if isinstance(model, Mapping) else model, priority=job.priority,
         progress=Progress(
-            runs=job.n_runs, finished=job.n_done, failed=job.n_failed, best_rms=job.best_rms,
-            evaluations=job.evaluations, generation=job.generation,
+            runs=job.n_runs, finished=job.n_done, failed=job.n_failed, reused=job.n_reused,
+            best_rms=job.best_rms, evaluations=job.evaluations, generation=job.generation,
             seconds_left=job.seconds_left,
         ),
         request=job.spec if with_request else None,

@@ -195,6 +195,7 @@ class Progress(Answer):
     runs: int
     finished: int
     failed: int
+    reused: int = Field(default=0, description="taken over from runs that were computed before")
     best_rms: float | None = None
     evaluations: int = 0
     generation: int = 0

@@ -177,6 +177,31 @@ def metrics_of(problem: Problem, simulated: FloatArray) -> Metrics:
     return Metrics(total, problem.unit, fit, channels)
 
 
+def rms_against(
+    problem: Problem, simulated: Sequence[Sequence[FloatArray]], records: Sequence[Record]
+) -> float:
+    """J of simulated outputs against other values at the same samples, such as noise-free ones.
+
+    Parameters
+    ----------
+    simulated : sequence of sequence of FloatArray
+        By experiment and output, as `Identification.simulated`.
+    records : sequence of Record
+        As many, of the same channels and times as those of the problem.
+    """
+    one, errors = len(problem.model.outputs) == 1, []
+    for part, outputs, record in zip(
+        problem.split(problem.evaluator.weight), simulated, records, strict=True
+    ):
+        for (name, values), channel in zip(
+            zip(part, outputs, strict=True), record.outputs, strict=True
+        ):
+            scored = part[name] > 0
+            weight = 1.0 if one else part[name][scored]
+            errors.append(weight * (channel.values - values)[scored])
+    return rms(np.concatenate(errors))
+
+
 def _channel_metrics(problem: Problem, simulated: FloatArray) -> list[ChannelMetrics]:
     found = []
     parts = zip(

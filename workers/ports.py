@@ -124,10 +124,11 @@ class Evolved:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Concluded:
-    """The run is complete."""
+    """The run is complete; `rms_noise_free` is its RMS against the records without noise."""
 
     state: RunState
     identification: Identification
+    rms_noise_free: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,14 +5,15 @@ import logging
 import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache, partial
 
 from sysid.errors import SysidError
 from sysid.ga.island import Island
 from sysid.models.model import Model
 from sysid.models.spec import parse_model
-from sysid.noise import with_noise
-from sysid.problem import Problem
+from sysid.noise import Noise, with_noise
+from sysid.problem import Problem, rms_against
 from sysid.records import split_record, start_of_validation
 from sysid.run import CALL_SECONDS, advance_island, begin, conclude, is_finished
 from sysid.run import advance as advance_run
@@ -73,7 +74,7 @@ def _outcome(item: Item, records: Mapping[str, Records]) -> Outcome:
         problem, validation = _problem(item.spec.problem, records)
         if isinstance(item, Evolve):
             return Evolved(_evolved(item, problem), item.target)
-        return _advanced(item, problem, validation)
+        return _advanced(item, problem, validation, records)
     except SysidError as error:
         return Failure(str(error), type(error).__name__)
     except Exception as error:  # noqa: BLE001 - the process border: its pack-mates go on
@@ -81,7 +82,9 @@ def _outcome(item: Item, records: Mapping[str, Records]) -> Outcome:
         return Failure(f"internal error: {type(error).__name__}: {error}", "InternalError")
 
 
-def _advanced(item: Advance, problem: Problem, validation: Problem | None) -> Outcome:
+def _advanced(
+    item: Advance, problem: Problem, validation: Problem | None, records: Mapping[str, Records]
+) -> Outcome:
     algorithm = item.spec.algorithm
     state = item.state
     if state is None:
@@ -89,7 +92,10 @@ def _advanced(item: Advance, problem: Problem, validation: Problem | None) -> Ou
     state = advance_run(problem, algorithm, state, item.seconds)
     if not is_finished(algorithm, state):
         return Advanced(state)
-    return Concluded(state, conclude(problem, algorithm, state, validation))
+    noise_free = _without_noise(item.spec.problem, records)
+    found = conclude(problem, algorithm, state, validation)
+    without = found.rms if noise_free is None else rms_against(problem, found.simulated, noise_free)
+    return Concluded(state, found, without)
 
 
 def _evolved(item: Evolve, problem: Problem) -> Island:
@@ -104,6 +110,11 @@ def _evolved(item: Evolve, problem: Problem) -> Island:
         if island.generation < before + count:
             return island  # it rests
     return island
+
+
+def _without_noise(spec: ProblemSpec, records: Mapping[str, Records]) -> Records | None:
+    """The records of the estimate before noise was added; None if none was."""
+    return None if spec.noise.sigma == 0 else prepared(replace(spec, noise=Noise()), records)[0]
 
 
 def _problem(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Problem, Problem | None]:

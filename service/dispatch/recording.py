@@ -110,7 +110,7 @@ class Recorder:
         ) as error:  # the numbers are worth more than the plot
             _log.error("the signals of %s are not stored: %s", run, error)
             signals = None
-        self._pending.outcomes.append(outcome_of(run, found, seconds, signals))
+        self._pending.outcomes.append(outcome_of(run, concluded, seconds, signals))
         self._evaluations += found.evaluations
         self._generation = max(self._generation, found.generations)
         self._best = min(self._best, found.rms)

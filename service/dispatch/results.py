@@ -6,17 +6,22 @@ from collections.abc import Iterator, Mapping
 from service.result_document import finite, result_document
 from service.storage.ledger import HistoryPoint, MigrantPoint, RunOutcome
 from service.storage.tables import State
-from sysid.result import Identification, Improvement, Migrant
+from sysid.result import Improvement, Migrant
+from workers.ports import Concluded
 
 
-def outcome_of(run: str, found: Identification, seconds: float, signals: str | None) -> RunOutcome:
+def outcome_of(
+    run: str, concluded: Concluded, seconds: float, signals: str | None
+) -> RunOutcome:
     """The row of a run that succeeded."""
+    found, without = concluded.identification, finite(concluded.rms_noise_free)
     return RunOutcome(
         run_id=run,
         state=State.SUCCEEDED,
-        result=result_document(found, seconds),
+        result={**result_document(found, seconds), "rms_noise_free": without},
         valid=found.valid,
         best_rms=finite(found.rms),
+        rms_noise_free=without,
         fit_estimation=finite(found.fit_percent),
         fit_validation=finite(found.fit_percent_validation),
         evaluations=found.evaluations,

@@ -61,6 +61,7 @@ class RunOutcome:
     result: Document | None = None
     valid: bool | None = None
     best_rms: float | None = None
+    rms_noise_free: float | None = None
     fit_estimation: float | None = None
     fit_validation: float | None = None
     evaluations: int = 0

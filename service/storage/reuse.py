@@ -8,12 +8,12 @@ from sqlalchemy.orm import Session
 
 from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOutcome
 from service.storage.queue import Lease, Queue
-from service.storage.statements import chunks
-from service.storage.tables import DEFAULT_PROJECT, MigrationLog, Run, RunHistory, State
+from service.storage.statements import IN_PLACE, chunks
+from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory, State
 
 _COPIED = (
-    "result", "valid", "best_rms", "fit_estimation", "fit_validation", "evaluations",
-    "generations", "seconds", "signals_sha256",
+    "result", "valid", "best_rms", "rms_noise_free", "fit_estimation", "fit_validation",
+    "evaluations", "generations", "seconds", "signals_sha256",
 )  # fmt: skip
 
 
@@ -50,11 +50,13 @@ def take_over(session: Session, lease: Lease, sources: Mapping[str, str]) -> lis
         query = select(Run).where(Run.id.in_(set(pairs.values())))
         known = {run.id: run for run in session.scalars(query)}
         outcomes = [_outcome(run, known[source]) for run, source in pairs.items()]
-        ledger.record(
+        written = ledger.record(
             outcomes,
             _copies(session, RunHistory, HistoryPoint, pairs),
             _copies(session, MigrationLog, MigrantPoint, pairs),
         )
+        more = update(Job).where(*lease.fence()).values(n_reused=Job.n_reused + len(written))
+        session.execute(more, execution_options=IN_PLACE)
         taken += outcomes
     return taken
 

@@ -151,7 +151,9 @@ class Job(Base):
 
     `attempt` counts the claims and is the fencing token. `lost_leases` counts the dispatchers
     that fell silent; at `max_attempts` of them the job fails. `evaluations`, `generation` and
-    `seconds_left` are progress over all runs, `best_rms` the smallest of any run so far.
+    `seconds_left` are progress over all runs, `best_rms` the smallest of any run so far. `n_reused`
+    runs were taken over from others. `floors` is what `service.dispatch.floors` makes of a job
+    with noise.
     """
 
     __tablename__ = "jobs"
@@ -176,11 +178,13 @@ class Job(Base):
     n_runs: Mapped[int]
     n_done: Mapped[int] = mapped_column(default=0)
     n_failed: Mapped[int] = mapped_column(default=0)
+    n_reused: Mapped[int] = mapped_column(default=0, server_default="0")
     best_rms: Mapped[float | None]
     evaluations: Mapped[int] = mapped_column(LargeInteger, default=0)
     generation: Mapped[int] = mapped_column(default=0)
     seconds_left: Mapped[float | None]
     error: Mapped[str | None]
+    floors: Mapped[Document | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     started_at: Mapped[datetime | None]
     finished_at: Mapped[datetime | None]
@@ -192,7 +196,7 @@ class Run(Base):
 
     `number` is the cell's place in the sweep, `spec_hash` names what is computed. `result` is the
     document of the run result; `estimates` repeats {name: {"value", "stderr"}} of it for summaries
-    over many runs.
+    over many runs. `rms_noise_free` is the RMS against the records before noise was added.
     """
 
     __tablename__ = "runs"
@@ -217,6 +221,7 @@ class Run(Base):
     attempt: Mapped[int] = mapped_column(default=0)
     valid: Mapped[bool | None]
     best_rms: Mapped[float | None]
+    rms_noise_free: Mapped[float | None]
     fit_estimation: Mapped[float | None]
     fit_validation: Mapped[float | None]
     evaluations: Mapped[int] = mapped_column(LargeInteger, default=0)
