@@ -28,8 +28,9 @@ __all__ = [
 CALL_SECONDS = 0.1
 """Aimed at for one compiled call, by measured cost, so that a cancel is heard in time."""
 
-_TARGET_ROUND = 5  # generations between two looks at the target RMS
+_TARGET_ROUND = 5  # generations between two looks at the target RMS, or at a warm start
 _AGREE = 2 / 3  # of the searches from random places: a false optimum seldom draws so many
+_WARM_SETTLED = 3  # of the searches that agree, a warm start needs one in three
 
 
 def begin(
@@ -40,17 +41,20 @@ def begin(
 ) -> RunState:
     """A run before its first generation; `warm`: parameter values that seed a quarter of it.
 
-    The improved search of a polynomial is seeded by least squares one step ahead, too.
+    The improved search of a polynomial is seeded by least squares one step ahead, too. A warm
+    start settles sooner.
     """
     given = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
     starts = equation_error_starts(problem, algorithm)
-    return RunState(seed, found(problem, algorithm, seed, given, starts.values, starts.evaluations))
+    islands = found(problem, algorithm, seed, given, starts.values, starts.evaluations)
+    return RunState(seed, islands, is_warm=bool(given))
 
 
 def border(algorithm: GeneticAlgorithm, state: RunState) -> int:
     """The generation up to which every island evolves alone."""
     every = algorithm.migration.every
-    step = every if algorithm.stop.rms is None else min(every, _TARGET_ROUND)
+    looks_often = algorithm.stop.rms is not None or state.is_warm
+    step = min(every, _TARGET_ROUND) if looks_often else every
     at, done = state.generation, state.generation % every
     return min(at + min(step, every - done), algorithm.generations)
 
@@ -86,12 +90,23 @@ def _has_ended(algorithm: GeneticAlgorithm, state: RunState) -> bool:
         return True
     if algorithm.stop.rms is not None and state.rms <= algorithm.stop.rms:
         return True
-    if algorithm.stop.settled is not None and state.confirmed >= max(
-        algorithm.stop.settled, _AGREE * state.independent
-    ):
+    if algorithm.stop.settled is not None and _is_settled(algorithm.stop.settled, state):
         return True
     # Below the border only those islands stay that have used up their evaluations.
     return all(island.generation < state.generation for island in state.islands)
+
+
+def _is_settled(settled: int, state: RunState) -> bool:
+    """Whether searches from random places agree with the best individual.
+
+    Behind a warm start stands an earlier result. So a third of them is enough, and so it is that
+    all of them, and the second half of the generations, have found nothing better.
+    """
+    if state.is_warm:
+        if state.independent >= settled and state.is_the_best_since(state.generation // 2):
+            return True
+        settled = -(-settled // _WARM_SETTLED)
+    return state.confirmed >= max(settled, _AGREE * state.independent)
 
 
 def is_finished(algorithm: GeneticAlgorithm, state: RunState) -> bool:

@@ -25,6 +25,8 @@ class RunState:
         Time computed so far.
     ended : bool
         Whether an end condition held at the last border.
+    is_warm : bool
+        Whether it was given values of an earlier result to begin with.
     """
 
     seed: int
@@ -34,6 +36,7 @@ class RunState:
     migrations: tuple[Migrant, ...] = ()
     seconds: float = 0.0
     ended: bool = False
+    is_warm: bool = False
 
     @property
     def evaluations(self) -> int:
@@ -55,6 +58,14 @@ class RunState:
         """How many searches from new random places led to the best champion's fitness."""
         most = self.rms * (1.0 + SAME)
         return sum(int(i.counters[CONFIRMED]) for i in self.islands if i.champion_rms <= most)
+
+    def is_the_best_since(self, generation: int) -> bool:
+        """Whether the best fitness was found by then, and nothing better after."""
+        most = self.rms * (1.0 + SAME)
+        return any(
+            one.rms <= most and one.generation <= generation
+            for history in self.history for one in history
+        )  # fmt: skip
 
     @property
     def history(self) -> tuple[tuple[Improvement, ...], ...]:
