@@ -1,4 +1,4 @@
-"""A warm start: the same result for at most half of the simulations, and no trust in a false one."""
+"""A warm start: the same result for at most half of the simulations, wherever it begins."""
 
 from functools import cache
 
