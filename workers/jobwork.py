@@ -8,6 +8,7 @@ from workers.errors import RecordsUnavailable
 from workers.packing import Cost, deal, pack_size
 from workers.ports import (
     Advanced,
+    Coming,
     Concluded,
     Crew,
     Done,
@@ -17,7 +18,7 @@ from workers.ports import (
     Item,
     JobSource,
     KnownRun,
-    QueuedRun,
+    NotYet,
     RefusedRun,
     RunObserver,
 )  # fmt: skip
@@ -46,7 +47,7 @@ class JobWork:
         self.observer = observer
         self.flying: dict[Handle, tuple[Item, ...]] = {}
         self._source, self._crew = source, crew
-        self._coming: Iterator[QueuedRun | RefusedRun | KnownRun] = iter(source.runs())
+        self._coming: Iterator[Coming] = iter(source.runs())
         self._ready: deque[ActiveRun] = deque()
         self._active: dict[str, ActiveRun] = {}
         self._shared: dict[str, Any] = {}
@@ -67,6 +68,8 @@ class JobWork:
             queued = next(self._coming, None)
             if queued is None:
                 self._exhausted = True
+            elif isinstance(queued, NotYet):
+                break
             elif isinstance(queued, RefusedRun):
                 self.observer.failure(queued.run, queued.failure)
             elif isinstance(queued, KnownRun):

@@ -225,10 +225,18 @@ class KnownRun:
     source: str
 
 
+@dataclass(frozen=True, slots=True)
+class NotYet:
+    """The next run waits for the result of one that is not over; ask again."""
+
+
+Coming: TypeAlias = QueuedRun | RefusedRun | KnownRun | NotYet
+
+
 class JobSource(Protocol):
     """Where a job's runs and records come from, asked for as they are needed."""
 
-    def runs(self) -> Iterable[QueuedRun | RefusedRun | KnownRun]:
+    def runs(self) -> Iterable[Coming]:
         """The runs, in order; the iterable is read lazily."""
 
     def records(self, key: str) -> Records:
