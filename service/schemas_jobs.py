@@ -149,7 +149,32 @@ class SweepIn(Body):
     axes: list[Axis] = Field(default=[], max_length=16)
 
 
-def _model_reference(value: Any) -> Any:
+PREVIOUS, REFERENCE = "previous", "reference:"
+
+
+def _warm_start(value: str) -> str:
+    named = value.removeprefix(REFERENCE)
+    if value != PREVIOUS and not value.startswith("run_") and (named == value or not named):
+        raise PydanticCustomError(
+            "warm_start", "need 'previous', the id of a run (run_…), or 'reference:' and a name"
+        )
+    return value
+
+
+class TrendIn(Body):
+    """How parameters depend on a label.
+
+    `x` is the name of a label that is a number in every cell, `parameters` those to look at (all
+    that are free by default), `predict` the values of x for which predictions are wanted.
+    """
+
+    x: str = Field(min_length=1, max_length=64)
+    parameters: list[str] = Field(default=[], max_length=100)
+    predict: list[Annotated[float, Field(allow_inf_nan=False)]] = Field(default=[], max_length=100)
+
+
+def model_reference(value: Any) -> Any:
+    """A model as a body may give it: by name or as a document."""
     if not isinstance(value, str | dict):
         raise PydanticCustomError(
             "model_reference",
@@ -162,7 +187,7 @@ class JobIn(Body):
     """A job: what is to be identified, from which data, and how."""
 
     name: str | None = Field(default=None, max_length=200)
-    model: Annotated[Any, AfterValidator(_model_reference)]
+    model: Annotated[Any, AfterValidator(model_reference)]
     datasets: list[str] = Field(min_length=1, max_length=1000)
     channels: dict[str, str] = Field(default={})
     hold: dict[str, Literal["zero", "first", "band-limited"]] = Field(default={})
@@ -178,6 +203,8 @@ class JobIn(Body):
     priority: int = Field(default=0, ge=-100, le=100)
     reuse: bool = Field(default=True, description="take results of runs that were computed before")
     sweep: SweepIn = SweepIn()
+    warm_start: Annotated[str, Field(max_length=300), AfterValidator(_warm_start)] | None = None
+    trend: TrendIn | None = None
 
     def normal_form(self) -> dict[str, Any]:
         """The body with every default written out, as it is stored and handed to workers."""

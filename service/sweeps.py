@@ -1,6 +1,6 @@
 """A sweep: from axes to cells, and from a cell to the body of its run."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from itertools import product
@@ -12,7 +12,7 @@ from service.schemas_jobs import Axis, JobIn
 from sysid.errors import nearest
 
 # Fields that decide on the job as a whole; a cell of it cannot have its own.
-FIXED_FIELDS = ("name", "priority", "reuse", "sweep")
+FIXED_FIELDS = ("name", "priority", "reuse", "sweep", "trend")
 
 MOST_LABEL = 64
 """Characters of the name of a label at most."""
@@ -46,8 +46,13 @@ def groups_of(job: JobIn) -> list[list[int]]:
     errors = list(_faults(job))
     if errors:
         raise InvalidRequest(errors)
+    return grouped(job.sweep.axes)
+
+
+def grouped(axes: Sequence[Axis]) -> list[list[int]]:
+    """Numbers of the axes that step together, group by group."""
     groups: dict[str, list[int]] = {}
-    for number, axis in enumerate(job.sweep.axes):
+    for number, axis in enumerate(axes):
         groups.setdefault(f"zip {axis.zip}" if axis.zip else f"axis {number}", []).append(number)
     return list(groups.values())
 

@@ -17,6 +17,8 @@ from sysid.result import Identification
 from sysid.settings import GeneticAlgorithm, Loss, Prediction
 
 Records: TypeAlias = tuple[Record, ...]
+Warm: TypeAlias = tuple[Mapping[str, float], ...]
+"""Parameter vectors of earlier results, to seed part of a population with."""
 Handle: TypeAlias = Any
 """Names a pack in flight; only the crew that gave it knows more."""
 
@@ -64,15 +66,12 @@ class ProblemSpec:
 
 @dataclass(frozen=True, slots=True)
 class RunSpec:
-    """One identification, complete: the same specification gives the same bits anywhere.
-
-    `warm` are parameter vectors from earlier results, to seed part of the population with.
-    """
+    """One identification, complete: the same specification gives the same bits anywhere."""
 
     problem: ProblemSpec
     algorithm: GeneticAlgorithm
     seed: int = 1
-    warm: tuple[Mapping[str, float], ...] = ()
+    warm: Warm = ()
 
     @property
     def key(self) -> str | None:

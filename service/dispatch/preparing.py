@@ -1,7 +1,7 @@
 """From a job's rows to specifications that workers can carry out."""
 
 import logging
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -9,6 +9,7 @@ from service import models
 from service.conversion import algorithm_of, loss_of
 from service.dispatch.checkpoints import unpacked
 from service.dispatch.signals import save_fit
+from service.dispatch.warm_starts import WarmStarts
 from service.errors import ServiceError
 from service.recordings import recording_of
 from service.storage.datasets import DatasetRepository
@@ -29,13 +30,16 @@ from sysid.records import Hold
 from sysid.result import Identification
 from workers.errors import RecordsUnavailable
 from workers.ports import (
+    Coming,
     Failure,
     KnownRun,
+    NotYet,
     ProblemSpec,
     QueuedRun,
     Records,
     RefusedRun,
     RunSpec,
+    Warm,
 )
 from workers.tasks import prepared
 
@@ -70,8 +74,9 @@ class JobRuns:
         self._models: dict[str, Model] = {}
         self._data: dict[str, DataKey] = {}
         self._read: OrderedDict[str, Records] = OrderedDict()
+        self._warm = WarmStarts(database, claim.job)
 
-    def runs(self) -> Iterator[QueuedRun | RefusedRun | KnownRun]:
+    def runs(self) -> Iterator[Coming]:
         """The unfinished runs in order, each from its checkpoint if it has one."""
         try:
             checkpoints = self._checkpoints()
@@ -79,19 +84,33 @@ class JobRuns:
             while rows:
                 states = {row.id: unpacked(checkpoints.pop(row.id, None)) for row in rows}
                 self._begin_anew([run for run, state in states.items() if state is None])
-                queued = [self._queued(row, states.pop(row.id)) for row in rows]
-                sources = self._computed(queued)
-                for one in queued:
-                    source = sources.get(one.run)
-                    if source is None and isinstance(one, QueuedRun):
-                        self._problems[one.run] = one.spec.problem
-                    yield one if source is None else KnownRun(one.run, source)
+                yield from self._in_turn([(row, states.pop(row.id)) for row in rows])
                 rows = self._pending(rows[-1].number)
         except LeaseLost as error:  # the recorder will meet it too, and stop the job
             _log.warning("no more runs: %s", error)
 
-    def specification(self, cell: Mapping[str, Any]) -> RunSpec:
-        """The run of one cell.
+    def _in_turn(self, rows: list[tuple[Run, RunState | None]]) -> Iterator[Coming]:
+        """As many runs at once as need not wait for others; those that do, when these are over."""
+        waiting = deque(rows)
+        while waiting:
+            queued: list[QueuedRun | RefusedRun] = []
+            while waiting and (one := self._queued(*waiting[0])) is not None:
+                queued.append(one)
+                waiting.popleft()
+            if not queued:
+                yield NotYet()
+                continue
+            sources = self._computed(queued)
+            for one in queued:
+                source = sources.get(one.run)
+                if source is not None:
+                    self._warm.note_known(one.run, source)
+                elif isinstance(one, QueuedRun):
+                    self._problems[one.run] = one.spec.problem
+                yield one if source is None else KnownRun(one.run, source)
+
+    def specification(self, cell: Mapping[str, Any], warm: Warm = ()) -> RunSpec:
+        """The run of one cell, with what it begins with.
 
         Raises
         ------
@@ -114,7 +133,7 @@ class JobRuns:
             skip=body["skip"],
             noise=Noise(float(body["noise"]["sigma"]), int(body["noise"]["seed"])),
         )
-        return RunSpec(problem, algorithm_of(body["algorithm"]), int(body["seed"]))
+        return RunSpec(problem, algorithm_of(body["algorithm"]), int(body["seed"]), warm)
 
     def records(self, key: str) -> Records:
         """The records of that key, read from the object store.
@@ -164,6 +183,7 @@ class JobRuns:
         ObjectStoreFailed
             If it cannot be written.
         """
+        self._warm.note(run, found)
         problem = self._problems.pop(run)
         records = {key: self.records(key) for key in problem.needs}
         estimation, validation = prepared(problem, records)
@@ -185,9 +205,13 @@ class JobRuns:
             with self._database.write() as session:
                 forget_progress(session, self._lease, runs)
 
-    def _queued(self, row: Run, state: RunState | None) -> QueuedRun | RefusedRun:
+    def _queued(self, row: Run, state: RunState | None) -> QueuedRun | RefusedRun | None:
+        """The run of a row; None if it waits for another."""
         try:
-            spec = self.specification(row.cell)
+            warm = self._warm.of(row, body_of(self._job.spec, row.cell))
+            if warm is None:
+                return None
+            spec = self.specification(row.cell, warm)
         except (SysidError, ServiceError, StorageError) as error:
             return RefusedRun(row.id, Failure(str(error), type(error).__name__))
         return QueuedRun(row.id, spec, state)
