@@ -31,11 +31,11 @@ from sysid.symmetries import scalings
 from sysid.translations import translations
 from sysid.types import BoolArray, FloatArray
 
-_RANK = 1e-7  # of the largest singular value: below, the differences are rounding
+RANK = 1e-7  # of the largest singular value: below, the differences are rounding
 _SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
 # Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
 # about, and of one that has no effect at all, which is known to many digits.
-_WEAK_MEMBER, _NULL_MEMBER = 0.05, 1e-5
+_WEAK_MEMBER, NULL_MEMBER = 0.05, 1e-5
 _AT_BOUND = 1e-6
 
 
@@ -89,17 +89,17 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
     # No step of least squares gains from a parameter on a plateau: there the loss is flat.
     sloping = np.where(plateau > 0, 0.0, columns)
     gain = _possible_gain(_influence(error, loss_scale(problem)), sloping, place)
-    scale = _physical(problem, theta)
+    scale = physical_scale(problem, theta)
     powers = scalings(problem.model, problem.all_parameters)
     shifts, more = translations(problem, theta, columns, scale)
     count += more
-    columns, known = _without_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
+    columns, known = without_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
     singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
-    kept = singular > _RANK * max(singular[0], np.finfo(float).tiny)
+    kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
     kept[d - known :] = False
     inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
     covariance, noise = _covariance(error, columns, inverse, loss_scale(problem))
-    member = np.any(rows[~kept] ** 2 > _NULL_MEMBER, axis=0) | np.any(powers != 0.0, axis=0)
+    member = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | np.any(powers != 0.0, axis=0)
     member |= np.any(shifts != 0.0, axis=0)
     weak = kept & (noise >= _SAYS_NOTHING * singular)
     directions = _Directions(singular, rows, ~kept, weak, member)
@@ -137,7 +137,7 @@ def criteria_of(error: FloatArray, parameters: int) -> Criteria:
     return Criteria(float(aic), None if aicc is None else float(aicc), float(bic), n, parameters)
 
 
-def _without_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[FloatArray, int]:
+def without_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[FloatArray, int]:
     """Sensitivities that do not change at all along the directions (k, D), and their number.
 
     By differences they would change a little, and where friction breaks away more than that.
@@ -147,7 +147,7 @@ def _without_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[Fl
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     size, rows = np.linalg.svd(directions / np.where(lengths > 0, lengths, 1.0),
                                full_matrices=False)[1:]  # fmt: skip
-    rows = rows[size > _RANK]
+    rows = rows[size > RANK]
     return columns - (columns @ rows.T) @ rows, rows.shape[0]
 
 
@@ -184,7 +184,7 @@ def _possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray
     if total == 0.0 or held.all():
         return 0.0
     left, singular, _ = np.linalg.svd(columns[:, ~held], full_matrices=False)
-    span = left[:, singular > _RANK * max(singular[0], np.finfo(float).tiny)]
+    span = left[:, singular > RANK * max(singular[0], np.finfo(float).tiny)]
     return float(np.sum((span.T @ influence) ** 2)) / total
 
 
@@ -198,7 +198,7 @@ def _covariance(
         return variance * inverse, float(np.sqrt(variance))
     influence = _influence(error, scale)
     share = 1.0 / np.sqrt(1.0 + (error / scale) ** 2)
-    bread = np.linalg.pinv((columns.T * share**3) @ columns, rcond=_RANK**2, hermitian=True)
+    bread = np.linalg.pinv((columns.T * share**3) @ columns, rcond=RANK**2, hermitian=True)
     filling = (columns.T * influence**2) @ columns
     noise = float(1.4826 * np.median(np.abs(error)))  # of the bulk, not of the outliers
     return n / (n - d) * bread @ filling @ bread, noise
@@ -215,7 +215,7 @@ def _statuses(place: FloatArray, found: tuple[Block, ...]) -> tuple[EstimateStat
     return tuple(statuses)
 
 
-def _physical(problem: Problem, theta: FloatArray) -> FloatArray:
+def physical_scale(problem: Problem, theta: FloatArray) -> FloatArray:
     """∂θ/∂p: the range, or on a log scale θ ln(upper/lower)."""
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
     ratio = np.where(problem.evaluator.log > 0, upper / np.where(lower > 0, lower, 1.0), 1.0)
