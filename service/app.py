@@ -7,7 +7,18 @@ from importlib.metadata import version
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
-from service.api import comparison, datasets, events, health, jobs, models, pages, problems, runs
+from service.api import (
+    comparison,
+    datasets,
+    events,
+    health,
+    jobs,
+    models,
+    noise,
+    pages,
+    problems,
+    runs,
+)
 from service.api.deps import Parts
 from service.settings import Settings
 from service.storage import migrate
@@ -39,7 +50,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     problems.install(app)
     # Exact REST paths come first: a page's path may have parameters.
-    for module in (health, datasets, models, jobs, events, comparison, runs, pages):
+    for module in (health, datasets, models, jobs, noise, events, comparison, runs, pages):
         app.include_router(module.router)
     return app
 

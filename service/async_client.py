@@ -1,7 +1,7 @@
 """The asynchronous twin of the client; `service.client` gives both."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -81,6 +81,12 @@ class AsyncClient:
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
         return await self._json(calls.create("jobs", job, headers))
 
+    async def noise_sweep(
+        self, body: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a noise sweep: σ × replicates × methods as one job."""
+        return await self._json(calls.noise_sweep(body, idempotency_key))
+
     async def job(self, name: str) -> Document:
         """One job with its state and progress."""
         return await self._json(calls.read("jobs", name))
@@ -119,6 +125,11 @@ class AsyncClient:
             cursor = page["next"]
             if cursor is None:
                 return
+
+    async def summary(self, job: str, by: Sequence[str] | None = None) -> Document:
+        """Quantiles over the values of axes or labels; by default over all axes but seeds."""
+        chosen = None if by is None else list(by)
+        return await self._json(calls.read("jobs", job, "summary", by=chosen))
 
     async def run(self, name: str) -> Document:
         """One run's result."""

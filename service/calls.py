@@ -143,6 +143,11 @@ def create(what: str, body: Any, headers: Mapping[str, str] | None = None) -> Ca
     return Call("POST", f"/v1/{what}", json=body, headers=headers or {})
 
 
+def noise_sweep(body: Mapping[str, Any], key: str | None) -> Call:
+    """POST of a noise sweep; the same idempotency key again gives the same job."""
+    return create("recipes/noise-sweep", body, {"Idempotency-Key": key} if key else {})
+
+
 def upload(
     source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
 ) -> Call:

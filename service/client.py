@@ -167,6 +167,12 @@ class Client:
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
         return self._json(calls.create("jobs", job, headers))
 
+    def noise_sweep(
+        self, body: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a noise sweep: σ × replicates × methods as one job."""
+        return self._json(calls.noise_sweep(body, idempotency_key))
+
     def jobs(self, limit: int | None = None) -> list[Document]:
         """Jobs, newest first: all, or at most `limit`."""
         return self._all("jobs", at_most=limit)
