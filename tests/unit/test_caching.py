@@ -44,3 +44,21 @@ def test_another_fingerprint_compiles_anew(tmp_path: Path) -> None:
     assert run("a") == "4.0 0"
     assert run("a") == "4.0 1"
     assert run("b") == "4.0 0"
+
+
+WARM = """
+import sys
+from sysid.warming import warm_up
+warm_up()
+loaded = ("numba.np.arraymath", "numba.np.npyimpl", "scipy.special", "scipy.linalg")
+print([name for name in loaded if name in sys.modules])
+"""
+
+
+@pytest.mark.slow
+def test_what_was_compiled_before_is_loaded_without_the_compiler() -> None:
+    for _ in range(2):  # the first may have to compile
+        ran = subprocess.run(
+            [sys.executable, "-c", WARM], check=True, capture_output=True, text=True
+        )
+    assert ran.stdout.strip() == "[]"
