@@ -19,6 +19,7 @@ from service.storage.ledger import add_runs
 from service.storage.lineage import LineageRepository
 from service.storage.tables import Job, State
 from service.sweeps import Cell, Step, body_of, count, expand, groups_of, steps_of, value_at
+from service.trend_checks import trend_faults
 
 # Fields that no other field depends on: their values are checked alone, a whole body for each of
 # a hundred thousand seeds would only take time.
@@ -51,6 +52,7 @@ def submit(session: Session, body: JobIn, settings: Settings, key: str | None = 
     groups = steps_of(body, axes)
     checker = JobChecker(session)
     _check(checker, document, groups)
+    _check_trend(checker, body)
     spec = checker.resolved(document)
     new = NewJob(
         name=body.name or _name(checker, spec), spec=spec, n_runs=n_runs, priority=body.priority,
@@ -104,6 +106,13 @@ def _check(checker: JobChecker, document: dict[str, Any], groups: list[list[Step
     if errors:
         unique = dict.fromkeys(errors)
         raise InvalidRequest(unique)
+
+
+def _check_trend(checker: JobChecker, body: JobIn) -> None:
+    model = checker.model(body.model)
+    errors = list(trend_faults(body, None if isinstance(model, list) else model[0]))
+    if errors:
+        raise InvalidRequest(errors)
 
 
 def _sweep_faults(
@@ -167,6 +176,8 @@ def _resolved(checker: JobChecker, spec: Mapping[str, Any], cell: Cell) -> Cell:
     if "/datasets" in values:
         named = values["/datasets"]
         values["/datasets"] = checker.identifiers([named] if isinstance(named, str) else named)
+    if "/warm_start" in values:
+        values["/warm_start"] = checker.warm_start(values["/warm_start"])
     return Cell(values, cell.labels)
 
 

@@ -293,6 +293,20 @@ class Event(Base):
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
 
 
+class AcceptedReference(Base):
+    """A run that was accepted as the reference of a name; the latest `number` is the one in use."""
+
+    __tablename__ = "accepted_references"
+
+    project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"), primary_key=True)
+    name: Mapped[str] = mapped_column(primary_key=True)
+    number: Mapped[int] = mapped_column(primary_key=True)
+    run_id: Mapped[str] = mapped_column(ForeignKey("runs.id"))
+    accepted_by: Mapped[str | None]
+    note: Mapped[str | None]
+    accepted_at: Mapped[datetime] = mapped_column(default=utc_now)
+
+
 class IdempotencyKey(Base):
     """A submission that was made under a client's key."""
 

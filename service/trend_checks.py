@@ -1,0 +1,45 @@
+"""Whether a trend can be made of a job's runs: every one needs its place on the axis."""
+
+from collections.abc import Iterator
+
+from service.errors import FieldError
+from service.schemas_jobs import PREVIOUS, JobIn
+from sysid.errors import nearest
+from sysid.models.model import Model
+
+
+def trend_faults(job: JobIn, model: Model | None) -> Iterator[FieldError]:
+    """Labels that are missing or no numbers, parameters that the model does not have."""
+    if job.warm_start == PREVIOUS and not job.sweep.axes:
+        yield FieldError("/warm_start", "'previous' needs a sweep; this job has one run")
+    if job.trend is None:
+        return
+    yield from _label_faults(job, job.trend.x)
+    known = [] if model is None else [one.name for one in model.parameters]
+    for index, name in enumerate(job.trend.parameters if known else []):
+        if name not in known:
+            yield FieldError(
+                f"/trend/parameters/{index}",
+                f"the model has no parameter {name!r}{nearest(name, known)}",
+            )
+
+
+def _label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
+    axes = [(n, axis.labels) for n, axis in enumerate(job.sweep.axes) if axis.labels]
+    named = [(n, labels) for n, labels in axes if any(x in one for one in labels)]
+    if not named:
+        known = sorted({name for _, labels in axes for one in labels for name in one})
+        there = f"there are {', '.join(known)}" if known else "no axis has labels"
+        yield FieldError(
+            "/trend/x",
+            f"no run has a label {x!r}{nearest(x, known)}; {there}; give an axis "
+            f'"labels": [{{"{x}": …}}, …], one for each value',
+        )
+    for n, labels in named:
+        for position, one in enumerate(labels):
+            if not isinstance(one.get(x), float | int):
+                found = f"found {one[x]!r}" if x in one else "it is missing"
+                yield FieldError(
+                    f"/sweep/axes/{n}/labels/{position}",
+                    f"{x}: {found}; a trend needs a number here",
+                )

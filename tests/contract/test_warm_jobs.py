@@ -1,0 +1,166 @@
+"""Jobs that start from earlier results: what each run begins with, and that it repeats."""
+
+import threading
+import time
+
+import pytest
+
+from service.conversion import algorithm_of
+from service.dispatch.claiming import Leases
+from service.dispatcher import Dispatcher
+from service.errors import InvalidRequest
+from service.references import accept
+from service.schemas_references import ReferenceIn
+from service.storage.tables import OPEN, State
+from sysid.errors import InvalidSettings
+from tests.dispatching import Place
+from workers.inline import InlineCrew
+
+QUICK = {"population": 16, "generations": 40, "islands": 2, "stop": {"settled": 2}}
+
+
+class KeepingCrew(InlineCrew):
+    """A crew that remembers what each run began with; `slots` decide how much is read ahead."""
+
+    def __init__(self, slots):
+        super().__init__(slots)
+        self.warm = {}
+
+    def submit(self, pack, keys, shared):
+        self.warm.update({item.run: item.spec.warm for item in pack})
+        return super().submit(pack, keys, shared)
+
+
+@pytest.fixture
+def place(tmp_path):
+    made = Place(tmp_path / "data")
+    yield made
+    made.database.dispose()
+
+
+def carried_out(place, slots=1, **body):
+    """The job's runs once it is over, and what each began with."""
+    job, crew = place.submit(**{"algorithm": QUICK, **body}), KeepingCrew(slots)
+    dispatcher = Dispatcher(place.database, place.store, crew, Leases(place.database, 30))
+
+    def stop_at_the_end():
+        while place.job(job).state in OPEN:
+            time.sleep(0.01)
+        dispatcher.stopping.set()
+
+    watcher = threading.Thread(target=stop_at_the_end)
+    watcher.start()
+    dispatcher.run()
+    watcher.join()
+    runs = place.runs(job)
+    return runs, [crew.warm.get(run.id) for run in runs]
+
+
+def values(run):
+    return {name: one["value"] for name, one in run.estimates.items()}
+
+
+def chained(*axes, **changes):
+    return {"sweep": {"axes": list(axes)}, "warm_start": "previous", **changes}
+
+
+NOISE = {"path": "/noise/sigma", "values": [0.0, 0.01, 0.02]}
+
+
+def test_a_run_begins_with_the_estimates_of_the_one_before(place):
+    runs, warm = carried_out(place, **chained(NOISE))
+    assert warm == [(), (values(runs[0]),), (values(runs[1]),)]
+
+
+def test_chains_of_crossed_axes_run_along_the_one_with_labels(place):
+    labelled = {**NOISE, "labels": [{"x": 1}, {"x": 2}, {"x": 3}]}
+    runs, warm = carried_out(place, **chained(labelled, {"path": "/seed", "values": [1, 2]}))
+    assert warm[:2] == [(), ()]
+    assert warm[2:] == [(values(one),) for one in runs[:4]]
+    runs, warm = carried_out(place, **chained({"path": "/seed", "values": [1, 2]}, labelled))
+    assert [one == () for one in warm] == [True, False, False] * 2
+
+
+def test_the_result_of_a_chain_does_not_depend_on_how_many_work(place):
+    alone, _ = carried_out(place, 1, **chained(NOISE))
+    several, _ = carried_out(place, 4, **chained(NOISE))
+    assert [values(one) for one in alone] == [values(one) for one in several]
+    assert [one.evaluations for one in alone] == [one.evaluations for one in several]
+
+
+def test_a_chain_computed_before_is_taken_over_whole(place):
+    before, _ = carried_out(place, **chained(NOISE, reuse=True))
+    after, warm = carried_out(place, **chained(NOISE, reuse=True))
+    assert [one.result["reused_from"] for one in after] == [one.id for one in before]
+    assert warm == [None, None, None]
+
+
+def test_behind_a_run_that_failed_the_last_that_succeeded_serves(place):
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("service.dispatch.preparing.algorithm_of", broken_second_time())
+        runs, warm = carried_out(place, **chained(NOISE))
+    assert [one.state for one in runs] == [State.SUCCEEDED, State.FAILED, State.SUCCEEDED]
+    assert warm[2] == (values(runs[0]),)
+
+
+def broken_second_time():
+    calls = iter(range(100))
+
+    def made(body):
+        if next(calls) == 1:
+            raise InvalidSettings("/algorithm", "as told")
+        return algorithm_of(body)
+
+    return made
+
+
+def test_an_earlier_run_seeds_all_cells_and_its_values_are_part_of_the_hash(place):
+    (first,), _ = carried_out(place)
+    runs, warm = carried_out(place, warm_start=first.id, sweep={"axes": [NOISE]})
+    assert warm == [(values(first),)] * 3
+    assert runs[0].spec_hash != first.spec_hash
+
+
+def test_a_reference_means_the_run_accepted_when_the_job_was_submitted(place):
+    (first,), _ = carried_out(place)
+    (second,), _ = carried_out(place, seed=2)
+    with place.database.write() as session:
+        accept(session, "tube", ReferenceIn(run=first.id, by="me"))
+    job = place.submit(warm_start="reference:tube")
+    with place.database.write() as session:
+        told = accept(session, "tube", ReferenceIn(run=second.id))
+    assert place.job(job).spec["warm_start"] == first.id
+    assert (told.run, [one.run for one in told.history]) == (second.id, [first.id])
+    assert told.history[0].by == "me"
+
+
+@pytest.mark.parametrize(
+    ("warm", "said"),
+    [
+        ("previous", "needs a sweep"), ("run_unknown", "there is no run run_unknown"),
+        ("reference:tupe", "there is no reference 'tupe'; did you mean 'tube'"),
+    ],
+)  # fmt: skip
+def test_a_warm_start_that_is_not_there_is_told(place, warm, said):
+    (first,), _ = carried_out(place)
+    with place.database.write() as session:
+        accept(session, "tube", ReferenceIn(run=first.id))
+    with pytest.raises(InvalidRequest) as caught:
+        place.submit(warm_start=warm)
+    (fault,) = caught.value.errors
+    assert fault.pointer == "/warm_start"
+    assert said in fault.detail
+
+
+def test_a_run_of_another_model_or_one_that_did_not_succeed_is_refused(place):
+    (first,), _ = carried_out(place)
+    open_job = place.submit()
+    (waiting,) = place.runs(open_job)
+    for warm, model, said in [
+        (waiting.id, "fopdt", "is queued; need one that succeeded"),
+        (first.id, "sopdt", "is of another model: it has the parameters K, T, L"),
+    ]:
+        with pytest.raises(InvalidRequest) as caught:
+            place.submit(warm_start=warm, model=model, parameters={})
+        assert [one.pointer for one in caught.value.errors] == ["/warm_start"]
+        assert said in caught.value.errors[0].detail
