@@ -1,10 +1,14 @@
-"""The two functions of statistics that every identification needs, by themselves.
+"""The functions of statistics that every identification needs, by themselves.
 
-They are a few lines; the package `scipy.special` that has them too takes longer to import than an
-identification of the paper's size.
+They are a few lines; the package `scipy.special` that has two of them takes longer to import than
+an identification of the paper's size, and NumPy's median imports its masked arrays.
 """
 
 from math import erfc, exp, inf, lgamma, log, pi, sqrt
+
+import numpy as np
+
+from sysid.types import FloatArray
 
 _ROUNDING = 1e-16
 _TINY = 1e-300  # keeps a continued fraction from dividing by zero
@@ -14,6 +18,15 @@ _NORMAL = 1.959963984540054  # two-sided 95 % of the normal distribution
 _OUTSIDE = 0.05
 _NEAR = 1e-9  # relative: the step after such a one, squared, would be rounding
 _STEPS = 200
+
+
+def median(values: FloatArray) -> float:
+    """The middle of the values (n ≥ 1), or the mean of the two in the middle; nan if one is."""
+    ordered = np.sort(values, axis=None)  # nan last
+    if ordered[-1] != ordered[-1]:
+        return float("nan")
+    middle = ordered.size // 2
+    return float(np.mean(ordered[middle - 1 + ordered.size % 2 : middle + 1]))
 
 
 def chi_squared_tail(degrees: float, statistic: float) -> float:

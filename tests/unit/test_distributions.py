@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import gammaincc, stdtrit
 
-from sysid.distributions import chi_squared_tail, student_95
+from sysid.distributions import chi_squared_tail, median, student_95
 
 
 @given(degrees=st.floats(0.5, 3000), share=st.floats(1e-4, 3))
@@ -35,3 +35,9 @@ def test_the_interval_of_student_is_the_quantile(degrees: float) -> None:
 def test_the_interval_of_student_narrows_as_the_degrees_grow() -> None:
     widths = [student_95(float(degrees)) for degrees in np.geomspace(1, 1e6, 300)]
     assert all(before > after for before, after in pairwise(widths))
+
+
+@given(st.lists(st.floats(allow_infinity=False), min_size=1, max_size=9))
+def test_the_median_is_that_of_numpy(values: list[float]) -> None:
+    with np.errstate(all="ignore"):
+        assert np.array_equal(median(np.array(values)), np.median(values), equal_nan=True)
