@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from datetime import timedelta
 from importlib.metadata import version
 
 from fastapi import FastAPI
@@ -17,9 +18,11 @@ from service.api import (
     noise,
     pages,
     problems,
+    references,
     runs,
 )
 from service.api.deps import Parts
+from service.reaping import Reaper
 from service.settings import Settings
 from service.storage import migrate
 from service.storage.objects import open_store
@@ -50,7 +53,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     problems.install(app)
     # Exact REST paths come first: a page's path may have parameters.
-    for module in (health, datasets, models, jobs, noise, events, comparison, runs, pages):
+    for module in (
+        health, datasets, models, jobs, noise, references, events, comparison, runs, pages,
+    ):  # fmt: skip
         app.include_router(module.router)
     return app
 
@@ -73,10 +78,13 @@ def _lifespan(settings: Settings):  # type: ignore[no-untyped-def]
     @asynccontextmanager
     async def run(app: FastAPI) -> AsyncIterator[None]:
         app.state.parts = parts = await run_in_threadpool(open_parts, settings)
+        reaper = Reaper(parts.database, timedelta(seconds=settings.lease_seconds), parts.stopping)
+        reaper.start()
         try:
             yield
         finally:
             parts.stopping.set()
+            reaper.join()
             parts.database.dispose()
 
     return run

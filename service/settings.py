@@ -46,7 +46,7 @@ class Settings(BaseSettings):
     allow_open_host: bool = False
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
     max_runs_per_job: int = Field(default=100_000, ge=1)
-    lease_seconds: float = Field(default=30.0, gt=0)
+    lease_seconds: float = Field(default=10.0, gt=0)
     max_attempts: int = Field(default=3, ge=1)
     poll_seconds: float = Field(default=0.3, gt=0)
     data: Path | None = None

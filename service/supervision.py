@@ -13,11 +13,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.settings import Settings
+from workers.processes import clear_after, kill, of_session
 
 _log = logging.getLogger(__name__)
 
 FIRST_PAUSE_SECONDS = 0.2
-LONGEST_PAUSE_SECONDS = 30.0
+LONGEST_PAUSE_SECONDS = 5.0
 STEADY_SECONDS = 60.0
 """A child that lived so long is restarted after the first pause again."""
 STOP_SECONDS = 2.0
@@ -66,8 +67,9 @@ class Supervisor:
             child.send_signal(signal.SIGTERM)
         with contextlib.suppress(subprocess.TimeoutExpired):
             child.wait(STOP_SECONDS)
-        kill_session(child.pid)
+        child.kill()
         child.wait()
+        clear_family(child.pid)
         self._thread.join()
 
     @property
@@ -84,7 +86,7 @@ class Supervisor:
             if child is None:
                 return
             code = child.wait()
-            kill_session(child.pid)
+            clear_family(child.pid)
             assert child.stdin is not None
             child.stdin.close()
             if self._stopping.is_set():
@@ -135,20 +137,7 @@ def environment_of(settings: Settings) -> dict[str, str]:
     return {f"LAGID_{name.upper()}": str(value) for name, value in values.items()}
 
 
-def kill_session(session: int) -> None:
-    """Kill every process of a session except this one."""
-    for pid in processes_of_session(session):
-        if pid != os.getpid():
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.kill(pid, signal.SIGKILL)
-
-
-def processes_of_session(session: int) -> tuple[int, ...]:
-    """Return the processes of a session; where there is no ``/proc``, at most its leader."""
-    found = []
-    listed = [int(entry.name) for entry in Path("/proc").glob("[0-9]*")] or [session]
-    for pid in listed:
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            if os.getsid(pid) == session:
-                found.append(pid)
-    return tuple(found)
+def clear_family(leader: int) -> None:
+    """Kill every process of the session of a child that has ended; clear what its Ray left."""
+    kill(of_session(leader))
+    clear_after(leader)

@@ -20,7 +20,7 @@ from service.storage.objects import ObjectStore, open_store
 from service.storage.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Job, Run, State
-from service.supervision import environment_of, kill_session
+from service.supervision import clear_family, environment_of
 from sysid.records import Recording
 from tests.runs import step_record
 
@@ -82,7 +82,7 @@ class Place:
             child.send_signal(signal.SIGTERM)
             child.wait(20.0)
         finally:
-            kill_session(child.pid)
+            clear_family(child.pid)
             child.wait()
             log.close()
 

@@ -10,7 +10,6 @@ import logging
 import os
 import secrets
 import shutil
-import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from typing import Any
 
 from workers.errors import ClusterLost, ClusterUnavailable, PackCancelled, PackFailed, WorkerDied
 from workers.ports import Done, Handle, Item, Records
+from workers.processes import children, clear_after_the_dead, folder_of, is_running, kill, of_folder
 from workers.tasks import advance
 from workers.warming import warm
 
@@ -26,9 +26,13 @@ _log = logging.getLogger(__name__)
 
 START_SECONDS = 180.0
 FETCH_SECONDS = 20.0
-SILENCE_SECONDS = 10.0
+SILENCE_SECONDS = 5.0
 """After so long without a finished task a no-op task asks whether Ray is alive."""
-ANSWER_SECONDS = 20.0
+ANSWER_SECONDS = 15.0
+PULSE_SECONDS = 0.1
+"""Between two looks at the processes of a local Ray."""
+VITAL = ("gcs_server", "raylet")
+"""Programs without which a local Ray is lost."""
 OBJECT_STORE_BYTES = 200 * 2**20
 """Records are small; the default of Ray, 30 % of the memory, is not."""
 
@@ -80,7 +84,8 @@ class RayCrew:
         self._noop = ray.remote(num_cpus=0, max_retries=0)(_answer)
         self._flying: set[Any] = set()
         self._probe: Any = None
-        self._heard = time.monotonic()
+        self._heard = self._felt = time.monotonic()
+        self._vital = () if settings.address else children(VITAL)
         self.slots = self._count_slots()
 
     def warm(self) -> None:
@@ -132,6 +137,7 @@ class RayCrew:
         """
         errors = self._ray.exceptions
         self._flying.discard(handle)
+        self._feel()
         try:
             done: tuple[Done, ...] = self._ray.get(handle, timeout=FETCH_SECONDS)
         except errors.TaskCancelledError as error:
@@ -141,6 +147,7 @@ class RayCrew:
         except errors.RayTaskError as error:
             raise PackFailed(str(error)) from error
         except errors.RayError as error:  # crashed, out of memory, node or object lost
+            self._feel(at_once=True)  # where the raylet died, no run is to blame
             raise WorkerDied(str(error).splitlines()[0]) from error
         return done
 
@@ -154,8 +161,9 @@ class RayCrew:
         Raises
         ------
         ClusterLost
-            If a no-op task has not been answered in time.
+            If a process of a local Ray is gone, or a no-op task has not been answered in time.
         """
+        self._feel()
         silence = time.monotonic() - self._heard
         if self._probe is None:
             if silence > SILENCE_SECONDS:
@@ -167,6 +175,10 @@ class RayCrew:
         elif silence > SILENCE_SECONDS + ANSWER_SECONDS:
             raise ClusterLost(f"Ray has not answered for {silence:.0f} s")
 
+    def is_alive(self) -> bool:
+        """Whether the processes of a local Ray are there; of a joined one nothing is known."""
+        return all(map(is_running, self._vital))
+
     def free_slots(self) -> int:
         """Cores without a task at this moment."""
         return int(self._ray.available_resources().get("CPU", 0))
@@ -175,6 +187,20 @@ class RayCrew:
         """Leave the cluster; a local one ends with it."""
         self._ray.shutdown()
         self._forget_folder()
+
+    def abandon(self) -> None:
+        """Let go of a cluster that is lost, without asking it anything."""
+        if self._folder is not None:
+            kill(of_folder(os.getpid()))
+            self._forget_folder()
+
+    def _feel(self, *, at_once: bool = False) -> None:
+        """Look at the processes of a local Ray: without them calls hang, or end this process."""
+        now = time.monotonic()
+        if at_once or now - self._felt > PULSE_SECONDS:
+            self._felt = now
+            if not self.is_alive():
+                raise ClusterLost("a process of the local Ray is gone")
 
     def _count_slots(self) -> int:
         return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
@@ -203,33 +229,11 @@ def _answer() -> bool:
     return True
 
 
-_PREFIX = "lagid-ray-"
-
-
 def _fresh_folder() -> Path:
-    """Make Ray's folder for this process; those of processes that are gone are removed.
-
-    Its path must be short: Ray puts sockets below it, and a socket's path has 107 bytes at most.
-    """
-    base = Path(tempfile.gettempdir())
-    if len(str(base)) > 30:
-        base = Path("/tmp")
-    for old in base.glob(f"{_PREFIX}*"):
-        owner = old.name.removeprefix(_PREFIX)
-        if owner.isdigit() and not _is_alive(int(owner)):
-            shutil.rmtree(old, ignore_errors=True)
-    folder = base / f"{_PREFIX}{os.getpid()}"
+    """Make Ray's folder for this process; what dispatchers that are gone have left is cleared."""
+    clear_after_the_dead()
+    folder = folder_of(os.getpid())
     shutil.rmtree(folder, ignore_errors=True)
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
     return folder
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True

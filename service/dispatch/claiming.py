@@ -11,6 +11,7 @@ from datetime import timedelta
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.reaping import identity, reap
 from service.storage.columns import utc_now
 from service.storage.dispatchers import DispatcherRepository
 from service.storage.errors import LeaseLost
@@ -19,6 +20,9 @@ from service.storage.sessions import Database
 from service.storage.watch import Signals, look
 
 _log = logging.getLogger(__name__)
+
+AGAIN_SECONDS = 0.5
+"""After a heartbeat that could not be written, until the next."""
 
 
 class Leases:
@@ -55,8 +59,9 @@ class Leases:
     def start(self, details: dict[str, object]) -> None:
         """Announce the dispatcher and begin to beat."""
         with self._database.write() as session:
-            DispatcherRepository(session).announce(self.owner, dict(details))
-            Queue(session, self._clock).reap()
+            announced = {**identity(), **details}
+            DispatcherRepository(session, self._clock).announce(self.owner, announced)
+        reap(self._database, self._length, self._clock)
         self._thread.start()
 
     def claim(self) -> Claim | None:
@@ -112,23 +117,24 @@ class Leases:
         with self._lock:
             before = tuple(self._held)
         with self._database.write() as session:
-            DispatcherRepository(session).beat(self.owner)
-            queue = Queue(session, self._clock)
-            renewed = {one.lease for one in queue.heartbeat(before, self._length)}
-            reaped = queue.reap()
+            DispatcherRepository(session, self._clock).beat(self.owner)
+            held = Queue(session, self._clock).heartbeat(before, self._length)
+        renewed = {one.lease for one in held}
         with self._lock:
             for lease in before:
                 if lease not in renewed:
                     self._held.pop(lease, None)
                 elif lease in self._held:
                     self._held[lease] = begun
-        if reaped.requeued or reaped.failed or reaped.cancelled:
-            _log.warning("leases that had expired: %s", reaped)
+        reap(self._database, self._length, self._clock)
 
     def _beat(self) -> None:
-        pause = self._length.total_seconds() / 3
+        third = self._length.total_seconds() / 3
+        pause = third
         while not self._ending.wait(pause):
             try:
                 self.renew()
-            except SQLAlchemyError:  # an unreachable database may come back before the lease ends
-                _log.exception("no heartbeat could be written")
+                pause = third
+            except SQLAlchemyError as error:  # it may come back before the leases end
+                _log.warning("no heartbeat could be written: %s", str(error).splitlines()[0])
+                pause = min(third, AGAIN_SECONDS)

@@ -35,6 +35,10 @@ class DispatcherRepository:
         """Tell that a dispatcher has stopped."""
         self._session.execute(delete(Dispatcher).where(Dispatcher.owner == owner))
 
+    def all(self) -> list[Dispatcher]:
+        """Every dispatcher that has not taken leave, by name."""
+        return list(self._session.scalars(select(Dispatcher).order_by(Dispatcher.owner)))
+
     def alive(self, within: timedelta = LEASE) -> list[Dispatcher]:
         """Dispatchers seen within that time, by name."""
         recent = select(Dispatcher).where(Dispatcher.seen_at >= self._clock() - within)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, and_, case, false, func, or_, select, update
+from sqlalchemy import ColumnElement, and_, case, exists, false, func, or_, select, update
 from sqlalchemy.orm import Session, aliased
 
 from service.storage.columns import Document, utc_now
@@ -23,7 +23,9 @@ from service.storage.jobs import close_runs, notify_queue
 from service.storage.statements import IN_PLACE
 from service.storage.tables import OPEN, Job, Run, State
 
-LEASE = timedelta(seconds=30)
+LEASE = timedelta(seconds=10)
+LONGEST = 2
+"""No lease ends later than after so many of its lengths, unless a clock was stepped back."""
 Clock = Callable[[], datetime]
 Outcome = Literal[State.SUCCEEDED, State.FAILED, State.CANCELLED]
 
@@ -71,9 +73,9 @@ class Progress:
 class Reaped:
     """What became of the jobs whose leases had expired."""
 
-    requeued: tuple[str, ...]
-    failed: tuple[str, ...]
-    cancelled: tuple[str, ...]
+    requeued: tuple[str, ...] = ()
+    failed: tuple[str, ...] = ()
+    cancelled: tuple[str, ...] = ()
 
 
 class Queue:
@@ -150,6 +152,10 @@ class Queue:
         self.hold(lease)
         self._events.append(lease.job_id, kind, data)
 
+    def tell_floors(self, lease: Lease, floors: Document) -> None:
+        """Write what the runs of the job are measured by."""
+        self._change(lease, {"floors": floors})
+
     def finish(self, lease: Lease, state: Outcome, error: str | None = None) -> Job:
         """End a job. Its unfinished runs end with it, unless it succeeded: then none may be left.
 
@@ -181,15 +187,37 @@ class Queue:
         else:
             self._requeue(job)
 
-    def reap(self) -> Reaped:
+    def has_silent(self, lease: timedelta = LEASE) -> bool:
+        """Whether a lease has expired, or seems to end later than any that is given."""
+        now = self._clock()
+        silent = or_(Job.lease_until < now, Job.lease_until > now + LONGEST * lease)
+        found = select(exists().where(Job.state == State.RUNNING, silent))
+        return bool(self._session.scalar(found))
+
+    def reap(self, gone: Collection[str] = (), lease: timedelta = LEASE) -> Reaped:
         """Give back the jobs whose leases have expired, or end them.
 
         A job that was to be cancelled is cancelled; one that lost its lease `max_attempts` times
-        fails with that reason; any other is queued and goes on from its checkpoints.
+        while no run of it ended fails with that reason; any other is queued and goes on from its
+        checkpoints.
+
+        Parameters
+        ----------
+        gone : collection of str
+            Dispatchers known to have ended: their leases are not waited for.
+        lease : timedelta
+            How long leases are. One that ends more than `LONGEST` of them from now was written
+            by a clock that was stepped back since: it is shortened to one, from now.
         """
+        now = self._clock()
+        ahead = update(Job).where(
+            Job.state == State.RUNNING, Job.lease_until > now + LONGEST * lease
+        )
+        self._session.execute(ahead.values(lease_until=now + lease), execution_options=IN_PLACE)
+        silent = or_(Job.lease_until < now, Job.lease_owner.in_(gone))
         expired = (
             select(Job)
-            .where(Job.state == State.RUNNING, Job.lease_until < self._clock())
+            .where(Job.state == State.RUNNING, silent)
             .with_for_update(skip_locked=True, key_share=True)
         )
         fates: dict[State, list[str]] = {state: [] for state in State}
@@ -218,13 +246,15 @@ class Queue:
             raise Conflict(f"{job_id} cannot succeed: {n_left} of its runs did not finish")
 
     def _bury(self, job: Job) -> State:
-        job.lost_leases += 1
+        mine = (Run.job_id == job.id, Run.attempt == job.attempt, Run.state.not_in(OPEN))
+        went_on = self._session.scalar(select(exists().where(*mine)))
+        job.lost_leases = 1 if went_on else job.lost_leases + 1
         if job.cancel_requested:
             self._end(job, State.CANCELLED, None)
         elif job.lost_leases >= job.max_attempts:
             self._end(
                 job, State.FAILED,
-                f"the dispatcher fell silent {job.lost_leases} times, the last was "
+                f"the dispatcher fell silent {job.lost_leases} times in a row, the last was "
                 f"{job.lease_owner}; see its log, and resume the job when the cause is gone",
             )  # fmt: skip
         else:

@@ -13,7 +13,7 @@ from service.storage.queue import Lease, Progress, Queue
 from service.storage.tables import State
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
 
-LEASE = timedelta(seconds=30)
+LEASE = timedelta(seconds=10)
 ENDS = [State.SUCCEEDED, State.FAILED, State.CANCELLED]
 
 
@@ -35,7 +35,7 @@ def finish(database, lease, state=State.SUCCEEDED, error=None):
 def lose(database, clock):
     """Claim whatever waits, fall silent, and be reaped."""
     got = claim(database, "silent", clock)
-    clock.advance(31)
+    clock.advance(11)
     return got, reap(database, clock)
 
 
@@ -107,11 +107,11 @@ def test_one_heartbeat_renews_the_leases_given_and_no_others(database, clock):
     others = {submit(database), submit(database)}
     claim(database, "d1", clock)  # of the same owner, who has dropped it
     claim(database, "d2", clock)
-    clock.advance(20)
+    clock.advance(7)
     with database.write() as session:
         held = Queue(session, clock).heartbeat(mine)
     assert {one.lease for one in held} == mine
-    clock.advance(11)
+    clock.advance(4)
     assert set(reap(database, clock).requeued) == others
 
 
@@ -135,17 +135,17 @@ def test_a_heartbeat_does_not_get_back_a_lease_that_was_lost(database, clock):
 def test_a_heartbeat_of_no_lease_renews_nothing(database, clock):
     job_id = submit(database)
     claim(database, "d1", clock)
-    clock.advance(20)
+    clock.advance(7)
     with database.write() as session:
         assert Queue(session, clock).heartbeat([]) == ()
-    clock.advance(11)
+    clock.advance(4)
     assert reap(database, clock).requeued == (job_id,)
 
 
 def test_the_reaper_leaves_a_living_lease_alone(database, clock):
     job_id = submit(database)
     claim(database, "d1", clock)
-    clock.advance(29)
+    clock.advance(9)
     assert reap(database, clock).requeued == ()
     assert state_of(database, job_id) is State.RUNNING
 
@@ -159,7 +159,7 @@ def test_an_expired_job_is_queued_again_with_its_unfinished_runs(database, clock
         first, second = (run.id for run in ledger.pending())
         ledger.start([first, second])
         ledger.record([RunOutcome(run_id=first, state=State.SUCCEEDED, best_rms=0.5)])
-    clock.advance(31)
+    clock.advance(11)
     assert reap(database, clock).requeued == (got.job.id,)
     assert [run.state for run in runs_of(database, got.job.id)] == [State.SUCCEEDED, State.QUEUED]
     again = claim(database, "d2", clock)
@@ -192,7 +192,7 @@ def test_a_job_that_was_to_be_cancelled_is_never_retried(database, clock):
     claim(database, "d1", clock)
     with database.write() as session:
         JobRepository(session).cancel(job_id)
-    clock.advance(31)
+    clock.advance(11)
     assert reap(database, clock).cancelled == (job_id,)
     assert state_of(database, job_id) is State.CANCELLED
 
@@ -200,7 +200,7 @@ def test_a_job_that_was_to_be_cancelled_is_never_retried(database, clock):
 def test_two_reapers_bury_a_job_once(database, clock):
     submit(database)
     claim(database, "d1", clock)
-    clock.advance(31)
+    clock.advance(11)
     reap(database, clock)
     assert reap(database, clock).requeued == ()
 
@@ -245,7 +245,7 @@ def test_a_late_writer_is_refused_and_changes_nothing(database, clock, write):
     got, (run_id,) = claimed(database)
     with database.write() as session:
         Queue(session, clock).heartbeat([got.lease])  # in the past of the true clock: it expires
-    clock.advance(31)
+    clock.advance(11)
     assert reap(database, clock).requeued == (got.job.id,)
     with database.read() as session:
         before = EventRepository(session).last_id(got.job.id)

@@ -1,0 +1,127 @@
+"""Processes as ``/proc`` shows them, and what Ray may leave behind; imports neither Ray nor NumPy.
+
+Where there is no ``/proc``, nothing is known of a process but whether its number is in use.
+"""
+
+import contextlib
+import os
+import shutil
+import signal
+import tempfile
+from collections.abc import Collection
+from pathlib import Path
+from typing import NamedTuple
+
+_PROC = Path("/proc")
+_PREFIX = "lagid-ray-"
+
+
+class Standing(NamedTuple):
+    """What a process is: its program, whether it is only waited for, parent, session, start."""
+
+    command: str
+    is_dead: bool
+    parent: int
+    session: int
+    started: int
+
+
+def standing(pid: int) -> Standing | None:
+    """The process of that number; None if there is none, or no ``/proc``."""
+    try:
+        text = (_PROC / str(pid) / "stat").read_text(errors="replace")
+    except OSError:
+        return None
+    head, _, tail = text.rpartition(")")
+    fields = tail.split()  # from the third on, as proc_pid_stat(5) counts them
+    command = head.partition("(")[2]
+    return Standing(command, fields[0] in "ZX", int(fields[1]), int(fields[3]), int(fields[19]))
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process of that number is there and does not merely wait to be buried."""
+    found = standing(pid)
+    if found is not None:
+        return not found.is_dead
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def children(commands: Collection[str]) -> tuple[int, ...]:
+    """Living children of this process that run one of these programs; none without ``/proc``."""
+    here = os.getpid()
+    found = ((pid, standing(pid)) for pid in _listed())
+    return tuple(
+        pid for pid, one in found
+        if one is not None and one.parent == here and one.command in commands and not one.is_dead
+    )  # fmt: skip
+
+
+def of_session(session: int) -> tuple[int, ...]:
+    """The processes of a session; where there is no ``/proc``, at most its leader."""
+    found = []
+    for pid in _listed() or (session,):
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            if os.getsid(pid) == session:
+                found.append(pid)
+    return tuple(found)
+
+
+def kill(pids: Collection[int]) -> None:
+    """Kill processes, but never this one."""
+    for pid in pids:
+        if pid != os.getpid():
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def folder_of(pid: int) -> Path:
+    """Ray's folder for the dispatcher of that number.
+
+    Its path must be short: Ray puts sockets below it, and a socket's path has 107 bytes at most.
+    """
+    return _base() / f"{_PREFIX}{pid}"
+
+
+def of_folder(pid: int) -> tuple[int, ...]:
+    """Processes of Ray whose arguments name the folder of that dispatcher.
+
+    Workers hide theirs, but end by themselves when their raylet does.
+    """
+    mark = f"{folder_of(pid)}/".encode()
+    return tuple(one for one in _listed() if mark in _arguments(one))
+
+
+def clear_after(pid: int) -> None:
+    """Kill what the Ray of a dispatcher that is gone has left running, and remove its folder."""
+    kill(of_folder(pid))
+    shutil.rmtree(folder_of(pid), ignore_errors=True)
+
+
+def clear_after_the_dead() -> None:
+    """Do so for every dispatcher of this machine that is gone."""
+    for folder in _base().glob(f"{_PREFIX}*"):
+        owner = folder.name.removeprefix(_PREFIX)
+        if owner.isdigit() and not is_running(int(owner)):
+            clear_after(int(owner))
+
+
+def _base() -> Path:
+    base = Path(tempfile.gettempdir())
+    return base if len(str(base)) <= 30 else Path("/tmp")
+
+
+def _listed() -> tuple[int, ...]:
+    return tuple(int(entry.name) for entry in _PROC.glob("[0-9]*"))
+
+
+def _arguments(pid: int) -> bytes:
+    try:
+        return (_PROC / str(pid) / "cmdline").read_bytes()
+    except OSError:
+        return b""
