@@ -12,6 +12,7 @@ import time
 from types import FrameType
 
 from service.dispatch.claiming import Leases
+from service.dispatch.floors import floors_for
 from service.dispatch.preparing import JobRuns
 from service.dispatch.recording import Recorder
 from service.errors import Misconfigured
@@ -113,7 +114,8 @@ class Dispatcher:
 
     def _take(self, claim: Claim) -> None:
         source = JobRuns(self._database, claim, self._store)
-        recorder = Recorder(self._database, claim, source.save)
+        floors = floors_for(self._database, claim, source)
+        recorder = Recorder(self._database, claim, source.save, floors)
         self._recorders[claim.lease] = recorder
         self._feeder.add(claim.lease, source, recorder)
         _log.info("%s: %d runs, attempt %d", claim.job.id, claim.job.n_runs, claim.lease.attempt)

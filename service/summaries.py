@@ -1,12 +1,13 @@
 """Use case of summaries: how a sweep's results depend on its axes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from sqlalchemy.orm import Session
 
 from service.errors import InvalidRequest
-from service.schemas_summaries import GroupOut, ParameterSummaryOut, SummaryOut
+from service.floors import Floors, at_sigma
+from service.schemas_summaries import GroupOut, ParameterSummaryOut, ReferenceOut, SummaryOut
 from service.storage.jobs import JobRepository
 from service.storage.runs import RunRepository
 from service.storage.summaries import QUANTILES, Group, GroupKey, Quantity, groups
@@ -15,9 +16,16 @@ from sysid.errors import nearest
 
 MOST_GROUPS = 2_000
 MIDDLE = QUANTILES.index(500)
-RMS, ESTIMATION, VALIDATION = (
-    Quantity("rms"), Quantity("fit_estimation"), Quantity("fit_validation"),
+RMS, NOISE_FREE, ESTIMATION, VALIDATION = (
+    Quantity("rms"), Quantity("rms_noise_free"), Quantity("fit_estimation"),
+    Quantity("fit_validation"),
 )  # fmt: skip
+SUCCESS = "a run succeeds if it ends with a finite simulation"
+SAFE = "a run succeeds if it ends with an RMS within the safe limit"
+FLOOR = (
+    "floors are Cramér–Rao bounds of the added noise alone; bounds on the parameters and a search "
+    "that stops early may hold errors below them"
+)
 
 
 def summary(session: Session, job_id: str, by: Sequence[str] | None) -> SummaryOut:
@@ -37,7 +45,8 @@ def summary(session: Session, job_id: str, by: Sequence[str] | None) -> SummaryO
     job = JobRepository(session).get(job_id)
     keys = _keys(job, by)
     units = _units(session, job)
-    quantities = [RMS, ESTIMATION, VALIDATION]
+    floors = Floors(job.floors)
+    quantities = [RMS, NOISE_FREE, ESTIMATION, VALIDATION]
     for name in units:
         quantities += [Quantity("estimate", name), Quantity("stderr", name)]
     found = groups(session, job.id, keys, quantities, MOST_GROUPS)
@@ -49,8 +58,27 @@ def summary(session: Session, job_id: str, by: Sequence[str] | None) -> SummaryO
         job=job.id,
         by=[key.name for key in keys],
         quantiles=[q / 1000 for q in QUANTILES],
-        groups=[_told(group, keys, units) for group in found],
+        groups=[_told(group, keys, units, floors) for group in found],
+        runs=job.n_runs,
+        reused=job.n_reused,
+        references=[_reference(one) for one in floors.problems],
+        notes=list(_notes(job, floors)),
     )
+
+
+def _notes(job: Job, floors: Floors) -> Iterator[str]:
+    yield SUCCESS if job.spec["algorithm"]["safe_limit"] is None else SAFE
+    if floors.problems:
+        yield from floors.notes()
+        yield FLOOR
+
+
+def _reference(problem: Mapping[str, Any]) -> ReferenceOut:
+    known = problem["reference"] or {}
+    return ReferenceOut(
+        cell=problem["cell"], kind=known.get("kind"), run=known.get("run"),
+        sigma=known.get("sigma"), parameters=known.get("values", {}), note=problem["note"],
+    )  # fmt: skip
 
 
 def _keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
@@ -90,33 +118,49 @@ def _units(session: Session, job: Job) -> dict[str, str]:
     }
 
 
-def _told(group: Group, keys: Sequence[GroupKey], units: dict[str, str]) -> GroupOut:
+def _told(
+    group: Group, keys: Sequence[GroupKey], units: dict[str, str], floors: Floors
+) -> GroupOut:
     ended = group.states[State.SUCCEEDED] + group.states[State.FAILED]
+    named = {key.name: value for key, value in zip(keys, group.key, strict=True)}
+    problem = floors.problem_of(named) or {}
+    same = group.sigma is not None and group.sigma[0] == group.sigma[1]
     return GroupOut(
-        key={key.name: value for key, value in zip(keys, group.key, strict=True)},
+        key=named,
         runs=sum(group.states.values()),
         succeeded=group.states[State.SUCCEEDED],
         failed=group.states[State.FAILED],
+        sigma=group.sigma[0] if group.sigma is not None and same else None,
         success_rate=group.n_valid / ended if ended else 0.0,
         evaluations=group.mean_evaluations,
         seconds=group.mean_seconds,
         rms=_list(group, RMS),
+        rms_noise_free=_list(group, NOISE_FREE),
+        rms_floor=at_sigma(problem.get("rms"), group.sigma),
         fit_percent={
             "estimation": _list(group, ESTIMATION), "validation": _list(group, VALIDATION),
         },
-        parameters=list(_parameters(group, units)),
+        parameters=list(_parameters(group, units, problem)),
     )  # fmt: skip
 
 
-def _parameters(group: Group, units: dict[str, str]) -> list[ParameterSummaryOut]:
-    told = []
+def _parameters(
+    group: Group, units: dict[str, str], problem: Mapping[str, Any]
+) -> Iterator[ParameterSummaryOut]:
+    known = (problem.get("reference") or {}).get("values", {})
+    floors = problem.get("stderr", {})
     for name, unit in units.items():
         values = _list(group, Quantity("estimate", name))
         errors = _list(group, Quantity("stderr", name))
         if values is not None:
-            middle = None if errors is None else errors[MIDDLE]
-            told.append(ParameterSummaryOut(name=name, unit=unit, value=values, stderr=middle))
-    return told
+            reference = known.get(name)
+            yield ParameterSummaryOut(
+                name=name, unit=unit, value=values,
+                stderr=None if errors is None else errors[MIDDLE],
+                reference=reference,
+                error=None if reference is None else [value - reference for value in values],
+                floor=at_sigma(floors.get(name), group.sigma),
+            )  # fmt: skip
 
 
 def _list(group: Group, quantity: Quantity) -> Any:

@@ -56,6 +56,26 @@ def usage(message: str) -> NoReturn:
     fail(message, 2)
 
 
+def parts_of(change: str) -> list[str]:
+    """The parts of the path of a ``--set path=value``; ends the command if it is none."""
+    path, equals, _ = change.partition("=")
+    if not equals:
+        usage(f"--set {change}: need path=value, as algorithm.population=100")
+    return [part for part in path.replace("/", ".").split(".") if part]
+
+
+def put(body: dict[str, Any], change: str) -> None:
+    """Put the value of a ``--set path=value`` into a body; the value is read as YAML."""
+    from service.documents import read_yaml
+
+    parts, here = parts_of(change), body
+    for part in parts[:-1]:
+        here = here.setdefault(part, {})
+        if not isinstance(here, dict):
+            usage(f"--set {change}: {part} has no fields")
+    here[parts[-1] if parts else ""] = read_yaml(change.partition("=")[2].encode())
+
+
 def print_json(value: Any) -> None:
     """Print a value as JSON, unstyled and unwrapped."""
     out.print(json.dumps(value, indent=2, ensure_ascii=False), markup=False, soft_wrap=True)

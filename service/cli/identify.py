@@ -14,12 +14,13 @@ from service.cli.common import (
     estimate,
     fail,
     out,
+    parts_of,
     print_json,
     print_table,
+    put,
     read_file,
     usage,
 )
-from service.documents import read_yaml
 
 if TYPE_CHECKING:
     from service.schemas_jobs import JobIn
@@ -85,17 +86,8 @@ def job_body(data: Path, model: str, changes: list[str], channels: dict[str, str
 
     body: dict[str, Any] = {"model": model, "datasets": [str(data)], "channels": channels}
     for change in changes:
-        path, equals, value = change.partition("=")
-        if not equals:
-            usage(f"--set {change}: need path=value, as algorithm.population=100")
-        parts = [part for part in path.replace("/", ".").split(".") if part]
-        _refuse_elsewhere(change, parts)
-        here = body
-        for part in parts[:-1]:
-            here = here.setdefault(part, {})
-            if not isinstance(here, dict):
-                usage(f"--set {change}: {part} has no fields")
-        here[parts[-1] if parts else ""] = read_yaml(value.encode())
+        _refuse_elsewhere(change, parts_of(change))
+        put(body, change)
     try:
         job = JobIn.model_validate(body)
     except ValidationError as error:

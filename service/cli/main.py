@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from service.calls import ClientError, NotFinite
-from service.cli import datasets, exporting, jobs, models, runs, serving, upkeep
+from service.cli import datasets, exporting, jobs, models, runs, serving, sweeps, upkeep
 from service.cli.common import err, out
 from service.cli.identify import identify
 from service.cli.paper import paper
@@ -37,6 +37,7 @@ app.command()(jobs.report)
 app.command("datasets")(datasets.listing)
 app.add_typer(datasets.app, name="dataset")
 app.add_typer(models.app, name="models")
+app.add_typer(sweeps.app, name="sweep")
 app.add_typer(upkeep.database, name="db")
 app.command()(upkeep.doctor)
 

@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 
 from service.dispatch.checkpoints import packed
 from service.dispatch.results import history_points, migrant_points, outcome_of
+from service.storage.columns import Document
 from service.storage.errors import ObjectStoreFailed
 from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOutcome
 from service.storage.queue import Claim, Progress, Queue
@@ -28,6 +29,9 @@ RESULTS_SECONDS = 0.2
 PROGRESS_SECONDS = 1.0
 CHECKPOINT_SECONDS = 4.0
 KEPT_REASONS = 3
+
+MakeFloors = Callable[[], Document]
+"""Makes the document of the job's floors, when all its results are stored."""
 
 SaveSignals = Callable[[str, Identification], str | None]
 """Stores the fitted signals of a run; gives the object's hash."""
@@ -64,8 +68,15 @@ class Recorder:
     `RESULTS_SECONDS`, progress and history every second, checkpoints every `CHECKPOINT_SECONDS`.
     """
 
-    def __init__(self, database: Database, claim: Claim, save_signals: SaveSignals) -> None:
+    def __init__(
+        self,
+        database: Database,
+        claim: Claim,
+        save_signals: SaveSignals,
+        floors: MakeFloors | None = None,
+    ) -> None:
         self.lease = claim.lease
+        self._floors = floors
         self.is_stopped = False
         with database.write() as session:
             before = tally(session, claim.lease, KEPT_REASONS)
@@ -170,10 +181,16 @@ class Recorder:
         self._written(time.monotonic(), tell=True, keep=True)
 
     def finish(self) -> None:
-        """Write the last results and end the job, in one transaction."""
+        """Write the last results and end the job, in one transaction.
+
+        Where floors are told, the results are written before: they are made of them.
+        """
+        floors = None if self._floors is None else self._made_floors(self._floors)
         with self._database.write() as session:
             self._write(session, tell=True, keep=False)
             queue = Queue(session)
+            if floors is not None:
+                queue.tell_floors(self.lease, floors)
             job = queue.hold(self.lease)
             session.refresh(job)
             complaint = self._complaint(job.n_failed, job.n_runs)
@@ -184,6 +201,12 @@ class Recorder:
                 queue.finish(self.lease, State.FAILED, complaint)
             else:
                 queue.finish(self.lease, State.SUCCEEDED, complaint)
+
+    def _made_floors(self, make: MakeFloors) -> Document:
+        with self._database.write() as session:
+            self._write(session, tell=True, keep=False)
+        self._written(time.monotonic(), tell=True, keep=False)
+        return make()
 
     def cancel(self) -> None:
         """End the job as cancelled; what its runs gave before stays."""

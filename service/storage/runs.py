@@ -79,7 +79,7 @@ class RunRepository:
             query = query.where(Run.state.in_(states))
         for column, wanted in ((Run.cell, cell), (Run.labels, labels)):
             for key, value in (wanted or {}).items():
-                query = query.where(self._entry_equals(column, key, value))
+                query = query.where(entry_equals(self._session, column, key, value))
         found = self._session.scalars(_ordered(query, _ORDERS[order], descending, cursor)).all()
         cursors = (json.dumps([getattr(run, order), run.number]) for run in found)
         return page_of(found, limit, cursors)
@@ -109,12 +109,14 @@ class RunRepository:
     def _of(self, job_id: str) -> tuple[ColumnElement[bool], ...]:
         return Run.job_id == job_id, Run.project_id == self._project_id
 
-    def _entry_equals(
-        self, column: InstrumentedAttribute[Document], key: str, value: object
-    ) -> ColumnElement[bool]:
-        if self._session.get_bind().dialect.name == "postgresql":
-            return type_coerce(column, JSONB)[key] == cast(literal(to_json(value)), JSONB)
-        return _sqlite_entry_equals(column, key, value)
+
+def entry_equals(
+    session: Session, column: InstrumentedAttribute[Document], key: str, value: object
+) -> ColumnElement[bool]:
+    """Whether a document has this value under a key."""
+    if session.get_bind().dialect.name == "postgresql":
+        return type_coerce(column, JSONB)[key] == cast(literal(to_json(value)), JSONB)
+    return _sqlite_entry_equals(column, key, value)
 
 
 def _sqlite_entry_equals(

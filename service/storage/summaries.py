@@ -1,6 +1,6 @@
 """Aggregates over the runs of a job, computed by the database: no run is loaded to be counted."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -8,6 +8,7 @@ from sqlalchemy import ColumnElement, Integer, case, cast, func, or_, select
 from sqlalchemy.orm import Session
 
 from service.storage.columns import to_json
+from service.storage.runs import entry_equals
 from service.storage.tables import DEFAULT_PROJECT, Run, State
 
 QUANTILES = (50, 250, 500, 750, 950)
@@ -33,7 +34,10 @@ class GroupKey:
 class Quantity:
     """A number of each run that quantiles are wanted of."""
 
-    kind: Literal["rms", "fit_estimation", "fit_validation", "evaluations", "estimate", "stderr"]
+    kind: Literal[
+        "rms", "rms_noise_free", "fit_estimation", "fit_validation", "evaluations", "estimate",
+        "stderr",
+    ]  # fmt: skip
     parameter: str = ""
 
     @property
@@ -53,12 +57,13 @@ class Quantity:
 
 @dataclass(slots=True)
 class Group:
-    """The runs that share the values of the grouping keys."""
+    """The runs that share the values of the grouping keys; `sigma` is the range of their noise."""
 
     key: tuple[Any, ...]
     first: int
     states: dict[State, int]
     n_valid: int
+    sigma: tuple[float, float] | None
     mean_evaluations: float | None
     mean_seconds: float | None
     quantiles: dict[Quantity, tuple[float, ...]] = field(default_factory=dict)
@@ -79,21 +84,34 @@ def groups(
         select(
             func.min(Run.number), func.sum(case((Run.valid.is_(True), 1), else_=0)),
             func.avg(_when_succeeded(Run.evaluations)), func.avg(_when_succeeded(Run.seconds)),
-            *counts, *columns,
+            func.min(Run.sigma), func.max(Run.sigma), *counts, *columns,
         )
         .where(*mine).group_by(*columns).order_by(func.min(Run.number)).limit(limit + 1)
     )  # fmt: skip
     found: dict[str, Group] = {}
-    for first, valid, evaluations, seconds, *rest in session.execute(query):
+    for first, valid, evaluations, seconds, low, high, *rest in session.execute(query):
         key = tuple(rest[len(counts) :])
         states = {state: int(n) for state, n in zip(State, rest, strict=False)}
         mean = None if evaluations is None else float(evaluations)
-        found[to_json(key)] = Group(key, int(first), states, int(valid), mean, seconds)
+        sigma = None if low is None else (float(low), float(high))
+        found[to_json(key)] = Group(key, int(first), states, int(valid), sigma, mean, seconds)
     for quantity in quantities:
         for key, values in _quantiles(session, mine, columns, quantity):
             if to_json(key) in found:  # not beyond the limit
                 found[to_json(key)].quantiles[quantity] = values
     return list(found.values())
+
+
+def quietest_run(
+    session: Session, job_id: str, cell: Mapping[str, Any], project_id: str = DEFAULT_PROJECT
+) -> Run | None:
+    """The best valid run of a cell among those with the least noise; None if none succeeded."""
+    query = select(Run).where(
+        Run.job_id == job_id, Run.project_id == project_id, Run.state == State.SUCCEEDED,
+        Run.valid.is_(True), Run.best_rms.is_not(None),
+        *(entry_equals(session, Run.cell, path, value) for path, value in cell.items()),
+    )  # fmt: skip
+    return session.scalar(query.order_by(Run.sigma, Run.best_rms, Run.number).limit(1))
 
 
 def _when_succeeded(column: Any) -> ColumnElement[Any]:

@@ -1,0 +1,256 @@
+"""`lagid sweep noise`: how far noise moves what is found, as one job and one table."""
+
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.common import (
+    DEFAULT_URL,
+    AsJson,
+    Key,
+    Url,
+    connected,
+    err,
+    out,
+    print_json,
+    print_table,
+    put,
+    read_file,
+    usage,
+)
+from service.cli.watching import follow
+from service.documents import read_yaml
+
+if TYPE_CHECKING:
+    from service.client import Client
+
+app = typer.Typer(help="Recipes: sweeps made for one purpose.", no_args_is_help=True)
+
+MOST_POINTS = 100_000
+MODEL_SUFFIXES = (".yaml", ".yml", ".json")
+A_TABLE = 4  # parameters beside each other
+LOW, MIDDLE, HIGH = 0, 2, 4  # places of 5, 50 and 95 % among the quantiles of a summary
+
+Named = list[str] | None
+
+
+@app.command()
+def noise(
+    model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
+    sigma: Annotated[
+        list[str],
+        typer.Option("--sigma", help="start:stop:step with both ends, or numbers: 0,0.1,0.3."),
+    ],
+    data: Annotated[
+        str | None, typer.Option("--data", help="Datasets on the server: ids or names, by commas.")
+    ] = None,
+    true: Annotated[
+        Named, typer.Option("--true", metavar="NAME=VALUE", help="A true parameter, to simulate.")
+    ] = None,
+    inputs: Annotated[
+        Named,
+        typer.Option("--input", metavar="NAME=EXPRESSION", help="Input over t: 'q=10*cos(5*t)'."),
+    ] = None,
+    samples: Annotated[int | None, typer.Option(help="Samples to simulate.")] = None,
+    sample_time: Annotated[float | None, typer.Option(help="Their period in s.")] = None,
+    relative: Annotated[
+        bool, typer.Option("--relative", help="σ in standard deviations of the output.")
+    ] = False,
+    replicates: Annotated[int, typer.Option(help="Draws of noise for each σ.")] = 20,
+    methods: Annotated[
+        str, typer.Option(help="simple, improved-paper, improved.")
+    ] = "simple,improved",
+    seed: Annotated[
+        int, typer.Option(help="Of all draws; replicates have seeds of their own.")
+    ] = 1,
+    channels: Annotated[
+        str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")
+    ] = None,
+    changes: Annotated[
+        Named, typer.Option("--set", help="path=value of the job, as algorithm.population=100.")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the job.")] = None,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")] = False,
+    idempotency_key: Annotated[
+        str | None, typer.Option(help="The same key again gives the same job.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Identify under noise: σ × replicates × methods, each parameter's error beside its floor.
+
+    The record is simulated from true parameters (--true, --input, --samples, --sample-time), or
+    that of a dataset (--data). The same sweep with more replicates or another grid computes only
+    the runs that are new.
+    """
+    truth = {
+        "parameters": {one: _number("--true", one, value) for one, value in _pairs("--true", true)},
+        "inputs": {
+            one: {"kind": "expression", "expression": text}
+            for one, text in _pairs("--input", inputs)
+        },
+        "samples": samples, "sample_time": sample_time,
+    }  # fmt: skip
+    body: dict[str, Any] = {
+        "model": _model(model), "sigma": [one for text in sigma for one in grid(text)],
+        "relative": relative, "replicates": replicates, "methods": _names(methods), "seed": seed,
+        "channels": dict(_pairs("--channels", _names(channels or ""))),
+        **_source(data, truth), **({} if name is None else {"name": name}),
+    }  # fmt: skip
+    for change in changes or []:
+        put(body, change)
+    with connected(url, key) as client:
+        job = client.noise_sweep(body, idempotency_key=idempotency_key)
+        if wait:
+            job = follow(client, job["id"], quiet=as_json)
+        _tell(client, job, wait=wait, as_json=as_json)
+
+
+def grid(text: str) -> list[float]:
+    """Values of σ from ``0:1:0.05``, both ends taken, or from ``0,0.1,0.3``.
+
+    Counted in decimals, so that the third of 0:1:0.05 is 0.15 and no number beside it.
+    """
+    found: list[float] = []
+    for part in _names(text):
+        ends = [_decimal(text, one) for one in part.split(":")]
+        if len(ends) == 1:
+            found.append(float(ends[0]))
+        elif len(ends) == 3 and ends[2] > 0 and ends[1] >= ends[0]:
+            start, stop, step = ends
+            count = int((stop - start) / step) + 1
+            if count > MOST_POINTS:
+                usage(f"--sigma {text}: {count} values; at most {MOST_POINTS}")
+            found += [float(start + step * number) for number in range(count)]
+        else:
+            usage(f"--sigma {text}: found {part!r}; need start:stop:step with start ≤ stop and a "
+                  "positive step, such as 0:1:0.05")  # fmt: skip
+    if not found:
+        usage(f"--sigma {text!r}: need numbers, such as 0:1:0.05 or 0,0.1,0.3")
+    return found
+
+
+def tables_of(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
+    """Headings and rows of the tables of a noise sweep, a row for each σ and method.
+
+    The first has the runs and the error of the response, the others those of the parameters.
+    """
+    groups = summary["groups"]
+    units = {one["name"]: one["unit"] for group in groups for one in group["parameters"]}
+    others = [key for key in summary["by"] if key != "/noise/sigma"]
+    cells = [[_short(one["sigma"], 4), *(str(one["key"][key]) for key in others)] for one in groups]
+    keys = [">σ", *(key.rsplit("/", 1)[-1] for key in others)]
+    found = [(
+        [*keys, ">runs", ">success", ">evaluations", "RMS error [5 %, 95 %]", ">floor"],
+        [[*cell, *_whole(one)] for cell, one in zip(cells, groups, strict=True)],
+    )]  # fmt: skip
+    names = list(units)
+    for first in range(0, len(names), A_TABLE):
+        some, headings = names[first : first + A_TABLE], list(keys)
+        for name in some:
+            headings += [f"{name}{'' if units[name] == '1' else f' in {units[name]}'}: error "
+                         "[5 %, 95 %]", ">floor"]  # fmt: skip
+        rows = [[*cell, *_errors(one, some)] for cell, one in zip(cells, groups, strict=True)]
+        found.append((headings, rows))
+    return found
+
+
+def _whole(group: dict[str, Any]) -> list[str]:
+    ended = group["succeeded"] + group["failed"]
+    return [
+        f"{ended}" if ended == group["runs"] else f"{ended}/{group['runs']}",
+        f"{100 * group['success_rate']:.0f} %" if ended else "–",
+        "–" if group["evaluations"] is None else f"{group['evaluations']:.0f}",
+        _band(group["rms_noise_free"]), _short(group["rms_floor"]),
+    ]  # fmt: skip
+
+
+def _errors(group: dict[str, Any], names: list[str]) -> list[str]:
+    known = {one["name"]: one for one in group["parameters"]}
+    found = [known.get(name, {"error": None, "floor": None}) for name in names]
+    return [text for one in found
+            for text in (_band(one["error"], signed=True), _short(one["floor"]))]  # fmt: skip
+
+
+def _tell(client: "Client", job: dict[str, Any], *, wait: bool, as_json: bool) -> None:
+    if not wait:
+        if as_json:
+            print_json(job)
+        else:
+            runs = job["progress"]["runs"]
+            out.print(f"{job['id']}  {job['name']}: {runs} runs, {job['state']}", markup=False)
+        return
+    summary = client.summary(job["id"])
+    if as_json:
+        print_json({**job, "summary": summary})
+    else:
+        for headings, rows in tables_of(summary):
+            print_table(headings, rows, empty="no runs")
+            out.print()
+        for note in summary["notes"]:
+            out.print(f"note: {note}", markup=False, soft_wrap=True)
+        out.print(f"{job['id']}: {summary['reused']} of {summary['runs']} runs reused",
+                  markup=False)  # fmt: skip
+    if job["state"] != "succeeded":
+        reason = f": {job['error']}" if job["error"] else ""
+        err.print(f"lagid: {job['id']} {job['state']}{reason}", markup=False)
+        raise typer.Exit(1)
+
+
+def _source(data: str | None, truth: dict[str, Any]) -> dict[str, Any]:
+    given = {name: value for name, value in truth.items() if value}
+    if (data is None) == (not given):
+        usage("give either --data, or --true, --input, --samples and --sample-time to simulate")
+    return {"truth": given} if data is None else {"datasets": _names(data)}
+
+
+def _model(name: str) -> Any:
+    path = Path(name)
+    return read_yaml(read_file(path)) if path.suffix in MODEL_SUFFIXES else name
+
+
+def _names(text: str) -> list[str]:
+    return [one.strip() for one in text.split(",") if one.strip()]
+
+
+def _pairs(option: str, texts: Named) -> list[tuple[str, str]]:
+    pairs = []
+    for text in texts or []:
+        name, equals, value = text.partition("=")
+        if not (equals and name.strip() and value.strip()):
+            usage(f"{option} {text}: need NAME=VALUE")
+        pairs.append((name.strip(), value.strip()))
+    return pairs
+
+
+def _number(option: str, name: str, value: str) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        usage(f"{option} {name}={value}: need NAME=VALUE with a number, such as c=0.2")
+
+
+def _decimal(text: str, part: str) -> Decimal:
+    try:
+        found = Decimal(part)
+    except InvalidOperation:
+        found = Decimal("NaN")
+    if not found.is_finite():
+        usage(f"--sigma {text}: found {part!r}; need a number, or start:stop:step")
+    return found
+
+
+def _short(value: float | None, digits: int = 2) -> str:
+    return "–" if value is None else f"{value:.{digits}g}"
+
+
+def _band(quantiles: list[float] | None, *, signed: bool = False) -> str:
+    if quantiles is None:
+        return "–"
+    low, middle, high = (
+        f"{quantiles[place]:{'+' if signed else ''}.2g}" for place in (LOW, MIDDLE, HIGH)
+    )
+    return f"{middle} [{low}, {high}]"
