@@ -1,24 +1,28 @@
 """What can be known of a job before it runs: every fault is found here, and found now."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from pydantic import ValidationError
 from sqlalchemy.orm import Session
 
-from service import models
+from service import models, warm_starts
 from service.conversion import algorithm_of, faults_of, loss_of
 from service.errors import FieldError
 from service.pointers import explained
+from service.record_checks import (
+    channel_faults,
+    length_faults,
+    pieces_of,
+    signal_faults,
+    unit_faults,
+)
 from service.schemas_jobs import JobIn
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import NotFound
 from service.storage.lookups import dataset_names, datasets_named
 from service.storage.tables import Dataset
-from sysid.errors import RecordTooShort, SysidError, nearest
-from sysid.language.intervals import bounds
-from sysid.language.lags import past_values
+from sysid.errors import SysidError, nearest
 from sysid.models.initial import initial_parameters
 from sysid.models.lags import check_lags
 from sysid.models.model import Model
@@ -28,25 +32,6 @@ from sysid.ties import tied_model, ties_of
 
 Body = dict[str, Any]
 MOST_GENES = 10_000_000  # individuals times parameters: 80 MB for each copy of a population
-
-
-@dataclass(frozen=True, slots=True)
-class _Piece:
-    """What is known of the length of one record; `words` say which part of it is meant."""
-
-    duration: float
-    samples: int
-    period: float | None
-    words: str = ""
-
-    def without(self, fraction: float) -> "_Piece | None":
-        """The part for estimation; None if it, or the part for validation, has no sample."""
-        left = self.samples - round(fraction * self.samples)
-        if not 0 < left < self.samples:
-            return None
-        # Where an irregular record is cut is not known here: its whole length is asked for.
-        duration = self.duration if self.period is None else (left - 1) * self.period
-        return _Piece(duration, left, self.period, "of the part for estimation: ")
 
 
 class JobChecker:
@@ -81,18 +66,24 @@ class JobChecker:
         found += self._data(body, tied, own)
         if model[0].rule is None:  # of candidates not all are kept; `check_samples` looks at them
             found += _sample_faults(parameters, self._scored(body, model[0]))
-        found += self._unit_faults(body, model[0])
-        return found + list(_signal_faults(body, model[0]))
+        found += self._units(body, model[0])
+        found += warm_starts.faults(self._session, body["warm_start"], model[0])
+        return found + list(signal_faults(body, model[0]))
 
     def resolved(self, body: Body) -> Body:
         """The body with identifiers of datasets, and an own model as its document."""
         model = self.model(body["model"])
         assert not isinstance(model, list)
         body = {**body, "model": model[1], "datasets": self.identifiers(body["datasets"])}
+        body["warm_start"] = self.warm_start(body["warm_start"])
         kept = body["validation"]
         if kept is not None and kept["datasets"] is not None:
             body["validation"] = {**kept, "datasets": self.identifiers(kept["datasets"])}
         return body
+
+    def warm_start(self, reference: str | None) -> str | None:
+        """The run that is meant now: what is accepted later does not change a job that waits."""
+        return warm_starts.resolved(self._session, reference)
 
     def model(self, reference: Any) -> tuple[Model, Any] | list[FieldError]:
         """The model and what to store for it, or what is wrong with it."""
@@ -183,25 +174,10 @@ class JobChecker:
                     "name another, or leave it out",
                 )  # fmt: skip
 
-    def _unit_faults(self, body: Body, model: Model) -> Iterator[FieldError]:
-        """Validation data that are in other units than the data that are fitted."""
-        kept = (body["validation"] or {}).get("datasets") or []
-        first = self.dataset(body["datasets"][0])
-        if isinstance(first, str):
-            return
-        known = {channel["name"]: channel.get("unit") for channel in first.channels}
-        inputs, outputs = signals_of(model)
-        for index, reference in enumerate(kept):
-            dataset = self.dataset(reference)
-            for channel in [] if isinstance(dataset, str) else dataset.channels:
-                name, unit = channel["name"], channel.get("unit")
-                used = name in {body["channels"].get(s, s) for s in (*inputs, *outputs)}
-                if used and _differ(unit, known.get(name)):
-                    yield FieldError(
-                        f"/validation/datasets/{index}",
-                        f"channel {name!r} is in {unit}, but in {first.name} it is in "
-                        f"{known[name]}; convert one of them",
-                    )
+    def _units(self, body: Body, model: Model) -> Iterator[FieldError]:
+        found = ((pointer, self.dataset(reference)) for pointer, reference in _references(body))
+        known = [(pointer, one) for pointer, one in found if isinstance(one, Dataset)]
+        return unit_faults(model, body["channels"], known)
 
     def _data(
         self, body: Body, model: Model, parameters: tuple[Parameter, ...]
@@ -212,11 +188,11 @@ class JobChecker:
             if isinstance(dataset, str):
                 yield FieldError(pointer, dataset)
                 continue
-            yield from _channel_faults(body["channels"], model, dataset)
-            for piece in _pieces(dataset):
+            yield from channel_faults(body["channels"], model, dataset)
+            for piece in pieces_of(dataset):
                 estimated = piece if kept is None else piece.without(kept)
                 if estimated is not None:
-                    yield from _length_faults(pointer, model, parameters, estimated, body["skip"])
+                    yield from length_faults(pointer, model, parameters, estimated, body["skip"])
                 else:
                     yield FieldError(
                         "/validation/fraction",
@@ -235,103 +211,11 @@ def value_faults(pointer: str, body: Body) -> list[FieldError]:
     return []
 
 
-def signals_of(model: Model) -> tuple[list[str], list[str]]:
-    """Names of a model's inputs and outputs: the signals that channels are given to."""
-    return [one.name for one in model.inputs], [one.name for one in model.outputs]
-
-
-def longest_delay(
-    model: Model, parameters: tuple[Parameter, ...], period: float | None
-) -> tuple[float, str]:
-    """The longest time (s) that any equation may look back, and which signal it looks at."""
-    between = {p.name: (p.lower, p.upper) if p.is_free else (p.fixed or 0.0,) * 2
-               for p in parameters}  # fmt: skip
-    longest = (0.0, "")
-    trees = (*model.equations, *(output.expression for output in model.outputs))
-    for past in (one for tree in trees for one in past_values(tree)):
-        back = float(past.offset)
-        if past.lag is not None:
-            back += bounds(past.lag, between, period)[1]
-        if model.form != "differential":
-            back *= period or 0.0
-        longest = max(longest, (back, past.name))
-    return longest
-
-
 def _references(body: Body) -> Iterator[tuple[str, str]]:
     for index, reference in enumerate(body["datasets"]):
         yield f"/datasets/{index}", reference
     for index, reference in enumerate((body["validation"] or {}).get("datasets") or []):
         yield f"/validation/datasets/{index}", reference
-
-
-def _signal_faults(body: Body, model: Model) -> Iterator[FieldError]:
-    inputs, outputs = signals_of(model)
-    for name in body["channels"]:
-        if name not in (*inputs, *outputs):
-            hint = nearest(name, (*inputs, *outputs))
-            yield FieldError(
-                f"/channels/{name}", f"model {model.name!r} has no signal {name!r}{hint}"
-            )
-    for name in body["hold"]:
-        if name not in inputs:
-            hint = nearest(name, inputs)
-            yield FieldError(f"/hold/{name}", f"model {model.name!r} has no input {name!r}{hint}")
-    for name, weight in (body["weights"] or {}).items():
-        if name not in outputs:
-            hint = nearest(name, outputs)
-            yield FieldError(f"/weights/{name}", f"the model has no output {name!r}{hint}")
-        elif not weight > 0:
-            yield FieldError(f"/weights/{name}", f"found {weight:g}; need a positive number")
-
-
-def _channel_faults(
-    channels: Mapping[str, str], model: Model, dataset: Dataset
-) -> Iterator[FieldError]:
-    known = [channel["name"] for channel in dataset.channels]
-    inputs, outputs = signals_of(model)
-    for signal in (*inputs, *outputs):
-        channel = channels.get(signal, signal)
-        if channel not in known:
-            yield FieldError(
-                f"/channels/{signal}" if signal in channels else "/channels",
-                f"dataset {dataset.id} ({dataset.name}) has no channel {channel!r} for signal "
-                f"{signal!r} of the model{nearest(channel, known)}",
-            )
-
-
-def _pieces(dataset: Dataset) -> list[_Piece]:
-    """The records that a dataset gives: its segments, or all of it."""
-    period = dataset.sample_time
-    spans = [one["stop"] - one["start"] for one in dataset.details.get("segments") or []]
-    if not spans:
-        return [_Piece(dataset.duration, dataset.n_samples, period)]
-    if period is None:  # how many samples each has is not stored; all together are enough to ask
-        return [_Piece(min(spans), dataset.n_samples, None)]
-    return [_Piece(span, round(span / period) + 1, period) for span in sorted(set(spans))]
-
-
-def _length_faults(
-    pointer: str, model: Model, parameters: tuple[Parameter, ...], piece: _Piece, skip: int
-) -> Iterator[FieldError]:
-    period = model.solver.step or piece.period or piece.duration / max(piece.samples - 1, 1)
-    substeps = model.solver.substeps
-    needed, signal = longest_delay(model, parameters, period / substeps)
-    what = f"the largest lag of {signal!r}" if needed else "a simulation"
-    if piece.duration <= needed:
-        error = RecordTooShort(piece.duration, needed, what)
-        yield FieldError(pointer, f"{piece.words}{error}")
-    if (piece.samples - 1 - skip) * substeps < model.memory:
-        yield FieldError(
-            pointer,
-            f"{piece.words}the record has {piece.samples} samples; the model's memory "
-            f"({model.memory}) and 'skip' ({skip}) need more",
-        )
-
-
-def _differ(unit: str | None, other: str | None) -> bool:
-    """Whether two units are known and not the same; 1 is that of a channel without one."""
-    return unit not in (None, "", "1") and other not in (None, "", "1") and unit != other
 
 
 def _sample_faults(parameters: tuple[Parameter, ...] | None, samples: int) -> Iterator[FieldError]:

@@ -1,5 +1,6 @@
 """Signals that a request describes: waves, steps, random binary signals, expressions, records."""
 
+from dataclasses import replace
 from math import pi
 
 import numpy as np
@@ -21,6 +22,7 @@ from service.storage.objects import ObjectStore
 from sysid.errors import InvalidRecord, SysidError
 from sysid.records import Channel, Hold
 from sysid.types import FloatArray
+from sysid.units import difference, factor, is_blank
 
 MOST_DRAWS = 10_000_000
 """Values of one random binary signal at most."""
@@ -62,8 +64,7 @@ class Signals:
             case ExpressionInput():
                 return _evaluated(pointer, signal.expression, t)
             case DatasetInput():
-                channel = self._recorded(pointer, signal)
-                return np.asarray(np.interp(t, channel.times, channel.values))
+                return sampled(self._recorded(pointer, signal), t)
 
     def channel(self, pointer: str, name: str, unit: str, signal: RunInputIn) -> Channel:
         """One input with what it does between its samples; before a step it has its offset.
@@ -78,12 +79,36 @@ class Signals:
                 times, values = (np.array(one) for one in (signal.times, signal.values))
                 return Channel(name, times, values, unit, signal.hold)
             case DatasetInput():
-                found = self._recorded(pointer, signal)
-                return Channel(name, found.times, found.values, unit, found.hold)
+                return self._converted(pointer, name, unit, signal)
             case StepInput():
                 return self._stepped(pointer, name, unit, signal)
             case _:
-                return Channel(name, self._times, self.of(pointer, signal), unit, hold_of(signal))
+                return self.on_samples(pointer, name, unit, signal)
+
+    def on_samples(self, pointer: str, name: str, unit: str, signal: InputIn) -> Channel:
+        """One input at the given times, with what it does between them.
+
+        Raises
+        ------
+        InvalidRequest, InvalidRecord
+            As `of`; if a recorded channel is in a unit that is not the input's.
+        """
+        if isinstance(signal, DatasetInput):
+            found = self._converted(pointer, name, unit, signal)
+            return replace(found, times=self._times, values=sampled(found, self._times))
+        return Channel(name, self._times, self.of(pointer, signal), unit, hold_of(signal))
+
+    def _converted(self, pointer: str, name: str, unit: str, signal: DatasetInput) -> Channel:
+        """A recorded channel as an input: in its unit, where both have one."""
+        found = self._recorded(pointer, signal)
+        times = 1.0 if is_blank(found.unit) or is_blank(unit) else factor(found.unit, unit)
+        if times is None:
+            raise InvalidRequest.at(
+                f"{pointer}/channel",
+                f"channel {found.name!r} of {signal.dataset} is in {found.unit}, but "
+                f"{name!r} is in {unit}: {difference(found.unit, unit)}",
+            )
+        return Channel(name, found.times, found.values * times, unit, found.hold)
 
     def _stepped(self, pointer: str, name: str, unit: str, signal: StepInput) -> Channel:
         start, stop = float(self._times[0]), float(self._times[-1])

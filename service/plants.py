@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 
 from service.datasets import add_recording, key_of
 from service.errors import FieldError, InvalidRequest
-from service.inputs import Signals, hold_of
+from service.inputs import Signals
 from service.schemas_datasets import SimulateIn
 from service.storage.datasets import DatasetRepository, Stored
 from service.storage.objects import ObjectStore
@@ -69,9 +69,8 @@ def _supply(session: Session, store: ObjectStore, body: SimulateIn) -> tuple[Cha
         raise InvalidRequest(faults)
     times = np.arange(body.samples or 0, dtype=np.float64) * (body.sample_time or 0.0)
     signals = Signals(session, store, times)
-    given = body.inputs["P_a"]
-    values = signals.of("/inputs/P_a", given)
-    return Channel("P_a", times, values, "Pa", hold_of(given)), signals.parents
+    supply = signals.on_samples("/inputs/P_a", "P_a", "Pa", body.inputs["P_a"])
+    return supply, signals.parents
 
 
 def _actuator(body: SimulateIn, supply: Channel) -> tuple[Recording, dict[str, float]]:

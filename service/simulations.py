@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from service import models
 from service.datasets import add_recording, key_of
 from service.errors import FieldError, InvalidRequest
-from service.inputs import Signals, hold_of
+from service.inputs import Signals
 from service.plants import simulate_plant
 from service.schemas_datasets import InputIn, SimulateIn
 from service.storage.datasets import DatasetRepository, Stored
@@ -50,13 +50,7 @@ def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored
         times = np.arange(body.samples or 0, dtype=np.float64) * (body.sample_time or 0.0)
         signals = Signals(session, store, times)
         inputs = [
-            Channel(
-                one.name,
-                times,
-                signals.of(f"/inputs/{one.name}", body.inputs[one.name]),
-                one.unit,
-                hold_of(body.inputs[one.name]),
-            )
+            signals.on_samples(f"/inputs/{one.name}", one.name, one.unit, body.inputs[one.name])
             for one in model.inputs
         ]
     recording = _simulated(model, inputs, body, times)

@@ -17,6 +17,7 @@ from sysid.pooling import pool, select
 from sysid.records import HOLDS, Channel, Hold, Recording, Segment, time_of_cut
 from sysid.resampling import resample
 from sysid.types import FloatArray
+from sysid.units import difference, factor, is_blank
 
 KINDS = ("gaussian", "uniform-sum")
 _HOLDS: Mapping[str, Hold] = {hold: hold for hold in HOLDS}
@@ -160,6 +161,21 @@ def set_hold(recording: Recording, given: Arguments) -> Recording:
     return recording.held({name: _HOLDS[given.choice(name, HOLDS)] for name, _ in given.items()})
 
 
+def set_unit(recording: Recording, given: Arguments) -> Recording:
+    """Convert named channels to other units; of one that has none the unit is only written down."""
+    units = {name: given.text(name) for name, _ in given.items()}
+    changed = {}
+    for name, unit in units.items():
+        channel = recording.channel(name)
+        times = 1.0 if is_blank(channel.unit) or is_blank(unit) else factor(channel.unit, unit)
+        if times is None:
+            given.fail(name, f"{difference(channel.unit, unit)}; need a unit of the same quantity")
+        values = channel.values if times == 1.0 else channel.values * times
+        changed[name] = replace(channel, unit=unit.strip() or "1", values=values)
+    channels = tuple(changed.get(one.name, one) for one in recording.channels)
+    return replace(recording, channels=channels)
+
+
 def rename(recording: Recording, given: Arguments) -> Recording:
     """Give channels other names."""
     names = {old: given.text(old) for old, _ in given.items()}
@@ -202,4 +218,5 @@ STEPS: Mapping[str, Step] = {
     "pool": pool,
     "hold": set_hold,
     "rename": rename,
+    "unit": set_unit,
 }

@@ -78,10 +78,13 @@ class InvalidRecord(SysidError, ValueError):
 class RecordTooShort(SysidError, ValueError):
     """A record is shorter than the model's memory."""
 
-    def __init__(self, duration: float, needed: float, what: str) -> None:
+    def __init__(
+        self, duration: float, needed: float, what: str, why: str = "", cure: str = ""
+    ) -> None:
+        because = f" ({why})" if why else ""
         super().__init__(
-            f"the record lasts {duration:g} s, but {what} needs more than {needed:g} s; "
-            "give a longer record or a smaller upper bound of the lag"
+            f"the record lasts {duration:g} s, but {what} needs more than {needed:g} s{because}; "
+            f"give {cure or 'a longer record'}"
         )
         self.duration, self.needed = duration, needed
 

@@ -13,6 +13,7 @@ from sysid.result import Identification
 from sysid.run import RunState, advance, begin, conclude, is_finished
 from sysid.selection import selected
 from sysid.settings import GeneticAlgorithm, Loss, Prediction
+from sysid.signal_units import check_units
 
 _PROGRESS_SECONDS = 0.25
 
@@ -67,24 +68,35 @@ def identify(
         If an argument cannot be used.
     """
     algorithm = settings or GeneticAlgorithm()
-    estimation = _estimation(_several(records), validation_fraction, noise)
+    whole = _checked(model, records, validation)
+    estimation = _estimation(whole, validation_fraction, noise)
     model, parameters = selected(model, estimation, parameters, skip)
     pose = partial(
         Problem.build, model, parameters=parameters, prediction=prediction, loss=loss, skip=skip
     )
     posed = pose(estimation, weights=weights)
-    kept, since = _kept(_several(records), validation, validation_fraction)
+    kept, since = _kept(whole, validation, validation_fraction)
     judged = None if kept is None else pose(kept, weights=posed.output_weights, scored_from=since)
-    state = _searched(posed, algorithm, begin(posed, algorithm, seed, warm), progress)
-    return conclude(posed, algorithm, state, judged)
+    return conclude(posed, algorithm, _searched(posed, algorithm, seed, warm, progress), judged)
+
+
+def _checked(
+    model: Model, records: Record | Sequence[Record], validation: Record | Sequence[Record] | None
+) -> tuple[Record, ...]:
+    """The records, after a look at the units of all."""
+    whole = _several(records)
+    check_units(model, (*whole, *_several(validation or ())))
+    return whole
 
 
 def _searched(
     problem: Problem,
     algorithm: GeneticAlgorithm,
-    state: RunState,
+    seed: int,
+    warm: Mapping[str, float] | None,
     progress: Callable[[RunState], None] | None,
 ) -> RunState:
+    state = begin(problem, algorithm, seed, warm)
     while not is_finished(algorithm, state):
         state = advance(problem, algorithm, state, _PROGRESS_SECONDS)
         if progress is not None:

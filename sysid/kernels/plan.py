@@ -7,13 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.errors import RecordTooShort
 from sysid.kernels.calls import LANES
 from sysid.kernels.demand import averaged_inputs, furthest, is_difference, lags, with_history
 from sysid.kernels.grid import Grid, is_on_grid
 from sysid.kernels.inputs import FineInput, fine_input
 from sysid.kernels.layout import Layout, Variant
 from sysid.language.intervals import Interval, bounds
+from sysid.models.lags import check_length
 from sysid.models.model import Model
 from sysid.records import Channel
 from sysid.types import FloatArray, IntArray
@@ -64,10 +64,8 @@ def largest_lags(
     for past in lags(model, kind):
         if past.lag is None:
             continue
+        check_length(model, past, parameters, step, grid.duration)
         upper = bounds(past.lag, parameters, step)[1]
-        seconds = (upper + past.offset) * step if is_difference(model) else upper
-        if not seconds < grid.duration:
-            raise RecordTooShort(grid.duration, seconds, f"the lag of {past.name!r}")
         steps = upper if is_difference(model) else upper / step
         largest[past.name] = max(steps, largest.get(past.name, 0.0))
     return largest

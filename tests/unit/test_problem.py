@@ -162,6 +162,10 @@ def test_a_record_shorter_than_the_largest_lag_is_refused() -> None:
         Problem.build(duffing(), [record(6)])
     with pytest.raises(RecordTooShort, match=r"the lag of 'u' needs more than 0\.4 s"):
         Problem.build(lag_element(), [record(6)])
+    with pytest.raises(RecordTooShort, match=r"upper bound of L is .*of L: below 0\.25"):
+        Problem.build(lag_element(), [record(6)])
+    with pytest.raises(RecordTooShort, match=r"\(L is 0\.3.*, or a smaller L: below 0\.25"):
+        Problem.build(lag_element(), [record(6)], parameters={"L": {"fixed": 0.3}})
     far = difference({"x": "0.5*x(k-12)"}, "x")
     with pytest.raises(RecordTooShort, match="the model's memory"):
         Problem.build(far, [record(10)])

@@ -377,3 +377,12 @@ def test_validation_data_in_other_units_or_with_other_channels_are_refused(own: 
     body["validation"] = {"datasets": [alien]}
     fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
     assert "has no channel 'y'" in fault["detail"]
+    pooled = {"model": "fopdt", "datasets": [fitted, other]}
+    fault = refused(own.post("/v1/jobs", json=pooled), 422, "invalid")[0]
+    assert fault["pointer"] == "/datasets/1"
+    assert "1 mm is 0.001 m" in fault["detail"]
+    declared = {"model": "duffing-delay", "datasets": [fitted], "channels": {"q": "u"}}
+    fault = refused(own.post("/v1/jobs", json=declared), 422, "invalid")[0]
+    assert fault["pointer"] == "/datasets/0"
+    assert "channel 'u' (signal 'q')" in fault["detail"]
+    assert "but in model 'duffing-delay' it is in N" in fault["detail"]

@@ -111,3 +111,19 @@ def test_the_command_line_says_the_same_in_one_line(
     found = CliRunner().invoke(lagid, ["identify", str(path), "--model", "fopdt", *options])
     assert found.exit_code != 0
     assert words in " ".join((found.output + str(found.exception or "")).split())
+
+
+def test_a_lag_that_the_record_has_no_room_for_is_refused_by_its_name(
+    parts: tuple[TestClient, Parts],
+) -> None:
+    own = parts[0]
+    short = stored(own, recording(40))
+    body: dict[str, Any] = {"model": "fopdt", "datasets": [short]}
+    fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
+    assert fault["pointer"] == "/datasets/0"
+    assert "lasts 3.9 s" in fault["detail"]
+    assert "the upper bound of L is 5 s" in fault["detail"]
+    assert "a smaller upper bound of L: below 3.9 s" in fault["detail"]
+    body["parameters"] = {"L": {"fixed": 4.5}}
+    fault = refused(own.post("/v1/jobs", json=body), 422, "invalid")[0]
+    assert "(L is 4.5 s); give a longer record, or a smaller L: below 3.9 s" in fault["detail"]

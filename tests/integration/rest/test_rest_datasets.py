@@ -179,3 +179,30 @@ def test_an_input_that_jumps_is_stored_as_held(
         assert not values[:11].any()
         assert values[11] < 0.05  # a ramp from the sample before gives 0.2
         assert values[12] > 0.3
+
+
+def test_a_recorded_input_keeps_its_hold_and_comes_in_the_unit_of_the_model(
+    server: TestClient,
+) -> None:
+    rows = ["t,P [kPa]", *(f"{0.1 * k:.1f},{int(k >= 10)}" for k in range(40))]
+    added = server.post("/v1/datasets?name=P", content="\n".join(rows).encode(), headers=CSV)
+    held = server.post(f"/v1/datasets/{added.json()['id']}:derive",
+                       json={"steps": [{"hold": {"P": "zero"}}]}).json()["id"]  # fmt: skip
+    model = {
+        "name": "gauge", "form": "differential", "inputs": {"u": "Pa"}, "states": {"x": "Pa"},
+        "parameters": {"T": {"lower": 0.1, "upper": 2, "unit": "s"}},
+        "equations": {"x": "(u - x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
+    }  # fmt: skip
+    body = {"model": model, "parameters": {"T": 0.5}, "samples": 40, "sample_time": 0.1,
+            "inputs": {"u": {"kind": "dataset", "dataset": held, "channel": "P"}}}  # fmt: skip
+    made = server.post("/v1/datasets:simulate", json=body)
+    assert made.status_code == 201, made.text
+    stored = read_recording(server.get(f"/v1/datasets/{made.json()['id']}/content").content)
+    u, y = stored.channel("u"), stored.channel("y")
+    assert (u.hold, u.unit, u.values[9], u.values[10]) == ("zero", "Pa", 0.0, 1000.0)
+    assert not y.values[:11].any()  # no ramp leads to the jump
+    assert y.values[20] == pytest.approx(1000 * (1 - np.exp(-2)), rel=1e-3)
+    body["model"] = {**model, "inputs": {"u": "V"}}
+    fault = refused(server.post("/v1/datasets:simulate", json=body), 422, "invalid")[0]
+    assert fault["pointer"] == "/inputs/u/channel"
+    assert "is in kPa, but 'u' is in V" in fault["detail"]
