@@ -23,7 +23,8 @@ TINY = GeneticAlgorithm(population=8, generations=2, islands=1)
      ("psi", "Pa", 6894.757293168361), ("deg", "rad", np.pi / 180), ("rpm", "rad/s", np.pi / 30),
      ("m/s^2", "m/s²", 1.0), ("N/kg", "m/s**2", 1.0), ("kg·m²", "kg m^2", 1.0),
      ("1/(V·s)", "1/V/s", 1.0), ("s⁻¹", "Hz", 1.0), ("µm", "mm", 1e-3), ("min", "s", 60.0),
-     ("m", "min", None), ("V", "N", None), ("°C", "K", None), ("counts", "counts", 1.0), ("counts", "V", None), ("(m", "m", None),
+     ("m", "min", None), ("V", "N", None), ("°C", "K", None), ("counts", "counts", 1.0),
+     ("counts", "V", None), ("(m", "m", None),
      ("km^99 km^99 km^99 km^99", "m^396", None), ("m/", "m", None), ("2 m", "m", None)],
 )  # fmt: skip
 def test_units_differ_by_a_factor_or_by_their_kind(
@@ -54,7 +55,7 @@ def model(u: str = "Pa", y: str = "1") -> Model:
 
 
 def record(u: str, y: str, name: str = "") -> Record:
-    times = 0.1 * np.arange(30)
+    times = 0.1 * np.arange(30.0)
     return Record(
         (Channel("u", times, np.sin(times), u),), (Channel("y", times, np.cos(times), y),), name
     )
