@@ -9,7 +9,10 @@ import signal
 import sys
 import threading
 import time
+from functools import partial
 from types import FrameType
+
+from sqlalchemy.exc import SQLAlchemyError
 
 from service.dispatch.claiming import Leases
 from service.dispatch.floors import floors_for
@@ -20,12 +23,13 @@ from service.settings import Settings
 from service.storage import migrate
 from service.storage.errors import LeaseLost, StorageError
 from service.storage.objects import ObjectStore, open_store
+from service.storage.patience import patiently
 from service.storage.queue import Claim, Lease
 from service.storage.sessions import Database
 from service.storage.wakeup import new_waker
 from service.supervision import SUPERVISED
 from workers.cluster import ClusterSettings, RayCrew
-from workers.errors import WorkersError
+from workers.errors import ClusterLost, WorkersError
 from workers.feeding import Feeder
 from workers.ports import Crew
 from workers.warming import warm
@@ -37,6 +41,8 @@ IDLE_SECONDS = 1.0
 BUSY_SECONDS = 0.1
 """How often a busy dispatcher looks for cancelled and waiting jobs."""
 STEP_SECONDS = 0.05
+LEAVE_SECONDS = 5.0
+"""What giving the jobs back may take once the parent or the workers are gone."""
 MAX_JOBS = 8
 """Jobs in hand at a time; the others are left to other dispatchers."""
 
@@ -63,13 +69,18 @@ class Dispatcher:
         Raises
         ------
         ClusterLost
-            If the workers do not answer; the leases are left to expire.
+            If the workers are gone; the jobs were given back, as lost.
         """
         self._leases.start({"cpus": self._crew.slots, "pid": os.getpid()})
         _log.info("ready: %s with %d cores", self._leases.owner, self._crew.slots)
         self._waking.start()
-        while not self.stopping.is_set():
-            self.turn()
+        try:
+            while not self.stopping.is_set():
+                self.turn()
+        except ClusterLost:
+            self._give_back(lost=True)
+            raise
+        self._feeder.stop()
         self._give_back()
 
     def turn(self) -> None:
@@ -85,12 +96,12 @@ class Dispatcher:
             self._end(lease)
         for recorder in self._kept():
             try:
-                recorder.flush()
+                patiently(recorder.flush)
             except LeaseLost as error:
                 self._lose(recorder, error)
 
     def _attend(self) -> None:
-        signals = self._leases.look()
+        signals = patiently(self._leases.look)
         for recorder in self._kept():
             lease = recorder.lease
             if self._leases.is_lost(lease):
@@ -98,7 +109,7 @@ class Dispatcher:
             elif lease.job_id in signals.to_cancel:
                 recorder.is_stopped = True
         if signals.is_waiting and len(self._recorders) < MAX_JOBS:
-            claim = self._leases.claim()
+            claim = patiently(self._leases.claim)
             if claim is not None:
                 self._take(claim)
 
@@ -114,8 +125,8 @@ class Dispatcher:
 
     def _take(self, claim: Claim) -> None:
         source = JobRuns(self._database, claim, self._store)
-        floors = floors_for(self._database, claim, source)
-        recorder = Recorder(self._database, claim, source.save, floors)
+        floors = patiently(partial(floors_for, self._database, claim, source))
+        recorder = patiently(partial(Recorder, self._database, claim, source.save, floors))
         self._recorders[claim.lease] = recorder
         self._feeder.add(claim.lease, source, recorder)
         _log.info("%s: %d runs, attempt %d", claim.job.id, claim.job.n_runs, claim.lease.attempt)
@@ -133,21 +144,20 @@ class Dispatcher:
             return
         try:
             if recorder.is_stopped:
-                recorder.cancel()
+                patiently(recorder.cancel)
             else:
-                recorder.finish()
+                patiently(recorder.finish)
         except LeaseLost as error:
             _log.warning("its end was not written: %s", error)
         self._leases.forget(lease)
 
-    def _give_back(self) -> None:
-        self._feeder.stop()
+    def _give_back(self, *, lost: bool = False) -> None:
         for recorder in self._kept():
             try:
-                recorder.keep()
+                patiently(recorder.keep)
             except LeaseLost as error:
                 self._lose(recorder, error)
-        self._leases.release_all()
+        self._leases.release_all(lost=lost)
         self._leases.stop()
         _log.info("stopped")
 
@@ -158,7 +168,9 @@ def main() -> int:
         return serve(Settings())
     except (Misconfigured, StorageError, WorkersError) as error:
         _log.error("%s", error)
-        return 1
+    except SQLAlchemyError as error:
+        _log.error("the database cannot be used: %s", str(error).splitlines()[0])
+    return 1
 
 
 def serve(settings: Settings) -> int:
@@ -182,15 +194,18 @@ def serve(settings: Settings) -> int:
         compiling.join()
         crew.warm()
         dispatcher = Dispatcher(database, store, crew, Leases(database, settings.lease_seconds))
-        _stop_on_signals(dispatcher.stopping)
+        _stop_on_signals(dispatcher.stopping, crew)
         dispatcher.run()
+    except ClusterLost as error:
+        _log.error("%s", error)
+        _end_at_once(crew)
     finally:
         crew.close()
         database.dispose()
     return 0
 
 
-def _stop_on_signals(stopping: threading.Event) -> None:
+def _stop_on_signals(stopping: threading.Event, crew: RayCrew) -> None:
     """SIGTERM, SIGINT, and the end of standard input where a supervisor holds it."""
 
     def handle(_number: int, _frame: FrameType | None) -> None:
@@ -200,12 +215,30 @@ def _stop_on_signals(stopping: threading.Event) -> None:
     signal.signal(signal.SIGTERM, handle)
     signal.signal(signal.SIGINT, handle)
     if os.environ.get(SUPERVISED):
-        threading.Thread(target=_outlive_no_parent, args=(stopping,), daemon=True).start()
+        threading.Thread(target=_outlive_no_parent, args=(stopping, crew), daemon=True).start()
+    threading.Thread(target=_outlive_no_cluster, args=(stopping, crew), daemon=True).start()
 
 
-def _outlive_no_parent(stopping: threading.Event) -> None:
+def _outlive_no_parent(stopping: threading.Event, crew: RayCrew) -> None:
     sys.stdin.buffer.read()
     stopping.set()
+    time.sleep(LEAVE_SECONDS)
+    _end_at_once(crew)
+
+
+def _outlive_no_cluster(stopping: threading.Event, crew: RayCrew) -> None:
+    """The main thread sees it as well, unless it is in a call of Ray's that does not return."""
+    while not stopping.wait(IDLE_SECONDS):
+        if not crew.is_alive():
+            time.sleep(LEAVE_SECONDS)
+            _end_at_once(crew)
+
+
+def _end_at_once(crew: RayCrew) -> None:
+    """End the process without Ray's own end, which waits for what may be gone."""
+    crew.abandon()
+    logging.shutdown()
+    os._exit(1)
 
 
 if __name__ == "__main__":

@@ -8,13 +8,15 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import timedelta
+from functools import partial
 
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.reaping import identity, reap
-from service.storage.columns import utc_now
+from service.storage.columns import Document, utc_now
 from service.storage.dispatchers import DispatcherRepository
 from service.storage.errors import LeaseLost
+from service.storage.patience import patiently
 from service.storage.queue import Claim, Clock, Lease, Queue
 from service.storage.sessions import Database
 from service.storage.watch import Signals, look
@@ -52,17 +54,20 @@ class Leases:
         self._database, self._length = database, timedelta(seconds=seconds)
         self._clock, self._stopwatch = clock, stopwatch
         self._held: dict[Lease, float] = {}  # when each was renewed
+        self._is_cut_off = False  # the last heartbeat did not reach the database
         self._lock = threading.Lock()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
 
     def start(self, details: dict[str, object]) -> None:
         """Announce the dispatcher and begin to beat."""
-        with self._database.write() as session:
-            announced = {**identity(), **details}
-            DispatcherRepository(session, self._clock).announce(self.owner, announced)
-        reap(self._database, self._length, self._clock)
+        patiently(partial(self._announce, {**identity(), **details}))
         self._thread.start()
+
+    def _announce(self, details: Document) -> None:
+        with self._database.write() as session:
+            DispatcherRepository(session, self._clock).announce(self.owner, details)
+        reap(self._database, self._length, self._clock)
 
     def claim(self) -> Claim | None:
         """Take the next job, if one waits."""
@@ -85,6 +90,8 @@ class Leases:
             renewed = self._held.get(lease)
         if renewed is None:
             return True
+        if self._is_cut_off:  # the next write that gets through will tell
+            return False
         return self._stopwatch() - renewed > self._length.total_seconds()
 
     def forget(self, lease: Lease) -> None:
@@ -92,17 +99,26 @@ class Leases:
         with self._lock:
             self._held.pop(lease, None)
 
-    def release_all(self) -> None:
-        """Give every job back, so that another dispatcher has it at once."""
+    def release_all(self, *, lost: bool = False) -> None:
+        """Give every job back, so that another dispatcher has it at once.
+
+        Parameters
+        ----------
+        lost : bool
+            Whether this counts as a lease that was lost.
+        """
         with self._lock:
             held = tuple(self._held)
         for lease in held:
             try:
-                with self._database.write() as session:
-                    Queue(session, self._clock).release(lease)
+                patiently(partial(self._release, lease, lost=lost))
             except LeaseLost:
                 _log.info("%s was no longer ours", lease.job_id)
             self.forget(lease)
+
+    def _release(self, lease: Lease, *, lost: bool) -> None:
+        with self._database.write() as session:
+            Queue(session, self._clock).release(lease, lost=lost)
 
     def stop(self) -> None:
         """Stop beating and take leave."""
@@ -134,7 +150,7 @@ class Leases:
         while not self._ending.wait(pause):
             try:
                 self.renew()
-                pause = third
+                pause, self._is_cut_off = third, False
             except SQLAlchemyError as error:  # it may come back before the leases end
                 _log.warning("no heartbeat could be written: %s", str(error).splitlines()[0])
-                pause = min(third, AGAIN_SECONDS)
+                pause, self._is_cut_off = min(third, AGAIN_SECONDS), True

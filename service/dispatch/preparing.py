@@ -2,7 +2,8 @@
 
 import logging
 from collections import OrderedDict, deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from service import models
@@ -16,10 +17,11 @@ from service.storage.datasets import DatasetRepository
 from service.storage.errors import LeaseLost, StorageError
 from service.storage.ledger import RunLedger
 from service.storage.objects import ObjectStore
+from service.storage.patience import patiently
 from service.storage.queue import Claim
 from service.storage.reuse import computed, mark
 from service.storage.sessions import Database
-from service.storage.tables import Run
+from service.storage.tables import Dataset, Run
 from service.storage.tally import forget_progress
 from service.sweeps import body_of
 from sysid.errors import SysidError
@@ -79,13 +81,14 @@ class JobRuns:
     def runs(self) -> Iterator[Coming]:
         """The unfinished runs in order, each from its checkpoint if it has one."""
         try:
-            checkpoints = self._checkpoints()
-            rows = self._pending(-1)
+            checkpoints = patiently(self._checkpoints)
+            rows = patiently(partial(self._pending, -1))
             while rows:
                 states = {row.id: unpacked(checkpoints.pop(row.id, None)) for row in rows}
-                self._begin_anew([run for run, state in states.items() if state is None])
+                fresh = [run for run, state in states.items() if state is None]
+                patiently(partial(self._begin_anew, fresh))
                 yield from self._in_turn([(row, states.pop(row.id)) for row in rows])
-                rows = self._pending(rows[-1].number)
+                rows = patiently(partial(self._pending, rows[-1].number))
         except LeaseLost as error:  # the recorder will meet it too, and stop the job
             _log.warning("no more runs: %s", error)
 
@@ -94,13 +97,13 @@ class JobRuns:
         waiting = deque(rows)
         while waiting:
             queued: list[QueuedRun | RefusedRun] = []
-            while waiting and (one := self._queued(*waiting[0])) is not None:
+            while waiting and (one := patiently(partial(self._queued, *waiting[0]))) is not None:
                 queued.append(one)
                 waiting.popleft()
             if not queued:
                 yield NotYet()
                 continue
-            sources = self._computed(queued)
+            sources = patiently(partial(self._computed, queued))
             for one in queued:
                 source = sources.get(one.run)
                 if source is not None:
@@ -162,9 +165,7 @@ class JobRuns:
     def _from_store(self, key: str) -> Records:
         datasets, inputs, outputs, holds = self._data[key]
         try:
-            with self._database.read() as session:
-                project = self._job.project_id
-                rows = DatasetRepository(session, project).get_all(datasets)
+            rows = patiently(partial(self._datasets, datasets))
             return tuple(
                 record
                 for row in rows
@@ -174,6 +175,10 @@ class JobRuns:
             )
         except (SysidError, ServiceError, StorageError) as error:
             raise RecordsUnavailable(str(error)) from error
+
+    def _datasets(self, datasets: tuple[str, ...]) -> Sequence[Dataset]:
+        with self._database.read() as session:
+            return DatasetRepository(session, self._job.project_id).get_all(datasets)
 
     def save(self, run: str, found: Identification) -> str | None:
         """Store the fitted signals of a run; gives the hash of the object.

@@ -179,10 +179,12 @@ class Queue:
         self._events.append_state(job)
         return job
 
-    def release(self, lease: Lease) -> None:
-        """Give a job back unharmed, because the dispatcher is shutting down."""
+    def release(self, lease: Lease, *, lost: bool = False) -> None:
+        """Give a job back, because the dispatcher is shutting down, or has `lost` its workers."""
         job = self.hold(lease)
-        if job.cancel_requested:
+        if lost:
+            self._bury(job)
+        elif job.cancel_requested:
             self._end(job, State.CANCELLED, None)
         else:
             self._requeue(job)
@@ -254,8 +256,9 @@ class Queue:
         elif job.lost_leases >= job.max_attempts:
             self._end(
                 job, State.FAILED,
-                f"the dispatcher fell silent {job.lost_leases} times in a row, the last was "
-                f"{job.lease_owner}; see its log, and resume the job when the cause is gone",
+                f"the dispatcher fell silent {job.lost_leases} times, or lost its workers; the "
+                f"last was {job.lease_owner}; see its log, and resume the job when the cause is "
+                "gone",
             )  # fmt: skip
         else:
             self._requeue(job)
