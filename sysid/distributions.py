@@ -96,6 +96,21 @@ def student_95(degrees: float) -> float:
     return t
 
 
+def student_tail(degrees: float, t: float) -> float:
+    """Probability that |T| of Student's t with so many degrees of freedom (> 0) is larger than |t|.
+
+    By Lentz's continued fraction of the incomplete beta function [1]_.
+
+    .. [1] W. H. Press et al., Numerical Recipes, 3rd ed., Cambridge 2007, §6.4 and §6.14.
+    """
+    if t != t or t in (inf, -inf):
+        return t if t != t else 0.0
+    if t == 0.0:
+        return 1.0
+    scale = exp(lgamma(0.5 * degrees + 0.5) - lgamma(0.5 * degrees))
+    return min(1.0, max(0.0, _outside(abs(t), degrees, scale)))
+
+
 def _expanded(degrees: float) -> float:
     z, inverse = _NORMAL, 1.0 / degrees
     square = z * z

@@ -1,0 +1,247 @@
+"""The trend of an estimate over a label, such as a lag over the length of a tube.
+
+From points (x, estimate ± standard error) to a law (`sysid.trend_laws`), its confidence band,
+predictions where nothing was measured, and flags: points that do not fit the law, and estimates
+that have drifted from a reference.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, sqrt
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.distributions import student_95, student_tail
+from sysid.trend_laws import Law, fit_line, fit_power, rounding
+from sysid.types import FloatArray
+
+LEAST_PLACES = 3
+"""Different values of x from which a law has errors."""
+
+_OUTLIER = 0.05  # of all batches without an outlier, the part that are told of one
+_DRIFT = 2.0 * (1.0 - NormalDist().cdf(3.0))  # outside three standard deviations
+_BAND_POINTS = 101
+_NEARLY_ONE = 1.0 - 1e-9
+
+
+class Estimate(NamedTuple):
+    """A value and its standard error."""
+
+    value: float
+    stderr: float
+
+
+class Place(NamedTuple):
+    """A law at one x: value, 95 % interval, and whether x lies outside the measured range."""
+
+    x: float
+    value: float
+    stderr: float
+    lower: float
+    upper: float
+    is_outside: bool
+
+
+class Influence(NamedTuple):
+    """How one point fits the law that the others give.
+
+    `studentised` is the deleted residual over its standard deviation, that of the others, which
+    follows Student's t with ν - 1 degrees of freedom [1]_; None where too few others are left.
+    `p_value` is multiplied by the number of points (Bonferroni).
+
+    .. [1] R. D. Cook, S. Weisberg, Residuals and Influence in Regression, Chapman and Hall 1982,
+       §2.2.
+    """
+
+    residual: float
+    studentised: float | None
+    p_value: float | None
+    is_outlier: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trend:
+    """Laws through the points and what follows from the one that was chosen.
+
+    Attributes
+    ----------
+    laws : tuple of Law
+        Those that could be fitted; empty with a `reason`.
+    chosen : Law or None
+        The one of the smaller AIC.
+    influences : tuple of Influence
+        Of each point.
+    band : tuple of Place
+        Confidence band of the law over the measured range.
+    predictions : tuple of Place
+        With intervals for a new estimate: what the law is unsure of and the scatter about it.
+    """
+
+    laws: tuple[Law, ...] = ()
+    chosen: Law | None = None
+    influences: tuple[Influence, ...] = ()
+    band: tuple[Place, ...] = ()
+    predictions: tuple[Place, ...] = ()
+    reason: str = ""
+
+
+def fit_trend(
+    x: Sequence[float], y: Sequence[float], stderr: Sequence[float], predict: Sequence[float] = ()
+) -> Trend:
+    """Choose a law for points and look at them with it.
+
+    Parameters
+    ----------
+    x, y : sequence of float, shape (n,)
+        Places and estimates.
+    stderr : sequence of float, shape (n,)
+        Standard errors of these, positive.
+    predict : sequence of float
+        Places for which an interval is wanted.
+    """
+    places, values, errors = (np.asarray(one, dtype=np.float64) for one in (x, y, stderr))
+    different = np.unique(places).size
+    if different < LEAST_PLACES:
+        return Trend(
+            reason=f"found {different} different {'value' if different == 1 else 'values'} of x "
+            f"with a standard error; a law with errors needs {LEAST_PLACES} or more"
+        )
+    line, power = fit_line(places, values, errors), fit_power(places, values, errors)
+    laws = (line,) if power is None else (line, power)
+    chosen = min(laws, key=lambda law: law.aic)  # of equals the line, which comes first
+    return Trend(
+        laws=laws,
+        chosen=chosen,
+        influences=_influences(chosen, places, values, errors),
+        band=_band(chosen, places),
+        predictions=tuple(prediction(chosen, places, errors, float(at)) for at in predict),
+    )
+
+
+def _band(law: Law, x: FloatArray) -> tuple[Place, ...]:
+    at = np.linspace(float(np.min(x)), float(np.max(x)), _BAND_POINTS)
+    errors = law.widening * law.stated(at)
+    reach = student_95(law.degrees) * errors
+    found = zip(at, law.values(at), errors, reach, strict=True)
+    return tuple(
+        Place(float(p), float(v), float(e), float(v - r), float(v + r), False)
+        for p, v, e, r in found
+    )
+
+
+def prediction(law: Law, x: FloatArray, stderr: FloatArray, at: float) -> Place:
+    """What an estimate at a new place would be, with its 95 % interval.
+
+    Its own stated error is interpolated (geometrically) between those of the points; outside the
+    measured range that of the nearest is taken. All is widened by the Birge ratio. A power law
+    knows nothing of x ≤ 0: there the interval is not finite.
+    """
+    is_outside = not float(np.min(x)) <= at <= float(np.max(x))
+    if law.kind == "power" and not at > 0:
+        return Place(at, float("nan"), inf, -inf, inf, True)
+    value, known = float(law.values(np.array([at]))[0]), float(law.stated(np.array([at]))[0])
+    error = law.widening * sqrt(known**2 + _own(x, stderr, at) ** 2)
+    reach = student_95(law.degrees) * error
+    return Place(at, value, error, value - reach, value + reach, is_outside)
+
+
+def _own(x: FloatArray, stderr: FloatArray, at: float) -> float:
+    """The stated error that an estimate at a place would have."""
+    places = np.unique(x)
+    logs = [float(np.mean(np.log(stderr[x == place]))) for place in places]
+    return float(np.exp(np.interp(at, places, logs)))
+
+
+def _influences(
+    law: Law, x: FloatArray, y: FloatArray, stderr: FloatArray
+) -> tuple[Influence, ...]:
+    residuals = (y - law.values(x)) / stderr
+    leverages = (law.stated(x) / stderr) ** 2
+    floor = rounding(y, stderr)
+    return tuple(
+        _influence(law, float(e), min(float(h), 1.0), x.size, floor)
+        for e, h in zip(residuals, leverages, strict=True)
+    )
+
+
+def _influence(law: Law, residual: float, leverage: float, n: int, floor: float) -> Influence:
+    """The deleted residual follows from the whole fit: t = e/(s₍ᵢ₎ √(1 - h))."""
+    degrees = law.degrees - 1
+    if degrees < 1 or leverage > _NEARLY_ONE:
+        return Influence(residual, None, None, False)
+    square = residual**2 / (1.0 - leverage)
+    others = max(law.chi_squared - square, 0.0) / degrees
+    if others <= floor:  # the others lie on the law exactly
+        t = float(np.copysign(inf, residual)) if square > 2.0 * floor else 0.0
+    else:
+        t = residual / sqrt(others * (1.0 - leverage))
+    p_value = min(1.0, n * student_tail(degrees, t))
+    return Influence(residual, t, p_value, p_value < _OUTLIER)
+
+
+def pooled(groups: Sequence[Sequence[Estimate]]) -> tuple[tuple[Estimate, ...], float]:
+    """One estimate for each group of runs of one label, and how much these scatter.
+
+    Within a group the weighted mean. How much runs of one label differ beyond their stated
+    errors is taken from all groups together, since each has few: the Birge ratio of all of them
+    multiplies every error where it is above 1, those of single runs as well.
+
+    Returns
+    -------
+    tuple of Estimate, float
+        The means, and the ratio; 1 where no group has two runs.
+    """
+    means, square, degrees = [], 0.0, 0
+    for group in groups:
+        weights = np.array([one.stderr**-2 for one in group])
+        values = np.array([one.value for one in group])
+        mean = float(weights @ values / np.sum(weights))
+        means.append(Estimate(mean, float(np.sum(weights)) ** -0.5))
+        square += float(weights @ (values - mean) ** 2)
+        degrees += len(group) - 1
+    ratio = sqrt(square / degrees) if degrees else 1.0
+    return tuple(Estimate(v, max(1.0, ratio) * s) for v, s in means), ratio
+
+
+class Drift(NamedTuple):
+    """How far an estimate is from what a reference says, in standard errors of the difference."""
+
+    difference: float
+    z: float
+    has_drifted: bool
+
+
+def drift(new: Estimate, old: Estimate, comparisons: int = 1) -> Drift:
+    """An estimate against that of a reference run.
+
+    Flagged beyond three standard errors; of many comparisons beyond more, so that a batch that
+    has not changed is flagged as seldom as one comparison would be (Bonferroni).
+    """
+    difference, error = new.value - old.value, sqrt(new.stderr**2 + old.stderr**2)
+    limit = -NormalDist().inv_cdf(_DRIFT / (2.0 * comparisons))
+    z = _ratio(difference, error)
+    return Drift(difference, z, abs(z) > limit)
+
+
+def drift_from_law(
+    new: Estimate, law: Law, x: FloatArray, stderr: FloatArray, at: float, comparisons: int = 1
+) -> Drift:
+    """An estimate against what the trend of a reference batch (of places `x`) predicts there."""
+    told = prediction(law, x, stderr, at)
+    if not isfinite(told.stderr):
+        return Drift(float("nan"), float("nan"), False)
+    known = law.widening * float(law.stated(np.array([at]))[0])
+    # Its own error is the larger of what it says and what points of that batch scatter.
+    scatter = sqrt(max(told.stderr**2 - known**2, 0.0))
+    error = sqrt(known**2 + max(scatter, new.stderr) ** 2)
+    difference = new.value - told.value
+    z = _ratio(difference, error)
+    return Drift(difference, z, student_tail(law.degrees, z) < _DRIFT / comparisons)
+
+
+def _ratio(difference: float, error: float) -> float:
+    if error > 0:
+        return difference / error
+    return float(np.copysign(inf, difference)) if difference else 0.0

@@ -1,0 +1,249 @@
+"""Laws of trends: exact laws are recovered, units do not matter, intervals cover what they say."""
+
+from math import inf, log
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from sysid.distributions import student_tail
+from sysid.trend import (
+    Estimate,
+    drift,
+    drift_from_law,
+    fit_trend,
+    pooled,
+    prediction,
+)  # fmt: skip
+from sysid.trend_laws import Law, fit_line, fit_power
+
+X = np.array([5.0, 10.0, 20.0, 40.0, 80.0])
+NUMBER = st.floats(-10, 10).filter(lambda v: v == 0 or abs(v) > 1e-3)
+SCALE = st.floats(1e-6, 1e6)
+
+
+def coefficients(law: Law) -> dict[str, tuple[float, float]]:
+    return {name: (value, error) for name, value, error in law.coefficients}
+
+
+def noisy(seed: int, n: int = 9) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    draw = np.random.default_rng(seed)
+    x = np.sort(draw.uniform(1.0, 50.0, n))
+    stderr = draw.uniform(0.5, 2.0, n)
+    return x, 3.0 * x**0.8 + stderr * draw.normal(size=n), stderr
+
+
+@settings(max_examples=50, deadline=None)
+@given(NUMBER, NUMBER)
+def test_an_exact_line_is_recovered_and_chosen(a: float, b: float) -> None:
+    found = fit_trend(X, a + b * X, np.full(5, 0.1), [30.0])
+    assert found.chosen is not None
+    assert found.chosen.kind == "line"
+    told = coefficients(found.chosen)
+    assert told["a"][0] == pytest.approx(a, abs=1e-12 * (abs(a) + 80 * abs(b)))
+    assert told["b"][0] == pytest.approx(b, abs=1e-12 * (abs(a) + abs(b)))
+    assert found.predictions[0].value == pytest.approx(a + 30 * b, abs=1e-11)
+    assert not any(one.is_outlier for one in found.influences)
+
+
+@settings(max_examples=50, deadline=None)
+@given(NUMBER.filter(bool), st.floats(-3, 3).filter(lambda b: min(abs(b), abs(b - 1)) > 0.05))
+def test_an_exact_power_law_is_recovered_and_chosen(a: float, b: float) -> None:
+    y = a * X**b
+    found = fit_trend(X, y, 0.01 * np.abs(y))
+    assert found.chosen is not None
+    assert found.chosen.kind == "power"
+    told = coefficients(found.chosen)
+    assert (told["a"][0], told["b"][0]) == (pytest.approx(a, rel=1e-7), pytest.approx(b, rel=1e-7))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000), SCALE, SCALE)
+def test_units_of_x_and_y_change_only_the_units_of_the_result(
+    seed: int, metre: float, second: float
+) -> None:
+    x, y, stderr = noisy(seed)
+    found = fit_trend(x, y, stderr, [30.0])
+    other = fit_trend(metre * x, second * y, second * stderr, [30.0 * metre])
+    assert found.chosen is not None
+    assert other.chosen is not None
+    assert other.chosen.kind == found.chosen.kind
+    assert other.chosen.birge == pytest.approx(found.chosen.birge, rel=1e-5)
+    one, two = found.predictions[0], other.predictions[0]
+    assert two.value == pytest.approx(second * one.value, rel=1e-5)
+    assert two.upper - two.lower == pytest.approx(second * (one.upper - one.lower), rel=1e-5)
+    for this, that in zip(found.influences, other.influences, strict=True):
+        assert that.studentised == pytest.approx(this.studentised, rel=1e-4, abs=1e-6)
+
+
+def test_the_line_and_its_covariance_are_those_of_the_textbook() -> None:
+    x, y, stderr = noisy(1)
+    law = fit_line(x, y, stderr)
+    (b, a), covariance = np.polyfit(x, y, 1, w=1 / stderr, cov="unscaled")
+    told = coefficients(law)
+    assert (told["a"][0], told["b"][0]) == (pytest.approx(a), pytest.approx(b))
+    assert told["b"][1] == pytest.approx(law.widening * covariance[0, 0] ** 0.5)
+    assert told["a"][1] == pytest.approx(law.widening * covariance[1, 1] ** 0.5)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_no_neighbour_of_the_power_law_is_better(seed: int) -> None:
+    x, y, stderr = noisy(seed)
+    law = fit_power(x, y, stderr)
+    assert law is not None
+    (_, a, da), (_, b, db) = law.coefficients
+    for step in np.random.default_rng(seed).normal(size=(50, 2)) * [0.1 * da, 0.1 * db]:
+        other = (a + step[0]) * x ** (b + step[1])
+        assert np.sum(((y - other) / stderr) ** 2) >= law.chi_squared * (1 - 1e-9)
+
+
+def test_a_point_of_infinite_error_has_no_weight_and_a_doubled_point_counts_twice() -> None:
+    x, y, stderr = noisy(2)
+    wild = fit_line(np.append(x, 30.0), np.append(y, 1e3), np.append(stderr, 1e9))
+    plain = fit_line(x, y, stderr)
+    assert wild.values(X) == pytest.approx(plain.values(X), rel=1e-9)
+    twice = fit_line(np.append(x, x[3]), np.append(y, y[3]), np.append(stderr, stderr[3]))
+    once = stderr.copy()
+    once[3] /= np.sqrt(2)
+    assert twice.values(X) == pytest.approx(fit_line(x, y, once).values(X), rel=1e-12)
+
+
+@pytest.mark.parametrize("understated", [1.0, 5.0])
+def test_intervals_cover_what_they_say_even_where_errors_are_understated(
+    understated: float,
+) -> None:
+    draw = np.random.default_rng(5)
+    stderr = 0.02 * X
+    covered = np.zeros(3)
+    n = 800
+    for _ in range(n):
+        y = 0.3 * X + 1.0 + stderr * draw.normal(size=5)
+        law = fit_line(X, y, stderr / understated)
+        told = prediction(law, X, stderr / understated, 30.0)
+        new = 0.3 * 30.0 + 1.0 + 0.02 * 30.0 * draw.normal()
+        covered[0] += told.lower <= new <= told.upper
+        error = student_95_of(law) * law.widening * law.stated(np.array([30.0]))[0]
+        covered[1] += abs(law.values(np.array([30.0]))[0] - 10.0) <= error
+        covered[2] += told.upper > told.lower
+    # 95 % to a binomial error of 0.8 %; wider where the stated errors alone already suffice.
+    assert covered[2] == n
+    assert np.all(covered[:2] / n >= 0.925)
+    if understated > 1:
+        assert np.all(covered[:2] / n <= 0.975)
+
+
+def student_95_of(law: Law) -> float:
+    return float(stats.t.ppf(0.975, law.degrees))
+
+
+def test_the_deleted_residual_is_that_of_a_fit_without_the_point() -> None:
+    x, y, stderr = noisy(7)
+    for i, one in enumerate(fit_trend_by_line(x, y, stderr)):
+        others = fit_line(np.delete(x, i), np.delete(y, i), np.delete(stderr, i))
+        at = x[i : i + 1]
+        difference = y[i] - others.values(at)[0]
+        error = others.birge * np.hypot(others.stated(at)[0], stderr[i])
+        assert one.studentised == pytest.approx(difference / error, rel=1e-9)
+
+
+def fit_trend_by_line(x, y, stderr):  # type: ignore[no-untyped-def]
+    from sysid.trend import _influences
+
+    return _influences(fit_line(x, y, stderr), x, y, stderr)
+
+
+def test_one_wild_point_is_flagged_and_rarely_one_of_a_clean_batch() -> None:
+    flagged = 0
+    for seed in range(200):
+        draw = np.random.default_rng(seed)
+        x = np.arange(1.0, 9.0)
+        y = 2.0 + 0.5 * x + 0.1 * draw.normal(size=8)
+        flagged += any(one.is_outlier for one in fit_trend(x, y, np.full(8, 0.1)).influences)
+    assert flagged <= 0.05 * 200 + 3 * (0.05 * 0.95 * 200) ** 0.5
+    y[4] += 3.0
+    found = fit_trend(x, y, np.full(8, 0.1))
+    assert [one.is_outlier for one in found.influences] == [i == 4 for i in range(8)]
+
+
+@pytest.mark.parametrize("n", [3, 4])
+def test_with_few_points_nothing_is_divided_by_nothing(n: int) -> None:
+    found = fit_trend(X[:n], [1.0, 2.1, 2.9, 4.2][:n], np.full(n, 0.1), [100.0, 0.0])
+    assert found.chosen is not None
+    assert found.chosen.aicc == inf
+    assert all((one.studentised is None) == (n == 3) for one in found.influences)
+    assert [one.is_outside for one in found.predictions] == [True, True]
+
+
+def test_less_than_three_places_give_a_reason() -> None:
+    found = fit_trend([5, 5, 10], [1, 2, 3], [0.1, 0.1, 0.1])
+    assert (found.laws, found.chosen) == ((), None)
+    assert "found 2 different values of x" in found.reason
+    assert "needs 3" in found.reason
+
+
+def test_a_power_law_needs_positive_x() -> None:
+    found = fit_trend([-1, 0, 1, 2], [1, 2, 3, 4.1], np.full(4, 0.1))
+    assert [law.kind for law in found.laws] == ["line"]
+
+
+def test_means_of_several_runs_carry_the_scatter_between_them() -> None:
+    draw = np.random.default_rng(3)
+    groups = [[Estimate(x + 0.5 * draw.normal(), 0.1) for _ in range(4)] for x in range(50)]
+    means, ratio = pooled(groups)
+    assert ratio == pytest.approx(5.0, rel=0.2)
+    assert means[0].stderr == pytest.approx(ratio * 0.1 / 2)
+    assert means[0].value == pytest.approx(np.mean([one.value for one in groups[0]]))
+    assert pooled([[Estimate(1.0, 0.1)]]) == ((Estimate(1.0, pytest.approx(0.1)),), 1.0)
+
+
+def test_drift_is_flagged_beyond_three_standard_errors() -> None:
+    old = Estimate(1.0, 0.03)
+    assert drift(Estimate(1.0 + 0.149, 0.04), old).has_drifted is False
+    found = drift(Estimate(1.0 + 0.151, 0.04), old)
+    assert found.has_drifted is True
+    assert found.z == pytest.approx(3.02)
+    assert drift(Estimate(1.0 + 0.151, 0.04), old, comparisons=10).has_drifted is False
+    assert drift(old, old).z == 0.0
+
+
+def test_a_batch_without_change_rarely_drifts_from_its_own_law() -> None:
+    draw, flags = np.random.default_rng(9), 0
+    stderr = 0.02 * X
+    for _ in range(400):
+        y = 0.3 * X + 1.0 + stderr * draw.normal(size=5)
+        law = fit_line(X, y, stderr)
+        new = Estimate(0.3 * 30.0 + 1.0 + 0.6 * draw.normal(), 0.6)
+        flags += drift_from_law(new, law, X, stderr, 30.0).has_drifted
+    assert flags <= 6
+    moved = Estimate(0.3 * 30.0 + 30.0, 0.6)
+    assert drift_from_law(moved, law, X, stderr, 30.0).has_drifted
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 3.5, 12, 400])
+@pytest.mark.parametrize("t", [-4.0, 0.0, 0.3, 2.0, 30.0, inf])
+def test_the_tail_of_student_is_scipys(degrees: float, t: float) -> None:
+    expected = 2 * stats.t.sf(abs(t), degrees)
+    assert student_tail(degrees, t) == pytest.approx(expected, rel=1e-9, abs=1e-300)
+
+
+def test_aic_prefers_the_law_that_made_the_data() -> None:
+    draw = np.random.default_rng(11)
+    right = {"line": 0, "power": 0}
+    for _ in range(100):
+        noise = draw.normal(size=5)
+        line = fit_trend(X, 5.0 + 0.3 * X + 0.05 * noise, np.full(5, 0.05)).chosen
+        curve = fit_trend(X, 0.01 * X**1.4 * (1 + 0.02 * noise), 0.0002 * X**1.4).chosen
+        right["line"] += line is not None and line.kind == "line"
+        right["power"] += curve is not None and curve.kind == "power"
+    assert right["line"] >= 95
+    assert right["power"] >= 95
+
+
+def test_aic_is_that_of_the_formula() -> None:
+    x, y, stderr = noisy(4)
+    law = fit_line(x, y, stderr)
+    n = x.size
+    assert law.aic == pytest.approx(n * log(law.chi_squared / n) + 6)
+    assert law.aicc == pytest.approx(law.aic + 24 / (n - 4))
