@@ -15,6 +15,7 @@ What no data tell follows from the form of the equations (`sysid.symmetries`) an
 exactly; what these data do not tell, from its singular values. Both give groups (`sysid.groups`).
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,7 @@ from sysid.ga.chromosome import placed
 from sysid.groups import Block, blocks, written
 from sysid.islands.archipelago import loss_scale
 from sysid.problem import Problem
+from sysid.pulls import AT_BOUND, Pull, pulls
 from sysid.result import Criteria, Estimate, EstimateStatus, Uncertainty
 from sysid.sensitivities import sensitivities
 from sysid.symmetries import scalings
@@ -36,7 +38,6 @@ _SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
 # Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
 # about, and of one that has no effect at all, which is known to many digits.
 _WEAK_MEMBER, NULL_MEMBER = 0.05, 1e-5
-_AT_BOUND = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,6 +61,8 @@ class Analysis:
     possible_gain: float
     evaluations: int
     criteria: Criteria
+    pulls: tuple[Pull, ...] = ()
+    """Bounds that hold parameters back, the costliest first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +91,9 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
     place = placed(problem.evaluator, theta[None])[0]
     # No step of least squares gains from a parameter on a plateau: there the loss is flat.
     sloping = np.where(plateau > 0, 0.0, columns)
-    gain = _possible_gain(_influence(error, loss_scale(problem)), sloping, place)
+    influence = _influence(error, loss_scale(problem))
+    gain = _possible_gain(influence, sloping, place)
+    pulled = pulls(problem.space, influence, sloping, place)
     scale = physical_scale(problem, theta)
     powers = scalings(problem.model, problem.all_parameters)
     shifts, more = translations(problem, theta, columns, scale)
@@ -115,14 +120,15 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
         noise_sd=noise,
         groups=tuple(g for one in found for g in written(one, names, theta, scale, physical)),
     )
+    statuses = _statuses(place, found, [p.name for p in pulled], problem)
     told = Known(
-        theta, _statuses(place, found), physical, float(stdtrit(n - d, 0.975)), member,
+        theta, statuses, physical, float(stdtrit(n - d, 0.975)), member,
         uncertainty.groups, rows[~kept], scale,
     )  # fmt: skip
     estimates = estimates_of(problem, told)
     jumps = {p.name for p, one in zip(problem.space, one_sided, strict=True) if one}
     estimates = tuple(_on_one_side(e) if e.name in jumps else e for e in estimates)
-    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria)
+    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, pulled)
 
 
 def criteria_of(error: FloatArray, parameters: int) -> Criteria:
@@ -180,7 +186,7 @@ def _possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray
     """
     total = float(influence @ influence)
     downhill = -(columns.T @ influence)
-    held = ((place < _AT_BOUND) & (downhill < 0)) | ((place > 1.0 - _AT_BOUND) & (downhill > 0))
+    held = ((place < AT_BOUND) & (downhill < 0)) | ((place > 1.0 - AT_BOUND) & (downhill > 0))
     if total == 0.0 or held.all():
         return 0.0
     left, singular, _ = np.linalg.svd(columns[:, ~held], full_matrices=False)
@@ -204,14 +210,21 @@ def _covariance(
     return n / (n - d) * bread @ filling @ bread, noise
 
 
-def _statuses(place: FloatArray, found: tuple[Block, ...]) -> tuple[EstimateStatus, ...]:
-    """What the data say of each parameter: see `EstimateStatus`."""
+def _statuses(
+    place: FloatArray, found: tuple[Block, ...], pulled: Collection[str], problem: Problem
+) -> tuple[EstimateStatus, ...]:
+    """What the data say of each parameter: see `EstimateStatus`.
+
+    Of one that they pull beyond its bound they say something, however large a residual the bound
+    leaves and standard errors with it.
+    """
     statuses: list[EstimateStatus] = ["identified"] * place.size
-    for d in np.flatnonzero((place < _AT_BOUND) | (place > 1.0 - _AT_BOUND)):
+    for d in np.flatnonzero((place < AT_BOUND) | (place > 1.0 - AT_BOUND)):
         statuses[d] = "at bound"
     for block in found:
         for d in block.members:
-            statuses[d] = "unidentifiable" if block.tells_nothing else "group"
+            if problem.space[d].name not in pulled:
+                statuses[d] = "unidentifiable" if block.tells_nothing else "group"
     return tuple(statuses)
 
 

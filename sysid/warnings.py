@@ -34,6 +34,7 @@ def warnings_of(
     limit = algorithm.safe_limit
     if limit is not None and rms > limit:
         found.append(f"the RMS error {rms:.4g} is above the safe limit {limit:g}: not valid")
+    found += _held_back(analysis)
     found += _worse_than_a_line(problem, simulated)
     found += _without_excitation(problem, analysis.estimates)
     found += _steps_read_as_ramps(problem)
@@ -48,6 +49,19 @@ def warnings_of(
     elif tests is not None and lagged:
         found += _coloured(tests, lagged)
     return tuple(found)
+
+
+def _held_back(analysis: Analysis) -> list[str]:
+    """Bounds too narrow for the data, and which of them to widen."""
+    if not analysis.pulls:
+        return []
+    first, *others = analysis.pulls
+    more = f", and {', '.join(map(str, others))}" if others else ""
+    cure = "lower" if first.side == "lower" else "raise"
+    return [
+        f"the data pull {first}{more}: {cure} the bound of {first.name}"
+        f"{' first' if others else ''}, unless nature sets it there"
+    ]
 
 
 def _steps_read_as_ramps(problem: Problem) -> list[str]:
