@@ -79,10 +79,14 @@ class Notebook:
         self.states: dict[str, list[RunState]] = {}
         self.results: dict[str, list[Identification]] = {}
         self.failures: dict[str, list[Failure]] = {}
+        self.kills: dict[str, list[int]] = {}
         self.is_stopped = False
 
     def started(self, run: str) -> None:
         self.begun.append(run)
+
+    def blamed(self, run: str, kills: int) -> None:
+        self.kills.setdefault(run, []).append(kills)
 
     def progress(self, run: str, state: RunState, seconds: float) -> None:
         self.states.setdefault(run, []).append(state)
@@ -92,6 +96,9 @@ class Notebook:
 
     def failure(self, run: str, failure: Failure) -> None:
         self.failures.setdefault(run, []).append(failure)
+
+    def known(self, run: str, source: str) -> None:
+        raise AssertionError("no run was computed before")
 
     def should_stop(self) -> bool:
         return self.is_stopped

@@ -7,14 +7,23 @@ from typing import Generic, TypeVar
 
 from workers.errors import PackFailed, PackLost
 from workers.jobwork import JobWork
-from workers.packing import PACKS_PER_CPU, fairest
+from workers.packing import PACKS_PER_CPU
 from workers.ports import Crew, Handle, JobSource, RunObserver
+from workers.sharing import Shares
 
 _log = logging.getLogger(__name__)
 
 GRACE_SECONDS = 1.0
 """A cancelled pack that has not ended by then loses its worker."""
 
+PREFETCH = 64
+"""Runs read ahead of the workers, for each core; the jobs share them."""
+
+LEAST_AHEAD = 128
+"""Runs that each job reads ahead: enough for a pack of short ones."""
+
+READ_SECONDS = 0.05
+"""Time that a step gives to reading runs: known ones cost no worker's time, and may be many."""
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -22,22 +31,44 @@ Key = TypeVar("Key", bound=Hashable)
 class Feeder(Generic[Key]):
     """The driver of a crew. `add` jobs, then call `step` until they have ended.
 
-    A job goes by a key of the caller's, which must not be in use.
+    A job goes by a key of the caller's, which must not be in use. Whose turn it is stands in
+    `workers.sharing`; `project_cores` is the most packs of one project that compute at a time.
     """
 
-    def __init__(self, crew: Crew, *, grace_seconds: float = GRACE_SECONDS) -> None:
+    def __init__(
+        self,
+        crew: Crew,
+        *,
+        grace_seconds: float = GRACE_SECONDS,
+        project_cores: int | None = None,
+    ) -> None:
         self._crew = crew
-        self._grace = grace_seconds
+        self._grace, self._project_cores = grace_seconds, project_cores
+        self._shares: Shares[Key] = Shares()
         self._jobs: dict[Key, JobWork] = {}
         self._stopped: dict[Key, float] = {}  # when the job was told to stop; inf once forced
 
     def __len__(self) -> int:
         return len(self._jobs)
 
-    def add(self, job: Key, source: JobSource, observer: RunObserver) -> None:
+    @property
+    def is_busy(self) -> bool:
+        """Whether every core has a pack."""
+        return self._in_flight >= self._crew.slots
+
+    def add(
+        self,
+        job: Key,
+        source: JobSource,
+        observer: RunObserver,
+        *,
+        priority: int = 0,
+        project: str = "",
+    ) -> None:
         """Take on a job."""
         assert job not in self._jobs
         self._jobs[job] = JobWork(source, observer, self._crew)
+        self._shares.enter(job, priority=priority, project=project)
 
     def step(self, timeout: float) -> tuple[Key, ...]:
         """Feed, wait at most `timeout` seconds, collect; returns the jobs that ended.
@@ -56,6 +87,7 @@ class Feeder(Generic[Key]):
         ended = tuple(job for job, work in self._jobs.items() if work.is_done)
         for job in ended:
             del self._jobs[job]
+            self._shares.leave(job)
             self._stopped.pop(job, None)
         return ended
 
@@ -68,22 +100,56 @@ class Feeder(Generic[Key]):
                 self._cancel(job, force=False)
 
     @property
-    def _room(self) -> int:
-        in_flight = sum(len(work.flying) for work in self._jobs.values())
-        return PACKS_PER_CPU * self._crew.slots - in_flight
+    def _in_flight(self) -> int:
+        return sum(len(work.flying) for work in self._jobs.values())
 
     def _feed(self) -> None:
-        while self._room > 0:
-            hungry = {
-                job: len(work.flying)
-                for job, work in self._jobs.items()
-                if job not in self._stopped and work.read_ahead()
-            }
-            chosen = fairest(hungry)
+        deadline = time.monotonic() + READ_SECONDS
+        while self._in_flight < PACKS_PER_CPU * self._crew.slots:
+            chosen = self._next(deadline)
             if chosen is None:
                 return
-            idle = self._crew.slots - sum(len(work.flying) for work in self._jobs.values())
-            self._jobs[chosen].feed(idle if len(hungry) == 1 else 0)
+            self._shares.serve(chosen)
+            self._jobs[chosen].feed(self._idle(chosen))
+
+    def _next(self, deadline: float) -> Key | None:
+        """The job that the next place belongs to, if it has work for it.
+
+        A place beside a pack that computes (`is_busy`) is not given away over the head of a job
+        that is with the workers and will come back: its next slice would wait behind that pack.
+        """
+        going = {job: work for job, work in self._jobs.items() if job not in self._stopped}
+        wanted = max(LEAST_AHEAD, PREFETCH * self._crew.slots // max(len(going), 1))
+        for job in self._shares.order({job: len(work.flying) for job, work in going.items()}):
+            if not self._has_core_for(job):
+                continue
+            if going[job].read_ahead(wanted, deadline):
+                return job
+            if going[job].flying and self.is_busy:
+                return None
+        return None
+
+    def _has_core_for(self, job: Key) -> bool:
+        if self._project_cores is None:
+            return True
+        project = self._shares.project_of(job)
+        flying = (
+            len(work.flying)
+            for mate, work in self._jobs.items()
+            if self._shares.project_of(mate) == project
+        )
+        return sum(flying) < self._project_cores
+
+    def _idle(self, chosen: Key) -> int:
+        """Cores that one run of this job may take besides its own: nobody else's turn suffers."""
+        rank = self._shares.rank(chosen)
+        taken = 0
+        for job, work in self._jobs.items():
+            if self._shares.rank(job) <= rank:
+                taken += len(work.flying)
+                if job != chosen and work.is_hungry:
+                    return 0
+        return self._crew.slots - taken
 
     def _collect(self, handle: Handle) -> None:
         owner = next((j for j, work in self._jobs.items() if handle in work.flying), None)
@@ -95,7 +161,9 @@ class Feeder(Generic[Key]):
             return
         if owner is None:  # the crew does not know it any more, that is all
             _log.warning("a pack of no job came back")
-        elif owner in self._stopped:
+            return
+        self._shares.charge(owner, sum(one.seconds for one in done))
+        if owner in self._stopped:
             del self._jobs[owner].flying[handle]
         else:
             self._jobs[owner].absorb(handle, done)

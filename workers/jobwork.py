@@ -1,5 +1,6 @@
 """The runs of one job on the driver's side: which items come next, what became of them."""
 
+import time
 from collections import deque
 from collections.abc import Iterator
 from typing import Any
@@ -22,13 +23,7 @@ from workers.ports import (
     RefusedRun,
     RunObserver,
 )  # fmt: skip
-from workers.progress import MAX_STRIKES, ActiveRun
-
-PREFETCH = 64
-"""Runs read ahead of the workers, for each core."""
-
-AT_ONCE = 1000
-"""Runs taken from the source before others have their turn: known ones cost no worker's time."""
+from workers.progress import MAX_KILLS, ActiveRun
 
 KEPT_RECORDS = 16
 """Sets of records that a job keeps with the crew."""
@@ -59,12 +54,17 @@ class JobWork:
         """Whether all runs were read, nothing waits and nothing is with the workers."""
         return self._exhausted and not self.flying and not self._ready
 
-    def read_ahead(self) -> bool:
-        """Ask the source for as many runs as may be needed soon; whether a run waits now."""
-        wanted = PREFETCH * self._crew.slots
-        for _ in range(AT_ONCE):
-            if self._exhausted or len(self._ready) >= wanted:
-                break
+    @property
+    def is_hungry(self) -> bool:
+        """Whether a run that was read waits for a worker."""
+        return bool(self._ready)
+
+    def read_ahead(self, wanted: int, deadline: float) -> bool:
+        """Ask the source until `wanted` runs wait or the time is up; whether a run waits now.
+
+        One is asked for in any case.
+        """
+        while not self._exhausted and len(self._ready) < wanted:
             queued = next(self._coming, None)
             if queued is None:
                 self._exhausted = True
@@ -78,6 +78,8 @@ class JobWork:
                 run = ActiveRun.of(queued)
                 self._active[run.run] = run
                 self._ready.append(run)
+            if time.monotonic() > deadline:
+                break
         return bool(self._ready)
 
     def feed(self, idle: int) -> None:
@@ -86,10 +88,11 @@ class JobWork:
         if run.should_spread(idle if len(self._ready) == 1 else 0):
             self._ready.popleft()
             self._spread(run)
-        elif run.strikes or run.slices:
-            self._send([self._ready.popleft().whole()])  # long, or suspected: alone
+        elif run.goes_alone:
+            self._send([self._ready.popleft().whole()])
         else:
-            size = pack_size(self._cost, len(self._ready), self._crew.slots)
+            shared_by = self._crew.slots if self._exhausted else 1  # else more follow
+            size = pack_size(self._cost, len(self._ready), shared_by)
             self._send([run.whole() for run in self._take_fresh(size)])
 
     def absorb(self, handle: Handle, done: tuple[Done, ...]) -> None:
@@ -106,17 +109,18 @@ class JobWork:
                 self._take(run, one)
 
     def lose(self, handle: Handle, reason: str) -> None:
-        """A worker died: its runs go on from where they were, a few times."""
-        for name in {item.run for item in self.flying.pop(handle)}:
-            run = self._active.get(name)
-            if run is None:
-                continue
-            run.strikes += 1
+        """A worker died: its runs go on from where they were, each alone.
+
+        Only a run that was alone is blamed, and not for what came of it elsewhere: two packs of
+        its islands that are lost at once are one death.
+        """
+        names = {item.run for item in self.flying.pop(handle)}
+        for run in [self._active[name] for name in names if name in self._active]:
             run.gather_again()
-            if run.strikes >= MAX_STRIKES:
-                text = f"its worker process died {run.strikes} times; the last time: {reason}"
-                self._fail(name, Failure(text, "WorkerDied"))
-            elif run not in self._ready:
+            if run in self._ready:
+                continue
+            run.is_suspect = True
+            if len(names) > 1 or self._may_go_on(run, reason):
                 self._ready.append(run)
 
     def fail(self, handle: Handle, reason: str) -> None:
@@ -134,7 +138,7 @@ class JobWork:
         chosen = [self._ready.popleft()]
         while self._ready and len(chosen) < size:
             following = self._ready[0]
-            if following.slices or following.spec.problem.needs != chosen[0].spec.problem.needs:
+            if following.goes_alone or following.spec.problem.needs != chosen[0].spec.problem.needs:
                 break
             chosen.append(self._ready.popleft())
         return chosen
@@ -185,8 +189,20 @@ class JobWork:
                 if run.gather(evolved, one.seconds):
                     self._go_on(run)
 
+    def _may_go_on(self, run: ActiveRun, reason: str) -> bool:
+        """Whether a run over which its worker died is tried once more; else it fails."""
+        run.kills += 1
+        self.observer.blamed(run.run, run.kills)
+        if run.kills >= MAX_KILLS:
+            text = f"its worker process died {run.kills} times; the last time: {reason}"
+            self._fail(run.run, Failure(text, "WorkerDied"))
+        return run.kills < MAX_KILLS
+
     def _go_on(self, run: ActiveRun) -> None:
         assert run.state is not None
+        if run.kills:
+            run.kills = 0
+            self.observer.blamed(run.run, 0)
         self.observer.progress(run.run, run.state, run.seconds)
         self._ready.append(run)
 

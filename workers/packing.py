@@ -4,10 +4,9 @@ A task should last 0.2 to 1 s: shorter, and Ray's millisecond a task shows; long
 cancellation and fairness suffer. Results never depend on any of this.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
-from typing import TypeVar
 
 PACK_SECONDS = 0.5
 """Compute time a task aims at."""
@@ -23,8 +22,6 @@ WORTH_SPREADING_SECONDS = 0.02
 
 KEPT = 0.7
 """Weight of what was known when a new cost is measured."""
-
-Key = TypeVar("Key", bound=Hashable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,11 +48,6 @@ def pack_size(cost: Cost, waiting: int, slots: int) -> int:
     by_cost = int(PACK_SECONDS / max(cost.seconds, 1e-4))
     share = ceil(waiting / max(slots, 1))
     return min(max(1, min(by_cost, share)), waiting)
-
-
-def fairest(in_flight: Mapping[Key, int]) -> Key | None:
-    """The job that has fewest packs in flight; among equals the first in order."""
-    return min(in_flight, key=lambda job: in_flight[job], default=None)
 
 
 def slice_seconds(slices: int) -> float:

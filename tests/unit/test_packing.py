@@ -8,7 +8,6 @@ from workers.packing import (
     PACK_SECONDS,
     Cost,
     deal,
-    fairest,
     is_worth_spreading,
     pack_size,
     slice_seconds,
@@ -70,11 +69,6 @@ def test_no_pack_exceeds_the_even_share_by_more_than_one_item(
     share = sum(loads) / len(packs)
     heaviest = max(sum(loads[index] for index in pack) for pack in packs)
     assert heaviest <= share + max(loads) + 1e-9
-
-
-def test_the_job_with_fewest_packs_in_flight_comes_next() -> None:
-    assert fairest({"a": 2, "b": 1, "c": 1}) == "b"
-    assert fairest({}) is None
 
 
 def test_slices_grow_from_the_first_to_that_of_a_pack() -> None:

@@ -1,0 +1,131 @@
+"""A crew that computes nothing, in a time of its own: what the order of packs does to jobs."""
+
+import heapq
+from collections import deque
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+from sysid.islands.run_state import RunState
+from sysid.run import begin
+from tests.runs import RECORDS, ListedRuns, Notebook, spec
+from workers.feeding import Feeder
+from workers.ports import (
+    Advance,
+    Advanced,
+    Done,
+    Failure,
+    Item,
+    QueuedRun,
+    Records,
+)  # fmt: skip
+from workers.tasks import build
+
+
+class SimulatedCrew:
+    """Workers that take packs in the order they were sent, and the time the runs say.
+
+    A run is named ``job/number/seconds``; it goes on in slices until it has had its seconds.
+    """
+
+    def __init__(self, slots: int) -> None:
+        self.slots, self.now = slots, 0.0
+        self.computed: dict[str, float] = {}
+        self.most_waiting = 0
+        self._waiting: deque[int] = deque()
+        self._computing: list[tuple[float, int]] = []
+        self._packs: dict[int, tuple[Item, ...]] = {}
+        self._next = 0
+
+    def share(self, records: Records) -> Any:
+        return records
+
+    def submit(self, pack: Sequence[Item], keys: Sequence[str], shared: Sequence[Any]) -> int:
+        self._next += 1
+        self._packs[self._next] = tuple(pack)
+        self._waiting.append(self._next)
+        self._begin()
+        self.most_waiting = max(self.most_waiting, len(self._waiting))
+        return self._next
+
+    def finished(self, timeout: float) -> tuple[int, ...]:
+        if not self._computing:
+            return ()
+        ends, handle = heapq.heappop(self._computing)
+        self.now = ends
+        self._begin()
+        return (handle,)
+
+    def fetch(self, handle: int) -> tuple[Done, ...]:
+        return tuple(self._done(item) for item in self._packs.pop(handle))
+
+    def cancel(self, handle: int, *, force: bool) -> None:
+        raise AssertionError("no job is cancelled here")
+
+    def check(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def _begin(self) -> None:
+        while self._waiting and len(self._computing) < self.slots:
+            handle = self._waiting.popleft()
+            seconds = sum(self._seconds(item) for item in self._packs[handle])
+            heapq.heappush(self._computing, (self.now + seconds, handle))
+
+    def _seconds(self, item: Item) -> float:
+        assert isinstance(item, Advance)
+        left = float(item.run.split("/")[2]) - self.computed.get(item.run, 0.0)
+        return min(item.seconds, left)
+
+    def _done(self, item: Item) -> Done:
+        seconds = self._seconds(item)
+        self.computed[item.run] = self.computed.get(item.run, 0.0) + seconds
+        if self.computed[item.run] >= float(item.run.split("/")[2]) - 1e-9:
+            return Done(item.run, Failure("as told"), seconds)
+        return Done(item.run, Advanced(_unfinished()), seconds)
+
+
+@cache
+def _unfinished() -> RunState:
+    problem, _ = build(spec().problem, RECORDS)
+    return begin(problem, spec().algorithm, 1)
+
+
+class Theatre:
+    """A feeder with a simulated crew, and when each of its jobs ended."""
+
+    def __init__(self, slots: int, **options: Any) -> None:
+        self.crew = SimulatedCrew(slots)
+        self.feeder: Feeder[str] = Feeder(self.crew, **options)
+        self.ended: dict[str, float] = {}
+
+    def add(self, job: str, runs: int, seconds: float, **rights: Any) -> None:
+        """A job of equal runs that take `seconds` each."""
+        one = spec()
+        queued = (QueuedRun(f"{job}/{number}/{seconds}", one) for number in range(runs))
+        self.feeder.add(job, ListedRuns(queued), Notebook(), **rights)
+
+    def play(self, seconds: float) -> None:
+        """Let so much time pass."""
+        end = self.crew.now + seconds
+        while self.crew.now < end and len(self.feeder):
+            self.step()
+
+    def until(self, job: str) -> float:
+        """Play until the job has ended; gives the time it took from now."""
+        begun = self.crew.now
+        while job not in self.ended:
+            self.step()
+        return self.ended[job] - begun
+
+    def step(self) -> None:
+        for job in self.feeder.step(0.0):
+            self.ended[job] = self.crew.now
+
+    def had(self, job: str) -> float:
+        """Compute time of a job so far."""
+        return sum(
+            seconds for run, seconds in self.crew.computed.items() if run.startswith(f"{job}/")
+        )

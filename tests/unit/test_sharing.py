@@ -1,0 +1,194 @@
+"""Who goes next: laws of fair sharing, with workers whose time is simulated."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.simulated_crew import Theatre
+from workers.packing import PACK_SECONDS, PACKS_PER_CPU
+from workers.sharing import HEADSTART_SECONDS, MOST_SAVED_SECONDS, PATIENT_TURN, Shares
+
+DELAY_SECONDS = 2.0
+"""A single identification is delayed by no more than this."""
+
+SWEEP = 5000
+"""Runs of 0.1 s: more than any play lasts."""
+
+
+@pytest.mark.parametrize("slots", [1, 4])
+@pytest.mark.parametrize("sweeps", [1, 20])
+@pytest.mark.parametrize("seconds", [0.1, 3.0, 12.0])
+def test_sweeps_delay_a_single_identification_by_two_seconds_at_most(
+    slots: int, sweeps: int, seconds: float
+) -> None:
+    theatre = Theatre(slots)
+    for number in range(sweeps):
+        theatre.add(f"sweep{number}", SWEEP, 0.1)
+    theatre.play((HEADSTART_SECONDS + 5.0) * sweeps / slots)
+    theatre.add("single", 1, seconds)
+    # One core alone gives every sixteenth pack to the patient; more cores lose nothing by it.
+    patient = seconds / (PATIENT_TURN - 1) if slots == 1 else 0.0
+    assert theatre.until("single") <= seconds + patient + DELAY_SECONDS
+
+
+def test_a_single_identification_does_not_wait_for_a_sweep_that_has_just_begun() -> None:
+    theatre = Theatre(2)
+    theatre.add("sweep", SWEEP, 0.1)
+    theatre.play(3.0)
+    theatre.add("single", 1, 3.0)
+    assert theatre.until("single") <= 3.0 + DELAY_SECONDS
+
+
+def test_sweeps_of_one_project_get_equal_parts_also_when_there_are_more_of_them_than_places() -> (
+    None
+):
+    theatre = Theatre(2)
+    names = [f"sweep{number}" for number in range(9)]
+    for name in names:
+        theatre.add(name, SWEEP, 0.1)
+    theatre.play(250.0)
+    parts = [theatre.had(name) for name in names]
+    assert sum(parts) == pytest.approx(500.0, abs=2.0)  # no core was idle
+    assert max(parts) - min(parts) <= 5 * PACK_SECONDS
+
+
+def test_a_sweep_that_comes_later_is_not_made_to_wait_until_it_has_caught_up() -> None:
+    theatre = Theatre(2)
+    theatre.add("early", SWEEP, 0.1)
+    theatre.play(100.0)
+    theatre.add("late", SWEEP, 0.1)
+    before = theatre.had("early")
+    theatre.play(100.0)
+    gained = theatre.had("early") - before
+    assert theatre.had("late") + gained == pytest.approx(200.0, abs=2.0)
+    assert theatre.had("late") - gained <= HEADSTART_SECONDS + 5 * PACK_SECONDS
+
+
+def test_projects_share_equally_however_many_jobs_each_has() -> None:
+    theatre = Theatre(2)
+    for number in range(9):
+        theatre.add(f"many{number}", SWEEP, 0.1, project="many")
+    theatre.add("one", SWEEP, 0.1, project="one")
+    theatre.play(400.0)
+    many = sum(theatre.had(f"many{number}") for number in range(9))
+    assert many - theatre.had("one") <= HEADSTART_SECONDS + 5 * PACK_SECONDS
+    assert theatre.had("one") - many <= 5 * PACK_SECONDS
+
+
+def test_a_project_cannot_get_more_by_cutting_its_sweep_into_short_jobs() -> None:
+    theatre = Theatre(2)
+    theatre.add("whole", SWEEP, 0.1, project="whole")
+    number = 0
+    while theatre.crew.now < 300.0:
+        while len(theatre.feeder) < 6:
+            number += 1
+            theatre.add(f"cut{number}", 20, 0.1, project="cut")
+        theatre.step()
+    cut = sum(theatre.had(f"cut{n}") for n in range(1, number + 1))
+    assert cut - theatre.had("whole") <= HEADSTART_SECONDS + 5 * PACK_SECONDS
+
+
+def test_a_project_that_asked_for_little_cannot_save_the_rest_for_later() -> None:
+    theatre = Theatre(2)
+    theatre.add("greedy", 5 * SWEEP, 0.1, project="greedy")
+    theatre.add("modest", 1, 1e6, project="modest")  # one core is all it can use
+    theatre.add("modest2", 1, 1.0, project="modest")
+    theatre.play(400.0)
+    theatre.add("burst", SWEEP, 0.1, project="modest")
+    before = theatre.had("greedy")
+    theatre.play(200.0)
+    gained = theatre.had("greedy") - before
+    assert gained >= (400.0 - MOST_SAVED_SECONDS - HEADSTART_SECONDS) / 2 - 5 * PACK_SECONDS
+
+
+def test_a_higher_priority_goes_first_and_the_lower_one_still_gets_its_sixteenth() -> None:
+    theatre = Theatre(2)
+    theatre.add("low", SWEEP, 0.1, priority=0)
+    theatre.play(50.0)
+    theatre.add("high", SWEEP, 0.1, priority=5)
+    before = theatre.had("low")
+    theatre.play(160.0)
+    part = (theatre.had("low") - before) / 320.0
+    assert part == pytest.approx(1 / PATIENT_TURN, rel=0.25)
+
+
+def test_a_priority_beats_even_a_new_identification_of_a_lower_one() -> None:
+    theatre = Theatre(1)
+    theatre.add("high", 100, 0.1, priority=1)
+    theatre.step()
+    theatre.add("low", 1, 3.0, priority=0)
+    theatre.until("low")
+    assert theatre.ended["high"] < theatre.ended["low"]
+
+
+def test_nobody_starves_under_a_stream_of_new_jobs() -> None:
+    theatre = Theatre(1)
+    theatre.add("sweep", SWEEP, 0.1)
+    theatre.play(HEADSTART_SECONDS + 1.0)
+    before, number = theatre.had("sweep"), 0
+    begun = theatre.crew.now
+    while theatre.crew.now < begun + 160.0:
+        while len(theatre.feeder) < 3:
+            number += 1
+            theatre.add(f"new{number}", 1, 1.0)
+        theatre.step()
+    assert theatre.had("sweep") - before >= 0.8 * 160.0 / PATIENT_TURN
+
+
+def test_a_project_takes_no_more_cores_than_it_may() -> None:
+    theatre = Theatre(4, project_cores=3)
+    theatre.add("a", SWEEP, 0.1, project="a")
+    theatre.add("b", SWEEP, 0.1, project="a")
+    theatre.play(20.0)
+    assert theatre.had("a") + theatre.had("b") == pytest.approx(60.0, abs=2.0)
+
+
+def test_a_lonely_sweep_has_a_pack_waiting_at_every_core() -> None:
+    theatre = Theatre(4)
+    theatre.add("sweep", SWEEP, 0.1)
+    theatre.play(20.0)
+    assert theatre.crew.most_waiting == (PACKS_PER_CPU - 1) * 4
+
+
+def test_new_workers_are_given_work_at_once() -> None:
+    theatre = Theatre(1)
+    theatre.add("sweep", SWEEP, 0.1)
+    theatre.play(10.0)
+    theatre.crew.slots = 3
+    before = theatre.had("sweep")
+    theatre.play(20.0)
+    assert theatre.had("sweep") - before == pytest.approx(60.0, abs=3.0)
+
+
+jobs = st.lists(
+    st.tuples(st.integers(0, 2), st.sampled_from("ab"), st.integers(1, 30), st.floats(0.01, 2.0)),
+    min_size=1,
+    max_size=8,
+)
+
+
+@settings(deadline=None)
+@given(jobs, st.integers(1, 5))
+def test_no_core_is_idle_while_work_waits_and_every_job_ends(
+    sizes: list[tuple[int, str, int, float]], slots: int
+) -> None:
+    theatre = Theatre(slots)
+    for number, (priority, project, runs, seconds) in enumerate(sizes):
+        theatre.add(f"j{number}", runs, seconds, priority=priority, project=project)
+    total = sum(runs * seconds for _, _, runs, seconds in sizes)
+    while len(theatre.feeder):
+        theatre.step()
+    assert len(theatre.ended) == len(sizes)
+    longest = max(seconds for *_, seconds in sizes)
+    assert theatre.crew.now <= total / slots + longest + 3 * PACK_SECONDS
+
+
+@given(st.lists(st.floats(0.0, 100.0), max_size=20), st.sampled_from("abc"))
+def test_the_order_holds_every_job_once(charges: list[float], project: str) -> None:
+    shares: Shares[str] = Shares()
+    for number, name in enumerate("abc"):
+        shares.enter(name, priority=number % 2, project=name)
+    for seconds in charges:
+        shares.serve(project)
+        shares.charge(project, seconds)
+        assert sorted(shares.order(dict.fromkeys("abc", 1))) == ["a", "b", "c"]

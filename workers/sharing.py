@@ -1,0 +1,146 @@
+"""Who has the next place at the workers: jobs of several projects share them.
+
+The rules, in this order (`docs/decisions/0015-who-goes-next.md`):
+
+1. A higher priority goes first.
+2. A job's first `HEADSTART_SECONDS` of compute go before the work of those that had theirs, so a
+   single identification does not wait for a sweep. A project that had so much more than another
+   one loses this privilege until that one has caught up.
+3. Projects share equally, and the jobs of a project share its part equally.
+4. Every sixteenth pack goes to the job that has waited longest, whatever the rules above say:
+   nobody starves.
+"""
+
+from collections.abc import Hashable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Generic, TypeAlias, TypeVar
+
+from workers.packing import PACK_SECONDS
+
+HEADSTART_SECONDS = 30.0
+"""Compute time that a new job gets before those that had as much."""
+
+MOST_SAVED_SECONDS = 2 * HEADSTART_SECONDS
+"""Nobody falls further behind than this: unused time is not saved for later."""
+
+PATIENT_TURN = 16
+"""Each so many packs, one goes to who has waited longest."""
+
+Key = TypeVar("Key", bound=Hashable)
+Rank: TypeAlias = tuple[int, bool]
+"""Priority (negated) and whether the head start is used up: a smaller rank goes first."""
+
+
+@dataclass(slots=True, eq=False)
+class _Account:
+    """What a job or project has had, in seconds of compute: shares are equal where levels are.
+
+    It is raised where one came later, or did not ask for its part.
+    """
+
+    level: float = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class _Member(_Account):
+    """A job's account; `served` is the number of the last pack it was given."""
+
+    received: float = 0.0
+    priority: int = 0
+    project: str = ""
+    served: int = 0
+
+
+@dataclass(slots=True)
+class Shares(Generic[Key]):
+    """The accounts of the jobs that a crew works on."""
+
+    _jobs: dict[Key, _Member] = field(default_factory=dict)
+    _projects: dict[str, _Account] = field(default_factory=dict)
+    _packs: int = 0
+
+    def enter(self, job: Key, *, priority: int = 0, project: str = "") -> None:
+        """Open an account: nobody begins ahead of those who are here, or behind them."""
+        active = {one.project for one in self._jobs.values()}
+        if project not in active:
+            floor = min((self._projects[name].level for name in active), default=0.0)
+            self._projects[project] = _Account(floor)
+        self._jobs[job] = _Member(priority=priority, project=project, served=self._packs)
+
+    def leave(self, job: Key) -> None:
+        """Close the account of a job that has ended."""
+        project = self._jobs.pop(job).project
+        if all(one.project != project for one in self._jobs.values()):
+            del self._projects[project]
+
+    def project_of(self, job: Key) -> str:
+        """The project that a job belongs to."""
+        return self._jobs[job].project
+
+    def serve(self, job: Key) -> None:
+        """A pack of this job was sent."""
+        self._packs += 1
+        self._jobs[job].served = self._packs
+
+    def charge(self, job: Key, seconds: float) -> None:
+        """A pack of this job has taken `seconds` of compute time."""
+        one = self._jobs[job]
+        was_fresh = one.received < HEADSTART_SECONDS
+        one.received += seconds
+        one.level += seconds
+        mates = [self._jobs[mate] for mate in self._settled(one.project) if mate != job]
+        if was_fresh and one.received >= HEADSTART_SECONDS:
+            one.level = max(one.level, min((mate.level for mate in mates), default=0.0))
+        _pull_up(one, mates)
+        project = self._projects[one.project]
+        project.level += seconds
+        _pull_up(project, self._projects.values())
+
+    def rank(self, job: Key) -> Rank:
+        """Which jobs it goes before, whatever each has had."""
+        return self._rank(self._jobs[job], self._floor())
+
+    def order(self, in_flight: Mapping[Key, int]) -> list[Key]:
+        """The jobs of `in_flight`, the one that should have the next place first.
+
+        Parameters
+        ----------
+        in_flight : mapping
+            Packs that each job has with the workers; they count as if they were charged.
+        """
+        of_project: dict[str, int] = dict.fromkeys(self._projects, 0)
+        for job, count in in_flight.items():
+            of_project[self._jobs[job].project] += count
+        floor = self._floor()
+
+        def turn(job: Key) -> tuple[Rank, float, float]:
+            one = self._jobs[job]
+            of_all = self._projects[one.project].level + PACK_SECONDS * of_project[one.project]
+            return self._rank(one, floor), of_all, one.level + PACK_SECONDS * in_flight[job]
+
+        ordered = sorted(in_flight, key=turn)
+        if ordered and self._packs % PATIENT_TURN == PATIENT_TURN - 1:
+            patient = min(ordered, key=lambda job: self._jobs[job].served)
+            ordered.remove(patient)
+            ordered.insert(0, patient)
+        return ordered
+
+    def _floor(self) -> float:
+        return min((project.level for project in self._projects.values()), default=0.0)
+
+    def _rank(self, one: _Member, floor: float) -> Rank:
+        privileged = self._projects[one.project].level - floor < HEADSTART_SECONDS
+        return -one.priority, not (privileged and one.received < HEADSTART_SECONDS)
+
+    def _settled(self, project: str) -> list[Key]:
+        """Jobs of a project that have had their head start."""
+        return [
+            job
+            for job, one in self._jobs.items()
+            if one.project == project and one.received >= HEADSTART_SECONDS
+        ]
+
+
+def _pull_up(ahead: _Account, others: Iterable[_Account]) -> None:
+    for one in others:
+        one.level = max(one.level, ahead.level - MOST_SAVED_SECONDS)
