@@ -25,7 +25,11 @@ def fit_percent(measured: FloatArray, simulated: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ChannelMetrics:
-    """Agreement of one output of one experiment, over its scored samples."""
+    """Agreement of one output of one experiment, over its scored samples.
+
+    `span` is from the least to the largest measured value: an estimate holds for amplitudes such
+    as these.
+    """
 
     experiment: int
     output: str
@@ -33,6 +37,7 @@ class ChannelMetrics:
     samples: int
     rms: float
     fit_percent: float
+    span: tuple[float, float] = (float("nan"), float("nan"))
 
 
 @dataclass(frozen=True, slots=True)

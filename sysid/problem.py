@@ -215,7 +215,8 @@ def _channel_metrics(problem: Problem, simulated: FloatArray) -> list[ChannelMet
                 y, computed = measured[output.name][scored], model[output.name][scored]
                 found.append(
                     ChannelMetrics(experiment, output.name, output.unit, int(y.size),
-                                   rms(y - computed), fit_percent(y, computed))
+                                   rms(y - computed), fit_percent(y, computed),
+                                   (float(np.min(y)), float(np.max(y))))
                 )  # fmt: skip
     return found
 
