@@ -53,15 +53,19 @@ format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-BENCHES := kernels search latency noise_sweep memory mcap
+BENCHES := kernels search peers latency silverbox noise_sweep memory mcap
+FULL    := $(BENCHES) robustness efficiency
+RESULTS := benchmarks/results
 
 bench: $(READY)
-	@mkdir -p benchmarks/results
-	@for name in $(BENCHES); do $(BIN)/python -m benchmarks.$$name --quick --json benchmarks/results/$$name.json; done
+	@mkdir -p $(RESULTS)
+	@for name in $(BENCHES); do rm -f $(RESULTS)/$$name.*; $(BIN)/python -m benchmarks.$$name --quick --json $(RESULTS)/$$name.json; done
+	@$(BIN)/python -m benchmarks.collect $(RESULTS) $(BENCHES)
 
 bench-full: $(READY)
-	@mkdir -p benchmarks/results
-	@for name in $(BENCHES) robustness efficiency; do $(BIN)/python -m benchmarks.$$name --json benchmarks/results/$$name.json; done
+	@mkdir -p $(RESULTS)
+	@for name in $(FULL); do rm -f $(RESULTS)/$$name.*; $(BIN)/python -m benchmarks.$$name --json $(RESULTS)/$$name.json; done
+	@$(BIN)/python -m benchmarks.collect $(RESULTS) $(FULL)
 
 real-data: $(READY)
 	@mkdir -p benchmarks/results

@@ -41,27 +41,35 @@ def parser(description: str) -> argparse.ArgumentParser:
     """Return a parser with the options of every benchmark: --quick, --json FILE, --check."""
     made = argparse.ArgumentParser(description=description)
     made.add_argument("--quick", action="store_true", help="fewer repetitions")
-    made.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON")
+    made.add_argument(
+        "--json", type=Path, metavar="FILE", help="write the figures as JSON, the table as FILE.md"
+    )
     made.add_argument("--check", action="store_true", help="exit 1 when a bar does not hold")
     return made
+
+
+def markdown(title: str, rows: list[Row], skipped: list[Skipped]) -> str:
+    """The figures as a table, those with a bar first."""
+    lines = [f"## {title}", "", "| figure | measured | unit | to reach | holds |",
+             "|---|--:|---|--:|---|"]  # fmt: skip
+    for row in sorted(rows, key=lambda row: row.bar is None):
+        bar = "" if row.bar is None else f"{row.relation} {row.bar:g}"
+        verdict = "" if row.bar is None else ("yes" if row.holds else "**no**")
+        lines.append(f"| {row.name} | {row.value:.5g} | {row.unit} | {bar} | {verdict} |")
+    lines += [f"| {one.name} | skipped | | | {one.reason} |" for one in skipped]
+    return "\n".join(lines) + "\n"
 
 
 def report(
     title: str, rows: list[Row], skipped: list[Skipped], options: argparse.Namespace
 ) -> None:
-    """Print a Markdown table, write the JSON, and exit as `--check` says (1 miss, 2 skipped)."""
-    print(f"\n## {title}\n")
-    print("| figure | measured | unit | to reach | holds |")
-    print("|---|--:|---|--:|---|")
-    for row in rows:
-        bar = "" if row.bar is None else f"{row.relation} {row.bar:g}"
-        verdict = "" if row.bar is None else ("yes" if row.holds else "**no**")
-        print(f"| {row.name} | {row.value:.5g} | {row.unit} | {bar} | {verdict} |")
-    for one in skipped:
-        print(f"| {one.name} | skipped | | | {one.reason} |")
+    """Print a Markdown table, write it and the JSON, exit as `--check` says (1 miss, 2 skipped)."""
+    text = markdown(title, rows, skipped)
+    print(f"\n{text}", end="")
     if options.json:
         figures = [{**asdict(row), "holds": row.holds} for row in rows if row.bar is not None]
         options.json.write_text(json.dumps(figures, indent=1) + "\n")
+        options.json.with_suffix(".md").write_text(text)
     if options.check and not all(row.holds for row in rows):
         sys.exit(1)
     if options.check and skipped:

@@ -1,0 +1,108 @@
+"""CPU time until the target is hit: `improved` beside the optimisers that are installed here.
+
+A0 and B0 are the paper's examples without noise, the others have noise of sd 0.01; A/300/1 and
+B/300/1 are the paper's, 1500 samples or a lag of up to 5 s make them harder. Target: 1.01 times the
+RMS of the record's least-squares optimum, without noise the errors of the paper's tables. Everybody
+gets the same records, 20,000 simulations and seeds of its own; compilation is excluded for all, and
+counters of this program, not of the optimisers, say when the target is hit. A search that fails
+costs its whole time: the time per hit is that of all searches over the number of hits.
+
+lagid's time is counted in two ways. *Prorated*, as the table of `bench/peers` does it for all: the
+time of a whole search times the share of its simulations that came before the hit. *Direct*: a
+search that ends with the generation of the hit, from nothing to the run's state. Direct is more,
+since what every search does once (plans, drawing and ranking each island's first population) falls
+on few simulations, and since the other islands run that generation to its end too.
+The peers stop at the simulation that hits, so theirs is direct.
+
+Bars: the fastest peer of this run; where a record is harder, the fastest that hits in all runs.
+"""
+
+import argparse
+from dataclasses import dataclass
+from statistics import median
+
+import numpy as np
+
+from benchmarks.peer_searches import HAS_PYGMO, PEERS, run_peer
+from benchmarks.robustness import FASTEST_PEER, Study, study
+from benchmarks.systems import PAPER
+from benchmarks.table import Row, Skipped, parser, report
+
+FIRST_SEED = 90_000
+"""Of these searches; robustness has others."""
+
+EASY = ("A0", "B0", "A/300/1", "B/300/1")
+
+
+@dataclass(frozen=True)
+class Peer:
+    """What one optimiser did on the records of one system."""
+
+    name: str
+    hits: int
+    runs: int
+    evaluations: float
+    milliseconds: float
+
+    @property
+    def always_hits(self) -> bool:
+        """Whether every run hit the target."""
+        return self.hits == self.runs
+
+
+def peers_of(done: Study, first: int, count: int) -> list[Peer]:
+    """Every installed peer on the first `count` records of a study."""
+    found = []
+    for name in PEERS:
+        run_peer(name, done.system, first, done.goals[0])  # compiles and warms
+        runs = [run_peer(name, done.system, first + i, done.goals[i]) for i in range(count)]
+        hits = [evaluations for evaluations, _ in runs if evaluations is not None]
+        cost = 1e3 * sum(seconds for _, seconds in runs) / max(len(hits), 1)
+        middle = median(np.inf if evaluations is None else evaluations for evaluations, _ in runs)
+        found.append(Peer(name, len(hits), count, middle, cost if hits else np.inf))
+    return found
+
+
+def rows_of(done: Study, peers: list[Peer]) -> list[Row]:
+    """Our figures against the fastest peer, then every peer's."""
+    name, count = done.system.name, len(done.searches)
+    able = [one for one in peers if one.always_hits or name in EASY]
+    best = min((one.milliseconds for one in able), default=np.inf)
+    hits = sum(one.to_target is not None for one in done.searches)
+    prorated, direct = done.milliseconds("prorated"), done.milliseconds("direct")
+    rows = [
+        Row(f"{name}: lagid, target hit", hits, f"of {count}", count, ">="),
+        Row(f"{name}: lagid, median simulations to the target", done.to_target(), ""),
+        Row(f"{name}: lagid, CPU to the target, prorated", prorated, "ms",
+            best if np.isfinite(best) else None),
+        Row(f"{name}: lagid, CPU to the target, direct", direct, "ms"),
+    ]  # fmt: skip
+    if name in FASTEST_PEER:
+        told = FASTEST_PEER[name]
+        rows.append(Row(f"{name}: fastest in bench/peers, on its machine, prorated", told, "ms"))
+    for one in peers:
+        rows.append(Row(f"{name}: {one.name}, target hit", one.hits, f"of {one.runs}"))
+        if one.hits:
+            rows.append(Row(f"{name}: {one.name}, median simulations", one.evaluations, ""))
+            rows.append(Row(f"{name}: {one.name}, CPU to the target", one.milliseconds, "ms"))
+    return rows
+
+
+def main(options: argparse.Namespace) -> None:
+    """Measure and print."""
+    count = options.searches or (5 if options.quick else 20)
+    rows: list[Row] = []
+    for system in PAPER:
+        if options.quick and system.name not in EASY:
+            continue
+        done = study(system, count, FIRST_SEED)
+        rows += rows_of(done, peers_of(done, FIRST_SEED, count))
+    reason = "pip install -r benchmarks/requirements-peers.txt"
+    skipped = [] if HAS_PYGMO else [Skipped("pygmo de1220, sade, cmaes", reason)]
+    report("Beside other optimisers", rows, skipped, options)
+
+
+if __name__ == "__main__":
+    made = parser(__doc__ or "")
+    made.add_argument("--searches", type=int, metavar="N", help="searches of each (20)")
+    main(made.parse_args())
