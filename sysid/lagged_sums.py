@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.fft import irfft, rfft
 
+from sysid.distributions import median
 from sysid.records import Channel, sampling_of
 from sysid.types import BoolArray, FloatArray
 
@@ -37,7 +38,7 @@ class Laid(NamedTuple):
 def laid_out(times: FloatArray, values: FloatArray) -> Laid:
     """Residuals (N,) in places a period apart, those between missing; irregular ones in order."""
     steps = np.diff(times)
-    period = float(np.median(steps)) if steps.size else 0.0
+    period = median(steps) if steps.size else 0.0
     if period > 0:
         rounded = np.cumsum(np.maximum(np.rint(steps / period), 0.0))
         period = float((times[-1] - times[0]) / rounded[-1])  # not off by the rounding of one step
@@ -56,6 +57,28 @@ def laid_out(times: FloatArray, values: FloatArray) -> Laid:
     distinct = max(np.unique(times).size - 1, 1)
     spacing = float(times[-1] - times[0]) / distinct
     return Laid(times, values, np.ones(values.size, dtype=np.bool_), spacing, is_regular=False)
+
+
+class Whiteness(NamedTuple):
+    """Autocorrelation at the lags from 1, its standard deviation if white, Ljung and Box's Q."""
+
+    values: FloatArray
+    deviation: FloatArray
+    statistic: float
+
+
+def whiteness(laid: Laid) -> Whiteness:
+    """How alike neighbouring residuals are, over `Laid.lags` lags; missing ones leave pairs out."""
+    n = np.count_nonzero(laid.present)
+    lags = range(1, laid.lags + 1)
+    values = np.array([laid.values[k:] @ laid.values[:-k] for k in lags])
+    values /= float(laid.values @ laid.values)
+    if n == laid.present.size:
+        pairs = n - np.arange(1, laid.lags + 1)
+    else:
+        pairs = np.array([np.count_nonzero(laid.present[k:] & laid.present[:-k]) for k in lags])
+    deviation = np.sqrt(np.maximum(pairs, 1) / (n * (n + 2.0)))
+    return Whiteness(values, deviation, float(np.sum(np.square(values / deviation))))
 
 
 class LaggedSums(NamedTuple):

@@ -27,9 +27,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from scipy.special import gammaincc
 
-from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, lagged_sums, laid_out
+from sysid.distributions import chi_squared_tail
+from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, lagged_sums, laid_out, whiteness
 from sysid.past_outputs import coefficients_on_past_outputs
 from sysid.records import Channel
 from sysid.types import BoolArray, FloatArray
@@ -236,18 +236,12 @@ def _untestable(one: Series) -> str:
 
 
 def _whiteness(one: Series, laid: Laid, level: float, lost: float) -> Correlation:
-    n = np.count_nonzero(laid.present)
-    power = float(laid.values @ laid.values)
-    lags = range(1, laid.lags + 1)
-    values = np.array([laid.values[k:] @ laid.values[:-k] for k in lags]) / power
-    pairs = np.array([np.count_nonzero(laid.present[k:] & laid.present[:-k]) for k in lags])
-    deviation = np.sqrt(np.maximum(pairs, 1) / (n * (n + 2.0)))
-    statistic = float(np.sum(np.square(values / deviation)))
-    degrees = max(len(lags) - lost, 1.0)
+    values, deviation, statistic = whiteness(laid)
+    degrees = max(laid.lags - lost, 1.0)
     test = _test(one, "whiteness", None, values / deviation, statistic, degrees, level)
     band = np.concatenate([[0.0], deviation])
     return Correlation(
-        test, laid.period if laid.is_regular else None, np.arange(0.0, len(lags) + 1),
+        test, laid.period if laid.is_regular else None, np.arange(0.0, laid.lags + 1),
         np.concatenate([[1.0], values]), _BAND95 * band, _BAND99 * band,
     )  # fmt: skip
 
@@ -287,7 +281,7 @@ def _test(
     one: Series, kind: Kind, channel: str | None, scaled: FloatArray, statistic: float,
     degrees: float, level: float,
 ) -> ResidualTest:  # fmt: skip
-    p = float(gammaincc(degrees / 2, statistic / 2))
+    p = chi_squared_tail(degrees, statistic)
     size = np.abs(scaled)
     return ResidualTest(
         one.experiment, one.output, kind, channel, "passed" if p >= level else "failed",

@@ -120,7 +120,10 @@ class Criteria:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """Local analysis at the estimate; rows and columns are the free parameters `names`."""
+    """Local analysis at the estimate; rows and columns are the free parameters `names`.
+
+    `is_coloured` tells that the covariance allows for residuals that are not white.
+    """
 
     names: tuple[str, ...]
     covariance: FloatArray
@@ -129,6 +132,7 @@ class Uncertainty:
     singular_values: FloatArray
     noise_sd: float
     groups: tuple[Group, ...] = ()
+    is_coloured: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,8 @@ scale: of its logarithm).
 
 With squares the covariance is s²(SᵀS)⁻¹, s² = Σe²/(n − D). With the soft-l1 loss it is that of an
 M-estimator (sandwich): n/(n − D) · (SᵀKS)⁻¹ (SᵀΨ²S) (SᵀKS)⁻¹ with ψ = e/√(1 + (e/s)²) and
-K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals unduly.
+K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals unduly. Where
+residuals of a free run are clearly not white, both are that of coloured ones (`sysid.serial`).
 
 Where the output does not change on a plateau of width w (a lag that is rounded to whole samples),
 nothing tells where in it the parameter lies: w²/12 is added to its variance.
@@ -19,8 +20,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import stdtrit
 
+from sysid.distributions import median, student_95
 from sysid.estimates import Known, estimates_of
 from sysid.ga.chromosome import placed
 from sysid.groups import Block, blocks, written
@@ -29,6 +30,7 @@ from sysid.problem import Problem
 from sysid.pulls import AT_BOUND, Pull, pulls
 from sysid.result import Criteria, Estimate, EstimateStatus, Uncertainty
 from sysid.sensitivities import sensitivities
+from sysid.serial import coloured_middle
 from sysid.symmetries import scalings
 from sysid.translations import translations
 from sysid.types import BoolArray, FloatArray
@@ -103,10 +105,12 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
     kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
     kept[d - known :] = False
     inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
-    covariance, noise = _covariance(error, columns, inverse, loss_scale(problem))
+    middle = coloured_middle(problem, _influence(error, loss_scale(problem)), columns)
+    covariance, noise = _covariance(error, columns, inverse, loss_scale(problem), middle)
     member = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | np.any(powers != 0.0, axis=0)
     member |= np.any(shifts != 0.0, axis=0)
-    weak = kept & (noise >= _SAYS_NOTHING * singular)
+    spread = np.sqrt(np.maximum(np.einsum("id,de,ie->i", rows, covariance, rows), 0.0))
+    weak = kept & ((spread >= _SAYS_NOTHING) | (noise >= _SAYS_NOTHING * singular))
     directions = _Directions(singular, rows, ~kept, weak, member)
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
     found = _blocks(directions)
@@ -118,11 +122,12 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
         condition=float(singular[0] / singular[-1]) if kept.all() else float("inf"),
         singular_values=singular,
         noise_sd=noise,
+        is_coloured=middle is not None,
         groups=tuple(g for one in found for g in written(one, names, theta, scale, physical)),
     )
     statuses = _statuses(place, found, [p.name for p in pulled], problem)
     told = Known(
-        theta, statuses, physical, float(stdtrit(n - d, 0.975)), member,
+        theta, statuses, physical, student_95(n - d), member,
         uncertainty.groups, rows[~kept], scale,
     )  # fmt: skip
     estimates = estimates_of(problem, told)
@@ -195,18 +200,24 @@ def _possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray
 
 
 def _covariance(
-    error: FloatArray, columns: FloatArray, inverse: FloatArray, scale: float
-) -> tuple[FloatArray, float]:
-    """Covariance of the places, and the standard deviation of the noise."""
+    error: FloatArray, columns: FloatArray, inverse: FloatArray, scale: float,
+    middle: FloatArray | None,
+) -> tuple[FloatArray, float]:  # fmt: skip
+    """Covariance of the places, and the standard deviation of the noise.
+
+    `middle` is that of the sandwich where the residuals are coloured.
+    """
     n, d = columns.shape
     if scale == 0.0:
         variance = float(error @ error) / (n - d)
+        if middle is not None:
+            return n / (n - d) * inverse @ middle @ inverse, float(np.sqrt(variance))
         return variance * inverse, float(np.sqrt(variance))
     influence = _influence(error, scale)
     share = 1.0 / np.sqrt(1.0 + (error / scale) ** 2)
     bread = np.linalg.pinv((columns.T * share**3) @ columns, rcond=RANK**2, hermitian=True)
-    filling = (columns.T * influence**2) @ columns
-    noise = float(1.4826 * np.median(np.abs(error)))  # of the bulk, not of the outliers
+    filling = (columns.T * influence**2) @ columns if middle is None else middle
+    noise = 1.4826 * median(np.abs(error))  # of the bulk, not of the outliers
     return n / (n - d) * bread @ filling @ bread, noise
 
 

@@ -47,7 +47,8 @@ def warnings_of(
     if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING * problem.output_scale:
         found.append(_not_an_optimum(algorithm, analysis.possible_gain))
     elif tests is not None and lagged:
-        found += _coloured(tests, lagged)
+        allowed = analysis.uncertainty is not None and analysis.uncertainty.is_coloured
+        found += _coloured(tests, lagged, allowed)
     return tuple(found)
 
 
@@ -199,7 +200,7 @@ def _is_vague_lag(estimate: Estimate) -> bool:
     return estimate.stderr is not None and abs(estimate.value) < _SEPARABLE * estimate.stderr
 
 
-def _coloured(tests: ResidualTests, lagged: set[str]) -> list[str]:
+def _coloured(tests: ResidualTests, lagged: set[str], allowed: bool) -> list[str]:
     """Residuals that are clearly not white: the model lacks something, most often an order.
 
     A lag makes up for an order that is missing. Of whether the tests are passed the result tells
@@ -207,10 +208,15 @@ def _coloured(tests: ResidualTests, lagged: set[str]) -> list[str]:
     """
     if all(one.kind != "whiteness" or one.p is None or one.p > _CHANCE for one in tests.tests):
         return []
+    errors = (
+        "the standard errors allow for the colour of the residuals, not for what the model lacks"
+        if allowed
+        else "the standard errors are too small"
+    )
     return [
         f"the residuals are not white (on the {tests.data} data): something of the dynamics is "
         f"not in the model, the estimate of {', '.join(sorted(lagged))} depends on the order of "
-        "the model, and the standard errors are too small"
+        f"the model, and {errors}"
     ]
 
 

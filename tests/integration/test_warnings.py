@@ -60,7 +60,7 @@ def test_a_model_of_too_low_an_order_is_told_that_its_lag_depends_on_it() -> Non
     y = response(parse_model(SECOND), steps(), L=0.1)
     found = identify(parse_model(FIRST), record(steps(), y), QUICK)
     assert told(found, "the estimate of L depends on the order of the model")
-    assert told(found, "standard errors are too small")
+    assert told(found, "standard errors allow for the colour of the residuals")
 
 
 def test_an_estimate_that_may_as_well_be_zero_is_told() -> None:

@@ -1,0 +1,97 @@
+"""Standard errors under coloured residuals, against repetition and against theory."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid.models.library import load_model
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+from sysid.refinement import refine
+from sysid.settings import Loss
+from sysid.types import FloatArray
+from sysid.uncertainty import Analysis, analyse
+from tests.searching import DUFFING, noisy, record
+
+STEADY = {
+    "name": "level", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "parameters": {"m": {"lower": -10, "upper": 10}}, "equations": {"x": "m + 0*u"},
+    "outputs": {"y": "x"}, "initial": {"x": 0},
+}  # fmt: skip
+N, POLE = 2000, 0.8
+
+
+def coloured(n: int, pole: float, seed: int) -> FloatArray:
+    """First-order noise of variance 1."""
+    white = np.random.default_rng(seed).standard_normal(n + 200)
+    noise = np.zeros(n + 200)
+    for k in range(1, n + 200):
+        noise[k] = pole * noise[k - 1] + np.sqrt(1 - pole**2) * white[k]
+    return noise[200:]
+
+
+def level(noise: FloatArray, **settings: object) -> Analysis:
+    """The analysis of a mean."""
+    times = 0.1 * np.arange(noise.size)
+    data = Record((Channel("u", times, times),), (Channel("y", times, noise),))
+    problem = Problem.build(load_model(STEADY), [data], skip=1, **settings)
+    return analyse(problem, np.array([np.mean(noise[1:])]))
+
+
+def standard_error(analysis: Analysis) -> float:
+    found = analysis.estimates[0].stderr
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("pole", [POLE, -0.5])
+def test_the_standard_error_of_a_mean_is_that_of_its_long_run_variance(pole: float) -> None:
+    found = [level(coloured(N, pole, seed)) for seed in range(20)]
+    theory = np.sqrt((1 + pole) / (1 - pole) / N)
+    assert np.mean([standard_error(one) for one in found]) == pytest.approx(theory, rel=0.15)
+    assert all(one.uncertainty and one.uncertainty.is_coloured for one in found)
+
+
+def test_of_white_residuals_the_covariance_is_the_plain_one() -> None:
+    noise = np.random.default_rng(3).standard_normal(N)
+    found = level(noise)
+    assert found.uncertainty is not None
+    assert not found.uncertainty.is_coloured
+    assert standard_error(found) == pytest.approx(np.std(noise[1:], ddof=1) / np.sqrt(N - 1))
+
+
+def test_one_step_ahead_residuals_keep_the_plain_covariance() -> None:
+    found = level(coloured(N, POLE, 0), prediction="one-step")
+    assert found.uncertainty is not None
+    assert not found.uncertainty.is_coloured
+
+
+def test_a_robust_loss_is_allowed_for_as_squares_are() -> None:
+    noise = coloured(N, POLE, 0)
+    squares, robust = level(noise), level(noise, loss=Loss("soft-l1", 10.0))
+    assert standard_error(robust) == pytest.approx(standard_error(squares), rel=0.1)
+
+
+def test_two_equal_halves_give_what_the_halves_say_together() -> None:
+    noise = coloured(N, POLE, 1)
+    times = 0.1 * np.arange(N)
+    one = Record((Channel("u", times, times),), (Channel("y", times, noise),))
+    both = Problem.build(load_model(STEADY), [one, replace(one)], skip=1)
+    joint = standard_error(analyse(both, np.array([np.mean(noise[1:])])))
+    assert joint == pytest.approx(standard_error(level(noise)) / np.sqrt(2), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth_where_the_noise_is_coloured() -> None:
+    model, clean = load_model("duffing-eq16"), noisy(sd=0.0)
+    truth = np.array([DUFFING[p.name] for p in Problem.build(model, [record(clean)]).space])
+    held = []
+    for seed in range(100):
+        problem = Problem.build(model, [record(clean + 0.01 * coloured(clean.size, 0.7, seed))])
+        end = refine(problem, [truth])[0]
+        assert end is not None
+        found = analyse(problem, end.theta).uncertainty
+        assert found is not None
+        held.append(np.abs(end.theta - truth) <= 1.97 * np.sqrt(np.diag(found.covariance)))
+    assert np.mean(held) > 0.87  # about 0.92; without R about 0.6
