@@ -46,7 +46,7 @@ def page(
     job = JobRepository(session).get(job_id)
     found = RunRepository(session).page(
         job.id, cursor=cursor, limit=limit, states=choice.states,
-        cell=_wanted("cell", choice.cell), labels=_wanted("label", choice.labels),
+        cell=wanted("cell", choice.cell), labels=wanted("label", choice.labels),
         order=choice.order, descending=choice.descending,
     )  # fmt: skip
     known = reached(session, [run.id for run in found.items if run.result is None])
@@ -162,15 +162,21 @@ def _progress(run: Run, job: Job, known: Reached | None) -> float:
     return min(reached_so_far / generations, ALMOST)
 
 
-def _wanted(name: str, filters: Sequence[str]) -> Mapping[str, Any]:
-    """Values asked for as ``key=value``; a value that is not JSON is a text."""
-    wanted: dict[str, Any] = {}
+def wanted(name: str, filters: Sequence[str]) -> Mapping[str, Any]:
+    """Values asked for as ``key=value``; a value that is not JSON is a text.
+
+    Raises
+    ------
+    InvalidRequest
+        If one is not of that form; `name` is that of the query's field.
+    """
+    found: dict[str, Any] = {}
     for text in filters:
         key, equals, value = text.partition("=")
         if not equals:
             raise InvalidRequest.at(f"?{name}", f"found {text!r}; need path=value")
         try:
-            wanted[key] = json.loads(value)
+            found[key] = json.loads(value)
         except ValueError:
-            wanted[key] = value
-    return wanted
+            found[key] = value
+    return found

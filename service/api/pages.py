@@ -6,6 +6,7 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, Response
 
 from service.api.deps import Cursor, PartsDep, ReadSession
+from service.api.jobs import Filter
 from service.errors import NotFound
 from service.storage.tables import State
 from service.web import assets, figures, pages, report, results
@@ -55,10 +56,12 @@ def jobs_page(session: ReadSession, state: StateFilter = None, cursor: Cursor = 
 
 @router.get("/jobs/{job_id}", **Hidden)
 def job_page(
-    job_id: str, request: Request, session: ReadSession, cursor: Cursor = None
-) -> Response:
-    """One job with its runs."""
-    return _Page(pages.job_page(session, job_id, str(request.base_url), cursor=cursor))
+    job_id: str, request: Request, session: ReadSession, cursor: Cursor = None,
+    cell: Filter = None,
+) -> Response:  # fmt: skip
+    """One job with its runs, or the grid of its cells and the runs of the chosen one."""
+    url = str(request.base_url)
+    return _Page(pages.job_page(session, job_id, url, cursor=cursor, cell=cell or []))
 
 
 @router.get("/runs/{run_id}", **Hidden)
@@ -111,6 +114,12 @@ def run_figure(
 ) -> Response:
     """A figure of a run as Plotly JSON, or the numbers it draws as CSV."""
     return _figure(results.run_figure(session, parts.store, run_id, name, choice), name, choice)
+
+
+@router.get("/v1/jobs/{job_id}/figures/summary", tags=["jobs"], response_class=JSONResponse)
+def job_figure(job_id: str, session: ReadSession, choice: Choice) -> Response:
+    """Errors against the noise (Figure 15) as Plotly JSON, or the numbers drawn as CSV."""
+    return _figure(results.job_figure(session, job_id, choice), "summary", choice)
 
 
 @router.get("/v1/datasets/{dataset_id}/figures/signals", tags=["datasets"],

@@ -36,64 +36,61 @@ LOW, MIDDLE, HIGH = 0, 2, 4  # places of 5, 50 and 95 % among the quantiles of a
 Named = list[str] | None
 
 
+Data = Annotated[
+    str | None, typer.Option("--data", help="Datasets on the server: ids or names, by commas.")
+]
+Sigma = Annotated[
+    list[str],
+    typer.Option("--sigma", help="start:stop:step with both ends, or numbers: 0,0.1,0.3."),
+]
+True_ = Annotated[
+    Named, typer.Option("--true", metavar="NAME=VALUE", help="A true parameter, to simulate.")
+]
+Input = Annotated[
+    Named, typer.Option("--input", metavar="NAME=EXPRESSION", help="Input over t: 'q=10*cos(5*t)'.")
+]
+Relative = Annotated[
+    bool, typer.Option("--relative", help="σ in standard deviations of the output.")
+]
+Replicates = Annotated[int, typer.Option(help="Draws of noise and of the search for each σ.")]
+Methods = Annotated[str, typer.Option(help="Of simple, improved-paper, improved.")]
+Seed = Annotated[int, typer.Option(help="Of all draws; each replicate has its own from it.")]
+Channels = Annotated[str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")]
+Changes = Annotated[
+    Named, typer.Option("--set", help="path=value of the job, as algorithm.population=100.")
+]
+Wait = Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")]
+IdempotencyKey = Annotated[str | None, typer.Option(help="The same key again: the same job.")]
+
+
 @app.command()
 def noise(
     model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
-    sigma: Annotated[
-        list[str],
-        typer.Option("--sigma", help="start:stop:step with both ends, or numbers: 0,0.1,0.3."),
-    ],
-    data: Annotated[
-        str | None, typer.Option("--data", help="Datasets on the server: ids or names, by commas.")
-    ] = None,
-    true: Annotated[
-        Named, typer.Option("--true", metavar="NAME=VALUE", help="A true parameter, to simulate.")
-    ] = None,
-    inputs: Annotated[
-        Named,
-        typer.Option("--input", metavar="NAME=EXPRESSION", help="Input over t: 'q=10*cos(5*t)'."),
-    ] = None,
+    sigma: Sigma,
+    data: Data = None,
+    true: True_ = None,
+    inputs: Input = None,
     samples: Annotated[int | None, typer.Option(help="Samples to simulate.")] = None,
     sample_time: Annotated[float | None, typer.Option(help="Their period in s.")] = None,
-    relative: Annotated[
-        bool, typer.Option("--relative", help="σ in standard deviations of the output.")
-    ] = False,
-    replicates: Annotated[int, typer.Option(help="Draws of noise for each σ.")] = 20,
-    methods: Annotated[
-        str, typer.Option(help="simple, improved-paper, improved.")
-    ] = "simple,improved",
-    seed: Annotated[
-        int, typer.Option(help="Of all draws; replicates have seeds of their own.")
-    ] = 1,
-    channels: Annotated[
-        str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")
-    ] = None,
-    changes: Annotated[
-        Named, typer.Option("--set", help="path=value of the job, as algorithm.population=100.")
-    ] = None,
+    relative: Relative = False,
+    replicates: Replicates = 20,
+    methods: Methods = "simple,improved",
+    seed: Seed = 1,
+    channels: Channels = None,
+    changes: Changes = None,
     name: Annotated[str | None, typer.Option(help="Name of the job.")] = None,
-    wait: Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")] = False,
-    idempotency_key: Annotated[
-        str | None, typer.Option(help="The same key again gives the same job.")
-    ] = None,
+    wait: Wait = False,
+    idempotency_key: IdempotencyKey = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
     """Identify under noise: σ × replicates × methods, each parameter's error beside its floor.
 
-    The record is simulated from true parameters (--true, --input, --samples, --sample-time), or
-    that of a dataset (--data). The same sweep with more replicates or another grid computes only
-    the runs that are new.
+    The record is simulated (--true, --input, --samples, --sample-time) or a dataset's (--data).
+    With more replicates, or another grid, only the runs that are new are computed.
     """
-    truth = {
-        "parameters": {one: _number("--true", one, value) for one, value in _pairs("--true", true)},
-        "inputs": {
-            one: {"kind": "expression", "expression": text}
-            for one, text in _pairs("--input", inputs)
-        },
-        "samples": samples, "sample_time": sample_time,
-    }  # fmt: skip
+    truth = _truth(true, inputs, samples, sample_time)
     body: dict[str, Any] = {
         "model": _model(model), "sigma": [one for text in sigma for one in grid(text)],
         "relative": relative, "replicates": replicates, "methods": _names(methods), "seed": seed,
@@ -198,6 +195,19 @@ def _tell(client: "Client", job: dict[str, Any], *, wait: bool, as_json: bool) -
         reason = f": {job['error']}" if job["error"] else ""
         err.print(f"lagid: {job['id']} {job['state']}{reason}", markup=False)
         raise typer.Exit(1)
+
+
+def _truth(
+    true: Named, inputs: Named, samples: int | None, sample_time: float | None
+) -> dict[str, Any]:
+    return {
+        "parameters": {one: _number("--true", one, value) for one, value in _pairs("--true", true)},
+        "inputs": {
+            one: {"kind": "expression", "expression": text}
+            for one, text in _pairs("--input", inputs)
+        },
+        "samples": samples, "sample_time": sample_time,
+    }  # fmt: skip
 
 
 def _source(data: str | None, truth: dict[str, Any]) -> dict[str, Any]:

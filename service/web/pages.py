@@ -14,6 +14,7 @@ from sqlalchemy.orm import Session
 
 from service import models
 from service.comparison import compare
+from service.runs import wanted
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import NotFound
 from service.storage.events import EventRepository
@@ -22,12 +23,14 @@ from service.storage.lineage import LineageRepository
 from service.storage.runs import RunRepository
 from service.storage.tables import Dataset, Job, Run, State
 from service.web import assets, figures_signals, formats
+from service.web.cells import grid_of
 from service.web.figures import WATERFALL_HEIGHT, convergence_height, correlation_height
+from service.web.figures_noise import noise_height, noise_keys
 from service.web.figures_residuals import residuals_height
 from service.web.findings import findings_of
 from service.web.reading import model_of, run_body, sought_parameters, unit_of
 from service.web.reference import operations
-from service.web.views import JobView, RunView, event_view, job_view, run_view
+from service.web.views import JobView, RunView, cell_text, event_view, job_view, run_view
 
 JOBS_PER_PAGE = 50
 RUNS_PER_PAGE = 100
@@ -80,18 +83,27 @@ def jobs_page(session: Session, state: State | None, cursor: str | None) -> str:
 
 def job_page(
     session: Session, job_id: str, base_url: str, run_id: str | None = None,
-    cursor: str | None = None,
+    cursor: str | None = None, cell: Sequence[str] = (),
 ) -> str:  # fmt: skip
-    """A job with its runs, one of them in full: the one asked for, else the best or the first."""
+    """A job with its runs, one of them in full: the one asked for, else the best or the first.
+
+    Of a large sweep the page has the grid of its cells, and lists the runs of the chosen `cell`,
+    given as ``/noise/sigma=0.1``.
+    """
     job = JobRepository(session).get(job_id)
     runs = RunRepository(session)
-    page = runs.page(job.id, cursor=cursor, limit=RUNS_PER_PAGE)
+    chosen_cell = wanted("cell", cell)
+    grid = grid_of(session, job, chosen_cell)
+    page = runs.page(job.id, cursor=cursor, limit=RUNS_PER_PAGE, cell=chosen_cell)
     chosen = runs.get(run_id) if run_id else _best(runs, job)
     view = job_view(job, unit_of(session, job.spec), datetime.now(UTC))
     return render(
         "job.html", job=view, runs=[run_summary(session, job, run) for run in page.items],
         run=run_in_full(session, job, chosen) if chosen else None,
-        next_runs=_query({"cursor": page.next}) if page.next else "",
+        next_runs=_query({"cell": cell, "cursor": page.next}) if page.next else "",
+        grid=grid, is_listed=grid is None or bool(chosen_cell),
+        cell_title=cell_text(chosen_cell, {}),
+        noise_height=_noise_height(job, chosen),
         comparable=_comparable(page.items),
         datasets=dataset_links(session, job), commands=_commands(view, base_url),
         events=[event_view(one) for one in _events(session, job)],
@@ -195,6 +207,15 @@ def _comparable(runs: Sequence[Run]) -> str:
     return urlencode([("run", one) for one in chosen]) if len(chosen) > 1 else ""
 
 
+def _noise_height(job: Job, run: Run | None) -> int:
+    """Height (px) of the figure of a sweep over σ; 0 where it is none."""
+    if job.n_runs == 1 or noise_keys(job.spec.get("sweep", {}).get("axes", [])) is None:
+        return 0
+    body = job.spec if run is None else run_body(job, run)
+    sought = sought_parameters(run, body) if run is not None else []
+    return noise_height(1 + len(sought), columns=2)
+
+
 def _best(runs: RunRepository, job: Job) -> Run | None:
     if job.n_runs == 1 or job.best_rms is None:
         found: Sequence[Run] = runs.page(job.id, limit=1).items
@@ -250,4 +271,4 @@ def _href(name: str) -> str:
 
 
 def _query(values: dict[str, Any]) -> str:
-    return f"?{urlencode(values)}" if values else ""
+    return f"?{urlencode(values, doseq=True)}" if values else ""

@@ -11,10 +11,12 @@ from service.storage.datasets import DatasetRepository
 from service.storage.jobs import JobRepository
 from service.storage.objects import ObjectStore
 from service.storage.runs import RunRepository
+from service.summaries import summary
 from service.web import figures, figures_signals
 from service.web.figures import Abscissa, Figure
+from service.web.figures_noise import noise_keys, noise_sweep
 from service.web.findings import residual_figure
-from service.web.reading import evidence_of
+from service.web.reading import evidence_of, unit_of
 from service.web.signals import experiments_of, traces_of
 from service.web.theme import Theme
 
@@ -67,6 +69,17 @@ def run_figure(
     if name == "convergence":
         return figures.convergence(evidence, choice.columns)
     return figures.correlation(evidence) if name == "correlation" else figures.waterfall(evidence)
+
+
+def job_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
+    """Errors against the noise of a job; empty where σ is no axis of it, or nothing ended yet."""
+    job = JobRepository(session).get(job_id)
+    keys = noise_keys(job.spec.get("sweep", {}).get("axes", []))
+    if keys is None:
+        return {"data": [], "layout": figures.layout(200)}
+    return noise_sweep(
+        summary(session, job.id, keys), unit_of(session, job.spec), min(choice.columns, 2)
+    )
 
 
 def _check_experiment(number: int, count: int) -> None:

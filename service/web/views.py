@@ -70,6 +70,7 @@ class JobView:
     n_runs: int
     n_done: int
     n_failed: int
+    n_reused: int
     progress: float
     progress_text: str
     best_rms: float | None
@@ -106,7 +107,8 @@ def job_view(job: Job, unit: str, now: datetime) -> JobView:
         can_resume=job.state in (State.FAILED, State.CANCELLED),
         cancel_requested=job.cancel_requested, model_name=model_name(job.spec), unit=unit,
         attempt=job.attempt, max_attempts=job.max_attempts, n_runs=job.n_runs, n_done=job.n_done,
-        n_failed=job.n_failed, progress=share, progress_text=_progress_text(job, share),
+        n_failed=job.n_failed, n_reused=job.n_reused,
+        progress=share, progress_text=_progress_text(job, share),
         best_rms=job.best_rms, evaluations=job.evaluations,
         rate=job.evaluations / seconds if seconds and job.evaluations else None,
         seconds_left=job.seconds_left, took=seconds, created_at=job.created_at,
