@@ -183,6 +183,9 @@ class RunObserver(Protocol):
     def started(self, run: str) -> None:
         """The run was given to a worker for the first time, from its checkpoint or the start."""
 
+    def blamed(self, run: str, kills: int) -> None:
+        """The worker died over this run alone, `kills` times by now; 0: it has gone on since."""
+
     def progress(self, run: str, state: RunState, seconds: float) -> None:
         """The run can go on from `state` after `seconds` of compute time."""
 
@@ -201,11 +204,16 @@ class RunObserver(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class QueuedRun:
-    """A run that waits for its turn; `state` is its checkpoint, if there is one."""
+    """A run that waits for its turn.
+
+    `state` is its checkpoint, if there is one; `kills` is how often its worker died over it, and
+    over no other run, since it last went on.
+    """
 
     run: str
     spec: RunSpec
     state: RunState | None = None
+    kills: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ from sysid.run import border, exchange, is_finished
 from workers.packing import is_worth_spreading, slice_seconds
 from workers.ports import Advance, Evolve, Evolved, Item, QueuedRun, RunSpec
 
-MAX_STRIKES = 3
-"""A run whose workers died this often is given up."""
+MAX_KILLS = 2
+"""A run over which workers died so often, and which did not go on between, is given up."""
 
 
 @dataclass(slots=True, eq=False)
@@ -22,8 +22,10 @@ class ActiveRun:
         Whether a worker was given it, by this driver.
     slices : int
         Time slices done; 0 before the first.
-    strikes : int
-        How often a worker died over it.
+    kills : int
+        How often a worker died over it and no other run, since it last went on.
+    is_suspect : bool
+        Whether a worker died over it and others: it goes alone from then on.
     seconds : float
         Compute time so far, over all workers.
     generation_seconds : float
@@ -39,7 +41,8 @@ class ActiveRun:
     state: RunState | None
     is_begun: bool = False
     slices: int = 0
-    strikes: int = 0
+    kills: int = 0
+    is_suspect: bool = False
     seconds: float = 0.0
     generation_seconds: float = 0.0
     islands: dict[int, Island] = field(default_factory=dict)
@@ -48,7 +51,12 @@ class ActiveRun:
     @classmethod
     def of(cls, queued: QueuedRun) -> "ActiveRun":
         """The run as it waits in the queue."""
-        return cls(queued.run, queued.spec, queued.state)
+        return cls(queued.run, queued.spec, queued.state, kills=queued.kills)
+
+    @property
+    def goes_alone(self) -> bool:
+        """Whether it shares no pack: it is long, or may be what kills workers."""
+        return self.slices > 0 or self.kills > 0 or self.is_suspect
 
     def should_spread(self, idle: int) -> bool:
         """Whether its islands should go to several workers, given `idle` cores."""

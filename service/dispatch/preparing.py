@@ -219,7 +219,7 @@ class JobRuns:
             spec = self.specification(row.cell, warm)
         except (SysidError, ServiceError, StorageError) as error:
             return RefusedRun(row.id, Failure(str(error), type(error).__name__))
-        return QueuedRun(row.id, spec, state)
+        return QueuedRun(row.id, spec, state, row.kills)
 
     def _computed(self, queued: list[QueuedRun | RefusedRun]) -> dict[str, str]:
         """Runs that were computed before, each with the run that did; all are marked."""

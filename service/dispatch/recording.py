@@ -58,7 +58,13 @@ class _Pending:
     outcomes: list[RunOutcome] = field(default_factory=list)
     history: list[HistoryPoint] = field(default_factory=list)
     migrants: list[MigrantPoint] = field(default_factory=list)
-    complaints: list[tuple[str, str]] = field(default_factory=list)
+    complaints: list[str] = field(default_factory=list)
+    kills: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def has_runs(self) -> bool:
+        """Whether a run has begun, ended or lost its worker."""
+        return bool(self.outcomes or self.started or self.known or self.kills)
 
 
 class Recorder:
@@ -91,12 +97,18 @@ class Recorder:
         self._generations = max(1, int(claim.job.spec["algorithm"]["generations"]))
         self._n_begun, self._begun = claim.job.n_done, time.monotonic()
         self._n_known = 0
+        self._taken: list[RunOutcome] = []  # from other runs, in the present transaction
         self._told = self._wrote = self._kept = 0.0
         self._news = False
 
     def started(self, run: str) -> None:
         """The run was given to a worker."""
         self._pending.started.append(run)
+
+    def blamed(self, run: str, kills: int) -> None:
+        """A worker died over the run alone, `kills` times since it last went on."""
+        self._pending.kills[run] = kills
+        self._wrote = 0.0  # at once: what counts them may die as well
 
     def progress(self, run: str, state: RunState, seconds: float) -> None:
         """The run can go on from `state`."""
@@ -119,7 +131,9 @@ class Recorder:
             ObjectStoreFailed,
             RecordsUnavailable,
         ) as error:  # the numbers are worth more than the plot
-            _log.error("the signals of %s are not stored: %s", run, error)
+            text = f"the signals of {run} are not stored: {error}"
+            _log.error(text)
+            self._pending.complaints.append(text)
             signals = None
         self._pending.outcomes.append(outcome_of(run, concluded, seconds, signals))
         self._evaluations += found.evaluations
@@ -140,7 +154,7 @@ class Recorder:
         ))  # fmt: skip
         if failure.reason not in self._reasons and len(self._reasons) < KEPT_REASONS:
             self._reasons.append(failure.reason)
-            self._pending.complaints.append((run, failure.reason))
+            self._pending.complaints.append(f"{run} failed: {failure.reason}")
         self._n_done += 1
         self._news = True
 
@@ -168,7 +182,7 @@ class Recorder:
         now = time.monotonic()
         tell = self._news and now - self._told > PROGRESS_SECONDS
         keep = bool(self._live) and now - self._kept > CHECKPOINT_SECONDS
-        some = bool(self._pending.outcomes or self._pending.started or self._pending.known)
+        some = self._pending.has_runs
         if tell or keep or (some and now - self._wrote > RESULTS_SECONDS):
             with self._database.write() as session:
                 self._write(session, tell=tell, keep=keep)
@@ -217,10 +231,11 @@ class Recorder:
     def _progress(self) -> Progress:
         """How far the job is; the generation is that of the run that is furthest."""
         states = [live.state for live in self._live.values()]
-        best = min([self._best, *(state.rms for state in states)])
+        best = min([self._best, *_rms_of(self._taken), *(state.rms for state in states)])
         return Progress(
             evaluations=self._evaluations
             + sum(self._waiting.values())
+            + sum(one.evaluations for one in self._taken)
             + sum(state.evaluations for state in states),
             generation=max([self._generation, *(state.generation for state in states)]),
             best_rms=best if math.isfinite(best) else None,
@@ -256,13 +271,12 @@ class Recorder:
 
     def _write(self, session: Session, *, tell: bool, keep: bool) -> None:
         ledger, pending = RunLedger(session, self.lease), self._pending
-        for one in take_over(session, self.lease, pending.known):
-            self._evaluations += one.evaluations
-            self._best = min(self._best, math.inf if one.best_rms is None else one.best_rms)
+        self._taken = take_over(session, self.lease, pending.known)
         ledger.start(pending.started)
         ledger.record(pending.outcomes, pending.history, pending.migrants)
-        for run, reason in pending.complaints:
-            Queue(session).tell(self.lease, "log", {"message": f"{run} failed: {reason}"})
+        ledger.blame(pending.kills)
+        for text in pending.complaints:
+            Queue(session).tell(self.lease, "log", {"message": text})
         if tell:
             for run, live in self._live.items():
                 points = history_points(run, live.state.history, live.written)
@@ -274,6 +288,9 @@ class Recorder:
 
     def _written(self, now: float, *, tell: bool, keep: bool) -> None:
         self._pending, self._wrote = _Pending(), now
+        self._evaluations += sum(one.evaluations for one in self._taken)
+        self._best = min([self._best, *_rms_of(self._taken)])
+        self._taken = []
         if tell:
             self._told, self._news = now, False
             for live in self._live.values():
@@ -283,3 +300,7 @@ class Recorder:
             self._kept = now
             for live in self._live.values():
                 live.changed = False
+
+
+def _rms_of(outcomes: list[RunOutcome]) -> list[float]:
+    return [one.best_rms for one in outcomes if one.best_rms is not None]

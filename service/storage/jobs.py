@@ -134,7 +134,7 @@ class JobRepository:
             )
         again = update(Run).where(Run.job_id == job_id, Run.state != State.SUCCEEDED)
         self._session.execute(
-            again.values(state=State.QUEUED, error=None, finished_at=None),
+            again.values(state=State.QUEUED, error=None, finished_at=None, kills=0),
             execution_options=IN_PLACE,
         )
         job.state, job.cancel_requested = State.QUEUED, False

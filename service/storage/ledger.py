@@ -1,6 +1,6 @@
 """Runs as the dispatcher writes them. Every write holds the job's lease; most are in bulk."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -101,6 +101,13 @@ class RunLedger:
                 started_at=func.coalesce(Run.started_at, self._clock()),
             )  # fmt: skip
             self._session.execute(begun, execution_options=IN_PLACE)
+
+    def blame(self, kills: Mapping[str, int]) -> None:
+        """Write how often in a row a worker died over each of these runs."""
+        self._queue.hold(self._lease)
+        if kills:
+            rows = [{"id": run, "kills": count} for run, count in kills.items()]
+            self._session.execute(update(Run), rows)
 
     def record(
         self,

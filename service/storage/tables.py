@@ -197,6 +197,7 @@ class Run(Base):
     `number` is the cell's place in the sweep, `spec_hash` names what is computed. `result` is the
     document of the run result; `estimates` repeats {name: {"value", "stderr"}} of it for summaries
     over many runs. `rms_noise_free` is the RMS against the records before noise was added.
+    `kills` is how often a worker died over it alone since it last went on.
     """
 
     __tablename__ = "runs"
@@ -219,6 +220,7 @@ class Run(Base):
     sigma: Mapped[float | None]
     state: Mapped[State] = mapped_column(default=State.QUEUED)
     attempt: Mapped[int] = mapped_column(default=0)
+    kills: Mapped[int] = mapped_column(default=0, server_default="0")
     valid: Mapped[bool | None]
     best_rms: Mapped[float | None]
     rms_noise_free: Mapped[float | None]

@@ -140,8 +140,47 @@ def test_a_run_that_kills_every_worker_fails_alone_and_says_so() -> None:
     notebook = jobs(feeder, a=4)["a"]
     finish(feeder)
     (failure,) = notebook.failures.pop("a1")
-    assert failure.reason == "its worker process died 3 times; the last time: out of memory"
+    assert failure.reason == "its worker process died 2 times; the last time: out of memory"
     assert all(told == [Failure("as told")] for told in notebook.failures.values())
+
+
+def test_a_run_packed_with_one_that_kills_its_worker_goes_alone_and_is_not_blamed() -> None:
+    crew = ScriptedCrew(lambda item: WorkerDied("x") if item.run == "a40" else fails(item))
+    feeder = Feeder(crew)
+    notebook = jobs(feeder, a=100)["a"]
+    finish(feeder)
+    shared = [set(pack) for pack in crew.sent if len(pack) > 1]
+    mates = next(runs for runs in shared if "a40" in runs)
+    alone = [pack[0] for pack in crew.sent if len(pack) == 1]
+    assert all(alone.count(mate) == 1 for mate in mates - {"a40"})
+    assert notebook.kills == {"a40": [1, 2]}
+    assert len(notebook.failures) == 100
+
+
+def test_a_death_counted_by_a_dispatcher_before_is_counted_on() -> None:
+    crew = ScriptedCrew(lambda item: WorkerDied("killed"))
+    feeder, notebook = Feeder(crew), Notebook()
+    feeder.add("a", ListedRuns([QueuedRun("a0", spec(), kills=1)]), notebook)
+    finish(feeder)
+    assert len(crew.sent) == 1
+    assert notebook.kills == {"a0": [2]}
+
+
+def test_a_run_that_went_on_between_two_deaths_is_not_given_up() -> None:
+    state = begin(build(spec().problem, RECORDS)[0], spec().algorithm, 1)
+    turns = iter([WorkerDied("x"), Advanced(state), WorkerDied("x"), Advanced(state)])
+
+    def answer(item: Item) -> Done | PackLost:
+        one = next(turns, None)
+        if one is None:
+            return fails(item)
+        return one if isinstance(one, PackLost) else Done(item.run, one, 0.1)
+
+    feeder = Feeder(ScriptedCrew(answer))
+    notebook = jobs(feeder, a=1)["a"]
+    finish(feeder)
+    assert notebook.kills == {"a0": [1, 0, 1, 0]}
+    assert notebook.failures["a0"] == [Failure("as told")]
 
 
 def test_a_programming_error_fails_the_runs_of_its_pack_with_its_last_line() -> None:
