@@ -76,6 +76,9 @@ class JobChecker:
         assert not isinstance(model, list)
         body = {**body, "model": model[1], "datasets": self.identifiers(body["datasets"])}
         body["warm_start"] = self.warm_start(body["warm_start"])
+        if body["trend"] is not None:
+            reference = self.warm_start(body["trend"]["reference"])
+            body["trend"] = {**body["trend"], "reference": reference}
         kept = body["validation"]
         if kept is not None and kept["datasets"] is not None:
             body["validation"] = {**kept, "datasets": self.identifiers(kept["datasets"])}

@@ -161,16 +161,24 @@ def _warm_start(value: str) -> str:
     return value
 
 
+def _reference(value: str) -> str:
+    if value == PREVIOUS:
+        raise PydanticCustomError("reference", "need the id of a run, or 'reference:' and a name")
+    return _warm_start(value)
+
+
 class TrendIn(Body):
     """How parameters depend on a label.
 
     `x` is the name of a label that is a number in every cell, `parameters` those to look at (all
     that are free by default), `predict` the values of x for which predictions are wanted.
+    `reference` is a run (run_…, or `reference:` and a name) that the batch is compared with.
     """
 
     x: str = Field(min_length=1, max_length=64)
     parameters: list[str] = Field(default=[], max_length=100)
     predict: list[Annotated[float, Field(allow_inf_nan=False)]] = Field(default=[], max_length=100)
+    reference: Annotated[str, Field(max_length=300), AfterValidator(_reference)] | None = None
 
 
 def model_reference(value: Any) -> Any:

@@ -2,21 +2,27 @@
 
 from collections.abc import Iterator
 
+from sqlalchemy.orm import Session
+
+from service import warm_starts
 from service.errors import FieldError
 from service.schemas_jobs import PREVIOUS, JobIn
 from sysid.errors import nearest
 from sysid.models.model import Model
 
 
-def trend_faults(job: JobIn, model: Model | None) -> Iterator[FieldError]:
-    """Labels that are missing or no numbers, parameters that the model does not have."""
+def trend_faults(session: Session, job: JobIn, model: Model | None) -> Iterator[FieldError]:
+    """Labels that are missing or no numbers, what the model or the reference does not have."""
     if job.warm_start == PREVIOUS and not job.sweep.axes:
         yield FieldError("/warm_start", "'previous' needs a sweep; this job has one run")
     if job.trend is None:
         return
     yield from _label_faults(job, job.trend.x)
-    known = [] if model is None else [one.name for one in model.parameters]
-    for index, name in enumerate(job.trend.parameters if known else []):
+    if model is None:
+        return
+    yield from warm_starts.faults(session, job.trend.reference, model, "/trend/reference")
+    known = [one.name for one in model.parameters]
+    for index, name in enumerate(job.trend.parameters):
         if name not in known:
             yield FieldError(
                 f"/trend/parameters/{index}",

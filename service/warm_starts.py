@@ -14,15 +14,17 @@ from sysid.models.model import Model
 POINTER = "/warm_start"
 
 
-def faults(session: Session, reference: str | None, model: Model) -> list[FieldError]:
+def faults(
+    session: Session, reference: str | None, model: Model, pointer: str = POINTER
+) -> list[FieldError]:
     """Why a body's warm start cannot be used: no such run, or one of another model."""
     if reference in (None, PREVIOUS):
         return []
     try:
-        run = references.run_of(session, str(reference), POINTER)
+        run = references.run_of(session, str(reference), pointer)
     except InvalidRequest as error:
         return list(error.errors)
-    return [FieldError(POINTER, text) for text in [_of_another_model(run, model)] if text]
+    return [FieldError(pointer, text) for text in [_of_another_model(run, model)] if text]
 
 
 def resolved(session: Session, reference: str | None) -> str | None:

@@ -4,12 +4,13 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Response, status
 
-from service import jobs, runs, summaries
+from service import jobs, runs, summaries, trends
 from service.api.deps import Cursor, Limit, PartsDep, ReadSession, WriteSession
 from service.schemas import Page
 from service.schemas_jobs import JobIn, JobOut
 from service.schemas_runs import RunOut
 from service.schemas_summaries import SummaryOut
+from service.schemas_trends import TrendOut
 from service.storage.jobs import JobRepository
 from service.storage.runs import RunOrder
 from service.storage.tables import Job, State
@@ -58,9 +59,9 @@ def cancel(job_id: str, session: WriteSession) -> JobOut:
 
 
 @router.post("/{job_id}:resume", status_code=status.HTTP_202_ACCEPTED)
-def resume(job_id: str, session: WriteSession, response: Response) -> JobOut:
+def resume(job_id: str, parts: PartsDep, session: WriteSession, response: Response) -> JobOut:
     """Queue a failed or cancelled job again; it goes on from its last checkpoints."""
-    return _accepted(JobRepository(session).resume(job_id), response)
+    return _accepted(jobs.resume(session, job_id, parts.settings), response)
 
 
 @router.post("/{job_id}:clone", status_code=status.HTTP_202_ACCEPTED)
@@ -97,6 +98,12 @@ def summary(
 ) -> SummaryOut:
     """Quantiles, success rate and mean evaluations for each value of the chosen axes."""
     return summaries.summary(session, job_id, by)
+
+
+@router.get("/{job_id}/trend")
+def trend(job_id: str, session: ReadSession) -> TrendOut:
+    """Estimates over a label: the law, its band, predictions, outliers and drift."""
+    return trends.trend(session, job_id)
 
 
 def _accepted(job: Job, response: Response) -> JobOut:

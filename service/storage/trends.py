@@ -1,0 +1,57 @@
+"""What a trend reads of a job's runs: the parts of their results that it needs, no more."""
+
+from typing import Any, NamedTuple
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from service.storage.columns import Document
+from service.storage.tables import DEFAULT_PROJECT, Run, State
+
+PARTS = ("parameters", "onset_delays", "agreement", "warnings")
+
+
+class TrendRow(NamedTuple):
+    """One run that succeeded."""
+
+    id: str
+    number: int
+    cell: Document
+    labels: Document
+    evaluations: int
+    best_rms: float | None
+    parameters: list[Document]
+    onset_delays: list[Document]
+    agreement: Document
+    warnings: list[str]
+
+
+def trend_rows(
+    session: Session, job_id: str, limit: int, project_id: str = DEFAULT_PROJECT
+) -> list[TrendRow]:
+    """The runs of a job that succeeded, in the order of the sweep, at most `limit` of them."""
+    names = TrendRow._fields
+    columns = [
+        Run.result.expression[name] if name in PARTS else getattr(Run, name) for name in names
+    ]
+    query = (
+        select(*columns)
+        .where(Run.job_id == job_id, Run.project_id == project_id, Run.state == State.SUCCEEDED)
+        .order_by(Run.number).limit(limit)
+    )  # fmt: skip
+    empty: dict[str, Any] = {"agreement": {}}
+    found = []
+    for row in session.execute(query):
+        values = dict(zip(names, row, strict=True))
+        for name in PARTS:
+            values[name] = values[name] or empty.get(name, [])
+        found.append(TrendRow(**values))
+    return found
+
+
+def count_succeeded(session: Session, job_id: str, project_id: str = DEFAULT_PROJECT) -> int:
+    """How many runs of a job succeeded."""
+    query = select(func.count()).where(
+        Run.job_id == job_id, Run.project_id == project_id, Run.state == State.SUCCEEDED
+    )
+    return int(session.scalar(query) or 0)
