@@ -21,6 +21,7 @@ from service.dispatch.recording import Recorder
 from service.errors import Misconfigured
 from service.settings import Settings
 from service.storage import migrate
+from service.storage.admission import Admission
 from service.storage.errors import LeaseLost, StorageError
 from service.storage.objects import ObjectStore, open_store
 from service.storage.patience import patiently
@@ -43,22 +44,35 @@ BUSY_SECONDS = 0.1
 STEP_SECONDS = 0.05
 LEAVE_SECONDS = 5.0
 """What giving the jobs back may take once the parent or the workers are gone."""
-MAX_JOBS = 8
-"""Jobs in hand at a time; the others are left to other dispatchers."""
+MAX_JOBS = 64
+"""Jobs in hand at a time: they share the workers, and each is read as it is needed. As many again
+may come if they are short or urgent: a single identification does not wait for 64 sweeps."""
+SHORT_RUNS = 8
+"""A job of so many runs is short."""
 
 
 class Dispatcher:
     """Joins the queue, the workers and the records of several jobs at a time."""
 
-    def __init__(self, database: Database, store: ObjectStore, crew: Crew, leases: Leases) -> None:
+    def __init__(
+        self,
+        database: Database,
+        store: ObjectStore,
+        crew: Crew,
+        leases: Leases,
+        *,
+        project_cores: int | None = None,
+    ) -> None:
         self.stopping = threading.Event()
         self._database, self._store, self._crew = database, store, crew
         self._woken = threading.Event()
         self._woken.set()  # what was queued before is not heard of
         self._leases = leases
         # By lease: a job may come back under a new attempt while packs of the old one fly.
-        self._feeder: Feeder[Lease] = Feeder(crew)
+        self._feeder: Feeder[Lease] = Feeder(crew, project_cores=project_cores)
         self._recorders: dict[Lease, Recorder] = {}
+        self._priorities: dict[Lease, int] = {}
+        self._is_filling = False
         self._lost: set[Lease] = set()
         self._looked = 0.0
         self._waking = threading.Thread(target=self._listen, name="waker", daemon=True)
@@ -92,7 +106,8 @@ class Dispatcher:
             self._woken.clear()
             self._looked = time.monotonic()
             self._attend()
-        for lease in self._feeder.step(STEP_SECONDS if self._recorders else 0.0):
+        has_time = self._recorders and not self._is_filling
+        for lease in self._feeder.step(STEP_SECONDS if has_time else 0.0):
             self._end(lease)
         for recorder in self._kept():
             try:
@@ -101,17 +116,27 @@ class Dispatcher:
                 self._lose(recorder, error)
 
     def _attend(self) -> None:
-        signals = patiently(self._leases.look)
+        admission = self._admission()
+        signals = patiently(partial(self._leases.look, admission))
         for recorder in self._kept():
             lease = recorder.lease
             if self._leases.is_lost(lease):
                 self._lose(recorder, LeaseLost(lease.job_id, lease.attempt))
             elif lease.job_id in signals.to_cancel:
                 recorder.is_stopped = True
-        if signals.is_waiting and len(self._recorders) < MAX_JOBS:
-            claim = patiently(self._leases.claim)
+        self._is_filling = False
+        if signals.is_waiting and len(self._recorders) < 2 * MAX_JOBS:
+            claim = patiently(partial(self._leases.claim, admission))
             if claim is not None:
                 self._take(claim)
+                self._is_filling = True  # the next one in the next turn: rivals get some
+                self._woken.set()
+
+    def _admission(self) -> Admission | None:
+        """What may still come; None is everything."""
+        if len(self._recorders) < MAX_JOBS:
+            return None
+        return Admission(SHORT_RUNS, min(self._priorities.values()))
 
     def _kept(self) -> list[Recorder]:
         return [one for lease, one in self._recorders.items() if lease not in self._lost]
@@ -128,7 +153,11 @@ class Dispatcher:
         floors = patiently(partial(floors_for, self._database, claim, source))
         recorder = patiently(partial(Recorder, self._database, claim, source.save, floors))
         self._recorders[claim.lease] = recorder
-        self._feeder.add(claim.lease, source, recorder)
+        job = claim.job
+        self._priorities[claim.lease] = job.priority
+        self._feeder.add(
+            claim.lease, source, recorder, priority=job.priority, project=job.project_id
+        )
         _log.info("%s: %d runs, attempt %d", claim.job.id, claim.job.n_runs, claim.lease.attempt)
 
     def _lose(self, recorder: Recorder, error: LeaseLost) -> None:
@@ -139,6 +168,7 @@ class Dispatcher:
 
     def _end(self, lease: Lease) -> None:
         recorder = self._recorders.pop(lease)
+        del self._priorities[lease]
         if lease in self._lost:
             self._lost.discard(lease)
             return
@@ -193,7 +223,8 @@ def serve(settings: Settings) -> int:
     try:
         compiling.join()
         crew.warm()
-        dispatcher = Dispatcher(database, store, crew, Leases(database, settings.lease_seconds))
+        leases = Leases(database, settings.lease_seconds)
+        dispatcher = Dispatcher(database, store, crew, leases, project_cores=settings.project_cores)
         _stop_on_signals(dispatcher.stopping, crew)
         dispatcher.run()
     except ClusterLost as error:

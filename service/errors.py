@@ -8,6 +8,7 @@
     - UnsupportedMediaType   415  a body of a kind that is not read
     - UnsatisfiableRange     416  a byte range outside the content
     - InvalidRequest         422  the body or a query value cannot be used, with every fault
+    - TooMuchUnfinished      429  the project has as much queued and running as it may
     - Unavailable            503  a part the service needs is down
     - Misconfigured               the settings cannot be used (command line only)
     - ServiceDidNotStart          `lagid serve` ended or did not get ready (command line only)
@@ -128,6 +129,17 @@ class InvalidRequest(ServiceError):
     def at(cls, pointer: str, detail: str) -> "InvalidRequest":
         """A request with one fault."""
         return cls((FieldError(pointer, detail),))
+
+
+class TooMuchUnfinished(ServiceError):
+    """The project has as much queued and running as it may."""
+
+    status, kind, title = 429, "too-much-unfinished", "The project has too much unfinished work"
+
+    @property
+    def headers(self) -> Mapping[str, str]:
+        """When to try again, in seconds: work ends all the time."""
+        return {"Retry-After": "10"}
 
 
 class Unavailable(ServiceError):

@@ -9,10 +9,11 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.orm import Session
 
 from service.checks import JobChecker, value_faults
-from service.errors import FieldError, InvalidRequest
+from service.errors import FieldError, InvalidRequest, TooMuchUnfinished
 from service.schemas import Page
 from service.schemas_jobs import JobIn, JobOut, Progress, Seed, Sigma
 from service.settings import Settings
+from service.storage.admission import unfinished
 from service.storage.jobs import JobRepository, NewJob, Submission
 from service.storage.ledger import Cell as StoredCell
 from service.storage.ledger import add_runs
@@ -52,7 +53,7 @@ def submit(session: Session, body: JobIn, settings: Settings, key: str | None = 
     groups = steps_of(body, axes)
     checker = JobChecker(session)
     _check(checker, document, groups)
-    _check_trend(checker, body)
+    _check_trend(session, checker, body)
     spec = checker.resolved(document)
     new = NewJob(
         name=body.name or _name(checker, spec), spec=spec, n_runs=n_runs, priority=body.priority,
@@ -60,6 +61,7 @@ def submit(session: Session, body: JobIn, settings: Settings, key: str | None = 
     )  # fmt: skip
     submission = JobRepository(session).submit(new, key=key, request_hash=digest)
     if submission.is_new:
+        check_limits(session, submission.job, settings)
         cells = (_resolved(checker, spec, cell) for cell in expand(groups))
         add_runs(session, submission.job, _stored(spec, cells))
         lineage = LineageRepository(session)
@@ -67,6 +69,44 @@ def submit(session: Session, body: JobIn, settings: Settings, key: str | None = 
         kept = (spec["validation"] or {}).get("datasets") or []
         lineage.link(submission.job.id, kept, "validation")
     return submission
+
+
+def check_limits(session: Session, job: Job, settings: Settings) -> None:
+    """Refuse a job that was just queued if its project now has more unfinished than it may.
+
+    Raises
+    ------
+    TooMuchUnfinished
+        With the counts; the caller's transaction ends with it.
+    """
+    open_now = unfinished(session, job.project_id)
+    if open_now.jobs > settings.max_open_jobs:
+        raise TooMuchUnfinished(
+            f"{open_now.jobs - 1} jobs of the project wait or run, and at most "
+            f"{settings.max_open_jobs} may; submit this one when some have ended, or cancel some"
+        )
+    if open_now.runs > settings.max_open_runs:
+        left = job.n_runs - job.n_done
+        raise TooMuchUnfinished(
+            f"{open_now.runs - left} runs of the project are not done, and this job has {left} "
+            f"more; at most {settings.max_open_runs} may be open; submit it when some have ended, "
+            "or cancel some"
+        )
+
+
+def resume(session: Session, job_id: str, settings: Settings) -> Job:
+    """Queue a failed or cancelled job again.
+
+    Raises
+    ------
+    Conflict
+        If it is in another state.
+    TooMuchUnfinished
+        If its project has as much queued and running as it may.
+    """
+    job = JobRepository(session).resume(job_id)
+    check_limits(session, job, settings)
+    return job
 
 
 def clone(session: Session, job_id: str, settings: Settings) -> Job:
@@ -108,9 +148,9 @@ def _check(checker: JobChecker, document: dict[str, Any], groups: list[list[Step
         raise InvalidRequest(unique)
 
 
-def _check_trend(checker: JobChecker, body: JobIn) -> None:
+def _check_trend(session: Session, checker: JobChecker, body: JobIn) -> None:
     model = checker.model(body.model)
-    errors = list(trend_faults(body, None if isinstance(model, list) else model[0]))
+    errors = list(trend_faults(session, body, None if isinstance(model, list) else model[0]))
     if errors:
         raise InvalidRequest(errors)
 

@@ -27,6 +27,10 @@ class Settings(BaseSettings):
         None: API keys are off on loopback and required elsewhere.
     allow_open_host : bool
         Serve other hosts although this version has no API keys yet.
+    max_open_jobs, max_open_runs : int
+        What one project may have unfinished; a submission beyond it is refused with 429.
+    project_cores : int or None
+        Cores that the runs of one project may take of each dispatcher; None: all.
     lease_seconds : float
         How long a job stays with a dispatcher that is not heard of.
     data : Path or None
@@ -46,6 +50,9 @@ class Settings(BaseSettings):
     allow_open_host: bool = False
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
     max_runs_per_job: int = Field(default=100_000, ge=1)
+    max_open_jobs: int = Field(default=1000, ge=1)
+    max_open_runs: int = Field(default=1_000_000, ge=1)
+    project_cores: int | None = Field(default=None, ge=1)
     lease_seconds: float = Field(default=10.0, gt=0)
     max_attempts: int = Field(default=3, ge=1)
     poll_seconds: float = Field(default=0.3, gt=0)

@@ -1,6 +1,6 @@
 """Who has the next place at the workers: jobs of several projects share them.
 
-The rules, in this order (`docs/decisions/0015-who-goes-next.md`):
+The rules, in this order (`docs/decisions/0017-who-goes-next.md`):
 
 1. A higher priority goes first.
 2. A job's first `HEADSTART_SECONDS` of compute go before the work of those that had theirs, so a

@@ -13,6 +13,7 @@ from functools import partial
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.reaping import identity, reap
+from service.storage.admission import Admission
 from service.storage.columns import Document, utc_now
 from service.storage.dispatchers import DispatcherRepository
 from service.storage.errors import LeaseLost
@@ -69,20 +70,20 @@ class Leases:
             DispatcherRepository(session, self._clock).announce(self.owner, details)
         reap(self._database, self._length, self._clock)
 
-    def claim(self) -> Claim | None:
-        """Take the next job, if one waits."""
+    def claim(self, admission: Admission | None = None) -> Claim | None:
+        """Take the next job that `admission` lets in, if one waits."""
         begun = self._stopwatch()
         with self._database.write() as session:
-            claim = Queue(session, self._clock).claim(self.owner, self._length)
+            claim = Queue(session, self._clock).claim(self.owner, self._length, admission)
         if claim is not None:
             with self._lock:
                 self._held[claim.lease] = begun
         return claim
 
-    def look(self) -> Signals:
-        """Whether a job waits, and which of ours are to be cancelled."""
+    def look(self, admission: Admission | None = None) -> Signals:
+        """Whether a job waits that `admission` lets in, and which of ours are to be cancelled."""
         with self._database.read() as session:
-            return look(session, self.owner)
+            return look(session, self.owner, admission)
 
     def is_lost(self, lease: Lease) -> bool:
         """Whether the lease is known to be lost, or was not renewed in time."""

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, and_, case, exists, false, func, or_, select, update
+from sqlalchemy import ColumnElement, and_, case, exists, false, func, or_, select, true, update
 from sqlalchemy.orm import Session, aliased
 
+from service.storage.admission import Admission, in_hand
 from service.storage.columns import Document, utc_now
 from service.storage.errors import Conflict, LeaseLost
 from service.storage.events import EventKind, EventRepository
@@ -85,13 +86,20 @@ class Queue:
         self._session, self._clock = session, clock
         self._events = EventRepository(session)
 
-    def claim(self, owner: str, lease: timedelta = LEASE) -> Claim | None:
-        """Take the first queued job: the highest priority, then the oldest. None if none waits."""
+    def claim(
+        self, owner: str, lease: timedelta = LEASE, admission: Admission | None = None
+    ) -> Claim | None:
+        """Take the first queued job that `admission` lets in; None if none waits.
+
+        First comes the highest priority, then the project that has fewest jobs running, then the
+        oldest.
+        """
         waiting = aliased(Job)
         first = (
             select(waiting.id)
             .where(waiting.state == State.QUEUED)
-            .order_by(waiting.priority.desc(), waiting.id)
+            .where(true() if admission is None else admission.holds(waiting))
+            .order_by(waiting.priority.desc(), in_hand(waiting.project_id), waiting.id)
             .limit(1)
             .with_for_update(skip_locked=True)  # rivals take the next one; SQLite has no rivals
         )

@@ -2,9 +2,10 @@
 
 from typing import NamedTuple
 
-from sqlalchemy import exists, select
+from sqlalchemy import exists, select, true
 from sqlalchemy.orm import Session
 
+from service.storage.admission import Admission
 from service.storage.tables import Job, State
 
 
@@ -15,9 +16,10 @@ class Signals(NamedTuple):
     to_cancel: frozenset[str]
 
 
-def look(session: Session, owner: str) -> Signals:
-    """What a dispatcher should attend to."""
-    waiting = session.scalar(select(exists().where(Job.state == State.QUEUED)))
+def look(session: Session, owner: str, admission: Admission | None = None) -> Signals:
+    """What a dispatcher should attend to: waiting jobs that `admission` lets in, and cancelled."""
+    admitted = true() if admission is None else admission.holds(Job)
+    waiting = session.scalar(select(exists().where(Job.state == State.QUEUED, admitted)))
     asked = select(Job.id).where(
         Job.lease_owner == owner, Job.state == State.RUNNING, Job.cancel_requested
     )

@@ -1,0 +1,52 @@
+"""Which jobs get in: those that a dispatcher takes, and those that a project may still submit."""
+
+from dataclasses import dataclass
+
+from sqlalchemy import ColumnElement, func, or_, select
+from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
+
+from service.storage.tables import OPEN, Job, State
+
+
+@dataclass(frozen=True, slots=True)
+class Admission:
+    """What a dispatcher that has its hands full still takes: short jobs, and more urgent ones.
+
+    Attributes
+    ----------
+    most_runs : int
+        A job of so many runs is short.
+    above : int
+        A job of a higher priority is urgent.
+    """
+
+    most_runs: int
+    above: int
+
+    def holds(self, job: type[Job]) -> ColumnElement[bool]:
+        """Condition that a row of `jobs` gets in."""
+        return or_(job.n_runs <= self.most_runs, job.priority > self.above)
+
+
+@dataclass(frozen=True, slots=True)
+class Unfinished:
+    """Jobs of a project that wait or run, and their runs that are not done."""
+
+    jobs: int
+    runs: int
+
+
+def unfinished(session: Session, project_id: str) -> Unfinished:
+    """What a project has queued or running."""
+    query = select(func.count(), func.coalesce(func.sum(Job.n_runs - Job.n_done), 0)).where(
+        Job.state.in_(OPEN), Job.project_id == project_id
+    )
+    jobs, runs = session.execute(query).one()
+    return Unfinished(int(jobs), int(runs))
+
+
+def in_hand(project_id: InstrumentedAttribute[str]) -> ColumnElement[int]:
+    """How many jobs of that project dispatchers have in hand: who has fewest goes first."""
+    mate = aliased(Job)
+    count = select(func.count()).where(mate.state == State.RUNNING, mate.project_id == project_id)
+    return count.scalar_subquery()

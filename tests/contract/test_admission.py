@@ -1,0 +1,62 @@
+"""Which waiting job is next, and how much a project may have unfinished; on both databases."""
+
+from service.storage.admission import Admission, Unfinished, unfinished
+from service.storage.jobs import JobRepository, NewJob
+from service.storage.queue import Queue
+from service.storage.tables import Project, State
+from service.storage.watch import look
+from tests.stored import claim, submit
+
+
+def submit_for(database, project, **values):
+    with database.write() as session:
+        if session.get(Project, project) is None:
+            session.add(Project(id=project, name=project))
+            session.flush()
+        new = NewJob(name="j", spec={"model": "tube"}, **values)
+        return JobRepository(session, project).submit(new).job.id
+
+
+def claim_within(database, admission):
+    with database.write() as session:
+        claimed = Queue(session).claim("d1", admission=admission)
+        return None if claimed is None else claimed.job.id
+
+
+def test_the_project_with_fewest_running_jobs_comes_first(database):
+    many = [submit_for(database, "many") for _ in range(3)]
+    one = submit_for(database, "one")
+    assert [claim(database).job.id for _ in range(4)] == [many[0], one, *many[1:]]
+
+
+def test_a_priority_comes_before_the_projects_turn(database):
+    ordinary, urgent = submit_for(database, "a"), submit_for(database, "b", priority=1)
+    more = submit_for(database, "b", priority=1)
+    assert [claim(database).job.id for _ in range(3)] == [urgent, more, ordinary]
+
+
+def test_a_full_dispatcher_sees_and_takes_only_short_or_urgent_jobs(database):
+    full = Admission(most_runs=8, above=3)
+    sweep = submit(database, n_runs=9, priority=3)
+    with database.read() as session:
+        assert not look(session, "d1", full).is_waiting
+        assert look(session, "d1").is_waiting
+    assert claim_within(database, full) is None
+    short, urgent = submit(database, n_runs=8), submit(database, n_runs=100_000, priority=4)
+    with database.read() as session:
+        assert look(session, "d1", full).is_waiting
+    assert [claim_within(database, full) for _ in range(3)] == [urgent, short, None]
+    assert claim_within(database, None) == sweep
+
+
+def test_unfinished_work_is_counted_by_project_and_only_while_it_is_open(database):
+    first = submit_for(database, "a", n_runs=10)
+    submit_for(database, "a", n_runs=5)
+    submit_for(database, "b", n_runs=7)
+    with database.read() as session:
+        assert unfinished(session, "a") == Unfinished(2, 15)
+        assert unfinished(session, "nobody") == Unfinished(0, 0)
+    with database.write() as session:
+        assert JobRepository(session, "a").cancel(first).state is State.CANCELLED
+    with database.read() as session:
+        assert unfinished(session, "a") == Unfinished(1, 5)
