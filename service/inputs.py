@@ -6,7 +6,7 @@ from math import pi
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.errors import InvalidRequest
+from service.errors import FieldError, InvalidRequest
 from service.recordings import recording_of
 from service.schemas_datasets import (
     BinaryInput,
@@ -20,6 +20,8 @@ from service.schemas_simulations import RunInputIn, SeriesInput
 from service.storage.datasets import DatasetRepository
 from service.storage.objects import ObjectStore
 from sysid.errors import InvalidRecord, SysidError
+from sysid.language.checker import check
+from sysid.language.scope import Scope
 from sysid.records import Channel, Hold
 from sysid.types import FloatArray
 from sysid.units import difference, factor, is_blank
@@ -173,6 +175,11 @@ def _evaluated(pointer: str, expression: str, times: FloatArray) -> FloatArray:
     from sysid.models.spec import parse_model
     from sysid.simulation import simulate as simulated
 
+    faults = check(expression, Scope("difference")).faults
+    if faults:
+        raise InvalidRequest(
+            FieldError(f"{pointer}/expression", one.detail, one.column) for one in faults
+        )
     document = {
         "name": "input", "form": "difference", "states": {"unused": "1"},
         "equations": {"unused": "0"}, "initial": {"unused": 0}, "outputs": {"value": expression},

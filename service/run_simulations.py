@@ -74,7 +74,7 @@ def simulate(
     with database.read() as session:
         asked = _asked(session, store, run_id, body)
     found = _closed(asked, body.control) if body.control else _open(asked)
-    check_finite(found.outputs, asked.times)
+    _check_finite(found, asked, body.control)
     reference = _sampled(asked.reference, asked.times)
     dataset = _stored(database, store, run_id, body, asked, found) if body.store else None
     return RunSimulationOut(
@@ -102,6 +102,7 @@ def _asked(session: Session, store: ObjectStore, run_id: str, body: RunSimulateI
     check_lags_at(model, body.parameters)
     period, notes = _period(session, model, body_of(job.spec, run.cell), body)
     times = np.arange(body.samples, dtype=np.float64) * period
+    _check_transport(body.control, float(times[-1]))
     signals = Signals(session, store, times)
     inputs = [
         signals.channel(f"/inputs/{one.name}", one.name, one.unit, body.inputs[one.name])
@@ -175,12 +176,15 @@ def _closed(asked: _Asked, control: ControlIn) -> _Simulated:
     from sysid.simulation import simulate as simulated
 
     transport = None if control.transport is None else Transport(**control.transport.model_dump())
+    solver = asked.model.solver
+    step = (solver.step or float(asked.times[1] - asked.times[0])) / solver.substeps
     try:
         loop = close_loop(
             asked.model,
             ProportionalControl(
                 control.input, control.output, control.gain, control.limit, transport
             ),
+            step,
         )
     except InvalidSettings as error:
         raise InvalidRequest.at(f"/control{error.pointer}", error.detail) from None
@@ -192,12 +196,27 @@ def _closed(asked: _Asked, control: ControlIn) -> _Simulated:
     inputs.append(found.channel(loop.input))
     notes = []
     if loop.steps_late:
-        step = (asked.times[1] - asked.times[0]) / loop.model.solver.substeps
         notes.append(
             f"the output answers at once, so the controller acts {step:.4g} s late, as a sampled "
             "one does"
         )
     return _Simulated(outputs, inputs, found.channel(loop.command), notes)
+
+
+def _check_finite(found: _Simulated, asked: _Asked, control: ControlIn | None) -> None:
+    """Refuse a simulation that diverges; of a loop the gain is to blame, not the parameters."""
+    try:
+        check_finite(found.outputs, asked.times)
+    except InvalidRequest as error:
+        if control is None:
+            raise
+        [fault] = error.errors
+        detail = fault.detail.removeprefix("with these values ").partition("; ")[0]
+        raise InvalidRequest.at(
+            "/control/gain",
+            f"found {control.gain:g}; with it the loop runs away: {detail}; choose a smaller "
+            "gain, a limit, or another sign",
+        ) from None
 
 
 def _sampled(channel: Channel | None, times: FloatArray) -> Channel | None:
@@ -227,8 +246,10 @@ def _metrics(
 
     return StepMetricsOut(
         output=output.name, unit=output.unit, rise_time=known(found.rise_time),
-        overshoot_percent=found.overshoot_percent, settling_time=known(found.settling_time),
-        band=found.band, steady_error=found.steady_error, final_value=found.final_value,
+        overshoot_percent=known(found.overshoot_percent),
+        settling_time=known(found.settling_time), band=found.band,
+        steady_error=known(found.steady_error), final_value=known(found.final_value),
+        runs_away=found.runs_away,
     )  # fmt: skip
 
 
@@ -266,9 +287,35 @@ def _parameter_faults(model: Model, values: Mapping[str, float]) -> Iterator[Fie
             yield FieldError(f"/parameters/{name}", detail)
 
 
+def _control_faults(model: Model, control: ControlIn) -> Iterator[FieldError]:
+    for role, name, signals in (
+        ("input", control.input, [one.name for one in model.inputs]),
+        ("output", control.output, [one.name for one in model.outputs]),
+    ):
+        if name not in signals:
+            detail = f"the model has no {role} {name!r}{nearest(name, signals)}"
+            yield FieldError(f"/control/{role}", detail)
+
+
+def _check_transport(control: ControlIn | None, duration: float) -> None:
+    if control is not None and control.transport is not None:
+        delay = control.transport.delay
+        if delay >= duration:
+            raise InvalidRequest.at(
+                "/control/transport/delay",
+                f"found {delay:g} s; the simulation lasts {duration:g} s, give more samples or a "
+                "shorter delay",
+            )
+
+
 def _input_faults(model: Model, body: RunSimulateIn) -> Iterator[FieldError]:
     known = [one.name for one in model.inputs]
     controlled = body.control.input if body.control else None
+    if body.control is not None:
+        found = list(_control_faults(model, body.control))
+        yield from found
+        if found:  # which inputs are still to be given is not known then
+            return
     for name in body.inputs:
         if name not in known:
             detail = f"the model has no input {name!r}{nearest(name, known)}"

@@ -85,17 +85,19 @@ class StepMetricsOut(Answer):
     """What the response to a step of the reference is judged by; null where it never happens.
 
     `settling_time` is when the output last enters `band` (2 % of the step) around its mean over
-    the last tenth of the record; `steady_error` is the reference minus that mean.
+    the last tenth of the record; `steady_error` is the reference minus that mean. Of a loop that
+    `runs_away`, which leaves the reference farther and farther behind, none of these is told.
     """
 
     output: str
     unit: str
     rise_time: float | None
-    overshoot_percent: float
+    overshoot_percent: float | None
     settling_time: float | None
     band: float
-    steady_error: float
-    final_value: float
+    steady_error: float | None
+    final_value: float | None
+    runs_away: bool = False
 
 
 class RunSimulationOut(Answer):

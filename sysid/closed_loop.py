@@ -11,7 +11,7 @@ it enters the plant (Asakura and Guo, Figure 21).
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from math import isfinite
+from math import floor, isfinite
 from typing import Any
 
 from sysid.errors import InvalidSettings, nearest
@@ -26,6 +26,7 @@ from sysid.models.spec import parse_model
 from sysid.parameters import Parameter
 
 _PERIOD = Symbol("h", "period")
+_ROUNDING = 1e-9  # of a step: a delay of so much less than a whole step is one
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,11 +113,20 @@ class ClosedLoop:
         return {self.renamed.get(name, name): value for name, value in values.items()}
 
 
-def close_loop(model: Model, control: ProportionalControl) -> ClosedLoop:
+def close_loop(
+    model: Model, control: ProportionalControl, period: float | None = None
+) -> ClosedLoop:
     """The model under proportional control.
 
     Behind a transport with a time constant the plant's input becomes a state. It starts at 0, or
     at the value that is given for ``u(0)`` if the input is called u.
+
+    Parameters
+    ----------
+    period : float or None
+        Step (s) at which a model in the difference form will be simulated. If it is known, a
+        transport's delay of a step or more is one: the controller need not act late. The loop
+        then holds for that step only.
 
     Raises
     ------
@@ -127,7 +137,7 @@ def close_loop(model: Model, control: ProportionalControl) -> ClosedLoop:
         If the closed loop is too long to be a model.
     """
     renamed = _renamed(model)
-    loop = _Loop(_called(model, renamed), control)
+    loop = _Loop(_called(model, renamed), control, period)
     document = loop.differential() if model.form == "differential" else loop.difference()
     closed = parse_model(document)
     return ClosedLoop(closed, loop.reference, control.input, loop.command, loop.steps_late, renamed)
@@ -136,8 +146,8 @@ def close_loop(model: Model, control: ProportionalControl) -> ClosedLoop:
 class _Loop:
     """A model and its controller, on the way to the document of the closed loop."""
 
-    def __init__(self, model: Model, control: ProportionalControl) -> None:
-        self.model, self.control = model, control
+    def __init__(self, model: Model, control: ProportionalControl, period: float | None) -> None:
+        self.model, self.control, self.period = model, control, period
         self.transport = control.transport or Transport()
         self.clock = "t" if model.form == "differential" else "k"
         self.output = _named(model.outputs, control.output, "output")
@@ -147,6 +157,7 @@ class _Loop:
         self.reference = _free("reference", taken)
         self.command = _free("command", taken)
         self.steps_late = 0
+        self.steps, self.delay = 0, self._delay()
 
     def differential(self) -> dict[str, Any]:
         """Document of a closed loop in the differential form."""
@@ -171,8 +182,26 @@ class _Loop:
             drive = text(self._given(1, lag))
             before = f"{self.input.name}(k-1)"
             return self._document(f"{drive} + {kept}*({before} - ({drive}))", None)
-        self.steps_late = int(self._is_circular())
+        if self._is_circular():
+            self.steps, self.delay = self._whole_steps()
+            self.steps_late = int(self.steps == 0)
         return self._document(None, self._fed_back)
+
+    def _delay(self) -> Expression:
+        """The transport's delay as a lag: in seconds, or in steps in the difference form."""
+        delay = Number(self.transport.delay)
+        return Binary("/", delay, _PERIOD) if self.clock == "k" else delay
+
+    def _whole_steps(self) -> tuple[int, Expression]:
+        """The transport's delay as whole steps and a rest, if a step or more is known to be in it.
+
+        Such a delay cuts the circle: the plant's input is one of an earlier sample.
+        """
+        if self.period is None:
+            return 0, self.delay
+        steps = self.transport.delay / self.period
+        whole = floor(steps + _ROUNDING)
+        return (whole, Number(max(steps - whole, 0.0))) if whole else (0, self.delay)
 
     def _given(self, steps: int, lag: Expression | None) -> Expression:
         """What leaves the transport but for its time constant, some steps and a lag ago."""
@@ -196,11 +225,9 @@ class _Loop:
         """The controller's signal where the plant reads its input."""
         match node:
             case Past(self.input.name, "input", offset, own):
-                delay: Expression = Number(self.transport.delay)
-                if self.clock == "k":
-                    delay = Binary("/", delay, _PERIOD)
+                delay = self.delay
                 lag = own if _is_zero(delay) else delay if own is None else Binary("+", delay, own)
-                return self._given(offset + self.steps_late, lag)
+                return self._given(offset + self.steps + self.steps_late, lag)
             case _:
                 return None
 

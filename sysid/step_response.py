@@ -11,6 +11,7 @@ from sysid.types import FloatArray
 _RISE = (0.1, 0.9)
 _BAND = 0.02
 _TAIL = 0.1
+_END, _GROWTH = 0.25, 1.03  # a limit cycle's peaks differ by less, by where the samples lie
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +32,10 @@ class StepMetrics:
         Reference minus that mean, in the unit of the output.
     final_value : float
         That mean.
+    runs_away : bool
+        The output is not finite, or farther from the reference in the last quarter of the record
+        than ever before: the loop is unstable, and there is no overshoot, settling time or final
+        value; they are ``nan``.
     """
 
     rise_time: float
@@ -39,6 +44,7 @@ class StepMetrics:
     band: float
     steady_error: float
     final_value: float
+    runs_away: bool = False
 
 
 def step_metrics(
@@ -67,11 +73,13 @@ def step_metrics(
     if height == 0:
         raise InvalidRecord(f"the reference does not change at {at:g} s")
     t, y = times[later] - at, values[later]
-    tail = t >= t[-1] - _TAIL * (t[-1] - t[0])
-    final = float(np.mean(y[tail]))
     way = (y - before) / height
     low, high = (_first_passing(t, way, level) for level in _RISE)
     band = _BAND * abs(height)
+    if _runs_away(t, np.abs(y - after), abs(height)):
+        return StepMetrics(high - low, nan, nan, band, nan, nan, runs_away=True)
+    tail = t >= t[-1] - _TAIL * (t[-1] - t[0])
+    final = float(np.mean(y[tail]))
     return StepMetrics(
         rise_time=high - low,
         overshoot_percent=100.0 * max(float(np.max(way)) - 1.0, 0.0),
@@ -80,6 +88,17 @@ def step_metrics(
         steady_error=after - final,
         final_value=final,
     )
+
+
+def _runs_away(t: FloatArray, away: FloatArray, height: float) -> bool:
+    """Whether the output is not finite, or leaves the reference farther and farther behind."""
+    if not np.all(np.isfinite(away)):
+        return True
+    late = t > t[-1] - _END * (t[-1] - t[0])
+    if late.all():
+        return False
+    before = max(float(np.max(away[~late])), height)
+    return float(np.max(away[late])) > _GROWTH * before
 
 
 def _first_passing(t: FloatArray, way: FloatArray, level: float) -> float:

@@ -142,6 +142,13 @@ def compare(
 def _print_step(metrics: dict[str, Any] | None) -> None:
     if metrics is None:
         return
+    if metrics["runs_away"]:
+        out.print(
+            f"the loop runs away: at the end {metrics['output']} is farther from the "
+            "reference than ever before; choose a smaller gain",
+            markup=False,
+        )
+        return
     told = (
         ("rise time (10 to 90 %)", metrics["rise_time"], "s"),
         ("overshoot", metrics["overshoot_percent"], "%"),

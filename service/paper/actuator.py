@@ -134,6 +134,8 @@ def _cell(found: Found, name: str) -> str:
 def _step_table(steps: Mapping[str, Any], exact: Mapping[str, Any]) -> Table:
     def row(name: str, answer: Mapping[str, Any]) -> list[str]:
         found = answer["metrics"]
+        if found["runs_away"]:
+            return [name, _seconds(found["rise_time"]), "runs away", "", ""]
         return [
             name, _seconds(found["rise_time"]), f"{found['overshoot_percent']:.1f}",
             _seconds(found["settling_time"]), f"{_degrees(found['steady_error']):.2f}",

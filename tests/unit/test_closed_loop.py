@@ -21,7 +21,7 @@ ACTUATOR = {
     "A_m": 5.0e-6, "B": 1.0e-3, "theta_s": 0.75 * pi, "theta(0)": 0.0,
 }  # fmt: skip
 TUBE = Transport(1.0, 0.35, 0.127)
-TIMES = 0.01 * np.arange(601)
+TIMES: FloatArray = 0.01 * np.arange(601.0)
 
 
 def stepped(height: float, unit: str = "rad") -> Channel:
@@ -124,6 +124,33 @@ def test_a_recursion_that_answers_at_once_has_a_controller_one_step_late() -> No
     np.testing.assert_allclose(first.channel("y").values[1:], expected[1:], rtol=1e-12)
 
 
+DIRECT = {"name": "d", "form": "difference", "inputs": {"u": "V"}, "states": {"x": "m"},
+          "equations": {"x": "0.5*x(k-1) + 0.4*u"}, "outputs": {"y": "x"}}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("delay", "steps_late", "back"),
+    [(0.03, 0, 3), (0.01, 0, 1), (0.005, 1, 1.5), (0.025, 0, 2.5), (0.0, 1, 1)],
+)
+def test_a_delay_of_a_step_or_more_is_no_circle(delay: float, steps_late: int, back: float) -> None:
+    control = ProportionalControl("u", "y", 0.9, None, Transport(1.0, 0.0, delay))
+    loop = close_loop(parse_model(DIRECT), control, 0.01)
+    assert loop.steps_late == steps_late
+    found = simulate(loop.model, [stepped(1.0, "m")], {}, times=TIMES).channel("y").values
+    x = np.zeros(TIMES.size)
+    grid = np.arange(TIMES.size)
+    for k in range(1, TIMES.size):  # the command between samples is on a straight line
+        command = 0.9 * (np.where(grid >= 0, 1.0, 0.0) - x)
+        entered = np.interp(k - back, grid, command) if k >= back else 0.0
+        x[k] = 0.5 * x[k - 1] + 0.4 * entered
+    np.testing.assert_allclose(found[5:], x[5:], rtol=0.02, atol=2e-3)
+
+
+def test_a_delay_whose_step_is_not_known_is_taken_for_less_than_one() -> None:
+    control = ProportionalControl("u", "y", 0.9, None, Transport(1.0, 0.0, 0.03))
+    assert close_loop(parse_model(DIRECT), control).steps_late == 1
+
+
 def test_a_polynomial_can_be_controlled() -> None:
     narx = parse_model({
         "name": "n", "form": "polynomial", "output": "y", "inputs": {"u": "V"}, "degree": 1,
@@ -188,6 +215,22 @@ def test_metrics_of_a_second_order_step_are_those_of_its_formula() -> None:
     assert found.rise_time == pytest.approx(
         float(np.interp(0.9, way[:1000], times[:1000]) - np.interp(0.1, way[:1000], times[:1000]))
     )
+
+
+def test_a_response_that_grows_or_is_not_finite_runs_away() -> None:
+    swing: FloatArray = np.exp(0.5 * TIMES) * np.sin(8 * TIMES)
+    for values in (1 + swing, np.where(TIMES < 3, swing, np.inf), -0.1 * TIMES):
+        found = step_metrics(TIMES, values, at=0.0, before=0.0, after=1.0)
+        assert found.runs_away
+        assert np.isnan([found.overshoot_percent, found.settling_time, found.final_value]).all()
+
+
+@pytest.mark.parametrize("rate", [-0.5, 0.0])
+def test_a_swing_that_stays_or_decays_does_not_run_away(rate: float) -> None:
+    values = 1 + 1.2 * np.exp(rate * TIMES) * np.cos(8 * TIMES)
+    found = step_metrics(TIMES, values, at=0.0, before=0.0, after=1.0)
+    assert not found.runs_away
+    assert found.overshoot_percent > 100
 
 
 def test_metrics_need_a_step_that_was_recorded() -> None:

@@ -146,7 +146,12 @@ def test_a_stored_simulation_is_a_dataset_that_knows_its_run_and_is_made_once(
 @pytest.mark.parametrize(
     ("change", "pointer", "part"),
     [
-        ({"control": {**CONTROL, "input": "P"}}, "/inputs/P_a", "or close the loop"),
+        ({"control": {**CONTROL, "input": "P"}}, "/control/input",
+         "no input 'P'; known are P_a"),
+        ({"control": {**CONTROL, "reference": {"kind": "expression", "expression": "foo(t)"}}},
+         "/control/reference/expression", "tanh, where"),
+        ({"control": {**CONTROL, "reference": {"kind": "expression", "expression": "q*t"}}},
+         "/control/reference/expression", "known are h, k, pi, t"),
         ({"control": {**CONTROL, "output": "theta_"}}, "/control/output", "did you mean 'theta'"),
         ({"control": {**CONTROL, "limit": 0}}, "/control/limit", "greater than 0"),
         ({"control": {**CONTROL, "transport": {"delay": -1}}}, "/control/transport/delay", "0"),
@@ -158,7 +163,8 @@ def test_a_stored_simulation_is_a_dataset_that_knows_its_run_and_is_made_once(
         ({"parameters": {"Fc": 1.0}}, "/parameters/Fc", "did you mean 'F_c'"),
         ({"samples": 1}, "/samples", "2"),
         ({"samples": 2_000_000}, "/samples", "1000000"),
-        ({"control": {**CONTROL, "transport": {"delay": 7}}}, "", "lag"),
+        ({"control": {**CONTROL, "transport": {"delay": 7}}}, "/control/transport/delay",
+         "found 7 s; the simulation lasts 6 s"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_simulated_is_told_where_it_is(
@@ -182,7 +188,31 @@ def test_a_simulation_that_diverges_is_told_with_its_time(served: Served) -> Non
     body = {"control": control, "samples": 201, "parameters": {"L": 0.5}}
     faults = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
                      "invalid")  # fmt: skip
+    assert faults[0]["pointer"] == "/control/gain"
+    assert "found 1e+30; with it the loop runs away" in faults[0]["detail"]
     assert "diverges at t =" in faults[0]["detail"]
+
+
+def test_a_loop_that_runs_away_has_no_overshoot(served: Served) -> None:
+    control = {"input": "u", "output": "y", "gain": 6.0, "reference": STEP}
+    body = {"samples": 201, "parameters": {"K": 2.0, "T": 1.0, "L": 0.5, "y0": 0.0}}
+    metrics = simulated(served, served.lag, {**body, "control": control})["metrics"]
+    assert metrics["runs_away"] is True
+    assert metrics["overshoot_percent"] is metrics["settling_time"] is metrics["steady_error"]
+    assert metrics["overshoot_percent"] is None
+    calm = {**control, "gain": 0.2}
+    metrics = simulated(served, served.lag, {**body, "control": calm})["metrics"]
+    assert metrics["runs_away"] is False
+    assert metrics["overshoot_percent"] is not None
+
+
+def test_no_name_of_our_own_is_suggested_in_an_expression(served: Served) -> None:
+    wave = {"kind": "expression", "expression": "foo(t) + q"}
+    body = {"inputs": {"u": wave}, "samples": 20}
+    faults = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
+                     "invalid")  # fmt: skip
+    assert [fault["column"] for fault in faults] == [1, 10]
+    assert not any("unused" in fault["detail"] for fault in faults)
 
 
 def test_the_client_simulates_a_run(served: Served) -> None:
