@@ -21,7 +21,7 @@ def limited(tmp_path: Path) -> Iterator[TestClient]:
 
 
 def body(runs: int = 1) -> dict[str, Any]:
-    sweep = {"axes": [{"path": "/seed", "range": [1, runs]}]}
+    sweep = {"axes": [{"path": "/seed", "range": [0, runs]}]}
     return {"model": "fopdt", "datasets": ["steps"], "sweep": sweep}
 
 
