@@ -8,13 +8,15 @@ leaves A/J and B/J.
 The powers are found as in dimensional analysis. Every expression gets a weight, the power of r by
 which it is multiplied; the terms of a sum must have equal weights, what a function such as sin is
 taken of has weight 0, and so have inputs, outputs, time, lags, and both sides of a power whose
-exponent is no plain number. These are linear equations with
-rational coefficients, and they are solved exactly.
+exponent is to be estimated. These are linear equations with rational coefficients, and they are
+solved exactly; the exponent of a power is a number such as 2, 1/3 or a fixed parameter.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import lru_cache
+from math import isfinite, nan
+from operator import add, mul, sub, truediv
 
 import numpy as np
 
@@ -23,6 +25,11 @@ from sysid.models.initial import initial_name
 from sysid.models.model import EstimatedInitial, FixedInitial, Initial, MeasuredInitial, Model
 from sysid.parameters import Parameter
 from sysid.types import FloatArray
+
+_ARITHMETIC: Mapping[str, Callable[[Fraction, Fraction], Fraction]] = {
+    "+": add, "-": sub, "*": mul, "/": truediv,
+}  # fmt: skip
+_DENOMINATOR, _MEANT = 1000, 1e-14
 
 Weight = Mapping[str, Fraction]
 """Coefficients of a linear form in the powers of parameters and states; empty: weight 0."""
@@ -56,9 +63,10 @@ def _scalings(
     """The same, kept for the many runs of one model; not to be written to."""
     free = [p.name for p in parameters if p.is_free]
     walk = _Weights(
-        {p.name for p in parameters if not p.is_free and p.fixed != 0.0},
+        {p.name: nan if p.fixed is None else p.fixed for p in parameters
+         if not p.is_free and p.fixed != 0.0},
         {p.name for p in parameters if p.fixed == 0.0},
-    )
+    )  # fmt: skip
     for state, equation in zip(states, equations, strict=True):
         walk.equal({state: Fraction(1)}, walk.of(equation))
     for output in outputs:
@@ -95,7 +103,7 @@ class _Weights:
     The weight of what is 0 is None: it has every weight.
     """
 
-    def __init__(self, known: set[str], zero: set[str]) -> None:
+    def __init__(self, known: Mapping[str, float], zero: set[str]) -> None:
         self._known, self._zero = known, zero
         self.equations: list[Weight] = []
 
@@ -152,15 +160,11 @@ class _Weights:
     def _power(
         self, base: Weight | None, exponent: Expression, weight: Weight | None
     ) -> Weight | None:
-        """Of a power; one whose exponent is no plain number pins the base and the exponent."""
-        match exponent:
-            case Number(value):
-                power = Fraction(value).limit_denominator(1000)
-            case Unary("-", Number(value)):
-                power = -Fraction(value).limit_denominator(1000)
-            case _:
-                self.equal({}, weight)
-                return self._pure(base)
+        """Of a power; one whose exponent is not known pins the base and the exponent."""
+        power = _worth(exponent, self._known)
+        if power is None:
+            self.equal({}, weight)
+            return self._pure(base)
         if base is None:
             return None if power > 0 else {}
         return {name: power * share for name, share in base.items() if power}
@@ -181,6 +185,31 @@ class _Weights:
     def _pure(self, argument: Weight | None) -> Weight:
         self.equal({}, argument)
         return {}
+
+
+def _worth(tree: Expression, known: Mapping[str, float]) -> Fraction | None:
+    """What an expression of numbers and fixed parameters is worth; None if it is no number."""
+    match tree:
+        case Number(value):
+            return _fraction(value)
+        case Symbol(name, "parameter") if isfinite(known.get(name, nan)):
+            return _fraction(known[name])
+        case Unary("-", operand):
+            inside = _worth(operand, known)
+            return None if inside is None else -inside
+        case Binary(operator, left, right) if operator in _ARITHMETIC:
+            a, b = _worth(left, known), _worth(right, known)
+            if a is None or b is None or (operator == "/" and b == 0):
+                return None
+            return _ARITHMETIC[operator](a, b)
+        case _:
+            return None
+
+
+def _fraction(value: float) -> Fraction:
+    """A number as it was meant: 0.1 and 0.3333333333333333 as 1/10 and 1/3, others as they are."""
+    near = Fraction(value).limit_denominator(_DENOMINATOR)
+    return near if abs(float(near) - value) <= _MEANT * abs(value) else Fraction(value)
 
 
 def _sum(a: Weight, b: Weight, sign: int) -> Weight:

@@ -101,6 +101,11 @@ def test_a_scaling_of_a_model_of_the_catalogue_leaves_its_outputs(
         ("a*u*atan(b*c) - z", 2),
         ("u(t - a*b/40) - c*z", 1),
         ("a*u - b*abs(z)**c", 0),
+        ("a*u - b*abs(z)**(1/3)", 1),
+        ("a*u - b*abs(z)**-(2/3 - 1)", 1),
+        ("a*u - b*abs(z)**0.123456789", 1),
+        ("a*u - b*abs(z)**(2*0.25/(1 + 1/5))", 1),
+        ("a*u - b*abs(z)**(1/(2 - 2*1))", 0),
     ],
 )
 def test_scalings_of_an_equation_of_a_hidden_state(equation: str, count: int) -> None:
@@ -119,3 +124,22 @@ def test_scalings_of_an_equation_of_a_hidden_state(equation: str, count: int) ->
     truth = {"a": 0.7, "b": 1.3, "c": 0.4, "d": 1.1}
     values = {one: truth[one] for one in names} | {"z(0)": 0.5}
     assert checked(model, values, (u,), times) == count
+
+
+def test_a_fixed_exponent_hides_the_scaling_no_more_than_a_number_does() -> None:
+    model = parse_model(
+        {
+            "name": "test", "form": "differential", "inputs": {"u": "V"},
+            "states": {"z": "m", "y": "m"},
+            "parameters": {one: {"lower": 0.1, "upper": 4} for one in "abd"}
+            | {"n": {"lower": 0.1, "upper": 4, "fixed": 0.37}},
+            "equations": {"z": "a*u - b*abs(z)**n", "y": "d*z - y"}, "outputs": {"y": "y"},
+            "initial": {"z": {"lower": 0, "upper": 2}, "y": 0},
+        }
+    )  # fmt: skip
+    times: FloatArray = 0.05 * np.arange(60, dtype=np.float64)
+    u = Channel("u", times, 1.5 + np.sin(times), "V", "first")
+    values = {"a": 0.7, "b": 1.3, "d": 1.1, "n": 0.37, "z(0)": 0.5}
+    assert checked(model, values, (u,), times) == 1
+    free = replace(model, parameters=tuple(replace(p, fixed=None) for p in model.parameters))
+    assert checked(free, values, (u,), times) == 0
