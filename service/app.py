@@ -19,6 +19,7 @@ from service.api import (
     pages,
     problems,
     references,
+    reidentify,
     runs,
 )
 from service.api.deps import Parts
@@ -54,7 +55,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     problems.install(app)
     # Exact REST paths come first: a page's path may have parameters.
     for module in (
-        health, datasets, models, jobs, noise, references, events, comparison, runs, pages,
+        health, datasets, models, jobs, noise, reidentify, references, events, comparison, runs,
+        pages,
     ):  # fmt: skip
         app.include_router(module.router)
     return app

@@ -81,6 +81,12 @@ class AsyncClient:
         headers = {"Idempotency-Key": idempotency_key} if idempotency_key else {}
         return await self._json(calls.create("jobs", job, headers))
 
+    async def reidentify(
+        self, body: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a batch re-identification: a run for each value of a label, with a trend."""
+        return await self._json(calls.reidentify(body, idempotency_key))
+
     async def noise_sweep(
         self, body: Mapping[str, Any], *, idempotency_key: str | None = None
     ) -> Document:
@@ -130,6 +136,24 @@ class AsyncClient:
         """Quantiles over the values of axes or labels; by default over all axes but seeds."""
         chosen = None if by is None else list(by)
         return await self._json(calls.read("jobs", job, "summary", by=chosen))
+
+    async def trend(self, job: str) -> Document:
+        """Estimates over the label of a batch: law, band, predictions, outliers, drift."""
+        return await self._json(calls.read("jobs", job, "trend"))
+
+    async def references(self) -> list[Document]:
+        """The references in use, by name."""
+        return list((await self._json(calls.read("references")))["items"])
+
+    async def reference(self, name: str) -> Document:
+        """One reference with its history."""
+        return await self._json(calls.read("references", name))
+
+    async def accept_reference(
+        self, name: str, run: str, *, by: str | None = None, note: str | None = None
+    ) -> Document:
+        """Make a run the reference of a name; the one before stays in the history."""
+        return await self._json(calls.accept(name, run, by, note))
 
     async def run(self, name: str) -> Document:
         """One run's result."""

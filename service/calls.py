@@ -148,6 +148,16 @@ def noise_sweep(body: Mapping[str, Any], key: str | None) -> Call:
     return create("recipes/noise-sweep", body, {"Idempotency-Key": key} if key else {})
 
 
+def reidentify(body: Mapping[str, Any], key: str | None) -> Call:
+    """POST of a batch re-identification; the same idempotency key again gives the same job."""
+    return create("recipes/reidentify", body, {"Idempotency-Key": key} if key else {})
+
+
+def accept(name: str, run: str, by: str | None, note: str | None) -> Call:
+    """PUT of a run as the reference of a name."""
+    return Call("PUT", f"/v1/references/{_quoted(name)}", json={"run": run, "by": by, "note": note})
+
+
 def upload(
     source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
 ) -> Call:

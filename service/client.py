@@ -173,6 +173,12 @@ class Client:
         """Queue a noise sweep: σ × replicates × methods as one job."""
         return self._json(calls.noise_sweep(body, idempotency_key))
 
+    def reidentify(
+        self, body: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a batch re-identification: a run for each value of a label, with a trend."""
+        return self._json(calls.reidentify(body, idempotency_key))
+
     def jobs(self, limit: int | None = None) -> list[Document]:
         """Jobs, newest first: all, or at most `limit`."""
         return self._all("jobs", at_most=limit)
@@ -233,6 +239,10 @@ class Client:
         """Quantiles over the values of axes or labels; by default over all axes but seeds."""
         return self._json(calls.read("jobs", job, "summary", by=None if by is None else list(by)))
 
+    def trend(self, job: str) -> Document:
+        """Estimates over the label of a batch: law, band, predictions, outliers, drift."""
+        return self._json(calls.read("jobs", job, "trend"))
+
     def run(self, name: str) -> Document:
         """One run's result."""
         return self._json(calls.read("runs", name))
@@ -269,3 +279,18 @@ class Client:
     def compare(self, *runs: str) -> Document:
         """Runs on the same data side by side, the best first."""
         return self._json(calls.create("runs:compare", {"runs": runs}))
+
+    # ---- references
+    def references(self) -> list[Document]:
+        """The references in use, by name."""
+        return list(self._json(calls.read("references"))["items"])
+
+    def reference(self, name: str) -> Document:
+        """One reference with its history."""
+        return self._json(calls.read("references", name))
+
+    def accept_reference(
+        self, name: str, run: str, *, by: str | None = None, note: str | None = None
+    ) -> Document:
+        """Make a run the reference of a name; the one before stays in the history."""
+        return self._json(calls.accept(name, run, by, note))

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 # Fields of a job body that mean nothing in one process, and what does their work here.
 ELSEWHERE = {
     "sweep": "a sweep needs a server: lagid submit job.yaml",
+    "trend": "a trend needs a server: lagid reidentify",
+    "warm_start": "a warm start needs a server: lagid submit job.yaml",
     "datasets": "name the recording as DATA",
     "model": "use --model",
     "validation.datasets": "use --validation FILE",

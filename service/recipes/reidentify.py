@@ -1,0 +1,96 @@
+"""Batch re-identification: one run for each value of a label, warm-started, with a trend."""
+
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service import jobs
+from service.errors import FieldError, InvalidRequest
+from service.schemas_jobs import PREVIOUS, REFERENCE, JobIn
+from service.schemas_reidentify import ReidentifyIn
+from service.settings import Settings
+from service.storage.jobs import Submission
+
+FIRST_AXIS = "/sweep/axes/0"
+
+
+def submit(
+    session: Session, body: ReidentifyIn, settings: Settings, key: str | None = None
+) -> Submission:
+    """Queue the batch as an ordinary job.
+
+    Raises
+    ------
+    InvalidRequest
+        With every fault that can be known before the job runs, at its place in this body.
+    KeyReused
+        If the idempotency key was used with another body.
+    """
+    if body.warm_start == "reference" and body.reference is None:
+        raise InvalidRequest.at("/warm_start", "'reference' needs one: give \"reference\"")
+    order = sorted(range(len(body.batch)), key=lambda number: body.batch[number].x)
+    try:
+        return jobs.submit(session, job_of(body, order), settings, key)
+    except InvalidRequest as error:
+        raise InvalidRequest(_at_home(one, order) for one in error.errors) from None
+
+
+def job_of(body: ReidentifyIn, order: list[int]) -> JobIn:
+    """The job, its cells in the order of x: neighbours begin where their neighbours ended."""
+    chosen = [body.batch[number] for number in order]
+    axis = {
+        "path": "/datasets",
+        "values": [one.datasets for one in chosen],
+        "labels": [{body.label: one.x} for one in chosen],
+    }
+    reference = _reference(body.reference)
+    trend = {
+        "x": body.label, "parameters": body.look_at, "predict": body.predict,
+        "reference": reference,
+    }  # fmt: skip
+    model = body.model["name"] if isinstance(body.model, dict) and "name" in body.model else "model"
+    name = body.model if isinstance(body.model, str) else model
+    return JobIn.model_validate({
+        "name": f"{name} over {body.label}"[:200],
+        **body.shared,
+        "datasets": chosen[0].datasets,
+        "sweep": {"axes": [axis]},
+        "warm_start": _warm_start(body, reference),
+        "trend": trend,
+    })  # fmt: skip
+
+
+def _reference(given: str | None) -> str | None:
+    """As a job names it: runs by their id, all else is the name of an accepted reference."""
+    if given is None or given.startswith(("run_", REFERENCE)):
+        return given
+    return REFERENCE + given
+
+
+def _warm_start(body: ReidentifyIn, reference: str | None) -> str | None:
+    wanted = body.warm_start or ("previous" if reference is None else "reference")
+    if wanted == "reference":
+        return reference
+    return PREVIOUS if wanted == "previous" and len(body.batch) > 1 else None
+
+
+def _at_home(error: FieldError, order: list[int]) -> FieldError:
+    """The fault of the job at the place of this body that it comes from."""
+    return FieldError(_place(error.pointer, order), error.detail, error.column)
+
+
+def _place(pointer: str, order: list[int]) -> str:
+    parts: list[Any] = pointer.split("/")
+    if pointer.startswith(f"{FIRST_AXIS}/values/"):
+        return f"/batch/{order[int(parts[5])]}/datasets"
+    if pointer.startswith(f"{FIRST_AXIS}/labels/"):
+        return "/label"
+    if pointer.startswith("/datasets"):
+        return "/".join([f"/batch/{order[0]}", *parts[1:]])
+    for theirs, ours in (
+        ("/trend/parameters", "/look_at"), ("/trend/reference", "/reference"),
+        ("/trend/predict", "/predict"), ("/trend/x", "/label"), ("/warm_start", "/reference"),
+    ):  # fmt: skip
+        if pointer.startswith(theirs):
+            return ours + pointer.removeprefix(theirs)
+    return pointer
