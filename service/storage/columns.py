@@ -1,6 +1,7 @@
 """Column types that mean the same on SQLite and on PostgreSQL."""
 
 import json
+import re
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any, TypeAlias
@@ -15,6 +16,9 @@ Document: TypeAlias = dict[str, Any]
 
 DocumentType = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql")
 """JSON text on SQLite, JSONB on PostgreSQL; None is NULL."""
+
+_ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+_SURROGATE = re.compile("[\ud800-\udfff]")
 
 LargeInteger = BigInteger().with_variant(Integer(), "sqlite")
 """64 bits on both: SQLite calls that INTEGER, and numbers rows by no other type."""
@@ -63,11 +67,12 @@ class Text(TypeDecorator[str]):
 def to_json(value: object) -> str:
     """JSON text of a document, refused where PostgreSQL would refuse or alter it."""
     try:
-        text = json.dumps(value, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+        text = _ENCODER.encode(value)
     except ValueError as error:
         raise UnstorableValue(f"a document holds NaN or an infinite number: {error}") from error
     # json.dumps escapes NUL as \u0000; an escaped backslash before u0000 is an ordinary text.
-    _require_storable(text, nul="\\u0000" in text.replace("\\\\", ""))
+    nul = "\\u0000" in text and "\\u0000" in text.replace("\\\\", "")
+    _require_storable(text, nul=nul)
     return text
 
 
@@ -84,5 +89,5 @@ def state_type(states: type[StrEnum]) -> Enum:
 def _require_storable(text: str, *, nul: bool = False) -> None:
     if nul or "\x00" in text:
         raise UnstorableValue("a text holds the character NUL (U+0000); remove it")
-    if not text.isascii() and any("\ud800" <= one <= "\udfff" for one in text):
+    if not text.isascii() and _SURROGATE.search(text):
         raise UnstorableValue("a text holds half of a surrogate pair; it is not valid Unicode")

@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 from service.storage.columns import Document, utc_now
 from service.storage.ids import new_ids
 from service.storage.queue import Clock, Lease, Outcome, Queue, smaller
-from service.storage.statements import CHUNK, IN_PLACE, chunks, insert_missing, upsert
+from service.storage.statements import CHUNK, IN_PLACE, chunks, insert_missing, update_by_id, upsert
 from service.storage.tables import OPEN, Checkpoint, Job, MigrationLog, Run, RunHistory, State
 
 
@@ -107,7 +107,7 @@ class RunLedger:
         self._queue.hold(self._lease)
         if kills:
             rows = [{"id": run, "kills": count} for run, count in kills.items()]
-            self._session.execute(update(Run), rows)
+            update_by_id(self._session, Run, rows)
 
     def record(
         self,
@@ -126,7 +126,7 @@ class RunLedger:
         if not fresh:
             return ()
         now, attempt = self._clock(), self._lease.attempt
-        self._session.execute(update(Run), [_ended(one, now, attempt) for one in fresh])
+        update_by_id(self._session, Run, (_ended(one, now, attempt) for one in fresh))
         self._count(fresh)
         for chunk in chunks(open_ids):
             self._session.execute(delete(Checkpoint).where(Checkpoint.run_id.in_(chunk)))

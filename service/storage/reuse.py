@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 
 from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOutcome
 from service.storage.queue import Lease, Queue
-from service.storage.statements import IN_PLACE, chunks
+from service.storage.statements import IN_PLACE, chunks, update_by_id
 from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory, State
 
 _COPIED = (
@@ -20,9 +20,8 @@ _COPIED = (
 def mark(session: Session, lease: Lease, hashes: Mapping[str, str]) -> None:
     """Write the hashes of runs' specifications, given by run; `LeaseLost` without the lease."""
     Queue(session).hold(lease)
-    rows = [{"id": run, "spec_hash": digest} for run, digest in hashes.items()]
-    if rows:
-        session.execute(update(Run), rows)
+    rows = ({"id": run, "spec_hash": digest} for run, digest in hashes.items())
+    update_by_id(session, Run, rows)
 
 
 def computed(

@@ -3,17 +3,23 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
-from sqlalchemy import Table
+from sqlalchemy import Table, bindparam
+from sqlalchemy import update as update_of
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session
 
 from service.storage.tables import Base
 
+if TYPE_CHECKING:
+    from sqlalchemy import Update
+
 T = TypeVar("T")
 CHUNK = 1000
 """Rows of one bulk statement: below PostgreSQL's 65,535 parameters for every table here."""
+
+_KEY = "key_of_row"
 
 IN_PLACE = {"synchronize_session": False, "populate_existing": True}
 """For UPDATE … RETURNING: the rows come back as the database has them."""
@@ -47,7 +53,7 @@ def page_of(found: Sequence[T], limit: int, cursor: Iterable[object]) -> Page[T]
 def insert_missing(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]]) -> None:
     """Insert rows in bulk; those whose key is there already stay as they are."""
     for chunk in chunks(rows):
-        session.execute(_insert(session, table).on_conflict_do_nothing(), chunk)
+        _execute(session, table, _insert(session, table).on_conflict_do_nothing(), chunk)
 
 
 def upsert(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]]) -> None:
@@ -56,7 +62,55 @@ def upsert(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]
     for chunk in chunks(rows):
         statement = _insert(session, table)
         changes = {name: statement.excluded[name] for name in chunk[0] if name not in keys}
-        session.execute(statement.on_conflict_do_update(index_elements=keys, set_=changes), chunk)
+        statement = statement.on_conflict_do_update(index_elements=keys, set_=changes)
+        _execute(session, table, statement, chunk)
+
+
+def update_by_id(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Change rows in bulk, each found by its `id`; all rows name the same columns."""
+    target = cast(Table, table.__table__)
+    for chunk in chunks(rows):
+        statement = update_of(target).where(target.c.id == bindparam(_KEY))
+        _execute(session, table, statement, [_keyed(row) for row in chunk])
+
+
+def _keyed(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {_KEY if name == "id" else name: value for name, value in row.items()}
+
+
+def _execute(
+    session: Session,
+    table: type[Base],
+    statement: "sqlite.Insert | postgresql.Insert | Update",
+    rows: Sequence[Mapping[str, Any]],
+) -> None:
+    """Carry a statement out for many rows of the same columns.
+
+    SQLAlchemy makes a dictionary of each row, then the driver's; a thousand rows of a history are
+    a tenth of a run's time. Here the columns' own conversions are applied column by column.
+    """
+    session.flush()
+    connection = session.connection()
+    dialect, columns = connection.dialect, cast(Table, table.__table__).c
+    names = list(rows[0])
+    compiled = statement.compile(
+        dialect=dialect, column_keys=[name for name in names if name != _KEY]
+    )
+    if compiled.insert_prefetch or compiled.update_prefetch:  # defaults that are made row by row
+        session.execute(statement, rows)
+        return
+    values = []
+    for name in names:
+        kind = columns["id" if name == _KEY else name].type.dialect_impl(dialect)
+        convert = kind.bind_processor(dialect)
+        column = [row[name] for row in rows]
+        values.append(column if convert is None else [convert(one) for one in column])
+    if compiled.positional:
+        order = [names.index(name) for name in compiled.positiontup or ()]
+        given: Any = list(zip(*(values[i] for i in order), strict=True))
+    else:
+        given = [dict(zip(names, row, strict=True)) for row in zip(*values, strict=True)]
+    connection.exec_driver_sql(str(compiled), given)
 
 
 def _insert(session: Session, table: type[Base]) -> "sqlite.Insert | postgresql.Insert":
