@@ -114,8 +114,8 @@ def _table(found: list[dict[str, Found]]) -> Table:
     return Table(
         "Table 3",
         ["parameter", "paper, simple", "paper, proposed", *(f"ours, {m}" for m in METHODS)], rows,
-        "Standard errors suppose white residuals. A first-order model of a long tube leaves "
-        "structure in them, so the two patterns differ by more than the errors say.",
+        "A first-order model of a long tube leaves structure in the residuals; the standard errors "
+        "allow for their colour.",
     )  # fmt: skip
 
 
