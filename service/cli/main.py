@@ -7,10 +7,21 @@ from typing import Annotated
 import typer
 
 from service.calls import ClientError, NotFinite
-from service.cli import datasets, exporting, jobs, models, runs, serving, sweeps, upkeep
+from service.cli import (
+    datasets,
+    exporting,
+    jobs,
+    models,
+    references,
+    runs,
+    serving,
+    sweeps,
+    upkeep,
+)
 from service.cli.common import err, out
 from service.cli.identify import identify
 from service.cli.paper import paper
+from service.cli.reidentifying import reidentify
 from service.errors import ServiceError
 
 app = typer.Typer(
@@ -38,6 +49,8 @@ app.command("datasets")(datasets.listing)
 app.add_typer(datasets.app, name="dataset")
 app.add_typer(models.app, name="models")
 app.add_typer(sweeps.app, name="sweep")
+app.command()(reidentify)
+app.add_typer(references.app, name="references")
 app.add_typer(upkeep.database, name="db")
 app.command()(upkeep.doctor)
 

@@ -1,0 +1,182 @@
+"""`lagid reidentify`: a batch over a label, warm-started, as one job and one table."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.common import (
+    DEFAULT_URL,
+    Key,
+    Url,
+    connected,
+    err,
+    fail,
+    out,
+    print_json,
+    put,
+    read_file,
+    usage,
+)
+from service.cli.trends import print_trend
+from service.cli.watching import follow
+from service.documents import read_yaml
+
+if TYPE_CHECKING:
+    from service.client import Client
+
+MODEL_SUFFIXES = (".yaml", ".yml", ".json")
+DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
+
+
+def reidentify(
+    experiments: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="X=DATA[,DATA] …",
+            help="For each value of the label its recordings, files or datasets on the server; "
+            "those joined by a comma are fitted together.",
+        ),
+    ],
+    model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
+    label: Annotated[str, typer.Option("--label", help="What X is, such as length_m.")],
+    reference: Annotated[
+        str | None,
+        typer.Option(help="Run (run_…) or accepted reference to start from and compare with."),
+    ] = None,
+    parameters: Annotated[
+        str, typer.Option(help="Parameters to look at, by commas; by default all that are free.")
+    ] = "",
+    predict: Annotated[str, typer.Option(help="Values of X to predict at, by commas.")] = "",
+    warm_start: Annotated[
+        str | None,
+        typer.Option(help="reference, previous or none: where each run begins."),
+    ] = None,
+    channels: Annotated[str, typer.Option(help="Which channel is which signal: u=P1,y=P2.")] = "",
+    changes: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="path=value of the job, as parameters.L.upper=0.5."),
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the job.")] = None,
+    wait: Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")] = False,
+    accept: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Accept a run as this reference at the end.")
+    ] = None,
+    accept_run: Annotated[
+        str | None, typer.Option(metavar="RUN|X", help="Which: a run, or a value of the label.")
+    ] = None,
+    json_file: Annotated[
+        str | None, typer.Option("--json", metavar="FILE", help="Write the trend; - for stdout.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Identify a model anew for several values of a label: estimates, trend, predictions, flags.
+
+    Each run begins at the reference, or at the result of its neighbour.
+    """
+    batch = [_experiments(text) for text in experiments]
+    if accept is not None and accept_run is None and len({x for x, _ in batch}) > 1:
+        usage("--accept needs --accept-run: a run, or a value of the label that has one run")
+    body: dict[str, Any] = {
+        "model": _model(model), "label": label, "look_at": _names(parameters),
+        "predict": [_number("--predict", one) for one in _names(predict)],
+        "channels": dict(_pair(one) for one in _names(channels)),
+        **_given(reference=reference, warm_start=warm_start, name=name),
+    }  # fmt: skip
+    for change in changes or []:
+        put(body, change)
+    with connected(url, key) as client:
+        body["batch"] = _uploaded(client, batch)
+        job = client.reidentify(body)
+        if not (wait or accept or json_file):
+            runs = job["progress"]["runs"]
+            out.print(f"{job['id']}  {job['name']}: {runs} runs, {job['state']}", markup=False)
+            return
+        ended = follow(client, job["id"], quiet=json_file == "-")
+        _tell(client, ended, json_file)
+        if accept is not None:
+            _accept(client, ended, accept, label, accept_run or f"{batch[0][0]:g}")
+
+
+def _tell(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
+    trend = client.trend(job["id"])
+    if json_file == "-":
+        print_json(trend)
+    else:
+        print_trend(trend)
+    if json_file not in (None, "-"):
+        try:
+            Path(str(json_file)).write_text(json.dumps(trend, indent=2, ensure_ascii=False))
+        except OSError as error:
+            fail(f"{json_file} cannot be written: {error.strerror}")
+    if job["state"] != "succeeded":
+        reason = f": {job['error']}" if job["error"] else ""
+        err.print(f"lagid: {job['id']} {job['state']}{reason}", markup=False)
+        raise typer.Exit(1)
+
+
+def _accept(client: "Client", job: dict[str, Any], name: str, label: str, chosen: str) -> None:
+    """Make a run of the batch the reference of a name."""
+    if not chosen.startswith("run_"):
+        x = _number("--accept-run", chosen)
+        found = [run["id"] for run in client.runs(job["id"], label=f"{label}={json.dumps(x)}")]
+        if len(found) != 1:
+            there = f" {', '.join(found)}" if found else ""
+            fail(f"--accept-run {chosen}: {len(found)} runs have {label} = {x:g}{there}; name one")
+        chosen = found[0]
+    told = client.accept_reference(name, chosen)
+    before = f" (before: {told['history'][0]['run']})" if told["history"] else ""
+    out.print(f"{told['name']}: {told['run']}{before}", markup=False)
+
+
+def _uploaded(client: "Client", batch: list[tuple[float, list[str]]]) -> list[dict[str, Any]]:
+    """The batch with identifiers of datasets; files are stored first, each once."""
+    known: dict[str, str] = {}
+    for source in (one for _, sources in batch for one in sources):
+        if source in known:
+            continue
+        is_file = Path(source).is_file()
+        if not is_file and source.endswith(DATA_SUFFIXES):
+            fail(f"there is no file {source}")
+        known[source] = client.add_dataset(Path(source))["id"] if is_file else source
+    return [{"x": x, "datasets": [known[one] for one in sources]} for x, sources in batch]
+
+
+def _experiments(text: str) -> tuple[float, list[str]]:
+    x, equals, sources = text.partition("=")
+    names = _names(sources)
+    if not (equals and names):
+        usage(f"{text}: need X=DATA, the value of the label and a recording, such as 5=a.csv")
+    return _number(text, x), names
+
+
+def _number(where: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        usage(f"{where}: found {text!r}; need a number")
+    return value
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not (equals and name and value):
+        usage(f"--channels {text}: need signal=channel, such as u=P1")
+    return name, value
+
+
+def _given(**options: str | None) -> dict[str, str]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _model(name: str) -> Any:
+    path = Path(name)
+    return read_yaml(read_file(path)) if path.suffix in MODEL_SUFFIXES else name
+
+
+def _names(text: str) -> list[str]:
+    return [one.strip() for one in text.split(",") if one.strip()]
