@@ -1,7 +1,7 @@
 """A sweep: from axes to cells, and from a cell to the body of its run."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from copy import deepcopy
+from copy import copy
 from dataclasses import dataclass, field
 from itertools import product
 from math import exp, log, prod
@@ -79,13 +79,19 @@ def expand(groups: list[list[Step]]) -> Iterator[Cell]:
 
 
 def body_of(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Body of one run: the job's normal form with the cell's values put in."""
-    body = deepcopy({name: value for name, value in document.items() if name != "sweep"})
+    """Body of one run: the job's normal form with the cell's values put in.
+
+    What no value changes is the document's own: neither is to be changed.
+    """
+    body = {name: value for name, value in document.items() if name != "sweep"}
     for path, value in values.items():
         *parents, last = _parts(path)
         here: Any = body
         for part in parents:
-            here = here[int(part)] if isinstance(here, list) else _child(here, part)
+            place: Any = int(part) if isinstance(here, list) else part
+            child = here[place] if isinstance(here, list) else here.get(place)
+            here[place] = {} if child is None else copy(child)
+            here = here[place]
         if isinstance(here, list):
             here[int(last)] = value
         else:
@@ -123,12 +129,6 @@ def values_of(axis: Axis) -> list[Any]:
 def _plain(value: float) -> float | int:
     """A whole number as such, so that fields of whole numbers take it."""
     return int(value) if value.is_integer() and value < 2**53 else value
-
-
-def _child(here: dict[str, Any], part: str) -> Any:
-    if here.get(part) is None:
-        here[part] = {}
-    return here[part]
 
 
 def _zipped(axes: list[Axis], numbers: list[int]) -> list[Step]:

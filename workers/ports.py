@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
@@ -55,13 +55,19 @@ class ProblemSpec:
     @cached_property
     def key(self) -> str:
         """Equal for equal specifications; names a built problem in a worker's cache."""
-        text = json.dumps(asdict(self), sort_keys=True)
+        parts = {one.name: getattr(self, one.name) for one in fields(self)}
+        text = json.dumps(parts, sort_keys=True, default=_plain)
         return blake2b(text.encode(), digest_size=16).hexdigest()
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Keys of the shared records."""
         return (self.records,) if self.validation is None else (self.records, self.validation)
+
+
+def _plain(value: Any) -> dict[str, Any]:
+    """A part that JSON does not know."""
+    return dict(value) if isinstance(value, Mapping) else asdict(value)
 
 
 @dataclass(frozen=True, slots=True)
