@@ -1,13 +1,16 @@
 """The web application: parts opened and closed, routes joined, errors made problem documents."""
 
+import tempfile
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from datetime import timedelta
 from importlib.metadata import version
+from pathlib import Path
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
+from service import temporary
 from service.api import (
     comparison,
     datasets,
@@ -71,6 +74,7 @@ def open_parts(settings: Settings) -> Parts:
         If the data folder is not writable.
     """
     settings.prepare_folder()
+    temporary.clear(Path(tempfile.gettempdir()))
     database = Database(settings.database)
     migrate.upgrade(database)
     return Parts(settings, database, open_store(settings.store))

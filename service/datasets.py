@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy.orm import Session
 
+from service import temporary
 from service.errors import TooLarge
 from service.recordings import recording_of
 from service.schemas import Page
@@ -178,7 +179,7 @@ def _derivation_key(parent: Dataset, body: DeriveIn) -> str:
 
 
 def _written(store: ObjectStore, recording: Recording, metadata: Mapping[str, str]) -> StoredObject:
-    with tempfile.TemporaryDirectory(prefix="lagid-") as folder:
+    with tempfile.TemporaryDirectory(prefix=temporary.prefix()) as folder:
         path = Path(folder) / "recording.mcap"
         write_recording(recording, path, metadata=metadata)
         return store.put_file(path)

@@ -13,6 +13,7 @@ from service.api.deps import Parts, PartsDep
 from service.errors import InvalidRequest
 from service.storage.events import EventRepository
 from service.storage.jobs import JobRepository
+from service.storage.patience import PASSING
 from service.storage.tables import Event
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -39,7 +40,10 @@ async def _stream(parts: Parts, job_id: str, last: int) -> AsyncIterator[str]:
     poll, quiet = parts.settings.poll_seconds, 0.0
     yield "retry: 1000\n\n"
     while not parts.stopping.is_set():
-        batch, is_over = await run_in_threadpool(_look, parts, job_id, last)
+        try:
+            batch, is_over = await run_in_threadpool(_look, parts, job_id, last)
+        except PASSING:  # the database may come back; the stream waits for it
+            batch, is_over = [], False
         for event in batch:
             last, quiet = event.id, 0.0
             yield _text(event)

@@ -1,5 +1,6 @@
 """RFC 9457 problem documents: the one place where an error becomes an answer."""
 
+import errno
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from http import HTTPStatus
@@ -7,6 +8,7 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
+from sqlalchemy.exc import TimeoutError as SqlTimeout
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
@@ -22,10 +24,12 @@ from service.errors import (
 )
 from service.pointers import body_type, detail_of, explained
 from service.storage.errors import StorageError
+from service.storage.patience import PASSING
 from sysid.errors import SysidError
 
 log = logging.getLogger(__name__)
 
+TRY_AGAIN = {"Retry-After": "1"}
 PROBLEM_TYPE = "application/problem+json"
 KINDS = {
     404: "not-found",
@@ -69,6 +73,9 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(SysidError, _sysid_error)
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(HTTPException, _http_error)
+    for passing in (*PASSING, SqlTimeout):
+        app.add_exception_handler(passing, _database_away)
+    app.add_exception_handler(OSError, _system_error)
     app.add_exception_handler(Exception, _unexpected)
 
 
@@ -85,6 +92,21 @@ def _storage_error(request: Request, error: Exception) -> Response:
         log.error("%s %s: %s", request.method, request.url.path, error)
     kind, title = STORAGE_KINDS.get(error.status, ("internal", "The service failed"))
     return problem(request, error.status, kind, title, str(error))
+
+
+def _database_away(request: Request, error: Exception) -> Response:
+    log.error("%s %s: %s", request.method, request.url.path, str(error).splitlines()[0])
+    detail = "the database does not answer, or its disk is full; nothing was changed, try again"
+    away = Unavailable(detail)
+    return problem(request, away.status, away.kind, away.title, away.detail, headers=TRY_AGAIN)
+
+
+def _system_error(request: Request, error: Exception) -> Response:
+    assert isinstance(error, OSError)
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        return _unexpected(request, error)
+    log.error("%s %s: %s", request.method, request.url.path, error)
+    return _service_error(request, Unavailable("there is no space left on a disk of the server"))
 
 
 def _sysid_error(request: Request, error: Exception) -> Response:

@@ -11,6 +11,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import UploadFile
 from starlette.requests import Request
 
+from service import temporary
 from service.datasets import Format, check_size
 from service.errors import InvalidRequest, TooLarge, UnsupportedMediaType
 from service.settings import Settings
@@ -50,7 +51,7 @@ async def received(request: Request, settings: Settings) -> AsyncIterator[Upload
         check_size(int(announced), settings)
     elif kind == MULTIPART:
         raise TooLarge("a form needs a Content-Length header, to be known as small enough")
-    with TemporaryDirectory(prefix="lagid-upload-") as folder:
+    with TemporaryDirectory(prefix=temporary.prefix()) as folder:
         path = Path(folder) / "upload"
         if kind == MULTIPART:
             yield await _from_form(request, path, settings)

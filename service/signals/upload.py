@@ -16,6 +16,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
+from service import temporary
 from service.signals.errors import InvalidUpload
 from service.signals.limits import DEFAULT_LIMITS, MIB, Limits
 from service.signals.reader import read_recording
@@ -67,7 +68,7 @@ def read_untrusted(
         raise InvalidUpload(f"the file has {size} bytes; at most {limits.file_bytes} are read")
     with source.open("rb") as stream:
         sha256 = file_digest(stream, "sha256").hexdigest()
-    with TemporaryDirectory(prefix="lagid-upload-") as folder:
+    with TemporaryDirectory(prefix=temporary.prefix()) as folder:
         clean = Path(folder) / "clean.mcap"
         task = {
             "source": str(source.absolute()),

@@ -9,7 +9,6 @@ import hashlib
 import os
 import re
 import tempfile
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -23,6 +22,7 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError
 from obstore.store import LocalStore, S3Store
 
+from service import temporary
 from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 
 if TYPE_CHECKING:
@@ -33,7 +33,6 @@ _HASH = re.compile(r"[0-9a-f]{64}")
 _BLOCK = 1 << 20
 _SINGLE_PUT = 64 << 20
 """Largest object that is sent in one request, and so held in memory."""
-_STALE_SECONDS = 24 * 3600
 _RETRIES: "RetryConfig" = {"max_retries": 3, "retry_timeout": timedelta(seconds=30)}
 
 
@@ -132,7 +131,7 @@ class ObjectStore(ABC):
 
     @contextmanager
     def _new_file(self) -> Iterator[BinaryIO]:
-        with tempfile.NamedTemporaryFile(dir=self._temporary) as file:
+        with tempfile.NamedTemporaryFile(dir=self._temporary, prefix=temporary.prefix()) as file:
             yield file  # type: ignore[misc]  # the wrapper has all of BinaryIO, undeclared
 
 
@@ -146,11 +145,12 @@ class FolderStore(ObjectStore):
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder.absolute()
-        temporary = self._folder / "tmp"
+        self._synced: set[Path] = set()  # folders that this process has seen on the disk
+        unfinished = self._folder / "tmp"
         with _failures("create its folder"):
-            temporary.mkdir(parents=True, exist_ok=True)
-            _clear_stale(temporary)
-            super().__init__(LocalStore(self._folder), temporary)
+            unfinished.mkdir(parents=True, exist_ok=True)
+            temporary.clear(unfinished, "*")
+            super().__init__(LocalStore(self._folder), unfinished)
 
     def check_writable(self) -> None:
         """Nothing, when an object could be written now; else `ObjectStoreFailed`."""
@@ -162,8 +162,11 @@ class FolderStore(ObjectStore):
         target.parent.mkdir(parents=True, exist_ok=True)
         with suppress(FileExistsError):  # the same bytes, by another writer
             os.link(source, target)
-        for folder in (target.parent, target.parent.parent, self._folder):
-            _sync_folder(folder)
+        _sync_folder(target.parent)
+        if target.parent not in self._synced:  # whoever made it may not have synced its parents
+            for folder in (target.parent.parent, self._folder):
+                _sync_folder(folder)
+            self._synced.add(target.parent)
 
 
 @final
@@ -236,12 +239,6 @@ def _cannot(doing: str, error: Exception) -> str:
 
 def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0].strip()
-
-
-def _clear_stale(temporary: Path) -> None:
-    for path in temporary.iterdir():
-        if time.time() - path.stat().st_mtime > _STALE_SECONDS:
-            path.unlink(missing_ok=True)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -15,6 +15,7 @@ from sqlalchemy.pool import ConnectionPoolEntry
 from service.storage.columns import to_json
 
 BUSY_SECONDS = 30.0
+CONNECT_SECONDS = 5
 _READ = {"lagid_reads": True, "postgresql_readonly": True}
 
 
@@ -71,7 +72,10 @@ def _engine(url: str, **options: Any) -> Engine:
     if address.drivername == "postgresql":
         address = address.set(drivername="postgresql+psycopg")
     # A pooled connection may have died with a restarted server: ask before use.
-    return create_engine(address, json_serializer=to_json, pool_pre_ping=True, **options)
+    settings = {"connect_timeout": CONNECT_SECONDS}
+    return create_engine(
+        address, json_serializer=to_json, pool_pre_ping=True, connect_args=settings, **options
+    )
 
 
 def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) -> None:
