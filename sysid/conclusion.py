@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.errors import DivergedEverywhere, NothingIdentifiable
-from sysid.islands.archipelago import of_island
+from sysid.islands.archipelago import analysis_budget, of_island
 from sysid.islands.run_state import RunState
 from sysid.metrics import Metrics
 from sysid.onset import onset_delays
@@ -55,7 +55,7 @@ def _concluded(
     ]
     best = min(range(len(ends)), key=lambda i: ends[i][1])
     theta = ends[best][0]
-    analysis = analyse(problem, theta)
+    analysis = analyse(problem, theta, _left(algorithm, state, refined))
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
         raise NothingIdentifiable(p.name for p in problem.space)
     simulated = problem.predictions(theta[None])[0]
@@ -100,17 +100,25 @@ def _polished(
     methods = {of_island(algorithm, i).method for i in range(len(champions))}
     if not algorithm.refine or "improved" not in methods:
         return (None,) * len(champions)
+    left = _left(algorithm, state, ())
+    kept = analysis_budget(len(champions[0]))
+    return refine(problem, champions, None if left is None else max(0, left - kept))
+
+
+def _left(
+    algorithm: GeneticAlgorithm, state: RunState, refined: tuple[Refined | None, ...]
+) -> int | None:
+    """What search and refinement have left of the budget of simulations; None: there is none."""
     limit = algorithm.stop.evaluations
-    # Standard errors take two simulations a parameter, beside jumps of the output ten more, and a
-    # look at what cannot be told two more.
-    kept = 14 * len(champions[0]) + 1
-    left = None if limit is None else max(0, limit - state.evaluations - kept)
-    return refine(problem, champions, left)
+    return None if limit is None else max(0, limit - state.evaluations - _polishing(refined))
+
+
+def _polishing(refined: tuple[Refined | None, ...]) -> int:
+    return sum(end.evaluations for end in refined if end is not None)
 
 
 def _evaluations(state: RunState, refined: tuple[Refined | None, ...], analysis: Analysis) -> int:
-    polishing = sum(end.evaluations for end in refined if end is not None)
-    return state.evaluations + polishing + analysis.evaluations
+    return state.evaluations + _polishing(refined) + analysis.evaluations
 
 
 def _summaries(

@@ -48,9 +48,23 @@ class Sensitivities(NamedTuple):
     evaluations: int
 
 
-def sensitivities(problem: Problem, theta: FloatArray) -> Sensitivities:
-    """Central differences at an estimate (D,); beside a bound one-sided."""
-    probe = _Probe(problem, theta)
+class BudgetSpentError(Exception):
+    """The simulations that were left do not suffice; `evaluations` of them were run."""
+
+    def __init__(self, evaluations: int) -> None:
+        super().__init__(f"{evaluations} simulations were not enough")
+        self.evaluations = evaluations
+
+
+def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) -> Sensitivities:
+    """Central differences at an estimate (D,); beside a bound one-sided.
+
+    Raises
+    ------
+    BudgetSpentError
+        If they take more than `most` simulations.
+    """
+    probe = _Probe(problem, theta, most)
     d = probe.place.size
     columns, plateau = np.zeros((probe.weight.size, d)), np.zeros(d)
     one_sided = np.zeros(d, dtype=np.bool_)
@@ -119,8 +133,8 @@ def _slope_of_side(probe: "_Probe", d: int, side: float) -> tuple[float, FloatAr
 class _Probe:
     """The scored output beside an estimate, one parameter moved at a time."""
 
-    def __init__(self, problem: Problem, theta: FloatArray) -> None:
-        self._problem = problem
+    def __init__(self, problem: Problem, theta: FloatArray, most: int | None) -> None:
+        self._problem, self._most = problem, most
         self._scored = problem.evaluator.weight > 0
         self.weight = problem.evaluator.weight[self._scored]
         self.measured = problem.evaluator.measured[self._scored]
@@ -130,6 +144,8 @@ class _Probe:
 
     def at(self, which: IntArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Steps taken, cut off at the bounds, and the outputs there: (n, number of `which`)."""
+        if self._most is not None and self.evaluations + which.size > self._most:
+            raise BudgetSpentError(min(self.evaluations, self._most))
         moved = np.clip(self.place[which] + steps, 0.0, 1.0)
         around = np.repeat(self.place[None], which.size, axis=0)
         around[np.arange(which.size), which] = moved

@@ -134,6 +134,10 @@ class GeneticAlgorithm:
         _require(self.safe_limit is None or self.safe_limit > 0, "safe_limit", self.safe_limit,
                  "positive")  # fmt: skip
         _require(self.n_islands >= 1, "islands", self.islands, "1 or more")
+        budget = self.stop.evaluations
+        _require(budget is None or budget >= self.population, "stop/evaluations", budget,
+                 f"{self.population} or more, the simulations of one population of "
+                 f"{self.population} individuals")  # fmt: skip
         _require(self.population >= 4 * self.n_islands, "population", self.population,
                  f"4 or more for each of the {self.n_islands} islands")  # fmt: skip
 

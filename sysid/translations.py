@@ -20,8 +20,9 @@ _SAME = 1e-10  # of the output's size: rounding
 
 
 def translations(
-    problem: Problem, theta: FloatArray, columns: FloatArray, scale: FloatArray
-) -> tuple[FloatArray, int]:
+    problem: Problem, theta: FloatArray, columns: FloatArray, scale: FloatArray,
+    most: int | None = None,
+) -> tuple[FloatArray, int]:  # fmt: skip
     """Directions along which the output stays, and the simulations this took.
 
     Parameters
@@ -32,6 +33,8 @@ def translations(
         Sensitivities over the places in [0, 1].
     scale : FloatArray, shape (D,)
         ∂θ/∂p of the places p.
+    most : int or None
+        Simulations that may be run; directions beyond are not looked at.
 
     Returns
     -------
@@ -43,7 +46,7 @@ def translations(
     evaluations = 0
     for row in rows[singular < _UNCERTAIN * singular[0]]:
         direction = _rounded(row, scale)
-        if not _adds_up(problem, direction):
+        if not _adds_up(problem, direction) or (most is not None and evaluations + 2 > most):
             continue
         evaluations += 2
         if _changes_nothing(problem, theta, direction, scale):

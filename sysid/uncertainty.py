@@ -29,7 +29,7 @@ from sysid.islands.archipelago import loss_scale
 from sysid.problem import Problem
 from sysid.pulls import AT_BOUND, Pull, pulls
 from sysid.result import Criteria, Estimate, EstimateStatus, Uncertainty
-from sysid.sensitivities import sensitivities
+from sysid.sensitivities import BudgetSpentError, Sensitivities, sensitivities
 from sysid.serial import coloured_middle
 from sysid.symmetries import scalings
 from sysid.translations import translations
@@ -82,9 +82,31 @@ class _Directions:
     member: BoolArray
 
 
-def analyse(problem: Problem, theta: FloatArray) -> Analysis:
-    """Standard errors, correlations and identifiability at an estimate (D,)."""
-    error, columns, plateau, one_sided, count = sensitivities(problem, theta)
+def analyse(problem: Problem, theta: FloatArray, most: int | None = None) -> Analysis:
+    """Standard errors, correlations and identifiability at an estimate (D,).
+
+    With no more than `most` simulations; where they do not suffice there are no standard errors.
+    """
+    try:
+        sensitive = sensitivities(problem, theta, most)
+    except BudgetSpentError as error:
+        return _unexplored(problem, theta, error.evaluations)
+    return _analysed(problem, theta, sensitive, most)
+
+
+def _unexplored(problem: Problem, theta: FloatArray, evaluations: int) -> Analysis:
+    """What is known without a look at the neighbours of the estimate."""
+    weight = problem.evaluator.weight
+    error = weight * (problem.predictions(theta[None])[0] - problem.evaluator.measured)
+    criteria = criteria_of(error[weight > 0], theta.size)
+    reason = "the budget of simulations left too few for standard errors"
+    return Analysis(_without(problem, theta, reason), None, 0.0, evaluations, criteria)
+
+
+def _analysed(
+    problem: Problem, theta: FloatArray, sensitive: Sensitivities, most: int | None
+) -> Analysis:
+    error, columns, plateau, one_sided, count = sensitive
     n, d = columns.shape
     criteria = criteria_of(error, d)
     if n <= d:
@@ -98,7 +120,9 @@ def analyse(problem: Problem, theta: FloatArray) -> Analysis:
     pulled = pulls(problem.space, influence, sloping, place)
     scale = physical_scale(problem, theta)
     powers = scalings(problem.model, problem.all_parameters)
-    shifts, more = translations(problem, theta, columns, scale)
+    shifts, more = translations(
+        problem, theta, columns, scale, None if most is None else most - count
+    )
     count += more
     columns, known = without_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
     singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]

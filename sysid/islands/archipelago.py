@@ -7,6 +7,7 @@ import numpy as np
 
 from sysid.errors import InvalidSettings
 from sysid.ga.chromosome import coded, placed
+from sysid.ga.development import TRIALS
 from sysid.ga.evolution import initial_places
 from sysid.ga.island import Island
 from sysid.ga.random import WARM, draws, unit
@@ -65,15 +66,56 @@ def search_budget(algorithm: GeneticAlgorithm, n: int) -> int:
     return limit - min(max(limit // 10, 4 * (n + 2)) + beyond, limit // 2)
 
 
+def analysis_budget(n: int) -> int:
+    """Simulations kept for the standard errors of n parameters.
+
+    They take two a parameter, beside jumps of the output ten more, and a look at what cannot be
+    told two more.
+    """
+    return 14 * n + 1
+
+
+def _island_budget(algorithm: GeneticAlgorithm, n: int, size: int) -> int:
+    """Simulations from which on an island begins no other generation.
+
+    Its share of `search_budget`; of a tiny budget less, so that its last generation does not take
+    it beyond its share of what the standard errors leave.
+    """
+    limit = algorithm.stop.evaluations
+    if limit is None:
+        return _UNLIMITED
+    share = search_budget(algorithm, n) * size // algorithm.population
+    left = max(limit - analysis_budget(n), algorithm.population) * size // algorithm.population
+    return max(1, min(share, left - _generation(n, size) + 1))
+
+
+def _generation(n: int, size: int) -> int:
+    """Simulations of one generation of an island at most."""
+    return size + n + 1 + TRIALS
+
+
+def budget_before(algorithm: GeneticAlgorithm, n: int) -> int:
+    """What the islands and the standard errors leave of the budget to the finding of starts.
+
+    It counts as the first island's work, which may be less than its share for that.
+    """
+    limit = algorithm.stop.evaluations
+    if limit is None:
+        return _UNLIMITED
+    taken = 0
+    for size in sizes(algorithm)[1:]:
+        rests = _island_budget(algorithm, n, size)
+        taken += size if rests <= size else rests - 1 + _generation(n, size)
+    return max(0, limit - (2 * n + 1) - sizes(algorithm)[0] - taken)
+
+
 def plans(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> tuple[Plan, ...]:
     """How each island searches."""
     progress = record_progress(problem)
     dealt = sizes(algorithm)
-    budget = search_budget(algorithm, len(problem.space))
     made = []
     for index, size in enumerate(dealt):
         own = of_island(algorithm, index)
-        share = budget if budget == _UNLIMITED else max(1, budget * size // algorithm.population)
         made.append(
             Plan(
                 seed=seed,
@@ -85,7 +127,7 @@ def plans(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> tuple[Pla
                 survivors=min(max(2, round(own.selection_rate * size)), size - 1),
                 stagnation=own.stagnation,
                 relative=int(own.sequence.relative),
-                evaluations=share,
+                evaluations=_island_budget(own, len(problem.space), size),
                 beta=float(own.sequence.beta),
                 rms=_NEVER if own.stop.rms is None else float(own.stop.rms),
                 loss_scale=loss_scale(problem),

@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sysid.islands.archipelago import of_island
+from sysid.islands.archipelago import budget_before, of_island
 from sysid.problem import Problem
 from sysid.selection.frols import forward, solved
 from sysid.selection.lagsearch import affordable, lag_values, search
@@ -54,7 +54,8 @@ def equation_error_starts(problem: Problem, algorithm: GeneticAlgorithm) -> Star
         return Starts()
     limit = algorithm.stop.evaluations
     with one_thread():  # so that the last bit does not depend on the number of cores
-        return _Finder(problem, 10**9 if limit is None else limit // _SHARE).starts()
+        before = budget_before(algorithm, len(problem.space))
+        return _Finder(problem, before if limit is None else min(limit // _SHARE, before)).starts()
 
 
 def _is_regression(problem: Problem) -> bool:

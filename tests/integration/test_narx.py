@@ -141,7 +141,7 @@ def test_a_model_that_is_no_polynomial_has_no_starts() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("evaluations", [200, 1000])
+@pytest.mark.parametrize("evaluations", [100, 200, 1000])
 def test_simulations_of_the_starts_count(evaluations: int) -> None:
     algorithm = GeneticAlgorithm(stop=Stop(evaluations=evaluations))
     posed = problem(narx_record(3.0, 7.0, noise=0.05))
