@@ -49,7 +49,8 @@ class Influence(NamedTuple):
 
     `studentised` is the deleted residual over its standard deviation, that of the others, which
     follows Student's t with ν - 1 degrees of freedom [1]_; None where too few others are left.
-    `p_value` is multiplied by the number of points (Bonferroni).
+    `p_value` is multiplied by the number of points (Bonferroni). An outlier is one that neither
+    the scatter of the others nor the stated errors explain.
 
     .. [1] R. D. Cook, S. Weisberg, Residuals and Influence in Regression, Chapman and Hall 1982,
        §2.2.
@@ -178,7 +179,8 @@ def _influence(law: Law, residual: float, leverage: float, n: int, floor: float)
     else:
         t = residual / sqrt(others * (1.0 - leverage))
     p_value = min(1.0, n * student_tail(degrees, t))
-    return Influence(residual, t, p_value, p_value < _OUTLIER)
+    is_explained = sqrt(square) <= -NormalDist().inv_cdf(_OUTLIER / (2.0 * n))
+    return Influence(residual, t, p_value, p_value < _OUTLIER and not is_explained)
 
 
 def pooled(groups: Sequence[Sequence[Estimate]]) -> tuple[tuple[Estimate, ...], float]:

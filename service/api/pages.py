@@ -122,6 +122,12 @@ def job_figure(job_id: str, session: ReadSession, choice: Choice) -> Response:
     return _figure(results.job_figure(session, job_id, choice), "summary", choice)
 
 
+@router.get("/v1/jobs/{job_id}/figures/trend", tags=["jobs"], response_class=JSONResponse)
+def trend_figure(job_id: str, session: ReadSession, choice: Choice) -> Response:
+    """Estimates over the label of a batch as Plotly JSON, or the numbers drawn as CSV."""
+    return _figure(results.trend_of_job(session, job_id, choice), "trend", choice)
+
+
 @router.get("/v1/datasets/{dataset_id}/figures/signals", tags=["datasets"],
             response_class=JSONResponse)  # fmt: skip
 def dataset_figure(

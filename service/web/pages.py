@@ -30,6 +30,7 @@ from service.web.figures_residuals import residuals_height
 from service.web.findings import findings_of
 from service.web.reading import model_of, run_body, sought_parameters, unit_of
 from service.web.reference import operations
+from service.web.trend_view import TrendView, trend_of, trend_view
 from service.web.views import JobView, RunView, cell_text, event_view, job_view, run_view
 
 JOBS_PER_PAGE = 50
@@ -103,7 +104,7 @@ def job_page(
         next_runs=_query({"cell": cell, "cursor": page.next}) if page.next else "",
         grid=grid, is_listed=grid is None or bool(chosen_cell),
         cell_title=cell_text(chosen_cell, {}),
-        noise_height=_noise_height(job, chosen),
+        noise_height=_noise_height(job, chosen), trend=_trend(session, job),
         comparable=_comparable(page.items),
         datasets=dataset_links(session, job), commands=_commands(view, base_url),
         events=[event_view(one) for one in _events(session, job)],
@@ -214,6 +215,11 @@ def _noise_height(job: Job, run: Run | None) -> int:
     body = job.spec if run is None else run_body(job, run)
     sought = sought_parameters(run, body) if run is not None else []
     return noise_height(1 + len(sought), columns=2)
+
+
+def _trend(session: Session, job: Job) -> TrendView | None:
+    found = trend_of(session, job)
+    return None if found is None else trend_view(found)
 
 
 def _best(runs: RunRepository, job: Job) -> Run | None:

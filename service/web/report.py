@@ -17,11 +17,14 @@ from service.storage.runs import RunOrder, RunRepository
 from service.storage.tables import Job, Run
 from service.web import assets, figures, figures_signals
 from service.web.figures import Figure
+from service.web.figures_trend import trend_figure
 from service.web.findings import residual_figure
 from service.web.pages import dataset_links, render, run_in_full, run_summary
 from service.web.reading import evidence_of, unit_of
+from service.web.results import FigureChoice, job_figure
 from service.web.signals import experiments_of
 from service.web.theme import template
+from service.web.trend_view import trend_of, trend_view
 from service.web.views import job_view
 
 RUNS_IN_TABLE = 1000
@@ -35,10 +38,12 @@ def job_report(session: Session, store: ObjectStore, job_id: str) -> str:
     runs = RunRepository(session).page(job.id, limit=RUNS_IN_TABLE).items
     order: RunOrder = "number" if len(runs) <= RUNS_IN_FULL else "best_rms"
     chosen = RunRepository(session).page(job.id, limit=RUNS_IN_FULL, order=order).items
-    made = datetime.now(UTC)
+    made, batch = datetime.now(UTC), trend_of(session, job)
     return render(
         "report.html", job=job_view(job, unit_of(session, job.spec), made), made=made,
-        runs=[run_summary(session, job, run) for run in runs],
+        runs=[run_summary(session, job, run) for run in runs], overview=_overview(session, job),
+        trend=None if batch is None else trend_view(batch),
+        trend_figure=None if batch is None else as_json(bare(trend_figure(batch))),
         sections=[
             (run_in_full(session, job, run), _figures(session, store, job, run)) for run in chosen
         ],
@@ -55,6 +60,14 @@ def policy() -> str:
     return (
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:"
     )
+
+
+def _overview(session: Session, job: Job) -> list[tuple[str, int, Markup]]:
+    """Title, height (px) and Plotly JSON of the figures of all runs together."""
+    found = job_figure(session, job.id, FigureChoice(columns=2))
+    if not found["data"]:
+        return []
+    return [("Errors against the noise", found["layout"]["height"], as_json(bare(found)))]
 
 
 def _figures(

@@ -15,10 +15,12 @@ from service.summaries import summary
 from service.web import figures, figures_signals
 from service.web.figures import Abscissa, Figure
 from service.web.figures_noise import noise_keys, noise_sweep
+from service.web.figures_trend import trend_figure
 from service.web.findings import residual_figure
 from service.web.reading import evidence_of, unit_of
 from service.web.signals import experiments_of, traces_of
 from service.web.theme import Theme
+from service.web.trend_view import trend_of
 
 FigureName = Literal["history", "convergence", "response", "residuals", "correlation", "waterfall"]
 
@@ -77,9 +79,16 @@ def job_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
     keys = noise_keys(job.spec.get("sweep", {}).get("axes", []))
     if keys is None:
         return {"data": [], "layout": figures.layout(200)}
-    return noise_sweep(
-        summary(session, job.id, keys), unit_of(session, job.spec), min(choice.columns, 2)
-    )
+    found = summary(session, job.id, keys, errors_only=True)
+    return noise_sweep(found, unit_of(session, job.spec), min(choice.columns, 2))
+
+
+def trend_of_job(session: Session, job_id: str, choice: FigureChoice) -> Figure:
+    """Estimates over the label of a batch; empty where the job asks for no trend."""
+    found = trend_of(session, JobRepository(session).get(job_id))
+    if found is None:
+        return {"data": [], "layout": figures.layout(200)}
+    return trend_figure(found, min(choice.columns, 2))
 
 
 def _check_experiment(number: int, count: int) -> None:

@@ -167,6 +167,14 @@ def test_one_wild_point_is_flagged_and_rarely_one_of_a_clean_batch() -> None:
     assert [one.is_outlier for one in found.influences] == [i == 4 for i in range(8)]
 
 
+def test_a_point_that_its_stated_error_explains_is_no_outlier() -> None:
+    y = 2.0 + 0.5 * X
+    y[1] += 0.1
+    wrong, right = (fit_trend(X, y, np.full(5, error)).influences[1] for error in (0.01, 0.2))
+    assert wrong.p_value == pytest.approx(right.p_value)
+    assert (wrong.is_outlier, right.is_outlier) == (True, False)
+
+
 @pytest.mark.parametrize("n", [3, 4])
 def test_with_few_points_nothing_is_divided_by_nothing(n: int) -> None:
     found = fit_trend(X[:n], [1.0, 2.1, 2.9, 4.2][:n], np.full(n, 0.1), [100.0, 0.0])

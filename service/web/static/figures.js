@@ -19,7 +19,7 @@ function address(plot, extra = {}) {
   const url = new URL(plot.dataset.url, location.href);
   const query = new URLSearchParams(plot.dataset.query ?? '');
   query.set('theme', dark.matches ? 'dark' : 'light');
-  if (['convergence', 'residuals', 'summary'].includes(plot.dataset.figure)) query.set('columns', columns(plot));
+  if (['convergence', 'residuals', 'summary', 'trend'].includes(plot.dataset.figure)) query.set('columns', columns(plot));
   for (const [name, value] of Object.entries(extra)) query.set(name, value);
   url.search = query;
   return url;

@@ -1,9 +1,9 @@
 // A job's page: plots, live regions while the job is open, and its actions.
 
 import { begin, choose, plots, profile, redraw } from './figures.js';
-import { Problem, element, post, refresh, throttled } from './live.js';
+import { Problem, element, post, put, refresh, throttled } from './live.js';
 
-const job = document.getElementById('job').dataset.job;
+const { job, runs } = document.getElementById('job').dataset;
 const isOpen = () => document.querySelector('[data-live="chip"]').dataset.open === '1';
 let stream = null;
 
@@ -13,7 +13,7 @@ const renew = throttled(async () => {
   await refresh();
   await redraw(isOpen() ? ['history', 'convergence'] : undefined);
   if (wasOpen && !isOpen()) close();
-}, 1000);
+}, 1000 + Number(runs) / 10); // the database looks at all runs of a sweep for its page
 
 function listen() {
   if (stream || !isOpen()) return; // a finished job opens no stream
@@ -55,6 +55,20 @@ async function act(button) {
     button.disabled = false;
   }
 }
+
+document.addEventListener('submit', async (event) => {
+  if (!('accept' in event.target.dataset)) return;
+  event.preventDefault();
+  const { run, name } = event.target.elements;
+  const told = event.target.querySelector('[data-accepted]');
+  try {
+    const found = await put(`/v1/references/${encodeURIComponent(name.value)}`, { run: run.value });
+    told.textContent = `${found.name} is ${found.run}; ${found.history.length} before it`;
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    told.textContent = error.message;
+  }
+});
 
 async function copy(button) {
   const text = button.closest('dialog').querySelector('pre');

@@ -68,9 +68,11 @@ export async function ask(url, options = {}) {
   );
 }
 
-export const post = (url, body) =>
+export const put = (url, body) => post(url, body, 'PUT');
+
+export const post = (url, body, method = 'POST') =>
   ask(url, {
-    method: 'POST',
+    method,
     ...(body === undefined
       ? {}
       : { headers: { 'Content-Type': 'application/json' }, body: JSON.stringify(body) }),
