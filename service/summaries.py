@@ -28,7 +28,9 @@ FLOOR = (
 )
 
 
-def summary(session: Session, job_id: str, by: Sequence[str] | None) -> SummaryOut:
+def summary(
+    session: Session, job_id: str, by: Sequence[str] | None, *, errors_only: bool = False
+) -> SummaryOut:
     """Aggregates over the values of some axes or labels of a job.
 
     Parameters
@@ -36,6 +38,8 @@ def summary(session: Session, job_id: str, by: Sequence[str] | None) -> SummaryO
     by : sequence of str, optional
         Paths of axes (``/noise/sigma``) and names of labels (``length_m``); by default every
         axis that is no seed.
+    errors_only : bool
+        Only the RMS against the records without noise, and the estimates: what figures draw.
 
     Raises
     ------
@@ -46,9 +50,10 @@ def summary(session: Session, job_id: str, by: Sequence[str] | None) -> SummaryO
     keys = _keys(job, by)
     units = _units(session, job)
     floors = Floors(job.floors)
-    quantities = [RMS, NOISE_FREE, ESTIMATION, VALIDATION]
-    for name in units:
-        quantities += [Quantity("estimate", name), Quantity("stderr", name)]
+    quantities = [NOISE_FREE, *(Quantity("estimate", name) for name in units)]
+    if not errors_only:
+        quantities += [RMS, ESTIMATION, VALIDATION]
+        quantities += [Quantity("stderr", name) for name in units]
     found = groups(session, job.id, keys, quantities, MOST_GROUPS)
     if len(found) > MOST_GROUPS:
         raise InvalidRequest.at(

@@ -4,12 +4,24 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Integer, case, cast, func, or_, select
+from sqlalchemy import (
+    CTE,
+    ColumnElement,
+    Integer,
+    Select,
+    case,
+    cast,
+    func,
+    literal,
+    or_,
+    select,
+    union_all,
+)
 from sqlalchemy.orm import Session
 
 from service.storage.columns import to_json
 from service.storage.runs import entry_equals
-from service.storage.tables import DEFAULT_PROJECT, Run, State
+from service.storage.tables import DEFAULT_PROJECT, Job, Run, State
 
 QUANTILES = (50, 250, 500, 750, 950)
 """In thousandths: the database counts places with whole numbers."""
@@ -78,7 +90,9 @@ def groups(
     Quantiles are those of runs that succeeded, linearly interpolated between neighbours.
     """
     columns = [key.column.label(f"key{i}") for i, key in enumerate(keys)]
-    mine = (Run.job_id == job_id, Run.project_id == project_id)
+    # Once asked for the project too, SQLite searches all its runs for those of the job.
+    of_project = select(Job.id).where(Job.id == job_id, Job.project_id == project_id)
+    mine = (Run.job_id == of_project.scalar_subquery(),)
     counts = [func.sum(case((Run.state == state, 1), else_=0)) for state in State]
     query = (
         select(
@@ -95,10 +109,10 @@ def groups(
         mean = None if evaluations is None else float(evaluations)
         sigma = None if low is None else (float(low), float(high))
         found[to_json(key)] = Group(key, int(first), states, int(valid), sigma, mean, seconds)
-    for quantity in quantities:
-        for key, values in _quantiles(session, mine, columns, quantity):
-            if to_json(key) in found:  # not beyond the limit
-                found[to_json(key)].quantiles[quantity] = values
+    by_first = {group.first: group for group in found.values()}
+    for first, quantity, values in _quantiles(session, mine, columns, quantities):
+        if first in by_first:  # not beyond the limit
+            by_first[first].quantiles[quantity] = values
     return list(found.values())
 
 
@@ -119,32 +133,55 @@ def _when_succeeded(column: Any) -> ColumnElement[Any]:
 
 
 def _quantiles(
-    session: Session, mine: Sequence[ColumnElement[bool]], keys: Sequence[Any], quantity: Quantity
-) -> Iterator[tuple[tuple[Any, ...], tuple[float, ...]]]:
-    """Each group's quantiles of one number: only the values beside each of them are read."""
-    value = quantity.column.label("value")
-    # A number for all rows where there is no key: a window needs something to part by.
-    parts = list(keys) or [Run.job_id]
-    ranked = (
-        select(
-            *keys, value,
-            func.row_number().over(partition_by=parts, order_by=value).label("place"),
-            func.count().over(partition_by=parts).label("n"),
-        )
-        .where(*mine, Run.state == State.SUCCEEDED, value.element.is_not(None))
-        .subquery()
-    )  # fmt: skip
-    place, n = ranked.c.place, cast(ranked.c.n, Integer)
+    session: Session, mine: Sequence[ColumnElement[bool]], keys: Sequence[Any],
+    quantities: Sequence[Quantity],
+) -> Iterator[tuple[int, Quantity, tuple[float, ...]]]:  # fmt: skip
+    """The first number of each group, a quantity, its quantiles: only values beside them are read.
+
+    One statement takes what it needs out of each row's documents once, and then ranks numbers.
+    """
+    if not quantities:
+        return
+    names = [f"q{i}" for i in range(len(quantities))]
+    group: ColumnElement[int] = func.dense_rank().over(order_by=list(keys)) if keys else literal(1)
+    # Also of runs that did not succeed, so that a group's first run is the same everywhere.
+    wide = select(
+        group.label("grp"), Run.number.label("number"),
+        *(_when_succeeded(one.column).label(name)
+          for one, name in zip(quantities, names, strict=True)),
+    ).where(*mine).cte("wide")  # fmt: skip
+    nothing = literal(0)
+    firsts = select(literal(-1), wide.c.grp, func.min(wide.c.number), nothing, nothing)
+    statement = union_all(
+        firsts.group_by(wide.c.grp), *(_beside(wide, name, i) for i, name in enumerate(names))
+    )
+    first: dict[int, int] = {}
+    values: dict[tuple[int, int], tuple[int, dict[int, float]]] = {}
+    for which, grp, number, at, count in session.execute(statement):
+        if which < 0:
+            first[int(grp)] = int(number)
+            continue
+        entry = values.setdefault((int(grp), int(which)), (int(count), {}))
+        entry[1][int(at)] = float(number)
+    for (grp, which), (count, places) in values.items():
+        found = tuple(_interpolated(places, count, q) for q in QUANTILES)
+        yield first[grp], quantities[which], found
+
+
+def _beside(wide: CTE, name: str, which: int) -> Select[Any]:
+    """The values on both sides of each quantile of one column, group by group."""
+    value = wide.c[name]
+    place = func.row_number().over(partition_by=wide.c.grp, order_by=value).label("place")
+    # The count is a window's too: SQLite joins a table of counts by trying every pair.
+    count = func.count().over(partition_by=wide.c.grp).label("n")
+    ranked = select(wide.c.grp, value.label("value"), place, count).where(
+        value.is_not(None)
+    ).subquery()  # fmt: skip
+    n = cast(ranked.c.n, Integer)
     lower = [1 + (q * (n - 1)) // 1000 for q in QUANTILES]
-    wanted = or_(*(place.in_((at, at + 1)) for at in lower))
-    rows = session.execute(select(ranked).where(wanted))
-    values: dict[str, tuple[tuple[Any, ...], int, dict[int, float]]] = {}
-    for row in rows:
-        *key, number, at, count = row
-        entry = values.setdefault(to_json(key), (tuple(key), int(count), {}))
-        entry[2][int(at)] = float(number)
-    for found, count, places in values.values():
-        yield found, tuple(_interpolated(places, count, q) for q in QUANTILES)
+    return select(literal(which), ranked).where(
+        or_(*(ranked.c.place.in_((at, at + 1)) for at in lower))
+    )
 
 
 def _interpolated(places: dict[int, float], count: int, thousandths: int) -> float:
