@@ -10,13 +10,16 @@ import logging
 import os
 import secrets
 import shutil
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sysid.program import program
 from workers.errors import ClusterLost, ClusterUnavailable, PackCancelled, PackFailed, WorkerDied
+from workers.joining import check_address, reason
 from workers.ports import Done, Handle, Item, Records
 from workers.processes import children, clear_after_the_dead, folder_of, is_running, kill, of_folder
 from workers.tasks import advance
@@ -29,6 +32,10 @@ FETCH_SECONDS = 20.0
 SILENCE_SECONDS = 5.0
 """After so long without a finished task a no-op task asks whether Ray is alive."""
 ANSWER_SECONDS = 15.0
+LATE_SECONDS = 30.0
+"""Workers that have not come up so long after the first are left to come up later."""
+COUNT_SECONDS = 2.0
+"""How often the cores of a joined cluster are counted."""
 PULSE_SECONDS = 0.1
 """Between two looks at the processes of a local Ray."""
 VITAL = ("gcs_server", "raylet")
@@ -51,7 +58,10 @@ _RAY_ENVIRONMENT = {
 
 @dataclass(frozen=True, slots=True)
 class ClusterSettings:
-    """Which Ray: `address` None starts one here with `cpus` cores (None: all of them)."""
+    """Which Ray: `address` None starts one here with `cpus` cores (None: all of them).
+
+    Of a cluster that is joined, `cpus` are the cores that are used at most.
+    """
 
     address: str | None = None
     cpus: int | None = None
@@ -68,6 +78,8 @@ class RayCrew:
 
     def __init__(self, settings: ClusterSettings) -> None:
         os.environ.update(_RAY_ENVIRONMENT)
+        if settings.address is not None:
+            check_address(settings.address)
         self._folder = None if settings.address else _fresh_folder()
         if settings.address is None:  # the token is read when Ray is imported
             os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
@@ -79,28 +91,47 @@ class RayCrew:
             _initialise(ray, settings, self._folder)
         except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
             self._forget_folder()
-            raise ClusterUnavailable(f"Ray could not be started or joined: {error}") from error
+            raise ClusterUnavailable(reason(settings.address, error)) from error
         self._advance = ray.remote(num_cpus=1, max_retries=0)(advance)
         self._noop = ray.remote(num_cpus=0, max_retries=0)(_answer)
         self._flying: set[Any] = set()
         self._probe: Any = None
         self._heard = self._felt = time.monotonic()
         self._vital = () if settings.address else children(VITAL)
+        self._most_slots = settings.cpus
         self.slots = self._count_slots()
+        self._left = threading.Event()
+        if settings.address is not None:  # nodes come and go
+            threading.Thread(target=self._keep_counting, name="slots", daemon=True).start()
 
     def warm(self) -> None:
         """Load the compiled loops in every worker, so that the first run need not.
 
+        Cores of a joined cluster that others are using are not waited for, once one has come up.
+
         Raises
         ------
         ClusterUnavailable
-            If the workers do not come up.
+            If the workers do not come up, or have another version of this program.
         """
-        task = self._ray.remote(num_cpus=1, max_retries=0)(warm)
+        task = self._ray.remote(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")(warm)
+        tasks = [task.remote() for _ in range(self.slots)]
+        limit = time.monotonic() + START_SECONDS
+        ready, late = self._ray.wait(tasks, timeout=START_SECONDS)
+        if late and ready:
+            left = min(LATE_SECONDS, limit - time.monotonic())
+            ready, late = self._ray.wait(tasks, num_returns=len(tasks), timeout=max(0.0, left))
+        if not ready:
+            raise ClusterUnavailable(f"no worker of Ray came up within {START_SECONDS:.0f} s")
         try:
-            self._ray.get([task.remote() for _ in range(self.slots)], timeout=START_SECONDS)
+            found = self._ray.get(ready, timeout=FETCH_SECONDS)
         except self._ray.exceptions.RayError as error:
-            raise ClusterUnavailable(f"Ray's workers do not come up: {error}") from error
+            last = str(error).strip().splitlines()[-1]
+            raise ClusterUnavailable(f"Ray's workers do not come up: {last}") from error
+        for one in late:
+            self._ray.cancel(one, force=False)
+        if self._folder is None:
+            _require_one_program(found)
         self._heard = time.monotonic()
 
     def share(self, records: Records) -> Any:
@@ -185,6 +216,7 @@ class RayCrew:
 
     def close(self) -> None:
         """Leave the cluster; a local one ends with it."""
+        self._left.set()
         self._ray.shutdown()
         self._forget_folder()
 
@@ -203,7 +235,20 @@ class RayCrew:
                 raise ClusterLost("a process of the local Ray is gone")
 
     def _count_slots(self) -> int:
-        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+        there = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+        return there if self._most_slots is None else min(there, self._most_slots)
+
+    def _keep_counting(self) -> None:
+        """In a thread, as the call may hang; the feeder sees the new number at its next step."""
+        while not self._left.wait(COUNT_SECONDS):
+            try:
+                there = self._count_slots()
+            except (self._ray.exceptions.RayError, RuntimeError, ConnectionError) as error:
+                _log.warning("the cores of the cluster could not be counted: %s", error)
+                continue
+            if there != self.slots:
+                _log.info("the cluster has %d cores now, before %d", there, self.slots)
+                self.slots = there
 
     def _forget_folder(self) -> None:
         if self._folder is not None:
@@ -223,6 +268,15 @@ def _initialise(ray: Any, settings: ClusterSettings, folder: Path | None) -> Non
         _temp_dir=str(folder),
         **common,
     )
+
+
+def _require_one_program(found: Sequence[str]) -> None:
+    others = set(found) - {program(Path(__file__).parent)}
+    if others:
+        raise ClusterUnavailable(
+            "some of the Ray workers have another version of lagid or its libraries than the "
+            "dispatcher, or machines of another kind: results would depend on where they are made"
+        )
 
 
 def _answer() -> bool:

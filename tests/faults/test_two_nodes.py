@@ -1,0 +1,120 @@
+"""A cluster that is joined by its address: two nodes, one of which dies; tokens and addresses."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.storage.tables import Run, State
+from service.supervision import environment_of
+from tests.dispatching import Place, until
+from tests.two_nodes import two_nodes
+
+pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(300)]
+
+SWEEP = {"axes": [{"path": "/seed", "range": [0, 24]}]}
+ALGORITHM = {"generations": 1500, "islands": 2, "stop": {"settled": None}}
+
+JOIN = """
+import sys
+from workers.cluster import ClusterSettings, RayCrew
+from workers.errors import ClusterUnavailable
+try:
+    RayCrew(ClusterSettings(sys.argv[1]))
+except ClusterUnavailable as error:
+    print(error)
+"""
+
+
+def plain(place: Place, job: str) -> list[dict[str, Any]]:
+    """What the job's runs give in this process, without Ray."""
+    from service.dispatch.claiming import Leases
+    from service.dispatcher import Dispatcher
+    from workers.inline import InlineCrew
+
+    dispatcher = Dispatcher(place.database, place.store, InlineCrew(), Leases(place.database, 30))
+    while not place.job(job).state.is_terminal:
+        dispatcher.turn()
+    return results(place.runs(job))
+
+
+def results(runs: tuple[Run, ...]) -> list[dict[str, Any]]:
+    assert all(run.result is not None for run in runs)
+    return [{**(run.result or {}), "seconds": 0} for run in runs]
+
+
+def told_on_joining(address: str, **environment: str) -> str:
+    """What a process prints that tries to join; it must end by itself."""
+    inherited = {name: text for name, text in os.environ.items() if not name.startswith("RAY_")}
+    done = subprocess.run(
+        [sys.executable, "-c", JOIN, address],
+        env={**inherited, "HOME": "/nonexistent", **environment}, capture_output=True, text=True,
+        timeout=90, check=True,
+    )  # fmt: skip
+    return done.stdout
+
+
+def test_two_nodes_give_the_bits_of_the_plain_loop_also_when_one_of_them_dies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = Place(tmp_path / "data")
+    with two_nodes(tmp_path) as cluster:
+        for name, value in cluster.environment.items():
+            monkeypatch.setenv(name, value)
+        place.settings = place.settings.model_copy(
+            update={"ray_address": cluster.address, "cpus": None}
+        )
+        quiet = place.submit(algorithm=ALGORITHM, sweep=SWEEP)
+        with place.dispatcher():
+            place.until(quiet, State.SUCCEEDED, State.FAILED)
+            assert "with 2 cores" in log_of(place)
+            assert any((tmp_path / "cache").glob("*.o"))  # the second node compiled, for itself
+            shaken = place.submit(algorithm=ALGORITHM, sweep=SWEEP)
+            until(lambda: place.job(shaken).n_done > 3, "some runs")
+            cluster.order("kill")
+            ended = place.until(shaken, State.SUCCEEDED, State.FAILED)
+            until(lambda: "has 1 cores now" in log_of(place), "one core")
+            cluster.order("add")
+            until(lambda: "has 2 cores now" in log_of(place), "two cores again")
+        wrong = told_on_joining(cluster.address, RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0" * 64)
+        assert wrong.count("\n") == 1
+        assert "does not let us in; its token is another one" in wrong
+        none = told_on_joining(cluster.address)
+        assert none.startswith(f"there is no token for the Ray cluster at {cluster.address}: set")
+    assert (ended.state, ended.attempt, ended.n_done, ended.n_failed) == (
+        State.SUCCEEDED, 1, 24, 0,
+    )  # fmt: skip
+    assert results(place.runs(shaken)) == results(place.runs(quiet))
+    alone = place.submit(algorithm=ALGORITHM, sweep=SWEEP)
+    assert results(place.runs(quiet)) == plain(place, alone)
+
+
+def log_of(place: Place) -> str:
+    return (place.settings.data_dir / "dispatcher.log").read_text()
+
+
+@pytest.mark.parametrize(
+    ("address", "told"),
+    [
+        ("127.0.0.1:1", "no Ray cluster answers at 127.0.0.1:1 (Connection refused)"),
+        ("nowhere.invalid:6379", "no Ray cluster answers at nowhere.invalid:6379"),
+        ("10.0.0.5", "the Ray address '10.0.0.5' is none: write host:port"),
+        ("ray://10.0.0.5:10001", "is one of Ray Client, which is not used"),
+    ],
+)
+def test_an_address_that_is_wrong_ends_the_dispatcher_with_one_line(
+    tmp_path: Path, address: str, told: str
+) -> None:
+    place = Place(tmp_path / "data")
+    settings = place.settings.model_copy(update={"ray_address": address})
+    done = subprocess.run(
+        [sys.executable, "-m", "service.dispatcher"],
+        env={**os.environ, **environment_of(settings)}, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 1
+    (line,) = [line for line in done.stderr.splitlines() if "ERROR" in line]
+    assert told in line
+    assert "Traceback" not in done.stderr
