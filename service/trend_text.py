@@ -37,7 +37,7 @@ def _flags(point: dict[str, Any]) -> list[str]:
 def span_text(one: dict[str, Any]) -> str:
     """From where to where an output went; the channel's name where it has no unit."""
     unit = f" {one['unit']}" if one["unit"] not in ("", "1") else f" ({one['channel']})"
-    return f"{one['lower']:.5g} to {one['upper']:.5g}{unit}"
+    return f"{one['lower']:.6g} to {one['upper']:.6g}{unit}"
 
 
 def law_text(name: str, law: dict[str, Any], x: str, shown: Callable[[dict[str, Any]], str]) -> str:

@@ -41,8 +41,8 @@ def trend_figure(found: TrendOut, columns: int = 2) -> Figure:
         at = _axes(figure, number, one, found.x, ((left, min(left + wide, 1.0)), (bottom, top)))
         for trace in _traces(one):
             name = trace["legendgroup"]
-            label = name if number == 0 else f"{one.name}: {name}"
             first = name not in told and trace.get("showlegend", True)
+            label = name if first else f"{one.name}: {name}"
             told.update({name} if first else ())
             figure["data"].append({**trace, "name": label, "showlegend": first, **at})
     return figure
