@@ -5,6 +5,7 @@ from typing import Any
 
 from service import jobs
 from service.api.deps import Parts
+from service.dispatch.floors import floors_for
 from service.dispatch.preparing import JobRuns
 from service.dispatch.recording import Recorder
 from service.schemas_jobs import JobIn
@@ -18,12 +19,19 @@ def identified(parts: Parts, body: dict[str, Any], steps: int = 5000) -> tuple[s
     """Submit a job and carry it out; gives its id and those of its runs."""
     with parts.database.write() as session:
         job = jobs.submit(session, JobIn.model_validate(body), parts.settings).job.id
+    return job, carried_out(parts, job, steps)
+
+
+def carried_out(parts: Parts, job: str, steps: int = 5000) -> list[str]:
+    """Carry out a job that waits; gives the ids of its runs."""
+    with parts.database.write() as session:
         claim = Queue(session).claim("test", timedelta(hours=1))
         while claim is not None and claim.job.id != job:  # others that wait are left claimed
             claim = Queue(session).claim("test", timedelta(hours=1))
     assert claim is not None
     source = JobRuns(parts.database, claim, parts.store)
-    recorder = Recorder(parts.database, claim, source.save)
+    floors = floors_for(parts.database, claim, source)
+    recorder = Recorder(parts.database, claim, source.save, floors)
     feeder: Feeder[str] = Feeder(InlineCrew())
     feeder.add(job, source, recorder)
     for _ in range(steps):
@@ -31,4 +39,4 @@ def identified(parts: Parts, body: dict[str, Any], steps: int = 5000) -> tuple[s
             recorder.finish()
             break
     with parts.database.read() as session:
-        return job, [run.id for run in RunRepository(session).page(job, limit=100).items]
+        return [run.id for run in RunRepository(session).page(job, limit=100).items]

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from service.storage.errors import LeaseLost
 from service.storage.ledger import Cell, RunLedger, RunOutcome
-from service.storage.queue import Queue
-from service.storage.summaries import QUANTILES, GroupKey, Quantity, groups
-from service.storage.tables import State
+from service.storage.queue import Lease, Queue
+from service.storage.summaries import QUANTILES, GroupKey, Quantity, groups, quietest_run
+from service.storage.tables import Job, State
 from tests.stored import runs_of, submit
 
 SIGMA = GroupKey("axis", "/noise/sigma")
@@ -20,9 +21,12 @@ def filled(database, cells, values):
         got = Queue(session).claim("d1")
         ledger = RunLedger(session, got.lease)
         ledger.create(
-            Cell(number=i, cell=cell, labels={"length_m": 5.0 * (i % 2)})
+            Cell(
+                number=i, cell=cell, labels={"length_m": 5.0 * (i % 2)},
+                sigma=cell.get("/noise/sigma"),
+            )
             for i, cell in enumerate(cells)
-        )
+        )  # fmt: skip
     outcomes = [
         RunOutcome(run_id=run.id, state=State.FAILED, error="diverged")
         if value is None
@@ -31,6 +35,7 @@ def filled(database, cells, values):
             state=State.SUCCEEDED,
             valid=True,
             best_rms=value,
+            rms_noise_free=value / 2,
             evaluations=100 + i,
             result={"parameters": [{"name": "L", "value": 2 * value, "stderr": None}]},
         )
@@ -102,3 +107,66 @@ def test_a_quantity_that_no_run_has_gives_no_quantiles(database):
 def test_at_most_one_group_more_than_the_limit_is_read(database):
     job = filled(database, [{"/noise/sigma": i} for i in range(9)], [1.0] * 9)
     assert len(summary(database, job, [SIGMA], Quantity("rms"), limit=4)) == 5
+
+
+def test_a_group_knows_between_which_deviations_its_noise_lies(database):
+    cells = [{"/noise/sigma": sigma, "/seed": seed} for sigma in (0.0, 0.5) for seed in (1, 2)]
+    job = filled(database, cells, [1.0] * 4)
+    assert [one.sigma for one in summary(database, job, [SIGMA])] == [(0.0, 0.0), (0.5, 0.5)]
+    assert [one.sigma for one in summary(database, job, [])] == [(0.0, 0.5)]
+
+
+def test_several_quantities_have_the_quantiles_that_each_has_alone(database):
+    draws = np.random.default_rng(3)
+    cells = [{"/noise/sigma": draws.integers(3) / 10} for _ in range(60)]
+    values = [None if draws.random() < 0.2 else float(draws.random()) for _ in cells]
+    job = filled(database, cells, values)
+    wanted = Quantity("rms"), Quantity("estimate", "L"), Quantity("rms_noise_free")
+    together = summary(database, job, [SIGMA], *wanted)
+    for quantity in wanted:
+        alone = summary(database, job, [SIGMA], quantity)
+        for one, other in zip(together, alone, strict=True):
+            assert one.key == other.key
+            assert one.quantiles.get(quantity) == other.quantiles.get(quantity)
+    for one in together:
+        mine = [v for v, c in zip(values, cells, strict=True) if c["/noise/sigma"] == one.key[0]]
+        left = [v for v in mine if v is not None]
+        expected = np.quantile(left, np.array(QUANTILES) / 1000)
+        np.testing.assert_allclose(one.quantiles[wanted[0]], expected, rtol=1e-12)
+        np.testing.assert_allclose(one.quantiles[wanted[2]], expected / 2, rtol=1e-12)
+
+
+def test_the_quietest_run_is_the_best_of_those_with_the_least_noise_in_its_cell(database):
+    cells = [
+        {"/noise/sigma": sigma, "/model": model, "/seed": seed}
+        for model in ("tube", {"name": "own"})
+        for sigma in (0.3, 0.1)
+        for seed in range(3)
+    ]
+    values = [0.1, 0.1, 0.1, 4.0, 2.0, None, 0.1, 0.1, 0.1, 5.0, 6.0, 5.0]
+    job = filled(database, cells, values)
+    with database.read() as session:
+        found = [quietest_run(session, job, cell).number
+                 for cell in ({}, {"/model": "tube"}, {"/model": {"name": "own"}})]  # fmt: skip
+        assert quietest_run(session, job, {"/model": "absent"}) is None
+    assert found == [4, 4, 9]
+
+
+def test_groups_of_a_job_are_not_told_to_another_project(database):
+    job = filled(database, [{"/noise/sigma": 0.0}], [1.0])
+    with database.read() as session:
+        assert groups(session, job, [SIGMA], [Quantity("rms")], 10, "proj_other") == []
+
+
+def test_floors_are_written_under_the_lease_only(database):
+    submit(database, n_runs=1)
+    with database.write() as session:
+        lease = Queue(session).claim("d1").lease
+        Queue(session).tell_floors(lease, {"axes": [], "problems": []})
+    with database.read() as session:
+        assert session.get(Job, lease.job_id).floors == {"axes": [], "problems": []}
+    late = Lease(lease.job_id, lease.attempt + 1, "d2")
+    with database.write() as session, pytest.raises(LeaseLost):
+        Queue(session).tell_floors(late, {"axes": ["late"], "problems": []})
+    with database.read() as session:
+        assert session.get(Job, lease.job_id).floors == {"axes": [], "problems": []}
