@@ -1,0 +1,322 @@
+"""Batch re-identification over REST: trend, drift from a reference, acceptance, bad input."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+from typer.testing import CliRunner
+
+from service.api.deps import Parts
+from service.app import create_app
+from service.cli import references, reidentifying
+from service.cli.main import app as lagid
+from service.client import Client
+from tests.identified import carried_out
+from tests.integration.rest.test_client import Through
+from tests.rest import CSV, refused, settings_of
+
+LENGTHS = (2.0, 4.0, 8.0, 16.0)
+QUICK = {"population": 20, "islands": 2, "stop": {"settled": 3}}
+BODY: dict[str, Any] = {
+    "model": "tube", "label": "length_m", "algorithm": QUICK, "look_at": ["L", "T"],
+}  # fmt: skip
+
+
+def recorded(length: float, seed: int = 1, longer: float = 0.0) -> bytes:
+    """A tube of that length: T = 0.06 s·m^½, dead time 20 ms + 10 ms/m; holds of 2 s."""
+    draw = np.random.default_rng(1000 * seed + round(10 * length))
+    t = np.arange(1000) * 0.01
+    u = np.repeat([1.0, 4.0, 2.0, 5.0, 3.0], 200)
+    lag = round((0.02 + 0.01 * length + longer) / 0.01)
+    delayed = np.concatenate([np.full(lag, u[0]), u[: u.size - lag]])
+    y, share = np.full(t.size, u[0]), np.exp(-0.01 / (0.06 * length**0.5))
+    for k in range(1, t.size):
+        y[k] = share * y[k - 1] + (1 - share) * delayed[k - 1]
+    y += 0.01 * draw.normal(size=t.size)
+    rows = ["t,u [bar],y [bar]"]
+    rows += [f"{a:.6g},{b:.6g},{c:.6g}" for a, b, c in zip(t, u, y, strict=True)]
+    return "\n".join(rows).encode()
+
+
+@dataclass(frozen=True)
+class Served:
+    server: TestClient
+    parts: Parts
+    datasets: dict[float, list[str]]
+    job: str
+
+
+def stored(server: TestClient, length: float, seed: int, longer: float = 0.0) -> str:
+    answer = server.post(
+        f"/v1/datasets?name=tube-{length:g}-{seed}-{longer:g}",
+        content=recorded(length, seed, longer), headers=CSV,
+    )  # fmt: skip
+    assert answer.status_code in (200, 201), answer.text
+    return str(answer.json()["id"])
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Four lengths, two experiments each, and the job of the first batch, in reverse order."""
+    app = create_app(settings_of(tmp_path_factory.mktemp("batch")))
+    with TestClient(app, raise_server_exceptions=False) as server:
+        parts: Parts = app.state.parts
+        datasets = {x: [stored(server, x, seed) for seed in (1, 2)] for x in LENGTHS}
+        batch = [{"x": x, "datasets": datasets[x][:1]} for x in reversed(LENGTHS)]
+        job = batch_of(server, parts, batch=batch, predict=[10, 32])
+        yield Served(server, parts, datasets, job)
+
+
+def batch_of(server: TestClient, parts: Parts, **fields: Any) -> str:
+    answer = server.post("/v1/recipes/reidentify", json={**BODY, **fields})
+    assert answer.status_code == 202, answer.text
+    job = str(answer.json()["id"])
+    assert answer.headers["location"] == f"/v1/jobs/{job}"
+    carried_out(parts, job)
+    return job
+
+
+def trend(served: Served, job: str) -> dict[str, Any]:
+    answer = served.server.get(f"/v1/jobs/{job}/trend")
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
+
+
+def quantity(found: dict[str, Any], name: str) -> dict[str, Any]:
+    return next(dict(one) for one in found["quantities"] if one["name"] == name)
+
+
+def chosen(one: dict[str, Any]) -> dict[str, Any]:
+    return next(dict(law) for law in one["laws"] if law["is_chosen"])
+
+
+def run_at(served: Served, job: str, x: float) -> str:
+    place = next(one for one in trend(served, job)["places"] if one["x"] == x)
+    return str(place["runs"][0])
+
+
+def test_a_batch_gives_each_length_in_order_with_errors_onset_and_span(served: Served) -> None:
+    found = trend(served, served.job)
+    assert [one["x"] for one in found["places"]] == list(LENGTHS)
+    assert [one["name"] for one in found["quantities"]] == ["L", "T", "onset delay"]
+    for point in quantity(found, "L")["points"]:
+        assert abs(point["value"] - (0.02 + 0.01 * point["x"])) < 5 * point["stderr"] + 1e-3
+        assert point["stderr"] > 0
+        assert point["status"] == "identified"
+    for place in found["places"]:
+        (span,) = place["spans"]
+        assert (span["channel"], span["unit"]) == ("y", "bar")
+        assert span["lower"] == pytest.approx(1, abs=0.1)
+        assert span["upper"] == pytest.approx(5, abs=0.1)
+    assert found["missing"] == 0
+
+
+def test_runs_begin_at_their_neighbours(served: Served) -> None:
+    request = served.server.get(f"/v1/jobs/{served.job}").json()["request"]
+    assert request["warm_start"] == "previous"
+    labels = request["sweep"]["axes"][0]["labels"]
+    assert [one["length_m"] for one in labels] == list(LENGTHS)
+
+
+def test_the_laws_are_those_of_the_tube_and_predictions_hold(served: Served) -> None:
+    found = trend(served, served.job)
+    delay, constant = quantity(found, "L"), quantity(found, "T")
+    assert chosen(delay)["law"] == "line"
+    slope = chosen(delay)["coefficients"][1]
+    assert slope["value"] == pytest.approx(0.01, abs=4 * slope["stderr"])
+    assert chosen(constant)["law"] == "power"
+    assert chosen(constant)["coefficients"][1]["value"] == pytest.approx(0.5, abs=0.03)
+    inside, outside = delay["predictions"]
+    assert inside["lower"] <= 0.12 <= inside["upper"]
+    assert (inside["is_outside"], outside["is_outside"]) == (False, True)
+    assert any("extrapolation" in note for note in delay["notes"])
+    assert all(place["lower"] <= place["value"] <= place["upper"] for place in delay["band"])
+
+
+def test_experiments_of_one_length_are_fitted_together_or_pooled(served: Served) -> None:
+    both = [{"x": x, "datasets": served.datasets[x]} for x in LENGTHS]
+    jointly = trend(served, batch_of(served.server, served.parts, batch=both))
+    assert quantity(jointly, "L")["between_runs"] is None
+    apart = [{"x": x, "datasets": [one]} for x in LENGTHS for one in served.datasets[x]]
+    pooled = trend(served, batch_of(served.server, served.parts, batch=apart))
+    assert quantity(pooled, "L")["between_runs"] > 0
+    for one, two in zip(quantity(jointly, "L")["points"], quantity(pooled, "L")["points"],
+                        strict=True):  # fmt: skip
+        assert len(two["runs"]) == 2
+        assert one["value"] == pytest.approx(two["value"], abs=4 * two["stderr"])
+
+
+def test_an_unchanged_batch_does_not_drift_and_a_changed_length_does(served: Served) -> None:
+    reference = run_at(served, served.job, 8.0)
+    accepted = served.server.put("/v1/references/tube", json={"run": reference, "by": "me"})
+    assert accepted.status_code == 200, accepted.text
+    changed = stored(served.server, 8.0, 3, longer=0.05)
+    batch = [{"x": x, "datasets": served.datasets[x][1:]} for x in LENGTHS if x != 8.0]
+    job = batch_of(
+        served.server, served.parts, reference="tube",
+        batch=[*batch, {"x": 8.0, "datasets": [changed]}],
+    )  # fmt: skip
+    found = trend(served, job)
+    assert (found["reference"], found["reference_x"]) == (reference, 8.0)
+    drifted = {
+        (point["x"], drift["kind"])
+        for point in quantity(found, "L")["points"] for drift in point["drifts"]
+        if drift["drifted"]
+    }  # fmt: skip
+    assert drifted == {(8.0, "run"), (8.0, "trend")}
+    (against_run,) = (
+        one for point in quantity(found, "L")["points"] for one in point["drifts"]
+        if one["kind"] == "run"
+    )  # fmt: skip
+    assert against_run["difference"] == pytest.approx(0.05, abs=0.005)
+    request = served.server.get(f"/v1/jobs/{job}").json()["request"]
+    assert request["warm_start"] == request["trend"]["reference"] == reference
+
+
+def test_references_keep_their_history_and_say_what_is_wrong(served: Served) -> None:
+    first, second = (run_at(served, served.job, x) for x in (2.0, 4.0))
+    for run in (first, second, second):
+        answer = served.server.put("/v1/references/kept", json={"run": run})
+        assert answer.status_code == 200
+    told = served.server.get("/v1/references/kept").json()
+    assert (told["run"], [one["run"] for one in told["history"]]) == (second, [first])
+    assert told["labels"] == {"length_m": 4.0}
+    assert set(told["estimates"]) == {"K", "T", "L"}
+    assert "kept" in [one["name"] for one in served.server.get("/v1/references").json()["items"]]
+    wrong = served.server.put("/v1/references/kept", json={"run": "run_none"})
+    assert refused(wrong, 422, "invalid")[0]["pointer"] == "/run"
+    missing = served.server.get("/v1/references/kep")
+    assert missing.status_code == 404
+    assert "did you mean 'kept'" in missing.json()["detail"]
+
+
+@pytest.mark.parametrize(
+    ("fields", "pointer", "said"),
+    [
+        ({"batch": []}, "/batch", "at least 1"),
+        ({"reference": "nobody"}, "/reference", "there is no reference 'nobody'"),
+        ({"warm_start": "reference"}, "/warm_start", "needs one"),
+        ({"look_at": ["Q"]}, "/look_at/0", "no parameter 'Q'"),
+        ({"batch": [{"x": 5, "datasets": ["ds_none"]}]}, "/batch/0/datasets", "ds_none"),
+        ({"label": 'a"b'}, "/label", "quotation marks"),
+    ],
+)
+def test_a_fault_is_told_at_its_place_in_the_recipe(
+    served: Served, fields: dict[str, Any], pointer: str, said: str
+) -> None:
+    batch = [{"x": x, "datasets": served.datasets[x]} for x in LENGTHS]
+    answer = served.server.post("/v1/recipes/reidentify", json={**BODY, "batch": batch, **fields})
+    faults = refused(answer, 422, "invalid")
+    assert pointer in faults[0]["pointer"]
+    assert said in json.dumps(faults)
+
+
+@pytest.mark.parametrize(
+    ("labels", "pointer", "said"),
+    [
+        (None, "/trend/x", "no axis has labels"),
+        ([{"width": 1}, {"width": 2}], "/trend/x", "no run has a label 'length_m'"),
+        ([{"length_m": 1}, {}], "/sweep/axes/0/labels/1", "it is missing"),
+        ([{"length_m": 1}, {"length_m": "two"}], "/sweep/axes/0/labels/1", "found 'two'"),
+    ],
+)
+def test_labels_missing_for_a_trend_are_told(
+    served: Served, labels: Any, pointer: str, said: str
+) -> None:
+    values = [served.datasets[2.0][:1], served.datasets[4.0][:1]]
+    axis = {"path": "/datasets", "values": values, "labels": labels}
+    body = {"model": "tube", "datasets": values[0], "sweep": {"axes": [axis]},
+            "trend": {"x": "length_m"}}  # fmt: skip
+    (fault,) = refused(served.server.post("/v1/jobs", json=body), 422, "invalid")
+    assert fault["pointer"] == pointer
+    assert said in fault["detail"]
+
+
+def test_a_trend_of_too_few_lengths_says_how_many_it_needs(served: Served) -> None:
+    batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS[:2]]
+    found = trend(served, batch_of(served.server, served.parts, batch=batch))
+    assert quantity(found, "L")["laws"] == []
+    assert "needs 3" in quantity(found, "L")["reason"]
+
+
+def test_a_job_without_a_trend_says_so(served: Served) -> None:
+    body = {"model": "tube", "datasets": served.datasets[2.0]}
+    job = served.server.post("/v1/jobs", json=body).json()["id"]
+    refused(served.server.get(f"/v1/jobs/{job}/trend"), 409, "conflict")
+    figure = served.server.get(f"/v1/jobs/{job}/figures/trend").json()
+    assert figure["data"] == []
+
+
+def test_figure_page_and_report_show_the_trend(served: Served) -> None:
+    figure = served.server.get(f"/v1/jobs/{served.job}/figures/trend").json()
+    points = [one for one in figure["data"] if one["name"].endswith("estimate ± standard error")]
+    assert [one["x"] for one in points] == [list(LENGTHS)] * 3
+    assert all(len(one["error_y"]["array"]) == 4 for one in points)
+    assert json.dumps(figure, allow_nan=False)
+    page = served.server.get(f"/jobs/{served.job}").text
+    assert "Trend over length_m" in page
+    assert "L = (0.0" in page
+    report = served.server.get(f"/v1/jobs/{served.job}/report").text
+    assert 'id="figure-trend"' in report
+
+
+@pytest.fixture
+def command(served: Served, monkeypatch: pytest.MonkeyPatch) -> CliRunner:
+    """The command line against this server; jobs are carried out while it waits."""
+    client = Client("http://testserver", transport=Through(served.server))
+
+    def follow(opened: Client, job: str, *, quiet: bool = False) -> dict[str, Any]:
+        carried_out(served.parts, job)
+        return opened.job(job)
+
+    for module in (reidentifying, references):
+        monkeypatch.setattr(f"{module.__name__}.connected", lambda *_: client)
+    monkeypatch.setattr(f"{reidentifying.__name__}.follow", follow)
+    return CliRunner()
+
+
+def test_the_command_uploads_prints_and_accepts(
+    served: Served, command: CliRunner, tmp_path: Any
+) -> None:
+    words = ["reidentify", "--model", "tube", "--label", "length_m", "--parameters", "L,T",
+             "--predict", "10", "--set", "algorithm.population=20", "--set",
+             "algorithm.islands=2"]  # fmt: skip
+    for x in LENGTHS[:3]:
+        file = tmp_path / f"{x:g}.csv"
+        file.write_bytes(recorded(x, 5))
+        words.append(f"{x:g}={file}")
+    out = tmp_path / "trend.json"
+    told = command.invoke(lagid, [*words, "--json", str(out), "--accept", "own", "--accept-run",
+                                  "4"])  # fmt: skip
+    assert told.exit_code == 0, told.output
+    assert "L = (" in told.output
+    assert "predicted" in told.output
+    trend = json.loads(out.read_text())
+    accepted = next(one["runs"][0] for one in trend["places"] if one["x"] == 4)
+    assert f"own: {accepted}" in told.output
+    shown = command.invoke(lagid, ["references", "show", "own"])
+    assert accepted in shown.output
+    listed = command.invoke(lagid, ["references", "list", "--json"])
+    assert accepted in listed.output
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["a.csv"], "need X=DATA"), (["long=a.csv"], "need a number"),
+        (["5=nowhere.csv"], "there is no file nowhere.csv"),
+        (["5=ds_a", "6=ds_b", "--accept", "x"], "--accept needs --accept-run"),
+        (["5=ds_a", "--predict", "inf"], "need a number"),
+        (["5=ds_a", "--channels", "u"], "need signal=channel"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_the_command_is_one_line(
+    command: CliRunner, words: list[str], said: str
+) -> None:
+    told = command.invoke(lagid, ["reidentify", "--model", "tube", "--label", "length_m", *words])
+    assert told.exit_code in (1, 2)
+    assert said in " ".join(told.output.split())
