@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.ga.gauss_newton import damped_step
+from sysid.kernels.caching import compiled
 from sysid.types import FloatArray
 
 _DAMPINGS = np.array([0.0, 1e-4, 1e-2, 1.0, 1e2])
@@ -52,14 +54,8 @@ class Loss:
         else:
             roots = np.sqrt(1 + (errors / self.scale) ** 2)
             values = 2 * self.scale**2 * np.sum(roots - 1, axis=1)
-        return np.asarray(np.where(np.isfinite(values), values, np.inf))
-
-    def weighted(self, error: FloatArray, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals and Jacobian whose squares have the loss's slope here."""
-        if self.scale == 0.0:
-            return error, columns
-        root = (1 + (error / self.scale) ** 2) ** -0.25
-        return root * error, root[:, None] * columns
+        values[~np.isfinite(values)] = np.inf
+        return np.asarray(values)
 
 
 def solve(
@@ -97,12 +93,11 @@ def _solved(
     error = residuals(place[None])[0]
     value = float(loss.total(error[None])[0])
     for _ in range(steps):
-        normal, slope = _normal_equations(loss, error, jacobian(place, error), place)
         tried = np.maximum(_DAMPINGS * damping, _LEAST)
-        moves = _moves(normal, slope, tried)
-        if float(slope @ moves[0]) <= tolerance * value:  # what the largest step promises
+        columns = np.ascontiguousarray(jacobian(place, error))
+        places, promised = _proposals(error, columns, place, tried, loss.scale)
+        if promised <= tolerance * value:  # by the largest step
             return Solution(place, True)
-        places = np.clip(place - moves, 0.0, 1.0)
         errors = residuals(places)
         values = loss.total(errors)
         best = int(np.argmin(values))
@@ -120,23 +115,32 @@ def _solved(
     return Solution(place, False)
 
 
+@compiled
 def _normal_equations(
-    loss: Loss, error: FloatArray, columns: FloatArray, place: FloatArray
+    error: FloatArray, columns: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray]:
-    """JᵀJ and Jᵀe, with the rows and columns of held places cleared."""
-    rows, sloped = loss.weighted(error, columns)
-    normal, slope = sloped.T @ sloped, sloped.T @ rows
-    held = ((place <= 0.0) & (slope > 0)) | ((place >= 1.0) & (slope < 0))
-    held |= np.diag(normal) == 0.0
-    slope[held] = 0.0
-    normal[held, :] = normal[:, held] = 0.0
-    normal[held, held] = 1.0
-    return normal, slope
+    """JᵀJ and Jᵀe of residuals (n,) and Jacobian (n, D), reweighted for the loss's slope here."""
+    n, d = columns.shape
+    sums, row = np.zeros((d + 1, d + 1)), np.empty(d + 1)
+    for m in range(n):
+        root = 1.0 if scale == 0.0 else (1.0 + (error[m] / scale) ** 2) ** -0.25
+        for i in range(d):
+            row[i] = root * columns[m, i]
+        row[d] = root * error[m]
+        for i in range(d + 1):
+            for j in range(i + 1):
+                sums[i, j] += row[i] * row[j]
+    return sums[:d, :d], sums[d, :d].copy()
 
 
-def _moves(normal: FloatArray, slope: FloatArray, damping: FloatArray) -> FloatArray:
-    """The damped steps (P, D), one for each damping (P,)."""
-    damped = normal + damping[:, None, None] * (normal * np.eye(slope.size))
-    right = np.empty((damping.size, slope.size, 1))
-    right[:, :, 0] = slope
-    return np.asarray(np.linalg.solve(damped, right)[:, :, 0])
+@compiled
+def _proposals(
+    error: FloatArray, columns: FloatArray, place: FloatArray, damping: FloatArray, scale: float
+) -> tuple[FloatArray, float]:
+    """Places (P, D) after the step of each damping (P,), and the gain that the first promises."""
+    normal, slope = _normal_equations(error, columns, scale)
+    places, promised = np.empty((damping.size, place.size)), 0.0
+    for p in range(damping.size):
+        gain = damped_step(normal, slope, place, damping[p], places[p])
+        promised = gain if p == 0 else promised
+    return places, promised

@@ -7,9 +7,12 @@ import numpy as np
 
 from sysid.ga.chromosome import located, placed
 from sysid.islands.archipelago import loss_scale
+from sysid.kernels.caching import compiled
+from sysid.kernels.evaluation import partial_predictions
+from sysid.kernels.evaluator import Evaluator
 from sysid.least_squares import TRIED, Loss, solve
 from sysid.problem import Problem
-from sysid.types import FloatArray
+from sysid.types import FloatArray, IntArray
 
 _SAME = 1e-3  # of the range: nearer champions lie in one valley
 _DIFFERENCE = 1e-6  # of the range
@@ -68,6 +71,39 @@ def _refined(
     return Refined(np.array(theta), reached, search.evaluations)
 
 
+@compiled
+def _residuals(
+    evaluator: Evaluator, places: FloatArray, scored: IntArray, weight: FloatArray
+) -> FloatArray:
+    """Weighted residuals (P, n) of the scored values at places (P, D)."""
+    predicted = partial_predictions(evaluator, located(evaluator, places), 1.0)
+    errors = np.empty((places.shape[0], scored.size))
+    for i in range(scored.size):
+        for p in range(places.shape[0]):
+            errors[p, i] = weight[i] * (predicted[scored[i], p] - evaluator.measured[scored[i]])
+    return errors
+
+
+@compiled
+def _slopes(
+    evaluator: Evaluator, place: FloatArray, error: FloatArray, scored: IntArray, weight: FloatArray
+) -> FloatArray:
+    """Slopes (n, D) of the residuals (n,) at a place (D,); 0 where a neighbour diverges."""
+    places, steps = np.empty((place.size, place.size)), np.empty(place.size)
+    for d in range(place.size):
+        steps[d] = _DIFFERENCE if place[d] < 0.5 else -_DIFFERENCE
+        for k in range(place.size):
+            places[d, k] = place[k] + (steps[d] if k == d else 0.0)
+    predicted = partial_predictions(evaluator, located(evaluator, places), 1.0)
+    slopes = np.empty((scored.size, place.size))
+    for i in range(scored.size):
+        for d in range(place.size):
+            there = weight[i] * (predicted[scored[i], d] - evaluator.measured[scored[i]])
+            slope = (there - error[i]) / steps[d]
+            slopes[i, d] = slope if np.isfinite(slope) else 0.0
+    return slopes
+
+
 class _LeastSquares:
     """Residuals and Jacobian over places in [0, 1], counting simulations.
 
@@ -78,27 +114,20 @@ class _LeastSquares:
     def __init__(self, problem: Problem, scale: float) -> None:
         self.problem, self.evaluations = problem, 0
         self.unit = float(np.ldexp(1.0, int(np.frexp(scale)[1]))) if scale > 0 else 1.0
-        weight = problem.evaluator.weight
-        scored = weight > 0
-        # A slice where nothing is left out: it copies nothing.
-        self._scored = slice(None) if scored.all() else scored
-        self._weight = weight[self._scored] / self.unit
-        self._measured = problem.evaluator.measured[self._scored]
+        evaluator = problem.evaluator
+        self._scored = np.flatnonzero(evaluator.weight > 0)
+        self._weight = evaluator.weight[self._scored] / self.unit
 
     def residuals(self, places: FloatArray) -> FloatArray:
         """Weighted residuals (P, n) of places (P, D), in one batch."""
         self.evaluations += places.shape[0]
-        theta = located(self.problem.evaluator, np.ascontiguousarray(places))
-        predicted = self.problem.predictions(theta)
-        return np.asarray(self._weight * (predicted[:, self._scored] - self._measured))
+        evaluator = self.problem.evaluator
+        return _residuals(evaluator, np.ascontiguousarray(places), self._scored, self._weight)
 
     def jacobian(self, place: FloatArray, error: FloatArray) -> FloatArray:
         """Forward differences away from the nearer bound, one batch of D simulations."""
-        steps = np.where(place < 0.5, _DIFFERENCE, -_DIFFERENCE)
-        slopes = (self.residuals(place + np.diag(steps)) - error) / steps[:, None]
-        if not np.isfinite(slopes).all():
-            slopes = np.where(np.isfinite(slopes), slopes, 0.0)
-        return np.asarray(slopes.T)
+        self.evaluations += place.size
+        return _slopes(self.problem.evaluator, place, error, self._scored, self._weight)
 
     def best(self, place: FloatArray) -> tuple[FloatArray, float]:
         """The solution, moved onto a bound that it only approaches if that is not worse."""

@@ -75,15 +75,19 @@ def normal_equations(
     """JᵀJ, Jᵀe and the fitness at a point, over the samples up to `horizon`: D + 1 simulations."""
     n = point.size
     predicted, steps = _sensed(evaluator, point, horizon, difference)
-    rows, count = np.empty((n + 1, predicted.shape[0])), 0
+    rows, count, total = np.empty((n + 1, predicted.shape[0])), 0, 0.0
     for m in range(predicted.shape[0]):
         weight = evaluator.weight[m]
         if weight == 0.0 or plan.progress[m] > horizon:
             continue
         error = weight * (predicted[m, 0] - evaluator.measured[m])
         if plan.loss_scale > 0.0:
-            share = (1.0 + (error / plan.loss_scale) ** 2) ** -0.25
+            root = np.sqrt(1.0 + (error / plan.loss_scale) ** 2)
+            total += 2.0 * plan.loss_scale**2 * (root - 1.0)
+            share = root**-0.5
             error, weight = share * error, share * weight
+        else:
+            total += error * error
         rows[n, count] = error
         for d in range(n):
             rows[d, count] = weight * (predicted[m, d + 1] - predicted[m, 0])
@@ -93,7 +97,8 @@ def normal_equations(
         gradient[d] = _product(rows[d], rows[n], count) / steps[d]
         for e in range(d + 1):
             matrix[d, e] = _product(rows[d], rows[e], count) / (steps[d] * steps[e])
-    return matrix, gradient, partial_fitness(evaluator, plan, predicted[:, :1], horizon)[0]
+    fitness = np.sqrt(total / max(count, 1))
+    return matrix, gradient, fitness if np.isfinite(fitness) else np.inf
 
 
 @compiled
@@ -138,19 +143,32 @@ def _shift(point: FloatArray, step: FloatArray, place: FloatArray) -> None:
 
 
 @compiled
-def damped_step(matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float,
-                place: FloatArray) -> None:  # fmt: skip
-    """Write the place after the step p of (A + λ diag A) p = −g, kept inside [0, 1]."""
-    factor = factored(matrix, gradient, point, damping)
-    step = np.zeros(point.size)
-    for d in range(point.size):
+def solved(factor: FloatArray, gradient: FloatArray) -> FloatArray:
+    """The step p (D,) of L Lᵀ p = −g; parameters that stay get zero."""
+    step = np.zeros(gradient.size)
+    for d in range(gradient.size):
         if factor[d, d] > 0.0:
             value = -gradient[d]
             for k in range(d):
                 value -= factor[d, k] * step[k]
             step[d] = value / factor[d, d]
     _back(factor, step)
+    return step
+
+
+@compiled
+def damped_step(matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float,
+                place: FloatArray) -> float:  # fmt: skip
+    """Write the place after the step p of (A + λ diag A) p = −g, kept inside [0, 1].
+
+    Gives −gᵀp: what the whole step promises to gain, in the loss's linear part.
+    """
+    step = solved(factored(matrix, gradient, point, damping), gradient)
     _shift(point, step, place)
+    promised = 0.0
+    for d in range(point.size):
+        promised -= gradient[d] * step[d]
+    return promised
 
 
 @compiled

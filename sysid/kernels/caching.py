@@ -17,7 +17,7 @@ from numba.core.runtime.nrt import rtsys
 
 _SOURCES = (
     "ga/*.py", "kernels/caching.py", "kernels/calls.py", "kernels/evaluation.py",
-    "kernels/evaluator.py", "plants/*.py",
+    "kernels/evaluator.py", "plants/*.py", "least_squares.py", "refinement.py",
 )  # fmt: skip
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
