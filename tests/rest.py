@@ -37,7 +37,8 @@ def awaited(work: Callable[[], Coroutine[Any, Any, T]]) -> T:
 
 
 def settings_of(folder: Path, **changes: object) -> Settings:
-    values = {"data_dir": folder, "poll_seconds": 0.02, **changes}
+    # Tests claim jobs without a heartbeat, and compile between two writes: the lease is long.
+    values = {"data_dir": folder, "poll_seconds": 0.02, "lease_seconds": 3600, **changes}
     return Settings.model_validate(values)
 
 

@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 
 from service import jobs
 from service.checks import JobChecker
+from service.conversion import faults_of
 from service.errors import FieldError, InvalidRequest
 from service.recordings import recording_of
 from service.schemas_datasets import SimulateIn
@@ -23,6 +24,7 @@ from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from service.truth import truth_of
+from sysid.errors import SysidError
 
 
 def submit(
@@ -65,13 +67,14 @@ def _simulated(database: Database, store: ObjectStore, body: NoiseSweepIn) -> st
     document = {"model": body.model, **body.truth.model_dump()}
     try:
         return simulate(database, store, SimulateIn.model_validate(document)).dataset.id
-    except InvalidRequest as error:
+    except (InvalidRequest, SysidError) as error:
+        faults = error.errors if isinstance(error, InvalidRequest) else faults_of(error)
         raise InvalidRequest(
             FieldError(
                 one.pointer if one.pointer.startswith("/model") else f"/truth{one.pointer}",
                 one.detail, one.column,
             )
-            for one in error.errors
+            for one in faults
         ) from None  # fmt: skip
 
 

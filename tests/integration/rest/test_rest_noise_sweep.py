@@ -1,0 +1,284 @@
+"""The noise sweep over REST: what job it makes, what its runs give, and what is refused."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.api.deps import Parts
+from service.app import create_app
+from tests.identified import carried_out
+from tests.rest import CSV, recording, refused, settings_of
+
+URL = "/v1/recipes/noise-sweep"
+TRUE = {"K": 2.0, "T": 1.0, "L": 0.5, "y0": 0.0}
+TRUTH = {
+    "parameters": TRUE, "inputs": {"u": {"kind": "binary", "period": 2}},
+    "samples": 150, "sample_time": 0.1,
+}  # fmt: skip
+SMALL = {"population": 12, "generations": 12, "islands": 1}
+BOUNDS = {"T": {"upper": 5.0}, "L": {"upper": 1.0}}
+BODY: dict[str, Any] = {
+    "model": "fopdt", "truth": TRUTH, "sigma": [0, 0.1], "replicates": 2, "algorithm": SMALL,
+    "parameters": BOUNDS,
+}  # fmt: skip
+
+
+def parts_of(server: TestClient) -> Parts:
+    found: Parts = server.app.state.parts  # type: ignore[attr-defined]
+    return found
+
+
+def submitted(server: TestClient, **changes: Any) -> dict[str, Any]:
+    answer = server.post(URL, json={**BODY, **changes})
+    assert answer.status_code == 202, answer.text
+    job: dict[str, Any] = answer.json()
+    assert answer.headers["location"] == f"/v1/jobs/{job['id']}"
+    return job
+
+
+def ended(server: TestClient, **changes: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A sweep that was carried out: the job, and its summary."""
+    job = submitted(server, **changes)["id"]
+    carried_out(parts_of(server), job)
+    return (
+        server.get(f"/v1/jobs/{job}").json(), server.get(f"/v1/jobs/{job}/summary").json(),
+    )  # fmt: skip
+
+
+def numbers(summary: dict[str, Any]) -> dict[str, Any]:
+    """A summary without what belongs to one job and one computer."""
+    groups = [{**group, "seconds": None} for group in summary["groups"]]
+    return {**summary, "job": None, "reused": None, "groups": groups}
+
+
+def test_the_job_has_a_run_for_each_deviation_replicate_and_method(server: TestClient) -> None:
+    job = submitted(server, name="mine", replicates=3)
+    assert job["name"] == "mine"
+    assert job["progress"]["runs"] == 12
+    runs = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
+    cells = [run["cell"] for run in runs]
+    assert [cell["/noise/sigma"] for cell in cells] == [0] * 6 + [0.1] * 6
+    assert {cell["/algorithm/method"] for cell in cells} == {"simple", "improved"}
+    seeds = [(cell["/noise/seed"], cell["/seed"]) for cell in cells]
+    assert seeds == [(1_000_000 + n // 2, 1_000_000 + n // 2) for n in range(6)] * 2
+
+
+def test_the_draws_of_a_replicate_do_not_depend_on_the_grid(server: TestClient) -> None:
+    def draws(**changes: Any) -> set[tuple[Any, ...]]:
+        job = submitted(server, **changes)["id"]
+        runs = server.get(f"/v1/jobs/{job}/runs", params={"limit": 100}).json()["items"]
+        return {tuple(run["cell"].values()) for run in runs}
+
+    small = draws()
+    assert small < draws(replicates=5)
+    assert small < draws(sigma=[0.05, 0.1, 0.7, 0])
+    assert small < draws(methods=["improved", "improved-paper", "simple"])
+    assert not small & draws(seed=2)
+
+
+def test_the_same_key_gives_the_same_job(server: TestClient) -> None:
+    key = {"Idempotency-Key": "noise once"}
+    first, again = (server.post(URL, json=BODY, headers=key).json() for _ in range(2))
+    assert first["id"] == again["id"]
+    other = server.post(URL, json={**BODY, "replicates": 9}, headers=key)
+    refused(other, 422, "invalid")
+
+
+def test_the_same_sweep_twice_gives_the_same_numbers(own: TestClient) -> None:
+    _, first = ended(own)
+    job, again = ended(own, reuse=False)
+    assert job["progress"]["reused"] == 0
+    assert numbers(first) == numbers(again)
+    assert first["groups"][2]["rms_noise_free"][2] > 0
+
+
+def test_more_replicates_compute_only_the_new_runs_and_say_so(own: TestClient) -> None:
+    _, first = ended(own)
+    job, more = ended(own, replicates=3)
+    assert (first["reused"], first["runs"]) == (0, 8)
+    assert (more["reused"], more["runs"]) == (8, 12)
+    assert job["progress"]["reused"] == 8
+    assert "8 of 12 reused" in own.get(f"/jobs/{job['id']}").text
+    _, other = ended(own, replicates=3, sigma=[0.1, 0.2])
+    assert (other["reused"], other["runs"]) == (6, 12)
+
+
+def test_errors_are_from_the_truth_and_the_floor_grows_in_proportion(own: TestClient) -> None:
+    _, found = ended(own, sigma=[0, 0.1, 0.2])
+    (reference,) = found["references"]
+    assert (reference["kind"], reference["note"]) == ("truth", "")
+    assert {name: reference["parameters"][name] for name in TRUE} == TRUE
+    assert any("true values" in note for note in found["notes"])
+    assert any("finite simulation" in note for note in found["notes"])
+    quiet, _, noisy, _, loud, _ = found["groups"]
+    assert (quiet["sigma"], noisy["sigma"], loud["sigma"]) == (0.0, 0.1, 0.2)
+    assert quiet["rms_floor"] == 0
+    # Four parameters and the start of y, of 150 samples, all of them told by the data.
+    assert noisy["rms_floor"] == pytest.approx(0.1 * math.sqrt(5 / 150))
+    assert len(noisy["parameters"]) == 5
+    for place, one in enumerate(noisy["parameters"]):
+        assert one["reference"] == TRUE.get(one["name"], 0.0)  # y starts at zero
+        assert one["error"] == [value - one["reference"] for value in one["value"]]
+        assert quiet["parameters"][place]["floor"] == 0
+        assert loud["parameters"][place]["floor"] == pytest.approx(2 * one["floor"])
+        assert one["floor"] > 0
+
+
+def test_without_truth_errors_are_from_the_best_run_without_noise(own: TestClient) -> None:
+    stored = own.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
+    job, found = ended(own, truth=None, datasets=[stored], sigma=[0.1])
+    assert job["progress"]["runs"] == 8  # σ = 0 was added
+    (reference,) = found["references"]
+    runs = own.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
+    silent = [run for run in runs if run["cell"]["/noise/sigma"] == 0]
+    best = min(silent, key=lambda run: run["rms"])
+    assert (reference["kind"], reference["run"]) == ("estimate", best["id"])
+    assert reference["parameters"] == {one["name"]: one["value"] for one in best["parameters"]}
+    assert any("not known" in note for note in found["notes"])
+    assert all(one["floor"] > 0 for one in found["groups"][-1]["parameters"])
+
+
+def test_a_truth_of_another_model_is_no_truth(own: TestClient) -> None:
+    body = {"name": "s", "model": "fopdt", **TRUTH}
+    stored = own.post("/v1/datasets:simulate", json=body).json()["id"]
+    document = own.get("/v1/models/fopdt").json()["document"]
+    other = {**document, "name": "other"}
+    changes = {"truth": None, "datasets": [stored], "sigma": [0], "replicates": 1}
+    _, same = ended(own, **changes)
+    _, apart = ended(own, **changes, model=other)
+    assert [one["kind"] for one in same["references"]] == ["truth"]
+    assert [one["kind"] for one in apart["references"]] == ["estimate"]
+
+
+def test_each_problem_of_a_sweep_has_a_truth_and_a_floor_of_its_own(own: TestClient) -> None:
+    names = []
+    for gain in (2.0, 3.0):
+        body = {"name": f"{gain}", "model": "fopdt", **TRUTH, "parameters": {**TRUE, "K": gain}}
+        names.append(own.post("/v1/datasets:simulate", json=body).json()["id"])
+    axes = [{"path": "/datasets", "values": names}, {"path": "/noise/sigma", "values": [0, 0.1]}]
+    body = {"model": "fopdt", "datasets": names[:1], "algorithm": SMALL, "parameters": BOUNDS,
+            "sweep": {"axes": axes}}  # fmt: skip
+    job = own.post("/v1/jobs", json=body).json()["id"]
+    carried_out(parts_of(own), job)
+    found = own.get(f"/v1/jobs/{job}/summary").json()
+    gains = [
+        next(one for one in group["parameters"] if one["name"] == "K") for group in found["groups"]
+    ]
+    assert [one["reference"] for one in gains] == [2.0, 2.0, 3.0, 3.0]
+    assert gains[1]["floor"] > 0
+    together = own.get(f"/v1/jobs/{job}/summary", params={"by": "/noise/sigma"}).json()
+    assert all(one["error"] is None for group in together["groups"] for one in group["parameters"])
+
+
+def test_a_job_without_noise_tells_no_floor(own: TestClient) -> None:
+    body = {"name": "s", "model": "fopdt", **TRUTH}
+    stored = own.post("/v1/datasets:simulate", json=body).json()["id"]
+    job = own.post("/v1/jobs", json={"model": "fopdt", "datasets": [stored], "algorithm": SMALL,
+                                     "parameters": BOUNDS}).json()["id"]  # fmt: skip
+    carried_out(parts_of(own), job)
+    found = own.get(f"/v1/jobs/{job}/summary").json()
+    assert found["references"] == []
+    assert found["groups"][0]["rms_floor"] is None
+
+
+def test_relative_deviations_are_in_those_of_the_output(server: TestClient) -> None:
+    stored = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
+    lines = recording().decode().splitlines()[1:]
+    y = [float(line.split(",")[2]) for line in lines]
+    mean = sum(y) / len(y)
+    spread = math.sqrt(sum((one - mean) ** 2 for one in y) / len(y))
+    job = submitted(server, truth=None, datasets=[stored], sigma=[0, 0.5], relative=True)
+    runs = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
+    assert runs[-1]["cell"]["/noise/sigma"] == pytest.approx(0.5 * spread)
+    assert runs[-1]["labels"] == {"relative": 0.5}
+
+
+def test_the_figure_has_a_line_a_method_in_each_plot_and_the_floor(own: TestClient) -> None:
+    job, found = ended(own)
+    figure = own.get(f"/v1/jobs/{job['id']}/figures/summary").json()
+    lines = [one for one in figure["data"] if one["mode"] == "lines+markers"]
+    names = [one["name"] for one in found["groups"][0]["parameters"]]
+    assert len(lines) == 2 * (1 + len(names))
+    medians = [group["rms_noise_free"][2] for group in found["groups"]
+               if group["key"]["/algorithm/method"] == "improved"]  # fmt: skip
+    drawn = next(one for one in lines if one["name"] == "improved")
+    assert drawn["x"] == [0, 0.1]
+    assert drawn["y"] == pytest.approx(medians, rel=1e-6)
+    floors = [one for one in figure["data"] if one.get("line", {}).get("dash") == "dash"]
+    assert len(floors) == 1 + 2 * len(names)
+    rows = own.get(f"/v1/jobs/{job['id']}/figures/summary?format=csv").text.splitlines()
+    assert rows[0] == "series,x,y"
+    assert any(row.startswith("improved,0.1,") for row in rows)
+    assert "overview-1" in own.get(f"/v1/jobs/{job['id']}/report").text
+
+
+def test_the_figure_of_a_sweep_without_noise_is_empty(server: TestClient) -> None:
+    dataset = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
+    axes = [{"path": "/seed", "range": [0, 2]}]
+    body = {"model": "fopdt", "datasets": [dataset], "sweep": {"axes": axes}}
+    job = server.post("/v1/jobs", json=body).json()["id"]
+    assert server.get(f"/v1/jobs/{job}/figures/summary").json()["data"] == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "pointer", "detail"),
+    [
+        ({"replicates": 0}, "/replicates", "greater than or equal to 1"),
+        ({"sigma": [0.1, -0.5]}, "/sigma/1", "greater than or equal to 0"),
+        ({"sigma": []}, "/sigma", "at least 1"),
+        ({"sigma": [0.1, 0.2, 0.1]}, "/sigma", "twice"),
+        ({"methods": ["simple", "best"]}, "/methods/1", "'improved'"),
+        ({"methods": []}, "/methods", "at least 1"),
+        ({"replicates": 25_001}, "/replicates",
+         "2 σ × 25001 replicates × 2 methods are 100004 runs; at most 100000 a job"),
+        ({"datasets": ["steps"]}, "", "either 'truth'"),
+        ({"truth": None}, "", "either 'truth'"),
+        ({"model": "fopdd"}, "/model", "fopdt"),
+        ({"truth": {**TRUTH, "parameters": {"K": 1}}}, "/truth/parameters/T", "true value"),
+        ({"truth": {**TRUTH, "inputs": {}}}, "/truth/inputs/u", "give input 'u'"),
+        ({"truth": {**TRUTH, "samples": 1}}, "/truth/samples", "2"),
+        ({"truth": {**TRUTH, "sample_time": 0.001}}, "/truth", "lag"),
+        ({"truth": None, "datasets": ["nowhere"]}, "/datasets/0", "nowhere"),
+        ({"algorithm": {"method": "simple"}}, "/algorithm/method", "'methods'"),
+        ({"parameters": {"Q": {"upper": 1}}}, "/parameters/Q", "Q"),
+        ({"sigmas": [1]}, "/sigmas", "unknown field"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_swept_is_refused_at_its_place(
+    server: TestClient, changes: dict[str, Any], pointer: str, detail: str
+) -> None:
+    answer = server.post(URL, json={**BODY, **changes})
+    faults = refused(answer, 422, "invalid")
+    assert pointer in [fault["pointer"] for fault in faults], faults
+    assert any(detail in fault["detail"] for fault in faults), faults
+
+
+def test_a_deviation_relative_to_an_output_that_does_not_vary_is_refused(
+    server: TestClient,
+) -> None:
+    still = {**TRUTH, "parameters": {**TRUE, "K": 1.0},
+             "inputs": {"u": {"kind": "step", "amplitude": 0.0}}}  # fmt: skip
+    (fault,) = refused(
+        server.post(URL, json={**BODY, "truth": still, "relative": True}), 422, "invalid"
+    )
+    assert fault["pointer"] == "/relative"
+    assert "does not vary" in fault["detail"]
+
+
+def test_a_deviation_relative_to_several_outputs_is_refused(server: TestClient) -> None:
+    document = server.get("/v1/models/fopdt").json()["document"]
+    twice = {**document, "name": "two", "outputs": {**document["outputs"], "z": "2*x"}}
+    answer = server.post(URL, json={**BODY, "model": twice, "relative": True})
+    (fault,) = refused(answer, 422, "invalid")
+    assert fault["pointer"] == "/relative"
+    assert "outputs" in fault["detail"]
+
+
+def test_the_limit_of_the_settings_is_that_of_the_sweep(tmp_path: Path) -> None:
+    app = create_app(settings_of(tmp_path, max_runs_per_job=7))
+    with TestClient(app, raise_server_exceptions=False) as server:
+        (fault,) = refused(server.post(URL, json=BODY), 422, "invalid")
+    assert "8 runs; at most 7" in fault["detail"]

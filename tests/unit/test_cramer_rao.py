@@ -1,0 +1,74 @@
+"""The Cramér–Rao floor: that of a linear model is known, and how it is written changes nothing."""
+
+import numpy as np
+import pytest
+
+from sysid.cramer_rao import floor
+from sysid.errors import InvalidSettings
+from sysid.models.spec import parse_model
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+
+TIMES = np.arange(200) * 0.1
+INPUT = np.sin(1.3 * TIMES) + 0.2 * TIMES
+LINE = {
+    "name": "line", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "parameters": {"a": {"lower": 0.1, "upper": 10}, "b": {"lower": -5, "upper": 5}},
+    "equations": {"x": "-x"}, "outputs": {"y": "a*u(t) + b + x"}, "initial": {"x": 0},
+}  # fmt: skip
+
+
+def problem(document=LINE, skip=0, **options):
+    model = parse_model(document)
+    signals = Channel("u", TIMES, INPUT), Channel("y", TIMES, 2.0 * INPUT + 1.0)
+    record = Record(inputs=signals[:1], outputs=signals[1:])
+    return Problem.build(model, [record], skip=skip, **{"weights": {"y": 1.0}, **options})
+
+
+@pytest.mark.parametrize("skip", [0, 50])
+def test_the_floor_of_a_linear_model_is_that_of_its_regressors(skip):
+    found = floor(problem(skip=skip), np.array([2.0, 1.0]))
+    regressors = np.column_stack([INPUT, np.ones(INPUT.size)])[skip:]
+    expected = np.sqrt(np.diag(np.linalg.inv(regressors.T @ regressors)))
+    assert found.names == ("a", "b")
+    np.testing.assert_allclose(found.stderr, expected, rtol=1e-6)
+    assert found.samples == 200 - skip
+    assert found.response == pytest.approx(np.sqrt(2 / (200 - skip)))
+
+
+def test_bounds_and_scale_of_the_search_do_not_change_the_floor():
+    theta = np.array([2.0, 1.0])
+    linear = floor(problem(), theta)
+    changed = {"a": {"lower": 0.5, "upper": 200.0, "scale": "log"}, "b": {"lower": 1.0}}
+    np.testing.assert_allclose(
+        floor(problem(parameters=changed), theta).stderr, linear.stderr, rtol=1e-4
+    )
+
+
+def test_a_product_of_which_the_data_tell_no_factor_has_none_but_the_others_keep_theirs():
+    document = {**LINE, "outputs": {"y": "a*c*u(t) + b + x"},
+                "parameters": {**LINE["parameters"], "c": {"lower": 0.1, "upper": 10}}}  # fmt: skip
+    found = floor(problem(document), np.array([1.0, 1.0, 2.0]))
+    known = dict(zip(found.names, found.stderr.tolist(), strict=True))
+    assert np.isinf(known["a"])
+    assert np.isinf(known["c"])
+    assert known["b"] == pytest.approx(floor(problem(), np.array([2.0, 1.0])).stderr[1], rel=1e-5)
+    assert found.response == pytest.approx(np.sqrt(2 / 200))
+
+
+def test_no_least_squares_estimate_is_better_than_the_floor_and_its_spread_reaches_it():
+    generator = np.random.default_rng(5)
+    regressors = np.column_stack([INPUT, np.ones(INPUT.size)])
+    noisy = (regressors @ [2.0, 1.0])[:, None] + 0.3 * generator.standard_normal((200, 4000))
+    spread = np.std(np.linalg.lstsq(regressors, noisy, rcond=None)[0], axis=1)
+    least = 0.3 * floor(problem(), np.array([2.0, 1.0])).stderr
+    np.testing.assert_allclose(spread, least, rtol=0.05)
+
+
+def test_weights_that_are_not_one_are_refused():
+    model = parse_model({**LINE, "outputs": {"y": "a*u(t) + b + x", "z": "b*u(t)"}})
+    outputs = tuple(Channel(name, TIMES, INPUT) for name in "yz")
+    record = Record(inputs=(Channel("u", TIMES, INPUT),), outputs=outputs)
+    weighted = Problem.build(model, [record], weights={"y": 1.0, "z": 2.0})
+    with pytest.raises(InvalidSettings, match="weight 1"):
+        floor(weighted, np.array([2.0, 1.0]))
