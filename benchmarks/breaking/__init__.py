@@ -1,0 +1,1 @@
+"""A whole service to be broken: for `benchmarks/torture.py` and `tests/faults`."""

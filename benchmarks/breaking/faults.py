@@ -1,0 +1,184 @@
+"""Faults, each as a function that breaks a standing service and tells how long it took to recover.
+
+Recovered means: a result that was computed after the fault is stored, and what was broken works
+again.
+"""
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import select
+
+from benchmarks.breaking.audit import owners, steps
+from benchmarks.breaking.stand import Stand, until
+from service.storage.tables import Dispatcher
+
+LIMIT_SECONDS = 90.0
+PAUSED_SECONDS = 13.0
+"""A dispatcher is stopped so long: past its lease of 10 s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """A service at work: the jobs that are open at the moment, and its server if it has one."""
+
+    stand: Stand
+    open_jobs: Callable[[], list[str]]
+    postgres: Any = None
+    clock: Path | None = None
+
+
+def kill_worker(bench: Bench) -> float:
+    """Kill a process that computes."""
+    family = bench.stand.family
+    busy = family.named("ray::advance") or family.named("ray::IDLE")
+    before = len(family.named("ray::advance") + family.named("ray::IDLE"))
+    return _recovery(bench, lambda: _kill(busy[:1]), lambda: len(_workers(bench)) >= before)
+
+
+def kill_raylet(bench: Bench) -> float:
+    """Kill the raylet of the dispatcher."""
+    return _renewal(bench, lambda: _kill(bench.stand.family.named("raylet")))
+
+
+def kill_gcs(bench: Bench) -> float:
+    """Kill Ray's store of what is where."""
+    return _renewal(bench, lambda: _kill(bench.stand.family.named("gcs_server")))
+
+
+def kill_dispatcher(bench: Bench) -> float:
+    """Kill the dispatcher."""
+    return _renewal(bench, lambda: _kill(bench.stand.family.dispatchers()))
+
+
+def kill_web(bench: Bench) -> float:
+    """Kill the web process; its dispatcher ends with it, and comes again with the next."""
+    web = bench.stand.web
+    assert web is not None
+    return _renewal(bench, lambda: _kill([web.pid]))
+
+
+def kill_postgres(bench: Bench) -> float:
+    """Kill the database's server and start it again; meanwhile the web must not answer 500."""
+
+    def restart() -> None:
+        _kill([bench.postgres.get_pid()])
+        time.sleep(1.0)
+        status = bench.stand.answers()
+        if status not in (200, 503, None):
+            raise AssertionError(f"the web answered {status} while its database was away")
+        for _ in range(20):  # the killed one's children hold its memory for a moment
+            with contextlib.suppress(Exception):
+                bench.postgres.ensure_postgres_running()
+                return
+            time.sleep(0.5)
+
+    return _recovery(bench, restart, lambda: bench.stand.answers() == 200)
+
+
+def pause_dispatcher(bench: Bench) -> float:
+    """Stop a dispatcher past its lease beside another, then let it go on."""
+    (first,) = bench.stand.family.dispatchers()[:1]
+    with bench.stand.another_dispatcher() as second:
+        mark = f"-{second.pid}-"
+        log = bench.stand.folder / "second.log"
+        until(lambda: mark in log.read_text(), "a second dispatcher", LIMIT_SECONDS)
+        os.kill(first, signal.SIGSTOP)
+        begun = time.monotonic()
+        try:
+            held = f"-{first}-"
+            until(
+                lambda: not any(held in owner for owner in owners(bench.stand)),
+                "the paused dispatcher's jobs were given to another", LIMIT_SECONDS,
+            )  # fmt: skip
+            took = _goes_on(bench, begun)
+            time.sleep(max(0.0, PAUSED_SECONDS - (time.monotonic() - begun)))
+        finally:
+            os.kill(first, signal.SIGCONT)
+        time.sleep(1.0)
+    return took
+
+
+def step_clock_back(bench: Bench) -> float:
+    """Set the clock back by an hour more."""
+    clock = bench.clock
+    assert clock is not None
+    return _recovery(bench, lambda: _write(clock, float(clock.read_text() or 0) - 3600.0))
+
+
+def step_clock_and_kill(bench: Bench) -> float:
+    """Set the clock back by an hour and kill the dispatcher, whose leases then end in an hour."""
+    clock = bench.clock
+    assert clock is not None
+
+    def both() -> None:
+        _kill(bench.stand.family.dispatchers())
+        _write(clock, float(clock.read_text() or 0) - 3600.0)
+
+    return _renewal(bench, both)
+
+
+def _renewal(bench: Bench, fault: Callable[[], None]) -> float:
+    """Of what only another dispatcher than the present one mends."""
+    known = _known(bench)
+    begun = time.monotonic()
+    fault()
+    until(
+        lambda: bench.stand.answers() == 200 and bool(owners(bench.stand) - known),
+        "another dispatcher has the jobs", LIMIT_SECONDS,
+    )  # fmt: skip
+    return _goes_on(bench, begun)
+
+
+def _known(bench: Bench) -> set[str]:
+    """Dispatchers that were ever heard of."""
+    with bench.stand.database.read() as session:
+        return {*session.scalars(select(Dispatcher.owner)), *owners(bench.stand)}
+
+
+def _recovery(
+    bench: Bench, fault: Callable[[], None], works: Callable[[], bool] = lambda: True
+) -> float:
+    begun = time.monotonic()
+    fault()
+    _goes_on(bench, begun)
+    until(works, "what was broken works again", LIMIT_SECONDS)
+    return time.monotonic() - begun
+
+
+def _goes_on(bench: Bench, begun: float) -> float:
+    """Wait until a result is stored that was not yet there; gives the seconds since `begun`."""
+    seen: dict[str, int] = {}
+
+    def is_further() -> bool:
+        for job in bench.open_jobs():
+            now = steps(bench.stand, [job])
+            if now is not None and now > seen.setdefault(job, now):
+                return True
+        return False
+
+    until(is_further, "the work went on", LIMIT_SECONDS)
+    return time.monotonic() - begun
+
+
+def _workers(bench: Bench) -> list[int]:
+    family = bench.stand.family
+    return family.named("ray::advance") + family.named("ray::IDLE")
+
+
+def _kill(pids: list[int]) -> None:
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def _write(clock: Path, step: float) -> None:
+    fresh = clock.with_suffix(".new")
+    fresh.write_text(str(step))
+    fresh.replace(clock)

@@ -1,0 +1,181 @@
+"""A service in processes of its own, started anew when it ends, as an init system would."""
+
+import contextlib
+import os
+import secrets
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+
+from benchmarks.breaking.processes import MARK, Family
+from service.client import Client
+from service.embedded import free_port
+from service.storage.sessions import Database, sqlite_url
+
+SHIM = Path(__file__).with_name("shim")
+START_SECONDS = 90.0
+RESTART_SECONDS = 0.5
+"""What the caretaker waits before it starts a web process that has ended."""
+
+
+class Stand:
+    """`lagid serve` with its dispatcher, on a folder of its own.
+
+    Parameters
+    ----------
+    database_url : str, optional
+        PostgreSQL; by default SQLite in the folder.
+    environment : mapping
+        Further variables for all its processes.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        database_url: str | None = None,
+        cpus: int = 2,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.temporary = Path(tempfile.mkdtemp(prefix="lb-"))  # short: Ray puts sockets there
+        self.folder, self.port = folder, free_port()
+        self.family = Family(mark := secrets.token_hex(8))
+        address = {} if database_url is None else {"LAGID_DATABASE_URL": database_url}
+        self.environment = {
+            **os.environ, MARK: mark, "LAGID_DATA_DIR": str(folder), "LAGID_CPUS": str(cpus),
+            "LAGID_PORT": str(self.port), "OPENBLAS_NUM_THREADS": "1",
+            "TMPDIR": str(self.temporary),
+            "PYTHONPATH": os.pathsep.join([str(SHIM), str(Path.cwd())]),
+            **address, **(environment or {}),
+        }  # fmt: skip
+        self.url = f"http://127.0.0.1:{self.port}"
+        self.database = Database(database_url or sqlite_url(folder / "lagid.db"))
+        self.client = Client(self.url)
+        self.web: subprocess.Popen[bytes] | None = None
+        self._before = set(shared_memory())
+        self._ending = threading.Event()
+        self._caretaker = threading.Thread(target=self._take_care, daemon=True)
+
+    def start(self, *, wait: bool = True) -> None:
+        """Start it; by default until a dispatcher is ready."""
+        self._spawn()
+        self._caretaker.start()
+        if wait:
+            until(self.is_ready, "the service was ready", START_SECONDS)
+
+    def is_ready(self) -> bool:
+        """Whether database, store and a dispatcher are."""
+        with contextlib.suppress(httpx.TransportError):
+            return httpx.get(f"{self.url}/readyz", timeout=5.0).status_code == httpx.codes.OK
+        return False
+
+    def answers(self) -> int | None:
+        """The status of the list of jobs; None if nobody listens."""
+        try:
+            return httpx.get(f"{self.url}/v1/jobs", timeout=20.0).status_code
+        except httpx.TransportError:
+            return None
+
+    @contextmanager
+    def another_dispatcher(self) -> Iterator["subprocess.Popen[bytes]"]:
+        """A second dispatcher for the length of the block, which ends in order."""
+        with (self.folder / "second.log").open("ab") as log:
+            child = subprocess.Popen(
+                [sys.executable, "-m", "service.dispatcher"], env=self.environment,
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+            )  # fmt: skip
+        try:
+            yield child
+        finally:
+            child.send_signal(signal.SIGTERM)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(20.0)
+            child.kill()
+            child.wait()
+
+    def stop(self) -> None:
+        """End it in order."""
+        self._ending.set()
+        self._caretaker.join()
+        if self.web is not None and self.web.poll() is None:
+            self.web.send_signal(signal.SIGTERM)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.web.wait(20.0)
+        self.client.close()
+        self.database.dispose()
+
+    def leftovers(self, seconds: float = 10.0) -> list[str]:
+        """Processes, shared memory and temporary files that a stopped service has not taken along.
+
+        Ray's last helpers end by themselves; they have some seconds.
+        """
+        limit = time.monotonic() + seconds
+        while (left := self._left()) and time.monotonic() < limit:
+            time.sleep(0.2)
+        return left
+
+    def _left(self) -> list[str]:
+        found = [f"process {pid} {one.command}" for pid, one in self.family.members().items()]
+        found += [f"shared memory {name}" for name in set(shared_memory()) - self._before]
+        found += [f"temporary {path.name}" for path in self.temporary.glob("*")]
+        unfinished = self.folder / "objects" / "tmp"
+        return found + [f"object {path.name}" for path in unfinished.glob("*")]
+
+    def _spawn(self) -> None:
+        with (self.folder / "serve.log").open("ab") as log:
+            self.web = subprocess.Popen(
+                [sys.executable, "-m", "service.cli.main", "serve"], env=self.environment,
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+            )  # fmt: skip
+
+    def _take_care(self) -> None:
+        while not self._ending.wait(RESTART_SECONDS):
+            if self.web is not None and self.web.poll() is not None:
+                self._spawn()
+
+
+@contextmanager
+def standing_service(stand: Stand, *, wait: bool = True) -> Iterator[Stand]:
+    """Run it for the length of the block; whatever happens, nothing of it stays alive."""
+    try:
+        stand.start(wait=wait)
+        yield stand
+        stand.stop()
+    finally:
+        stand._ending.set()
+        if stand.web is not None and stand.web.poll() is None:
+            stand.stop()
+        stand.family.kill()
+        shutil.rmtree(stand.temporary, ignore_errors=True)
+
+
+def until(holds: Callable[[], bool], what: str, seconds: float) -> float:
+    """Wait until something is so; gives the seconds it took.
+
+    Raises
+    ------
+    TimeoutError
+        If it has not come true in time.
+    """
+    begun = time.monotonic()
+    while not holds():
+        if time.monotonic() - begun > seconds:
+            raise TimeoutError(f"not within {seconds:g} s: {what}")
+        time.sleep(0.05)
+    return time.monotonic() - begun
+
+
+def shared_memory() -> list[str]:
+    """Names below ``/dev/shm`` that Ray or a pool of processes may have made."""
+    folder = Path("/dev/shm")
+    return [one.name for one in folder.glob("*") if not one.name.startswith(("PostgreSQL", "sem"))]
