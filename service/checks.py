@@ -29,6 +29,7 @@ from sysid.models.model import Model
 from sysid.models.polynomial import check_samples
 from sysid.parameters import Parameter, override
 from sysid.ties import tied_model, ties_of
+from sysid.unused import unused
 
 Body = dict[str, Any]
 MOST_GENES = 10_000_000  # individuals times parameters: 80 MB for each copy of a population
@@ -62,6 +63,8 @@ class JobChecker:
         _tried(check_lags, found, tied, own)
         if model[0].rule is not None:
             _tried(check_samples, found, len(model[0].terms), self._samples(body))
+        found += [FieldError(one.pointer, one.detail)
+                  for one in unused(tied, own, body["weights"])]  # fmt: skip
         found += self._repeated(body)
         found += self._data(body, tied, own)
         if model[0].rule is None:  # of candidates not all are kept; `check_samples` looks at them

@@ -14,6 +14,7 @@ from sysid.run import RunState, advance, begin, conclude, is_finished
 from sysid.selection import selected
 from sysid.settings import GeneticAlgorithm, Loss, Prediction
 from sysid.signal_units import check_units
+from sysid.unused import check_used
 
 _PROGRESS_SECONDS = 0.25
 
@@ -68,7 +69,7 @@ def identify(
         If an argument cannot be used.
     """
     algorithm = settings or GeneticAlgorithm()
-    whole = _checked(model, records, validation)
+    whole = _checked(model, records, validation, parameters, weights)
     estimation = _estimation(whole, validation_fraction, noise)
     model, parameters = selected(model, estimation, parameters, skip)
     pose = partial(
@@ -81,10 +82,12 @@ def identify(
 
 
 def _checked(
-    model: Model, records: Record | Sequence[Record], validation: Record | Sequence[Record] | None
-) -> tuple[Record, ...]:
-    """The records, after a look at the units of all."""
+    model: Model, records: Record | Sequence[Record], validation: Record | Sequence[Record] | None,
+    parameters: Mapping[str, Mapping[str, Any]] | None, weights: Mapping[str, float] | None,
+) -> tuple[Record, ...]:  # fmt: skip
+    """The records, after a look at the units of all, and at what would have no effect."""
     whole = _several(records)
+    check_used(model, len(whole), parameters, weights)
     check_units(model, (*whole, *_several(validation or ())))
     return whole
 

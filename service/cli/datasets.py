@@ -76,7 +76,11 @@ def simulate(
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a recording from a model or a reference plant, its parameters, inputs and noise."""
+    """Make a recording from a model or a reference plant, its parameters, inputs and noise.
+
+    Inputs that jump (step, binary) are stored as held between samples, waves and expressions as
+    straight; a channel of a dataset keeps its own hold.
+    """
     if file is None and plant is None:
         fail("give a file with the request, or --plant actuator or --plant tube")
     body = {} if file is None else _object(read_yaml(read_file(file)), file)

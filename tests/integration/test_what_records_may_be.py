@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sysid.derivations import derive
+from sysid.errors import InvalidSettings
 from sysid.ga.chromosome import located
 from sysid.identify import identify
 from sysid.models.model import Model
@@ -69,6 +70,16 @@ def test_a_measured_start_is_that_of_each_experiment() -> None:
     assert values(found) == pytest.approx(TRUTH, abs=1e-4)
     starts = [outputs[0][0] for outputs in found.simulated]
     assert starts == [1.5, -0.8]
+
+
+def test_a_parameter_or_a_weight_without_any_effect_is_refused() -> None:
+    dead = lag_model(q={"lower": 0, "upper": 1})
+    with pytest.raises(InvalidSettings, match=r"/parameters/q: no equation and no output"):
+        identify(dead, record(), QUICK)
+    with pytest.raises(InvalidSettings, match=r"/weights/y: 'y' is the model's only output"):
+        identify(lag_model(), record(), QUICK, weights={"y": 2.0})
+    tied = identify(dead, record(), QUICK, parameters={"q": {"tied": "K/9"}})
+    assert values(tied)["K"] == pytest.approx(TRUTH["K"], abs=1e-4)
 
 
 def test_a_fixed_start_is_not_estimated() -> None:

@@ -113,6 +113,30 @@ def test_the_command_line_says_the_same_in_one_line(
     assert words in " ".join((found.output + str(found.exception or "")).split())
 
 
+def test_what_would_have_no_effect_is_refused_with_its_place(
+    parts: tuple[TestClient, Parts],
+) -> None:
+    dead = {**FIRST, "parameters": {**FIRST["parameters"], "q": {"lower": 0, "upper": 1}}}
+    terms = {
+        "name": "terms", "form": "polynomial", "output": "y", "inputs": {"u": "1"}, "degree": 1,
+        "lags": {"y": [1], "u": ["1 + d"]}, "parameters": {"d": {"lower": 0, "upper": 6}},
+        "terms": ["y(k-1)"], "coefficients": {"lower": -2, "upper": 2},
+    }  # fmt: skip
+    data = stored(parts[0], recording())
+    for body, pointer, words in (
+        ({"model": dead}, "/parameters/q", "no equation and no output of model 'first' uses 'q'"),
+        ({"model": terms}, "/parameters/d", "no term of model 'terms' uses 'd'"),
+        ({"model": FIRST, "weights": {"y": 2}}, "/weights/y", "a weight would change nothing"),
+    ):
+        answer = parts[0].post("/v1/jobs", json={**body, "datasets": [data]})
+        faults = refused(answer, 422, "invalid")
+        assert [one for one in faults if one["pointer"] == pointer and words in one["detail"]], (
+            faults
+        )
+    accepted = {"model": dead, "datasets": [data], "parameters": {"q": {"fixed": 0.5}}}
+    assert parts[0].post("/v1/jobs", json=accepted).status_code == 202
+
+
 def test_a_lag_that_the_record_has_no_room_for_is_refused_by_its_name(
     parts: tuple[TestClient, Parts],
 ) -> None:
