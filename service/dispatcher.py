@@ -219,7 +219,7 @@ def serve(settings: Settings) -> int:
     store = open_store(settings.store)
     compiling = threading.Thread(target=warm, name="warm", daemon=True)
     compiling.start()  # the compiler and Ray's start wait on different things
-    crew = RayCrew(ClusterSettings(settings.ray_address, settings.cpus))
+    crew = RayCrew(ClusterSettings(settings.ray_address, settings.cpus, settings.worker_memory))
     try:
         compiling.join()
         crew.warm()

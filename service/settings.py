@@ -23,6 +23,8 @@ class Settings(BaseSettings):
         None: a local Ray of this process.
     cpus : int or None
         Workers of the local Ray; None: all cores.
+    worker_memory_mb : int or None
+        Memory that a worker may use for its runs, in MiB; None: its share of 80 % of the machine.
     require_keys : bool or None
         None: API keys are off on loopback and required elsewhere.
     allow_open_host : bool
@@ -44,6 +46,7 @@ class Settings(BaseSettings):
     store_url: str | None = None
     ray_address: str | None = None
     cpus: int | None = Field(default=None, ge=1)
+    worker_memory_mb: int | None = Field(default=None, ge=256)
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535)
     require_keys: bool | None = None
@@ -63,6 +66,11 @@ class Settings(BaseSettings):
         """SQLAlchemy address of the database."""
         folder = self.data_dir.absolute()
         return self.database_url or f"sqlite:///{folder / 'lagid.db'}"
+
+    @property
+    def worker_memory(self) -> int | None:
+        """The same in bytes."""
+        return None if self.worker_memory_mb is None else self.worker_memory_mb * 2**20
 
     @property
     def store(self) -> str:

@@ -20,9 +20,9 @@ from typing import Any
 from sysid.program import program
 from workers.errors import ClusterLost, ClusterUnavailable, PackCancelled, PackFailed, WorkerDied
 from workers.joining import check_address, reason
+from workers.limits import advance_within, memory_for_each
 from workers.ports import Done, Handle, Item, Records
 from workers.processes import children, clear_after_the_dead, folder_of, is_running, kill, of_folder
-from workers.tasks import advance
 from workers.warming import warm
 
 _log = logging.getLogger(__name__)
@@ -52,6 +52,7 @@ ONE_THREAD = {
 _RAY_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_task_events_report_interval_ms": "0",  # else the GCS keeps 3-4 kB for each task
+    "RAY_memory_monitor_refresh_ms": "0",  # it kills the youngest task, not the largest
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # tomorrow's default; silences a warning
 }
 
@@ -60,11 +61,13 @@ _RAY_ENVIRONMENT = {
 class ClusterSettings:
     """Which Ray: `address` None starts one here with `cpus` cores (None: all of them).
 
-    Of a cluster that is joined, `cpus` are the cores that are used at most.
+    Of a cluster that is joined, `cpus` are the cores that are used at most. `memory_bytes` is what
+    a worker may use for its runs; None: on a local Ray, its share of the machine's.
     """
 
     address: str | None = None
     cpus: int | None = None
+    memory_bytes: int | None = None
 
 
 class RayCrew:
@@ -92,7 +95,7 @@ class RayCrew:
         except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
             self._forget_folder()
             raise ClusterUnavailable(reason(settings.address, error)) from error
-        self._advance = ray.remote(num_cpus=1, max_retries=0)(advance)
+        self._advance = ray.remote(num_cpus=1, max_retries=0)(advance_within)
         self._noop = ray.remote(num_cpus=0, max_retries=0)(_answer)
         self._flying: set[Any] = set()
         self._probe: Any = None
@@ -100,6 +103,9 @@ class RayCrew:
         self._vital = () if settings.address else children(VITAL)
         self._most_slots = settings.cpus
         self.slots = self._count_slots()
+        self._memory = settings.memory_bytes
+        if self._memory is None and settings.address is None:
+            self._memory = memory_for_each(self.slots)
         self._left = threading.Event()
         if settings.address is not None:  # nodes come and go
             threading.Thread(target=self._keep_counting, name="slots", daemon=True).start()
@@ -140,7 +146,7 @@ class RayCrew:
 
     def submit(self, pack: Sequence[Item], keys: Sequence[str], shared: Sequence[Any]) -> Handle:
         """Send a pack; `keys` name the shared records in order."""
-        handle = self._advance.remote(tuple(pack), tuple(keys), *shared)
+        handle = self._advance.remote(self._memory, tuple(pack), tuple(keys), *shared)
         self._flying.add(handle)
         return handle
 

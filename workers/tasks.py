@@ -77,6 +77,8 @@ def _outcome(item: Item, records: Mapping[str, Records]) -> Outcome:
         return _advanced(item, problem, validation, records)
     except SysidError as error:
         return Failure(str(error), type(error).__name__)
+    except MemoryError as error:
+        return Failure(f"it needs more memory than a worker may use: {error}", "OutOfMemory")
     except Exception as error:  # noqa: BLE001 - the process border: its pack-mates go on
         _log.exception("run %s met a programming error", item.run)
         return Failure(f"internal error: {type(error).__name__}: {error}", "InternalError")

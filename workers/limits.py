@@ -1,0 +1,52 @@
+"""How much memory a worker may use, so that a run that wants too much harms only itself.
+
+Without a limit the machine runs full, and whom the kernel or Ray kills then is not always who
+took the memory: Ray kills the youngest task first.
+"""
+
+import contextlib
+import os
+import resource
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+from workers.ports import Done, Item, Records
+from workers.tasks import advance
+
+SHARE = 0.8
+"""Of the machine's memory, for all workers together."""
+
+
+def memory_for_each(workers: int) -> int:
+    """What each of so many workers on this machine may use, in bytes."""
+    total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
+        total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return int(SHARE * total / workers)
+
+
+def advance_within(
+    limit: int | None, pack: Sequence[Item], keys: Sequence[str], *shared: Records
+) -> tuple[Done, ...]:
+    """`workers.tasks.advance`, in a process that may use `limit` bytes beyond its program."""
+    if limit is not None:
+        _bound(limit)
+    return advance(pack, keys, *shared)
+
+
+@cache
+def _bound(limit: int) -> None:
+    """Once in a process: what it holds already is Ray's and the program's."""
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    allowed = _held() + limit
+    if hard == resource.RLIM_INFINITY or allowed < hard:
+        resource.setrlimit(resource.RLIMIT_DATA, (allowed, hard))
+
+
+def _held() -> int:
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((1024 * int(one.split()[1]) for one in lines if one.startswith("VmData")), 0)
