@@ -1,0 +1,155 @@
+"""What the command line of the noise sweep reads and prints, and what its figure draws."""
+
+import pytest
+import typer
+
+from service.cli.sweeps import grid, tables_of
+from service.floors import Floors, at_sigma
+from service.schemas_summaries import GroupOut, ParameterSummaryOut, SummaryOut
+from service.web.figures_noise import NORMAL_95, noise_keys, noise_sweep
+from service.web.theme import DASHES
+
+SIGMAS = (0.0, 0.5, 1.0)
+
+
+def group(sigma, method, scale=1.0, **changes):
+    quantiles = [scale * sigma * q for q in (0.1, 0.3, 0.5, 0.7, 0.9)]
+    error = [q - 0.4 * scale * sigma for q in quantiles]
+    parameter = ParameterSummaryOut(
+        name="L", unit="s", value=[2.0 + one for one in error], stderr=0.1, reference=2.0,
+        error=error, floor=0.25 * sigma,
+    )  # fmt: skip
+    known = {
+        "key": {"/noise/sigma": sigma, "/algorithm/method": method}, "runs": 10, "succeeded": 8,
+        "failed": 2, "success_rate": 0.8, "sigma": sigma, "evaluations": 1234.4, "seconds": 0.1,
+        "rms": quantiles, "rms_noise_free": quantiles, "rms_floor": 0.2 * sigma,
+        "fit_percent": {}, "parameters": [parameter],
+    }  # fmt: skip
+    return GroupOut(**{**known, **changes})
+
+
+def summary(groups):
+    return SummaryOut(
+        job="job_1", by=["/noise/sigma", "/algorithm/method"],
+        quantiles=[0.05, 0.25, 0.5, 0.75, 0.95], groups=groups,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("0:1:0.05", [i / 20 for i in range(21)]),
+        ("0:0.3:0.1", [0.0, 0.1, 0.2, 0.3]),
+        ("0:1:0.3", [0.0, 0.3, 0.6, 0.9]),
+        ("0.5", [0.5]),
+        (" 0, 1e-3 ,2", [0.0, 0.001, 2.0]),
+        ("0:0.2:0.1,1", [0.0, 0.1, 0.2, 1.0]),
+        ("1:1:1", [1.0]),
+    ],
+)
+def test_a_grid_has_exactly_the_numbers_that_are_written(text, expected):
+    assert grid(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["", ",", "a", "0:1", "0:1:0", "0:1:-0.1", "1:0:0.1", "0:1:0.1:2", "nan", "0:inf:1",
+             "0:1:1e-9"],
+)  # fmt: skip
+def test_a_grid_that_cannot_be_read_is_one_line_and_exit_code_2(text, capsys):
+    with pytest.raises(typer.Exit) as ended:
+        grid(text)
+    assert ended.value.exit_code == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_the_tables_have_a_row_for_each_group_and_at_most_four_parameters_each():
+    names = "abcdefghi"
+    one = group(0.5, "simple")
+    many = [one.parameters[0].model_copy(update={"name": name}) for name in names]
+    found = tables_of(summary([one.model_copy(update={"parameters": many})] * 3).model_dump())
+    assert [len(rows) for _, rows in found] == [3] * 4
+    for headings, rows in found:
+        assert all(len(row) == len(headings) for row in rows)
+    assert [sum("error [" in one for one in headings) for headings, _ in found] == [1, 4, 4, 1]
+    assert found[0][1][0] == [
+        "0.5", "simple", "10", "80 %", "1234", "0.25 [0.05, 0.45]", "0.1",
+    ]  # fmt: skip
+    assert found[1][1][0][2:4] == ["+0.05 [-0.15, +0.25]", "0.12"]
+
+
+def test_what_is_not_known_is_a_dash():
+    blank = ParameterSummaryOut(name="L", unit="s", value=[0.0] * 5, stderr=None)
+    waiting = group(
+        0.5, "simple", succeeded=0, failed=0, evaluations=None, rms_noise_free=None,
+        rms_floor=None, parameters=[blank],
+    )  # fmt: skip
+    first, second = (rows[0] for _, rows in tables_of(summary([waiting]).model_dump()))
+    assert first == ["0.5", "simple", "0/10", "–", "–", "–", "–"]
+    assert second == ["0.5", "simple", "–", "–"]
+
+
+def lines(figure, axis, dash=None):
+    return [
+        one for one in figure["data"]
+        if one["xaxis"] == axis and one["line"].get("dash") == dash and one["line"]["width"] > 0
+    ]  # fmt: skip
+
+
+def test_each_plot_has_a_median_and_a_band_for_each_method():
+    groups = [group(s, m, 1 + n) for s in SIGMAS for n, m in enumerate(("simple", "improved"))]
+    figure = noise_sweep(summary(groups), "m")
+    for axis in ("x", "x2"):
+        medians = [one for one in figure["data"]
+                   if one["xaxis"] == axis and one["mode"] == "lines+markers"]  # fmt: skip
+        bands = [one for one in figure["data"] if one["xaxis"] == axis and "fill" in one]
+        assert [one["legendgroup"] for one in medians] == ["simple", "improved"]
+        assert [one["legendgroup"] for one in bands] == ["simple", "improved"]
+        assert all(one["x"] == list(SIGMAS) for one in medians + bands)
+    shown = [one["name"] for one in figure["data"] if one["showlegend"]]
+    assert len(shown) == len(set(shown)) == 3
+    assert figure["layout"]["yaxis"]["title"]["text"] == "RMS error [m]"
+
+
+def test_the_floor_of_a_parameter_is_drawn_at_the_quantiles_of_the_band():
+    figure = noise_sweep(summary([group(s, "improved") for s in SIGMAS]), "m")
+    assert "dash" in DASHES
+    (response,) = lines(figure, "x", "dash")
+    assert response["y"] == pytest.approx([0.2 * s for s in SIGMAS])
+    below, above = lines(figure, "x2", "dash")
+    expected = [NORMAL_95 * 0.25 * s for s in SIGMAS]
+    assert above["y"] == pytest.approx(expected)
+    assert below["y"] == pytest.approx([-one for one in expected])
+
+
+def test_groups_are_drawn_in_the_order_of_their_noise():
+    figure = noise_sweep(summary([group(s, "improved") for s in (1.0, 0.0, 0.5)]), "m")
+    medians = [one for one in figure["data"] if one["mode"] == "lines+markers"]
+    assert all(one["x"] == [0.0, 0.5, 1.0] for one in medians)
+    assert medians[0]["y"] == pytest.approx([0.0, 0.25, 0.5])
+
+
+def test_a_sweep_that_has_given_nothing_yet_has_an_empty_figure():
+    waiting = [group(0.5, "simple", rms_noise_free=None, parameters=[])]
+    assert noise_sweep(summary(waiting), "m")["data"] == []
+
+
+def test_only_a_sweep_over_the_deviation_has_the_figure():
+    assert noise_keys([{"path": "/seed"}]) is None
+    axes = [{"path": one} for one in ("/noise/sigma", "/noise/seed", "/seed", "/skip")]
+    assert noise_keys(axes) == ["/noise/sigma", "/skip"]
+
+
+def test_a_floor_is_told_where_the_runs_of_a_group_have_one_deviation_and_one_problem():
+    assert at_sigma(2.0, (0.5, 0.5)) == 1.0
+    assert at_sigma(2.0, (0.0, 0.0)) == 0.0
+    assert at_sigma(2.0, (0.0, 0.5)) is None
+    assert at_sigma(None, (0.5, 0.5)) is None
+    problems = [
+        {"cell": {"/datasets": [one]}, "reference": None, "stderr": {}, "rms": None, "note": ""}
+        for one in ("ds_1", "ds_2")
+    ]
+    several = Floors({"axes": ["/datasets"], "problems": problems})
+    assert several.problem_of({"/datasets": ["ds_2"]}) is problems[1]
+    assert several.problem_of({"/noise/sigma": 0.1}) is None
+    assert Floors({"axes": [], "problems": problems[:1]}).problem_of({}) is problems[0]
+    assert Floors(None).problem_of({}) is None
