@@ -38,6 +38,8 @@ class Sensitivities(NamedTuple):
         Width on which the output does not change with that parameter; 0: it changes at once.
     one_sided : BoolArray, shape (D,)
         The output changes on one side of the estimate only, and not at once: no slope.
+    middle : FloatArray, shape (D,)
+        How far above the estimate the middle of its plateau lies; 0 where there is none.
     evaluations : int
     """
 
@@ -45,6 +47,7 @@ class Sensitivities(NamedTuple):
     columns: FloatArray
     plateau: FloatArray
     one_sided: BoolArray
+    middle: FloatArray
     evaluations: int
 
 
@@ -67,6 +70,7 @@ def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) 
     probe = _Probe(problem, theta, most)
     d = probe.place.size
     columns, plateau = np.zeros((probe.weight.size, d)), np.zeros(d)
+    middle = np.zeros(d)
     one_sided = np.zeros(d, dtype=np.bool_)
     everything = np.arange(d)
     low, below = probe.at(everything, np.full(d, -_DIFFERENCE))
@@ -86,11 +90,12 @@ def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) 
             both = np.isfinite(down) & np.isfinite(up)
             width = np.where(both, up + down, 0.0)
             plateau[jumping], one_sided[jumping] = width, np.isfinite(down) != np.isfinite(up)
+            middle[jumping] = np.where(both, 0.5 * (up - down), 0.0)
             steps = np.where(both, 2.0 * width, np.inf)
             columns[:, jumping] = np.where(both, (above - below) / steps, 0.0)
         columns = probe.weight[:, None] * np.where(np.isfinite(columns), columns, 0.0)
         error = probe.weight * (probe.predicted - probe.measured)
-    return Sensitivities(error, columns, plateau, one_sided, probe.evaluations)
+    return Sensitivities(error, columns, plateau, one_sided, middle, probe.evaluations)
 
 
 def _differ(

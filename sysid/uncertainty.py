@@ -10,7 +10,8 @@ K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals u
 residuals of a free run are clearly not white, both are that of coloured ones (`sysid.serial`).
 
 Where the output does not change on a plateau of width w (a lag that is rounded to whole samples),
-nothing tells where in it the parameter lies: w²/12 is added to its variance.
+nothing tells where in it the parameter lies: w²/12 is added to its variance, and the interval is
+around the plateau's middle, wherever on it the search has ended.
 
 What no data tell follows from the form of the equations (`sysid.symmetries`) and is taken out of S
 exactly; what these data do not tell, from its singular values. Both give groups (`sysid.groups`).
@@ -106,7 +107,7 @@ def _unexplored(problem: Problem, theta: FloatArray, evaluations: int) -> Analys
 def _analysed(
     problem: Problem, theta: FloatArray, sensitive: Sensitivities, most: int | None
 ) -> Analysis:
-    error, columns, plateau, one_sided, count = sensitive
+    error, columns, plateau, one_sided, aside, count = sensitive
     n, d = columns.shape
     criteria = criteria_of(error, d)
     if n <= d:
@@ -157,6 +158,8 @@ def _analysed(
     estimates = estimates_of(problem, told)
     jumps = {p.name for p, one in zip(problem.space, one_sided, strict=True) if one}
     estimates = tuple(_on_one_side(e) if e.name in jumps else e for e in estimates)
+    moved = {p.name: by for p, by in zip(problem.space, aside * scale, strict=True) if by}
+    estimates = tuple(_centred(e, moved[e.name]) if e.name in moved else e for e in estimates)
     return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, pulled)
 
 
@@ -200,6 +203,17 @@ def _on_one_side(estimate: Estimate) -> Estimate:
     """An estimate whose slope is not known because the output jumps on one side of it only."""
     reason = "the output changes with it in jumps, and here on one side only"
     return replace(estimate, stderr=None, interval95=None, reason=reason)
+
+
+def _centred(estimate: Estimate, aside: float) -> Estimate:
+    """An estimate whose interval is around the middle of its plateau, which lies so far above it.
+
+    On a plateau the loss is the same, so where on it the search ended says nothing.
+    """
+    if estimate.interval95 is None:
+        return estimate
+    lower, upper = estimate.interval95
+    return replace(estimate, interval95=(lower + aside, upper + aside))
 
 
 def _influence(error: FloatArray, scale: float) -> FloatArray:

@@ -186,6 +186,18 @@ def test_a_rounded_lag_is_no_surer_than_its_plateau() -> None:
     assert errors == pytest.approx([expected] * len(errors), rel=0.1)
 
 
+def test_the_interval_of_a_rounded_lag_does_not_depend_on_where_the_search_ended() -> None:
+    problem = rounded()
+    for lag in (0.4901, 0.4912, 0.5, 0.5088, 0.5099):  # all the same samples
+        found = by_name(analyse(problem, np.array([0.2, lag, 5.0, 1.0])).estimates)["L"]
+        assert found.value == pytest.approx(lag)
+        assert found.interval95 is not None
+        lower, upper = found.interval95
+        assert 0.5 * (lower + upper) == pytest.approx(0.5, abs=5e-4)
+        assert lower <= 0.49
+        assert upper >= 0.51
+
+
 def test_a_rounded_lag_leaves_the_other_standard_errors_alone() -> None:
     found = by_name(analyse(rounded(), np.array([0.2, 0.5, 5.0, 1.0])).estimates)
     for name in ("c", "b", "a"):
