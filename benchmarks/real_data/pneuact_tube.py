@@ -25,14 +25,14 @@ def measure(client: Client, folder: Path) -> list[Row]:
     source = folder / "pneuact_tube" / "pneuact_tube.csv"
     raw = client.add_dataset(source, name="pneuact tube", segments=",".join(LABELS))["id"]
     runs = {
-        length: identify_all(client, _job(client, raw, length, pressures))
-        for length, pressures in _pressures(source).items()
+        length: identify_all(client, _job(client, raw, length, several))
+        for length, several in pressures(source).items()
     }
     _print_runs(runs)
     return _rows(runs)
 
 
-def _pressures(source: Path) -> dict[float, list[float]]:
+def pressures(source: Path) -> dict[float, list[float]]:
     """Nominal pressures (bar) of the fill phase at each length (m)."""
     found: dict[float, set[float]] = defaultdict(set)
     with source.open(newline="") as lines:
@@ -42,10 +42,10 @@ def _pressures(source: Path) -> dict[float, list[float]]:
     return {length: sorted(found[length]) for length in sorted(found)}
 
 
-def _job(client: Client, raw: str, length: float, pressures: list[float]) -> dict[str, Any]:
+def _job(client: Client, raw: str, length: float, several: list[float]) -> dict[str, Any]:
     """A sweep over the pressures; a lag is sought up to half the record or the model's bound."""
-    even = [_pooled(client, raw, length, pressure, 0) for pressure in pressures]
-    odd = [_pooled(client, raw, length, pressure, 1) for pressure in pressures]
+    even = [pooled(client, raw, length, pressure, 0) for pressure in several]
+    odd = [pooled(client, raw, length, pressure, 1) for pressure in several]
     half = [min(one["duration"] / 2, 1.0) for one in even]
     values = {
         "/datasets": [[one["id"]] for one in even],
@@ -68,7 +68,7 @@ def _job(client: Client, raw: str, length: float, pressures: list[float]) -> dic
     }
 
 
-def _pooled(
+def pooled(
     client: Client, raw: str, length: float, pressure: float, remainder: int
 ) -> dict[str, Any]:
     """The pooled record of the even (0) or odd (1) repeats."""
