@@ -30,10 +30,10 @@ LIMIT_SECONDS = 120.0
 class Place:
     """A data folder with its database and store, and one dataset in it."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, database: Database | None = None) -> None:
         self.settings = Settings(data_dir=folder, cpus=2, lease_seconds=3.0)
         self.settings.prepare_folder()
-        self.database = Database(self.settings.database)
+        self.database = database or Database(self.settings.database)
         upgrade(self.database)
         self.store: ObjectStore = open_store(self.settings.store)
         self.dataset = self._dataset()

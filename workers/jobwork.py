@@ -204,7 +204,7 @@ class JobWork:
             run.kills = 0
             self.observer.blamed(run.run, 0)
         self.observer.progress(run.run, run.state, run.seconds)
-        self._ready.append(run)
+        self._ready.appendleft(run)  # what was begun is ended first: few runs are under way
 
     def _fail(self, name: str, failure: Failure) -> None:
         if self._active.pop(name, None) is not None:

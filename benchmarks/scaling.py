@@ -1,0 +1,242 @@
+"""Two workers against one, the cost of a task and of a run, and a single run beside a sweep.
+
+The model of `docs/scaling.md` is made of these: one dispatcher's second of CPU pays for so many
+runs and packs, hence for so many workers.
+"""
+
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from benchmarks import paper_example
+from benchmarks.family import cpu_seconds
+from benchmarks.table import Row, Skipped, parser, report
+from service.client import Client
+from service.embedded import embedded_service
+from sysid.settings import GeneticAlgorithm, Stop
+from workers.cluster import ClusterSettings, RayCrew
+from workers.packing import PACK_SECONDS
+from workers.ports import Advance, ProblemSpec, RunSpec
+
+LONG = {"generations": 2500, "stop": {"settled": None}}
+"""A run of some tenths of a second; the default one of the paper takes some hundredths."""
+POLL_SECONDS = 0.01
+
+
+@dataclass(frozen=True)
+class Swept:
+    """One sweep that was carried out: wall time, and CPU time by kind of process."""
+
+    runs: int
+    wall: float
+    cpu: Mapping[str, float]
+
+    def each(self, kind: str) -> float:
+        """CPU time of that kind of process for each run, in ms."""
+        return 1e3 * self.cpu.get(kind, 0.0) / self.runs
+
+
+@dataclass(frozen=True)
+class Service:
+    """A running service with the record of the paper's example in it."""
+
+    client: Client
+    dataset: str
+
+    def body(self, runs: int, **changes: Any) -> dict[str, Any]:
+        """A sweep over seeds; what was computed before is computed anew."""
+        axes = [{"path": "/seed", "range": [0, runs]}]
+        plain = {**paper_example.job(self.dataset, 0), "reuse": False, **changes}
+        return plain if runs == 1 else {**plain, "sweep": {"axes": axes}}
+
+    def ended(self, job: str, pause: float = POLL_SECONDS) -> dict[str, Any]:
+        """Wait for a job, which takes the web process some time at every look."""
+        while (found := self.client.job(job))["state"] in ("queued", "running"):
+            time.sleep(pause)
+        assert found["state"] == "succeeded", found
+        return found
+
+    def sweep(self, runs: int, **changes: Any) -> Swept:
+        """Carry a sweep out and measure it."""
+        before = cpu_seconds()
+        job = self.ended(self.client.submit(self.body(runs, **changes))["id"], 0.2)
+        after = cpu_seconds()
+        spent = {name: after[name] - before.get(name, 0.0) for name in after}
+        begun, done = (datetime.fromisoformat(job[f"{end}_at"]) for end in ("started", "finished"))
+        return Swept(runs, (done - begun).total_seconds(), spent)
+
+    def wait(self, **changes: Any) -> float:
+        """How long a single identification takes, from submission to result, in s."""
+        start = time.perf_counter()
+        self.ended(self.client.submit(self.body(1, **changes))["id"])
+        return time.perf_counter() - start
+
+
+@contextmanager
+def service(cpus: int) -> Iterator[Service]:
+    """A service with so many workers, all of them warm."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(TemporaryDirectory(prefix="lagid-")))
+        url = stack.enter_context(embedded_service(folder / "data", cpus=cpus))
+        client = stack.enter_context(Client(url))
+        path = paper_example.write_csv(folder / "record.csv", seed=1)
+        made = Service(client, client.add_dataset(path, name="example 1")["id"])
+        made.sweep(40)
+        yield made
+
+
+def two_against_one(pairs: int, runs: Mapping[str, tuple[int, dict[str, Any]]]) -> list[Row]:
+    """The same sweeps with one worker and with two, in turn: others on the machine hit both."""
+    rows: list[Row] = []
+    with service(1) as one, service(2) as two:
+        for name, (count, changes) in runs.items():
+            both = [(one.sweep(count, **changes), two.sweep(count, **changes))
+                    for _ in range(pairs)]  # fmt: skip
+            rows += _efficiency(name, [pair[0] for pair in both], [pair[1] for pair in both])
+    return rows
+
+
+def _efficiency(name: str, alone: Sequence[Swept], both: Sequence[Swept]) -> list[Row]:
+    # The fastest of each: others on the machine can only add to a time.
+    gain = min(one.wall for one in alone) / min(two.wall for two in both)
+
+    def median(kind: str) -> float:
+        return statistics.median(two.each(kind) for two in both)
+
+    work, ours, rays = median("workers"), median("dispatcher"), median("Ray")
+    inflation = statistics.median(
+        one.each("workers") / two.each("workers") for one, two in zip(alone, both, strict=True)
+    )
+    cores = os.cpu_count() or 1
+    bar = 0.92 if cores > 2 else None  # else the dispatcher shares the second worker's core
+    return [
+        Row(f"{name}: efficiency of 2 workers against 1, wall time on {cores} cores",
+            gain / 2, "", bar, ">="),
+        Row(f"{name}: the same by CPU time (a run's with 1 worker over that with 2)",
+            inflation, "", 0.92, ">="),
+        Row(f"{name}: part of all CPU time that computes", work / (work + ours + rays), ""),
+        Row(f"{name}: CPU of a worker for a run", work, "ms"),
+        Row(f"{name}: CPU of the dispatcher for a run", ours, "ms"),
+        Row(f"{name}: CPU of Ray's own processes for a run", rays, "ms"),
+        Row(f"{name}: workers that one dispatcher feeds, by its CPU time", work / ours, ""),
+    ]  # fmt: skip
+
+
+def cost_of_a_task(count: int) -> list[Row]:
+    """Packs of one small item, sent and fetched as the dispatcher does."""
+    record = paper_example.record(1)
+    algorithm = GeneticAlgorithm(population=8, generations=1, stop=Stop(settled=None))
+    document = {
+        "name": "static",
+        "form": "differential",
+        "inputs": {"q": "N"},
+        "states": {"y": "m"},
+        "parameters": {"k": {"lower": 0.1, "upper": 1.0}},
+        "equations": {"y": "k*q - y"},
+        "outputs": {"y": "y"},
+        "initial": {"y": 0},
+    }
+    spec = RunSpec(ProblemSpec(document, "r"), algorithm)
+    crew = RayCrew(ClusterSettings(cpus=2))
+    try:
+        crew.warm()
+        shared = crew.share((record,))
+
+        def rounds(number: int) -> None:
+            sent = fetched = 0
+            while fetched < number:
+                while sent < number and sent - fetched < 4:
+                    item = Advance(f"r{sent}", spec, None, PACK_SECONDS)
+                    crew.submit((item,), ("r",), (shared,))
+                    sent += 1
+                for handle in crew.finished(1.0):
+                    crew.fetch(handle)
+                    fetched += 1
+
+        rounds(50)
+        before, own = cpu_seconds(), time.process_time()
+        rounds(count)
+        own = time.process_time() - own
+        rays = cpu_seconds().get("Ray", 0.0) - before.get("Ray", 0.0)
+    finally:
+        crew.close()
+    return [
+        Row("a task: CPU of the process that sends it", 1e3 * own / count, "ms"),
+        Row("a task: CPU of Ray's own processes", 1e3 * rays / count, "ms"),
+        Row("workers that one sender of packs of 0.5 s feeds", PACK_SECONDS / (own / count), ""),
+    ]
+
+
+def beside_a_sweep(runs: int, singles: int) -> list[Row]:
+    """How much longer a single identification takes beside a sweep, submitted at random times."""
+    kinds: dict[str, dict[str, Any]] = {"paper-size": {}, "long": {"algorithm": {
+        "generations": 20_000, "islands": 2, "stop": {"settled": None}}}}  # fmt: skip
+    with service(2) as one:
+
+        def waits() -> dict[str, list[float]]:
+            return {name: [one.wait(seed=n, **changes) for n in range(singles)]
+                    for name, changes in kinds.items()}  # fmt: skip
+
+        alone = waits()
+        start = time.perf_counter()
+        sweep = one.client.submit(one.body(runs))["id"]
+        submitted = time.perf_counter() - start
+        _until(lambda: one.client.job(sweep)["progress"]["finished"] > 0)
+        at_first = one.wait()
+        _until(lambda: one.client.job(sweep)["progress"]["finished"] > min(2000, runs // 10))
+        beside = waits()
+        left = one.client.job(sweep)["progress"]
+        assert left["finished"] < left["runs"], "the sweep had ended: take more runs"
+    rows = [Row(f"submission of a sweep of {runs} runs", submitted, "s")]
+    for name in kinds:
+        typical = statistics.median(alone[name])
+        rows += [
+            Row(f"{name} single, alone: median", typical, "s"),
+            Row(f"{name} single beside the sweep: median delay",
+                statistics.median(beside[name]) - typical, "s", 2.0),
+            Row(f"{name} single beside the sweep: longest delay",
+                max(beside[name]) - typical, "s", 2.0 if name == "paper-size" else None),
+        ]  # fmt: skip
+    typical = statistics.median(alone["paper-size"])
+    return [*rows, Row("paper-size single just after the sweep began: delay",
+                       at_first - typical, "s", 2.0)]  # fmt: skip
+
+
+def _until(holds: Callable[[], bool]) -> None:
+    while not holds():
+        time.sleep(POLL_SECONDS)
+
+
+def main() -> None:
+    """Measure and print."""
+    options = parser(__doc__ or "").parse_args()
+    few = options.quick
+    sweeps = {
+        "short runs": (200 if few else 1000, {}),
+        "longer runs": (40 if few else 120, {"algorithm": LONG}),
+    }
+    skipped = []
+    if (os.cpu_count() or 1) <= 2:
+        skipped.append(Skipped(
+            "bar of the efficiency by wall time",
+            "two workers and the dispatcher share two cores here",
+        ))  # fmt: skip
+    rows = [
+        *two_against_one(3 if few else 7, sweeps),
+        *cost_of_a_task(300 if few else 2000),
+        *beside_a_sweep(10_000 if few else 100_000, 5 if few else 15),
+    ]
+    report("Scaling", rows, [], options)
+    for one in skipped:
+        print(f"{one.name}: none, {one.reason}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,149 @@
+"""Jobs that share the workers of a real Ray, and dispatchers that share a queue."""
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from service.dispatch.claiming import Leases
+from service.dispatcher import Dispatcher
+from service.storage.admission import Admission
+from service.storage.objects import open_store
+from service.storage.queue import Claim
+from service.storage.sessions import Database
+from service.storage.tables import State
+from tests.dispatching import LIMIT_SECONDS, Place
+from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
+from workers.feeding import Feeder
+from workers.inline import InlineCrew
+from workers.ports import Evolve, QueuedRun
+
+QUICK = {"generations": 60, "population": 16, "stop": {"settled": None}}
+
+
+def sweep(runs: int) -> dict[str, Any]:
+    return {"axes": [{"path": "/seed", "range": [0, runs]}]}
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_a_single_identification_gets_in_while_nine_sweeps_of_thousands_of_runs_go_on(
+    tmp_path: Path, ray_crew
+) -> None:
+    place = Place(tmp_path / "data")
+    dispatcher = Dispatcher(place.database, place.store, ray_crew, Leases(place.database, 60.0))
+    sweeps = [place.submit(sweep=sweep(2000), algorithm=QUICK) for _ in range(9)]
+
+    def turn_until(job: str, *states: State) -> None:
+        limit = time.monotonic() + LIMIT_SECONDS
+        while place.job(job).state not in states:
+            assert time.monotonic() < limit
+            dispatcher.turn()
+
+    for job in sweeps:
+        turn_until(job, State.RUNNING)
+    single = place.submit(seed=5)
+    turn_until(single, State.SUCCEEDED)
+    assert all(place.job(job).state is State.RUNNING for job in sweeps)
+    for job in sweeps:
+        place.cancel(job)
+    for job in sweeps:
+        turn_until(job, State.CANCELLED)
+
+
+class Counted(Leases):
+    """Leases that count what they claim."""
+
+    claimed = 0
+
+    def claim(self, admission: Admission | None = None) -> Claim | None:
+        found = super().claim(admission)
+        self.claimed += found is not None
+        return found
+
+
+def test_two_dispatchers_split_the_jobs_of_one_database_and_each_run_is_done_once(
+    tmp_path: Path, database: Database
+) -> None:
+    place = Place(tmp_path / "data", database)
+    jobs = [place.submit(sweep=sweep(4), algorithm=QUICK, seed=n) for n in range(12)]
+    url = database.engine.url.render_as_string(hide_password=False)
+    own = [Database(url), Database(url)]
+    leases = [Counted(one, 60.0) for one in own]
+    dispatchers = [
+        Dispatcher(one, open_store(place.settings.store), InlineCrew(), mine)
+        for one, mine in zip(own, leases, strict=True)
+    ]
+    threads = [threading.Thread(target=one.run) for one in dispatchers]
+    for thread in threads:
+        thread.start()
+    try:
+        for job in jobs:
+            place.until(job, State.SUCCEEDED, State.FAILED)
+    finally:
+        for dispatcher, thread in zip(dispatchers, threads, strict=True):
+            dispatcher.stopping.set()
+            thread.join()
+        for one in own:
+            one.dispose()
+    assert sum(one.claimed for one in leases) == len(jobs)
+    assert min(one.claimed for one in leases) > 0
+    for job in jobs:
+        ended = place.job(job)
+        assert (ended.state, ended.attempt, ended.n_done) == (State.SUCCEEDED, 1, 4)
+        assert [run.number for run in place.runs(job)] == [0, 1, 2, 3]
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
+    ray_crew, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
+    monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 0.001)
+    one = spec(3, "long", generations=120, islands=8, population=64)
+    plain = carry_out(InlineCrew(), {"r": one})
+    flying: set[Any] = set()
+    most = 0
+    submit, fetch = ray_crew.submit, ray_crew.fetch
+
+    def counted(pack, keys, shared) -> Any:
+        nonlocal most
+        handle = submit(pack, keys, shared)
+        if isinstance(pack[0], Evolve):
+            flying.add(handle)
+            most = max(most, len(flying))
+        return handle
+
+    def fetched(handle) -> Any:
+        flying.discard(handle)
+        return fetch(handle)
+
+    monkeypatch.setattr(ray_crew, "submit", counted)
+    monkeypatch.setattr(ray_crew, "fetch", fetched)
+    spread = carry_out(ray_crew, {"r": one})
+    assert most == ray_crew.slots
+    assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])
+
+
+@pytest.mark.ray
+@pytest.mark.slow
+def test_a_short_job_passes_a_sweep_on_real_workers(ray_crew) -> None:
+    feeder: Feeder[str] = Feeder(ray_crew)
+    long, short = Notebook(), Notebook()
+    runs = (QueuedRun(f"s{n}", spec(n)) for n in range(3000))
+    feeder.add("sweep", ListedRuns(runs), long)
+    limit = time.monotonic() + LIMIT_SECONDS
+    while not long.results and time.monotonic() < limit:
+        feeder.step(0.05)
+    feeder.add("single", ListedRuns([QueuedRun("one", spec(9, "long", generations=300))]), short)
+    while "single" not in feeder.step(0.05):
+        assert time.monotonic() < limit
+    assert len(short.results["one"]) == 1
+    assert len(long.results) < 3000
+    long.is_stopped = True
+    while len(feeder):
+        feeder.step(0.05)
+        assert time.monotonic() < limit
