@@ -1,0 +1,53 @@
+"""Chains of a sweep: which run comes before which."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.chains import Chain
+from service.schemas_jobs import Axis
+from service.sweeps import Cell, Step, expand, grouped, values_of
+
+DATA = Axis(path="/datasets", values=["a", "b", "c"])
+SEEDS = Axis(path="/seed", range=[0, 4])
+LABELLED = Axis(path="/noise/sigma", values=[0, 1], labels=[{"x": 1}, {"x": 2}])
+
+
+def test_without_axes_there_is_no_chain() -> None:
+    assert Chain.along([]) is None
+
+
+@pytest.mark.parametrize(
+    ("axes", "along"),
+    [
+        ([SEEDS, DATA], "/datasets"), ([DATA, SEEDS], "/datasets"),
+        ([DATA, SEEDS, LABELLED], "/noise/sigma"), ([SEEDS], "/seed"),
+    ],
+)  # fmt: skip
+def test_the_run_before_differs_in_that_axis_only_by_one_step(axes: list[Axis], along: str) -> None:
+    chain = Chain.along(axes)
+    assert chain is not None
+    groups = [[Step("", cell) for cell in _cells(axes[numbers[0]])] for numbers in grouped(axes)]
+    cells = [dict(cell.values) for cell in expand(groups)]
+    order = values_of(next(axis for axis in axes if axis.path == along))
+    for number, cell in enumerate(cells):
+        before = chain.before(number)
+        place = order.index(cell[along])
+        if place == 0:
+            assert before is None
+        else:
+            assert before is not None
+            assert cells[before] == {**cell, along: order[place - 1]}
+
+
+def _cells(axis: Axis) -> list[Cell]:
+    return [Cell({axis.path: value}) for value in values_of(axis)]
+
+
+@given(st.integers(1, 50), st.integers(1, 50), st.integers(0, 10_000))
+def test_every_chain_ends_at_its_first_run(stride: int, length: int, number: int) -> None:
+    chain, steps = Chain(stride, length), 0
+    at: int | None = number
+    while at is not None:
+        at, steps = chain.before(at), steps + 1
+    assert steps == number // stride % length + 1
