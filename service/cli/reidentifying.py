@@ -30,45 +30,60 @@ MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
 
 
+Experiments = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="X=DATA[,DATA] …",
+        help="For each value of the label its recordings, files or datasets on the server; those "
+        "joined by a comma are fitted together.",
+    ),
+]
+Model = Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")]
+Label = Annotated[str, typer.Option("--label", help="What X is, such as length_m.")]
+Reference = Annotated[
+    str | None,
+    typer.Option(help="Run (run_…) or accepted reference to start from and compare with."),
+]
+Parameters = Annotated[
+    str, typer.Option(help="Parameters to look at, by commas; by default all that are free.")
+]
+Predict = Annotated[str, typer.Option(help="Values of X to predict at, by commas.")]
+WarmStart = Annotated[
+    str | None, typer.Option(help="reference, previous or none: where each run begins.")
+]
+Channels = Annotated[str, typer.Option(help="Which channel is which signal: u=P1,y=P2.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="path=value of the job, as parameters.L.upper=0.5."),
+]
+Name = Annotated[str | None, typer.Option(help="Name of the job.")]
+Wait = Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")]
+Accept = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Accept a run as this reference at the end.")
+]
+AcceptRun = Annotated[
+    str | None, typer.Option(metavar="RUN|X", help="Which: a run, or a value of the label.")
+]
+JsonFile = Annotated[
+    str | None, typer.Option("--json", metavar="FILE", help="Write the trend; - for stdout.")
+]
+
+
 def reidentify(
-    experiments: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="X=DATA[,DATA] …",
-            help="For each value of the label its recordings, files or datasets on the server; "
-            "those joined by a comma are fitted together.",
-        ),
-    ],
-    model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
-    label: Annotated[str, typer.Option("--label", help="What X is, such as length_m.")],
-    reference: Annotated[
-        str | None,
-        typer.Option(help="Run (run_…) or accepted reference to start from and compare with."),
-    ] = None,
-    parameters: Annotated[
-        str, typer.Option(help="Parameters to look at, by commas; by default all that are free.")
-    ] = "",
-    predict: Annotated[str, typer.Option(help="Values of X to predict at, by commas.")] = "",
-    warm_start: Annotated[
-        str | None,
-        typer.Option(help="reference, previous or none: where each run begins."),
-    ] = None,
-    channels: Annotated[str, typer.Option(help="Which channel is which signal: u=P1,y=P2.")] = "",
-    changes: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="path=value of the job, as parameters.L.upper=0.5."),
-    ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the job.")] = None,
-    wait: Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")] = False,
-    accept: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Accept a run as this reference at the end.")
-    ] = None,
-    accept_run: Annotated[
-        str | None, typer.Option(metavar="RUN|X", help="Which: a run, or a value of the label.")
-    ] = None,
-    json_file: Annotated[
-        str | None, typer.Option("--json", metavar="FILE", help="Write the trend; - for stdout.")
-    ] = None,
+    experiments: Experiments,
+    model: Model,
+    label: Label,
+    reference: Reference = None,
+    parameters: Parameters = "",
+    predict: Predict = "",
+    warm_start: WarmStart = None,
+    channels: Channels = "",
+    changes: Changes = None,
+    name: Name = None,
+    wait: Wait = False,
+    accept: Accept = None,
+    accept_run: AcceptRun = None,
+    json_file: JsonFile = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
 ) -> None:
