@@ -5,7 +5,7 @@ A kernel is one C function of addresses and whole numbers::
     void kernel(i64 P, double *theta, i64 stride, i64 *ints, double *floats, double *work,
                 double *predictions, i64 predictions_stride, double *loss)
 
-theta : K rows of `stride`: row = parameter, column = individual; P is a multiple of `LANES`.
+theta : K rows of `stride`: row = parameter, column = individual; P is a multiple of `FEW`.
 ints, floats : one experiment as `sysid.kernels.plan` lays it out.
 work : scratch of the experiment's size; its contents on entry do not matter.
 predictions : null, or M_e rows of `predictions_stride`: the simulated value at each measured time.
@@ -23,6 +23,9 @@ from numba.extending import intrinsic
 
 LANES = 16
 """W: individuals that run side by side in one vector of doubles."""
+
+FEW = 8
+"""The same where no more are left: a block of so many takes two thirds of the time."""
 
 ARGUMENTS = ("P", "theta", "stride", "ints", "floats", "work", "predictions",
              "predictions_stride", "loss")  # fmt: skip

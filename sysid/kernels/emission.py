@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from llvmlite import ir
 
 from sysid.kernels import demand
-from sysid.kernels.calls import ARGUMENTS, LANES, kernel_type
+from sysid.kernels.calls import ARGUMENTS, FEW, LANES, kernel_type
 from sysid.kernels.comparison import Comparison
 from sysid.kernels.experiment import Experiment
 from sysid.kernels.lanes import Lanes, Loop, Value
@@ -27,24 +27,37 @@ def kernel_code(model: Model, variant: Variant) -> str:
         argument.name = name
         if isinstance(argument.type, ir.PointerType):
             argument.add_attribute("noalias")
-    lanes = Lanes(function)
+    lanes = Lanes(function, LANES)
     arguments = dict(zip(ARGUMENTS, function.args, strict=True))
     experiment = Experiment(lanes, Layout.of(model), arguments["ints"], arguments["floats"])
     blocks = Loop(lanes)
     first = blocks.carry(lanes.integer(0))
-    blocks.leave_if(lanes.builder.icmp_signed(">=", first, arguments["P"]))
-    loss = _Block(lanes, model, variant, experiment, arguments, first).simulated()
-    so_far = lanes.load_row(arguments["loss"], first)
-    lanes.store_row(lanes.add(so_far, loss), arguments["loss"], first)
+    left = lanes.builder.sub(arguments["P"], first)
+    blocks.leave_if(lanes.builder.icmp_signed("<=", left, lanes.integer(FEW)))
+    _add_loss(lanes, _Block(lanes, model, variant, experiment, arguments, first))
     blocks.update(first, lanes.builder.add(first, lanes.integer(LANES)))
     blocks.repeat()
+
+    def few() -> list[Value]:
+        _add_loss(narrow, _Block(narrow, model, variant, experiment, arguments, first))
+        return []
+
+    narrow = lanes.of_width(FEW)
+    lanes.branch(lanes.builder.icmp_signed(">", left, lanes.integer(0)), few, [])
     lanes.builder.ret_void()
     return str(module)
 
 
+def _add_loss(lanes: Lanes, block: "_Block") -> None:
+    """Simulate a block and add its losses to those that are there."""
+    loss, target = block.simulated(), block.arguments["loss"]
+    so_far = lanes.load_row(target, block.first)
+    lanes.store_row(lanes.add(so_far, loss), target, block.first)
+
+
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """`LANES` individuals, from the start of the experiment to its end."""
+    """As many individuals as lanes, from the start of the experiment to its end."""
 
     lanes: Lanes
     model: Model

@@ -7,7 +7,7 @@ order, nor on the copies that fill the last lanes.
 import numpy as np
 
 from sysid.kernels.caching import compiled
-from sysid.kernels.calls import LANES, call_kernel
+from sysid.kernels.calls import FEW, call_kernel
 from sysid.kernels.evaluator import Evaluator
 from sysid.kernels.layout import HEAD
 from sysid.types import FloatArray, IntArray
@@ -19,7 +19,7 @@ _LAST = HEAD.index("last")
 def expanded(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """All parameters of (P, D) individuals as the kernel wants them: (K, P rounded up)."""
     individuals, free = theta.shape
-    stride = (individuals + LANES - 1) // LANES * LANES
+    stride = (individuals + FEW - 1) // FEW * FEW
     full = np.empty((evaluator.template.size, stride))
     for row in range(evaluator.template.size):
         full[row, :] = evaluator.template[row]

@@ -1,27 +1,27 @@
-"""Writes vector instructions of LLVM: arithmetic on `LANES` individuals at once, and memory.
+"""Writes vector instructions of LLVM: arithmetic on several individuals at once, and memory.
 
 A value is either the same for all individuals (a scalar: time, inputs, numbers) or one per
 individual (a vector). Scalars stay scalars until they meet a vector.
 """
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any, TypeAlias
 
 from llvmlite import ir
 
-from sysid.kernels.calls import LANES
 from sysid.kernels.vectormath import vector_functions
 
 DOUBLE, INT, BOOL = ir.DoubleType(), ir.IntType(64), ir.IntType(1)
-VECTOR, INTS, BOOLS = (ir.VectorType(kind, LANES) for kind in (DOUBLE, INT, BOOL))
 _INT32 = ir.IntType(32)
 
-FLAGS = ("contract", "nsz", "arcp")
-"""Fast-math flags in use: fused multiply-add, any sign of zero, reciprocal for a division.
+FLAGS = ("nsz", "arcp")
+"""Fast-math flags in use: any sign of zero, reciprocal for a division.
 
 Never ``nnan`` or ``ninf``: with them the compiler may drop the very ``nan`` or ``inf`` by which a
 diverged simulation is known. Nor ``reassoc``: sums stay in the order written, so that a lane's
-bits do not depend on how the compiler arranges its neighbours.
+bits do not depend on how the compiler arranges its neighbours. Nor ``contract``: which products
+are fused with a sum is said here, else the compiler decides, for 8 lanes otherwise than for 16.
 """
 
 # llvmlite is untyped
@@ -30,11 +30,19 @@ Function: TypeAlias = Any
 
 
 class Lanes:
-    """An instruction builder that knows vectors of individuals."""
+    """An instruction builder that knows vectors of `width` individuals."""
 
-    def __init__(self, function: Function) -> None:
-        self.function = function
+    def __init__(self, function: Function, width: int) -> None:
+        self.function, self.width = function, width
+        self.vector, self._ints = ir.VectorType(DOUBLE, width), ir.VectorType(INT, width)
         self.builder = ir.IRBuilder(function.append_basic_block("entry"))
+
+    def of_width(self, width: int) -> "Lanes":
+        """A builder of other vectors that goes on where this one writes."""
+        other = copy(self)
+        other.width = width
+        other.vector, other._ints = ir.VectorType(DOUBLE, width), ir.VectorType(INT, width)
+        return other
 
     # ---- constants and shapes -------------------------------------------------------------
     @staticmethod
@@ -47,22 +55,21 @@ class Lanes:
         """A whole number."""
         return ir.Constant(INT, value)
 
-    @staticmethod
-    def lane_numbers() -> Value:
-        """0, 1, …, LANES - 1."""
-        return ir.Constant(INTS, list(range(LANES)))
+    def lane_numbers(self) -> Value:
+        """0, 1, …, width - 1."""
+        return ir.Constant(self._ints, list(range(self.width)))
 
     def splat(self, value: Value) -> Value:
         """The scalar in every lane; a vector as it is."""
         if isinstance(value.type, ir.VectorType):
             return value
-        kind = ir.VectorType(value.type, LANES)
+        kind = ir.VectorType(value.type, self.width)
         if isinstance(value, ir.Constant):
-            return ir.Constant(kind, [value.constant] * LANES)
+            return ir.Constant(kind, [value.constant] * self.width)
         one = self.builder.insert_element(
             ir.Constant(kind, ir.Undefined), value, ir.Constant(_INT32, 0)
         )
-        zeros = ir.Constant(ir.VectorType(_INT32, LANES), [0] * LANES)
+        zeros = ir.Constant(ir.VectorType(_INT32, self.width), [0] * self.width)
         return self.builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), zeros)
 
     def same_shape(self, *values: Value) -> list[Value]:
@@ -77,11 +84,19 @@ class Lanes:
         return getattr(self.builder, operation)(left, right, flags=FLAGS)
 
     def add(self, a: Value, b: Value) -> Value:
-        """Sum of a and b."""
+        """Sum of a and b; a product is fused with it, in one rounding where the machine can."""
+        for product, other in ((b, a), (a, b)):
+            if _is_product(product):
+                return self.intrinsic("fmuladd", *product.operands, other)
         return self._float("fadd", a, b)
 
     def sub(self, a: Value, b: Value) -> Value:
-        """Difference of a and b."""
+        """Difference of a and b; a product is fused with it as in a sum."""
+        if _is_product(b):
+            first, second = b.operands
+            return self.intrinsic("fmuladd", self.builder.fneg(first), second, a)
+        if _is_product(a):
+            return self.intrinsic("fmuladd", *a.operands, self.builder.fneg(b))
         return self._float("fsub", a, b)
 
     def mul(self, a: Value, b: Value) -> Value:
@@ -117,7 +132,7 @@ class Lanes:
         offered = vector_functions()
         if name in offered.symbols and isinstance(kind, ir.VectorType):
             return self._in_parts(offered.symbols[name], offered.lanes, values)
-        suffix = f"v{LANES}f64" if isinstance(kind, ir.VectorType) else "f64"
+        suffix = f"v{self.width}f64" if isinstance(kind, ir.VectorType) else "f64"
         signature = ir.FunctionType(kind, [v.type for v in values])
         return self.builder.call(self._declared(f"llvm.{name}.{suffix}", signature), values)
 
@@ -125,9 +140,9 @@ class Lanes:
         """A vector function of `width` lanes, called on the parts of wider vectors."""
         part = ir.VectorType(DOUBLE, width)
         function = self._declared(symbol, ir.FunctionType(part, [part] * len(values)))
-        nothing = ir.Constant(VECTOR, ir.Undefined)
+        nothing = ir.Constant(self.vector, ir.Undefined)
         parts = []
-        for first in range(0, LANES, width):
+        for first in range(0, self.width, width):
             chosen = _positions(range(first, first + width))
             pieces = [self.builder.shuffle_vector(one, nothing, chosen) for one in values]
             parts.append(self.builder.call(function, pieces))
@@ -143,7 +158,7 @@ class Lanes:
     def whole_and_fraction(self, value: Value) -> tuple[Value, Value]:
         """Floor as whole numbers, and what remains."""
         floor = self.intrinsic("floor", value)
-        return self.builder.fptosi(floor, INTS), self.sub(value, floor)
+        return self.builder.fptosi(floor, self._ints), self.sub(value, floor)
 
     def clamped(self, value: Value, upper: Value) -> Value:
         """Inside [0, upper]; 0 where the value is ``nan``, so that it may address memory."""
@@ -165,7 +180,7 @@ class Lanes:
 
     def load_row(self, base: Value, index: Value) -> Value:
         """The vector of doubles that begins at ``base[index]``."""
-        return self.builder.load(self._address(base, index), typ=VECTOR, align=8)
+        return self.builder.load(self._address(base, index), typ=self.vector, align=8)
 
     def store_row(self, value: Value, base: Value, index: Value) -> None:
         """Store a vector of doubles from ``base[index]`` on."""
@@ -184,8 +199,8 @@ class Lanes:
         """
         b = self.builder
         step = b.shl(shift, self.integer(3))
-        found = ir.Constant(VECTOR, ir.Undefined)
-        for number in range(LANES):
+        found = ir.Constant(self.vector, ir.Undefined)
+        for number in range(self.width):
             lane = ir.Constant(_INT32, number)
             start = b.inttoptr(b.extract_element(addresses, lane), ir.PointerType())
             place = b.gep(start, [step], source_etype=ir.IntType(8))
@@ -227,6 +242,10 @@ class Lanes:
         module = self.function.module
         known = module.globals.get(name)
         return known if known is not None else ir.Function(module, signature, name)
+
+
+def _is_product(value: Value) -> bool:
+    return getattr(value, "opname", "") == "fmul"
 
 
 def _positions(places: Sequence[int]) -> Value:

@@ -7,13 +7,12 @@ computed once, and what one step has read the next need not read again.
 from dataclasses import dataclass
 from typing import Protocol
 
-from sysid.kernels.calls import LANES
 from sysid.kernels.lanes import Lanes, Loop, Value
 
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """One state's past in the work array: rows of `LANES`; step m lies in row m + const."""
+    """One state's past in the work array: a row for each step m, in it a double for each lane."""
 
     base: Value
 
@@ -68,7 +67,7 @@ class LinearReader:
         self._length = self._top - places[-1] // 2
         whole, self._fraction = lanes.whole_and_fraction(lag)
         b = lanes.builder
-        wide, own = lanes.splat(lanes.integer(LANES)), lanes.lane_numbers()
+        wide, own = lanes.splat(lanes.integer(lanes.width)), lanes.lane_numbers()
         one = lanes.splat(lanes.integer(1))
         self._within = b.icmp_signed("==", whole, lanes.splat(lanes.integer(0)))
         back = b.select(self._within, one, whole)
@@ -83,7 +82,7 @@ class LinearReader:
 
     def _sample(self, row: Value, steps: int) -> Value:
         b, lanes = self._lanes.builder, self._lanes
-        index = b.mul(b.add(row, lanes.integer(steps)), lanes.integer(LANES))
+        index = b.mul(b.add(row, lanes.integer(steps)), lanes.integer(lanes.width))
         return lanes.gather(self._addresses, index)
 
     def open(self, loop: Loop) -> None:
@@ -97,7 +96,7 @@ class LinearReader:
         lanes = self._lanes
         if self._forward:
             b = lanes.builder
-            index = b.mul(b.add(turn.row, lanes.integer(1)), lanes.integer(LANES))
+            index = b.mul(b.add(turn.row, lanes.integer(1)), lanes.integer(lanes.width))
             self._sample_now = self._newest
             self._ahead = lanes.gather(self._ahead_addresses, index)
         else:
@@ -185,9 +184,9 @@ class FreshReader:
         zero = lanes.splat(lanes.integer(0))
         place = b.add(whole, lanes.splat(lanes.integer(steps)))
         place = b.select(b.icmp_signed("<", place, zero), place, zero)
-        index = b.add(lanes.lane_numbers(), b.mul(place, lanes.splat(lanes.integer(LANES))))
+        index = b.add(lanes.lane_numbers(), b.mul(place, lanes.splat(lanes.integer(lanes.width))))
         addresses = lanes.addresses(self._history.base, index)
-        return lanes.gather(addresses, b.mul(self._turn.row, lanes.integer(LANES)))
+        return lanes.gather(addresses, b.mul(self._turn.row, lanes.integer(lanes.width)))
 
 
 def _lagrange(lanes: Lanes, at: Value, nodes: tuple[int, ...], samples: list[Value]) -> Value:

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 from sysid.kernels import demand
-from sysid.kernels.calls import LANES
 from sysid.kernels.experiment import Experiment
 from sysid.kernels.expressions import Scope, emit
 from sysid.kernels.lanes import DOUBLE, Lanes, Loop, Value
@@ -62,7 +61,7 @@ class States:
             n: lanes.splat(lanes.number(0.0)) if zero else v for n, v in self.now.items()
         }
         self._reach, self._rows = experiment.head("reach"), experiment.head("rows")
-        size = lanes.builder.mul(self._rows, lanes.integer(LANES))
+        size = lanes.builder.mul(self._rows, lanes.integer(lanes.width))
         self._histories = {
             name: History(
                 lanes.builder.gep(
@@ -84,7 +83,9 @@ class States:
             loop = Loop(lanes)
             row = loop.carry(lanes.integer(0))
             for name, history in self._histories.items():
-                lanes.store_row(self._before[name], history.base, b.mul(row, lanes.integer(LANES)))
+                lanes.store_row(
+                    self._before[name], history.base, b.mul(row, lanes.integer(lanes.width))
+                )
             following = b.add(row, lanes.integer(1))
             loop.update(row, following)
             loop.leave_if(b.icmp_signed(">=", following, self._reach))
@@ -94,14 +95,14 @@ class States:
 
     def store(self, row: Value) -> None:
         """Write the present states into a row of the history."""
-        index = self._lanes.builder.mul(row, self._lanes.integer(LANES))
+        index = self._lanes.builder.mul(row, self._lanes.integer(self._lanes.width))
         for name, history in self._histories.items():
             self._lanes.store_row(self.now[name], history.base, index)
 
     def far(self, name: str, back: int, row: Value) -> Value:
         """A sample a fixed number of steps before the last finished one."""
         b = self._lanes.builder
-        index = b.mul(b.sub(row, self._lanes.integer(back)), self._lanes.integer(LANES))
+        index = b.mul(b.sub(row, self._lanes.integer(back)), self._lanes.integer(self._lanes.width))
         return self._lanes.load_row(self._histories[name].base, index)
 
     def open(self, loop: Loop) -> None:
@@ -132,8 +133,8 @@ class States:
 
         def slide() -> list[Value]:
             first = b.sub(following, self._reach)
-            size = b.mul(b.add(self._reach, lanes.integer(1)), lanes.integer(LANES))
-            source = b.mul(first, lanes.integer(LANES))
+            size = b.mul(b.add(self._reach, lanes.integer(1)), lanes.integer(lanes.width))
+            source = b.mul(first, lanes.integer(lanes.width))
             for history in self._histories.values():
                 lanes.copy_rows(history.base, lanes.integer(0), source, size)
             return [self._reach]
