@@ -50,7 +50,8 @@ def own_site(tmp_path: Path) -> Iterator[Site]:
 
 @contextmanager
 def _serving(folder: Path) -> Iterator[Site]:
-    settings = Settings(data_dir=folder, poll_seconds=0.05)
+    # Jobs are claimed here without a heartbeat: the lease is long.
+    settings = Settings(data_dir=folder, poll_seconds=0.05, lease_seconds=3600)
     app = create_app(settings)
     config = uvicorn.Config(app, host="127.0.0.1", port=0, log_level="error", ws="none")
     server = uvicorn.Server(config)
