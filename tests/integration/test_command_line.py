@@ -297,3 +297,37 @@ def test_a_number_that_is_none_is_one_line_and_never_sent(tmp_path: Path) -> Non
     job.write_text("model: fopdt\ndatasets: [a]\nparameters: {L: {upper: .inf}}\n")
     said = refused(lagid("submit", job), 2)
     assert said == "lagid: /parameters/L/upper: found inf; need a finite number"
+
+
+NOISE = (
+    "sweep", "noise", "--model", "fopdt", "--true", "K=2", "--true", "T=1", "--true", "L=0.5",
+    "--true", "y0=0", "--input", "u=sin(t)", "--samples", 100, "--sample-time", 0.1,
+)  # fmt: skip
+
+
+def test_a_noise_sweep_is_submitted_with_the_settings_that_were_given(server: str) -> None:
+    words = (*NOISE, "--sigma", "0:0.2:0.1", "--replicates", 2, "--methods", "improved",
+             "--set", "algorithm.population=12", "--set", "parameters.L.upper=1")  # fmt: skip
+    done = lagid(*words, "--json", LAGID_URL=server)
+    assert done.returncode == 0, done.stderr
+    job = json.loads(done.stdout)
+    assert job["progress"]["runs"] == 6
+    request = httpx.get(f"{server}/v1/jobs/{job['id']}").json()["request"]
+    assert request["algorithm"]["population"] == 12
+    assert request["parameters"] == {"L": {"upper": 1}}
+    assert request["sweep"]["axes"][0]["values"] == [0, 0.1, 0.2]
+    again = lagid(*words, LAGID_URL=server)
+    assert "6 runs, queued" in again.stdout
+
+
+def test_a_mistake_of_a_noise_sweep_is_one_line(server: str) -> None:
+    for words, code, expected in (
+        ((*NOISE, "--sigma", "0:1"), 2, "start:stop:step"),
+        ((*NOISE, "--sigma", "0.1", "--data", "steps"), 2, "either --data"),
+        ((*NOISE, "--sigma", "0.1", "--true", "K"), 2, "NAME=VALUE"),
+        ((*NOISE, "--sigma", "0.1", "--true", "Q=1"), 1, "/truth/parameters/Q"),
+        ((*NOISE, "--sigma", "-0.1"), 1, "/sigma/0"),
+        ((*NOISE, "--sigma", "0.1", "--replicates", 0), 1, "/replicates"),
+        ((*NOISE, "--sigma", "0.1", "--methods", "best"), 1, "/methods/0"),
+    ):
+        assert expected in refused(lagid(*words, LAGID_URL=server), code)
