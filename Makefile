@@ -54,7 +54,7 @@ format: $(READY)
 	$(BIN)/ruff format .
 
 BENCHES := kernels search peers latency silverbox noise_sweep memory mcap
-FULL    := $(BENCHES) robustness efficiency
+FULL    := $(BENCHES) robustness efficiency scaling
 RESULTS := benchmarks/results
 
 bench: $(READY)
