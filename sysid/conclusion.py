@@ -1,13 +1,15 @@
 """From the end of a search to its result: refinement, uncertainty, validation, warnings."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from sysid.errors import DivergedEverywhere, NothingIdentifiable
-from sysid.islands.archipelago import analysis_budget, of_island
+from sysid.islands.archipelago import analysis_budget, loss_scale, of_island
 from sysid.islands.run_state import RunState
 from sysid.metrics import Metrics
+from sysid.neighbours import neighbourhood, widened
 from sysid.onset import onset_delays
 from sysid.problem import Problem, metrics_of
 from sysid.refinement import Refined, refine
@@ -18,6 +20,8 @@ from sysid.threads import one_thread
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis, analyse
 from sysid.warnings import warnings_of
+
+_AROUND = 1800  # simulations at most for minima beside the estimate
 
 
 def conclude(
@@ -56,6 +60,11 @@ def _concluded(
     best = min(range(len(ends)), key=lambda i: ends[i][1])
     theta = ends[best][0]
     analysis = analyse(problem, theta, _left(algorithm, state, refined))
+    if _polishes(algorithm, len(ends)):
+        end, analysis = _with_neighbours(problem, algorithm, state, refined, ends[best], analysis)
+        theta = end.theta
+        ends[best] = theta, end.rms
+        refined = (*refined[:best], end, *refined[best + 1 :])
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
         raise NothingIdentifiable(p.name for p in problem.space)
     simulated = problem.predictions(theta[None])[0]
@@ -97,12 +106,46 @@ def _champion(problem: Problem, history: tuple[Improvement, ...]) -> FloatArray:
 def _polished(
     problem: Problem, algorithm: GeneticAlgorithm, state: RunState, champions: list[FloatArray]
 ) -> tuple[Refined | None, ...]:
-    methods = {of_island(algorithm, i).method for i in range(len(champions))}
-    if not algorithm.refine or "improved" not in methods:
+    if not _polishes(algorithm, len(champions)):
         return (None,) * len(champions)
     left = _left(algorithm, state, ())
     kept = analysis_budget(len(champions[0]))
     return refine(problem, champions, None if left is None else max(0, left - kept))
+
+
+def _polishes(algorithm: GeneticAlgorithm, islands: int) -> bool:
+    """Whether least squares goes on from where the search has ended."""
+    methods = {of_island(algorithm, i).method for i in range(islands)}
+    return algorithm.refine and "improved" in methods
+
+
+def _with_neighbours(
+    problem: Problem, algorithm: GeneticAlgorithm, state: RunState,
+    refined: tuple[Refined | None, ...], end: tuple[FloatArray, float], analysis: Analysis,
+) -> tuple[Refined, Analysis]:  # fmt: skip
+    """The best of the minima beside an estimate, with intervals that allow for the others.
+
+    The evaluations of it are those of all the islands' ends in its place, and of the search here.
+    """
+    theta, rms = end
+    known = next((one for one in refined if one is not None and one.theta is theta), None)
+    before = 0 if known is None else known.evaluations
+    unchanged = Refined(theta, rms, before)
+    if analysis.uncertainty is None or loss_scale(problem) > 0:
+        return unchanged, analysis
+    left = _left(algorithm, state, refined)
+    kept = analysis.evaluations + analysis_budget(theta.size)
+    most = _AROUND if left is None else min(max(0, left - kept), _AROUND)
+    covariance = analysis.uncertainty.covariance
+    found = neighbourhood(problem, theta, rms, covariance, state.seed, most)
+    spent = before + found.evaluations
+    if found.best is not None:
+        spent += analysis.evaluations
+        theta, rms = found.best.theta, found.best.rms
+        analysis = analyse(problem, theta)
+    names = tuple(p.name for p in problem.space)
+    estimates = widened(analysis.estimates, names, problem.n_scored, found)
+    return Refined(theta, rms, spent), replace(analysis, estimates=estimates)
 
 
 def _left(

@@ -57,6 +57,16 @@ def refine(
     return tuple(found)
 
 
+def refine_one(
+    problem: Problem, start: FloatArray, rms: float, left: int, steps: int = _STEPS
+) -> Refined | None:
+    """Least squares from one start (D,) of known RMS; None if fewer than a step is `left`."""
+    if left < start.size + TRIED + _ENDS:
+        return None
+    place = placed(problem.evaluator, start[None])[0]
+    return _refined(problem, start, place, rms, min(left, steps * (start.size + TRIED) + _ENDS))
+
+
 def _refined(
     problem: Problem, start: FloatArray, place: FloatArray, rms: float, left: int
 ) -> Refined:

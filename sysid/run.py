@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 
+import numpy as np
+
 from sysid.conclusion import conclude
 from sysid.ga.island import Island, evolve
 from sysid.ga.state import Plan
@@ -30,6 +32,7 @@ CALL_SECONDS = 0.1
 
 _TARGET_ROUND = 5  # generations between two looks at the target RMS, or at a warm start
 _AGREE = 2 / 3  # of the searches from random places: a false optimum seldom draws so many
+_RETURN = 0.9  # of the searches from beside the best individual
 _WARM_SETTLED = 3  # of the searches that agree, a warm start needs one in three
 
 
@@ -60,7 +63,12 @@ def border(algorithm: GeneticAlgorithm, state: RunState) -> int:
 
 
 def is_resting(plan: Plan, island: Island) -> bool:
-    """Whether an island has used up its evaluations or reached the target RMS."""
+    """Whether an island has used up its evaluations or reached the target RMS.
+
+    Not before its population is evaluated: finding the starts of a polynomial counts, too.
+    """
+    if np.isnan(island.fitness).all():
+        return False
     return island.evaluations >= plan.evaluations or island.champion_rms <= plan.rms
 
 
@@ -97,8 +105,10 @@ def _has_ended(algorithm: GeneticAlgorithm, state: RunState) -> bool:
 
 
 def _is_settled(settled: int, state: RunState) -> bool:
-    """Whether searches from random places agree with the best individual.
+    """Whether searches from random places agree with the best individual, and it has no rivals.
 
+    Nearly all searches that began beside it have to lead back to it: where the fitness is rough
+    others nearby may be better.
     Behind a warm start stands an earlier result. So a third of them is enough, and so it is that
     all of them, and the second half of the generations, have found nothing better.
     """
@@ -106,6 +116,9 @@ def _is_settled(settled: int, state: RunState) -> bool:
         if state.independent >= settled and state.is_the_best_since(state.generation // 2):
             return True
         settled = -(-settled // _WARM_SETTLED)
+    hops, returned = state.hops
+    if returned < max(settled, _RETURN * hops):
+        return False
     return state.confirmed >= max(settled, _AGREE * state.independent)
 
 

@@ -20,7 +20,7 @@ from sysid.ga.gauss_newton import (
     spread,
 )
 from sysid.ga.operators import rank
-from sysid.ga.random import DEVELOPMENT, below, draws, unit
+from sysid.ga.random import DEVELOPMENT, Draws, below, draws, unit
 from sysid.ga.state import (
     CONFIRMED,
     DAMPING,
@@ -30,11 +30,14 @@ from sysid.ga.state import (
     FRESH,
     GENERATION,
     GROWTH,
+    HOP,
+    HOPS,
     HORIZON,
     OLD,
     POINT,
     PROBES,
     REACHED,
+    RETURNED,
     ROUGH,
     SAME,
     SEQUENCE,
@@ -58,6 +61,9 @@ N_GROWTHS = 3
 MOST_STEPS = 12
 ENOUGH = 1e-4  # relative gain of a step below which a full-record search ends
 ENOUGH_PART = 1e-2
+EARLY = 3  # developments that follow each other at once and are cheap, before the long ones
+FAR = 1.1  # of the champion's fitness: above, a search ends at the first small gain
+SHORTEST_HOP, LONGEST_HOP = 0.3, 50.0  # standard errors
 
 
 @compiled
@@ -78,6 +84,64 @@ def _fresh(
 
 
 @compiled
+def _difference(plan: Plan, counters: IntArray, memory: FloatArray) -> float:
+    """Distance (of the range) over which the next slopes are taken.
+
+    The first searches take derivatives, the others slopes over a distance that each step draws
+    anew: where switches (dry friction) make the fitness rough, these tell what lies behind the
+    next ripple, and no ripple stops them all.
+    """
+    if memory[ROUGH] == 0.0:
+        return FINE
+    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    return float(10.0 ** (-2.0 - 4.0 * unit(word[2])))
+
+
+@compiled
+def _normal(word: Draws) -> float:
+    """A normal number of standard deviation 1 from the first two of four drawn words."""
+    return float(np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(2.0 * np.pi * unit(word[1])))
+
+
+@compiled
+def _hop(evaluator: Evaluator, plan: Plan, counters: IntArray, memory: FloatArray) -> None:
+    """Move the point away, as the covariance of the estimate there spreads it."""
+    point = memory[POINT:]
+    counters[EVALUATIONS] += point.size + 1
+    difference = _difference(plan, counters, memory)
+    matrix, gradient, base = normal_equations(evaluator, plan, point, 1.0, difference)
+    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    size = base * SHORTEST_HOP * (LONGEST_HOP / SHORTEST_HOP) ** unit(word[0])
+    deviation = np.empty(point.size)
+    for d in range(point.size):
+        word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 1 + d)
+        deviation[d] = size * _normal(word)
+    spread(factored(matrix, gradient, point, 0.0), point, deviation, point)
+
+
+@compiled
+def _choose(plan: Plan, size: int, counters: IntArray, memory: FloatArray) -> int:
+    """What kind of development comes next; gives the individual it begins with, -1: a fresh one."""
+    number = counters[DEVELOPMENTS]
+    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    grows = number == EARLY or (number > EARLY and number % 2 == 0)
+    settled = counters[SETTLED] == 1 and number > EARLY
+    chosen = below(word[1], 3 * size) - size if grows else 0
+    memory[ROUGH] = counters[SETTLED] == 1 or grows
+    if settled and (chosen >= size or number % 4 == 3):
+        counters[HOP] = 1
+    elif grows:
+        memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
+        memory[GROWTH] = 2.0 if number == EARLY else 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
+        counters[PROBES] = 0 if number == EARLY else size // 3  # in lanes that would idle
+    elif settled:
+        counters[PROBES] = size
+    if 1 < number <= EARLY:
+        chosen = -1
+    return chosen if chosen < size else 0
+
+
+@compiled
 def start_development(
     evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray,
     counters: IntArray, memory: FloatArray,
@@ -85,31 +149,22 @@ def start_development(
     """Choose the point to begin with, and how much of the record counts at first."""
     counters[DEVELOPMENTS] += 1
     counters[SEQUENCE], counters[STEP], counters[FAILED] = 1, 0, 0
-    memory[DAMPING], memory[HORIZON] = FIRST_DAMPING, 1.0
-    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
-    grows = counters[DEVELOPMENTS] % 2 == 0
-    memory[ROUGH] = counters[SETTLED] == 1 or grows
-    chosen, counters[PROBES], counters[FRESH] = 0, 0, 0
-    memory[REACHED] = np.inf
-    if grows:
-        memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
-        memory[GROWTH] = 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
-        chosen = below(word[1], 3 * words.shape[0]) - words.shape[0]
-        chosen = -1 if counters[DEVELOPMENTS] == 2 else chosen
-        if counters[EVALUATIONS] + words.shape[0] > plan.evaluations:
-            chosen = max(chosen, 0)  # the places of a fresh start would pass the budget
-        counters[PROBES] = words.shape[0] // 3  # in lanes that would idle
-    elif counters[SETTLED]:
-        counters[PROBES] = words.shape[0]
+    counters[PROBES], counters[FRESH], counters[HOP] = 0, 0, 0
+    memory[DAMPING], memory[HORIZON], memory[REACHED] = FIRST_DAMPING, 1.0, np.inf
+    chosen = _choose(plan, words.shape[0], counters, memory)
+    # The places of a fresh start, or the slopes of a hop, would pass the budget.
+    if counters[EVALUATIONS] + max(words.shape) + 1 > plan.evaluations:
+        chosen, counters[HOP] = max(chosen, 0), 0
     if chosen >= 0:
-        chosen = chosen if chosen < words.shape[0] else 0
-        memory[OLD] = fitness[chosen]
+        memory[OLD] = np.inf if counters[HOP] else fitness[chosen]
         begin = decoded(words[chosen : chosen + 1], plan.bits)[0]
     else:
         memory[OLD], counters[FRESH] = np.inf, 1
         begin = _fresh(evaluator, plan, words.shape, counters, memory[HORIZON])
     for d in range(begin.size):
         memory[POINT + d] = begin[d]
+    if counters[HOP]:
+        _hop(evaluator, plan, counters, memory)
 
 
 @compiled
@@ -155,8 +210,11 @@ def _next_part(counters: IntArray, memory: FloatArray, fitness: FloatArray) -> N
         memory[HORIZON] = min(memory[HORIZON] * memory[GROWTH], 1.0)
         return
     counters[SEQUENCE], counters[STEP] = 0, 0
-    if memory[OLD] == fitness[0]:
+    if memory[OLD] == fitness[0] and counters[DEVELOPMENTS] > 1:
         counters[SETTLED] = 1
+    if counters[HOP]:
+        counters[HOPS] += 1
+        counters[RETURNED] += abs(memory[REACHED] - fitness[0]) <= fitness[0] * SAME
     if counters[FRESH]:
         counters[TRIED] += 1
         counters[CONFIRMED] += memory[REACHED] <= fitness[0] * (1.0 + SAME)
@@ -176,26 +234,9 @@ def _trials(plan: Plan, counters: IntArray, memory: FloatArray, matrix: FloatArr
         for d in range(point.size):
             draw = 1 + t * point.size + d
             word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
-            size = base * 10.0 ** (1.5 - 2.5 * unit(word[2]))
-            deviation[d] = (
-                size * np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(2.0 * np.pi * unit(word[1]))
-            )
+            deviation[d] = base * 10.0 ** (1.5 - 2.5 * unit(word[2])) * _normal(word)
         spread(factor, point, deviation, places[t])
     return places
-
-
-@compiled
-def _difference(plan: Plan, counters: IntArray, memory: FloatArray) -> float:
-    """Distance (of the range) over which the next slopes are taken.
-
-    The first searches take derivatives, the others slopes over a distance that each step draws
-    anew: where switches (dry friction) make the fitness rough, these tell what lies behind the
-    next ripple, and no ripple stops them all.
-    """
-    if memory[ROUGH] == 0.0:
-        return FINE
-    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
-    return float(10.0 ** (-2.0 - 4.0 * unit(word[2])))
 
 
 @compiled
@@ -218,7 +259,8 @@ def adaptive_sequence(
         reached = population_fitness(evaluator, located(evaluator, places))
     best = np.argmin(reached)
     _scatter(words, fitness, counters, proposals, reached, int(best))
-    enough = ENOUGH if horizon == 1.0 else ENOUGH_PART
+    strict = horizon == 1.0 and counters[DEVELOPMENTS] > 1 and reached[best] < FAR * fitness[0]
+    enough = ENOUGH if strict else ENOUGH_PART
     if reached[best] < base:
         for d in range(point.size):
             point[d] = places[best, d]

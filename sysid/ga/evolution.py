@@ -3,7 +3,7 @@
 import numpy as np
 
 from sysid.ga.chromosome import decoded, located
-from sysid.ga.development import adaptive_sequence, start_development
+from sysid.ga.development import EARLY, adaptive_sequence, start_development
 from sysid.ga.operators import cross, flip, rank, reflected, scheduled, stepped, two_of
 from sysid.ga.random import CHILDREN, INITIAL, RESTART, STRATA, below, draws, unit
 from sysid.ga.sequence import fixed_sequence
@@ -15,10 +15,12 @@ from sysid.ga.state import (
     EVALUATIONS,
     GENERATION,
     GENETIC,
+    HOPS,
     IMPROVED,
     LOCAL,
     MIGRATION,
     PHASE,
+    RETURNED,
     RMS,
     SAME,
     SEQUENCE,
@@ -186,7 +188,7 @@ def _turn(
     if counters[SEQUENCE] or plan.method == SIMPLE:
         return
     if plan.method == IMPROVED:
-        if counters[DEVELOPMENTS] < 2 or counters[STEP] >= max(1, plan.stagnation // 10):
+        if counters[DEVELOPMENTS] < EARLY or counters[STEP] >= max(1, plan.stagnation // 10):
             start_development(evaluator, plan, words, fitness, counters, memory)
     elif counters[STAGNATION] >= plan.stagnation:
         counters[SEQUENCE], counters[STAGNATION] = 1, 0
@@ -233,7 +235,7 @@ def generations(
         if fitness[0] < best:
             counters[STAGNATION] = 0
             if fitness[0] < best * (1.0 - SAME):
-                counters[CONFIRMED] = 0
+                counters[CONFIRMED], counters[HOPS], counters[RETURNED] = 0, 0, 0
             if phase == GENETIC:
                 counters[SETTLED] = 0
             _note(evaluator, plan, words, fitness, counters, phase, improvements[written])

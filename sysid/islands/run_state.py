@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sysid.ga.island import Island
-from sysid.ga.state import CONFIRMED, SAME, TRIED
+from sysid.ga.state import CONFIRMED, HOPS, RETURNED, SAME, TRIED
 from sysid.result import Improvement, Migrant
 
 
@@ -58,6 +58,13 @@ class RunState:
         """How many searches from new random places led to the best champion's fitness."""
         most = self.rms * (1.0 + SAME)
         return sum(int(i.counters[CONFIRMED]) for i in self.islands if i.champion_rms <= most)
+
+    @property
+    def hops(self) -> tuple[int, int]:
+        """Searches from beside the best champion, and how many of them led back to it."""
+        most = self.rms * (1.0 + SAME)
+        best = [i.counters for i in self.islands if i.champion_rms <= most]
+        return sum(int(c[HOPS]) for c in best), sum(int(c[RETURNED]) for c in best)
 
     def is_the_best_since(self, generation: int) -> bool:
         """Whether the best fitness was found by then, and nothing better after."""
