@@ -194,8 +194,13 @@ class Dispatcher:
 
 def main() -> int:
     """Run a dispatcher with the settings of the environment; gives the exit code."""
+    return run_to_the_end(Settings())
+
+
+def run_to_the_end(settings: Settings) -> int:
+    """Run a dispatcher; what cannot be used is told in one line. Gives the exit code."""
     try:
-        return serve(Settings())
+        return serve(settings)
     except (Misconfigured, StorageError, WorkersError) as error:
         _log.error("%s", error)
     except SQLAlchemyError as error:

@@ -63,9 +63,9 @@ def dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
     """Claim jobs and have them computed, until told to end (`serve` starts one by itself)."""
     settings = settings_of(data_dir=data_dir, cpus=cpus)
     settings.prepare_folder()
-    from service.dispatcher import serve as work
+    from service.dispatcher import run_to_the_end
 
-    raise typer.Exit(work(settings))
+    raise typer.Exit(run_to_the_end(settings))
 
 
 def settings_of(**given: Any) -> "Settings":

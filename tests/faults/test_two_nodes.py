@@ -97,6 +97,9 @@ def log_of(place: Place) -> str:
 
 
 @pytest.mark.parametrize(
+    "command", [["service.dispatcher"], ["service.cli.main", "dispatcher"]], ids=["module", "lagid"]
+)
+@pytest.mark.parametrize(
     ("address", "told"),
     [
         ("127.0.0.1:1", "no Ray cluster answers at 127.0.0.1:1 (Connection refused)"),
@@ -106,12 +109,12 @@ def log_of(place: Place) -> str:
     ],
 )
 def test_an_address_that_is_wrong_ends_the_dispatcher_with_one_line(
-    tmp_path: Path, address: str, told: str
+    tmp_path: Path, command: list[str], address: str, told: str
 ) -> None:
     place = Place(tmp_path / "data")
     settings = place.settings.model_copy(update={"ray_address": address})
     done = subprocess.run(
-        [sys.executable, "-m", "service.dispatcher"],
+        [sys.executable, "-m", *command],
         env={**os.environ, **environment_of(settings)}, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert done.returncode == 1
