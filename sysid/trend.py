@@ -22,6 +22,7 @@ LEAST_PLACES = 3
 
 _OUTLIER = 0.05  # of all batches without an outlier, the part that are told of one
 _DRIFT = 2.0 * (1.0 - NormalDist().cdf(3.0))  # outside three standard deviations
+_NORMAL_95 = NormalDist().inv_cdf(0.975)
 _BAND_POINTS = 101
 _NEARLY_ONE = 1.0 - 1e-9
 
@@ -121,10 +122,26 @@ def fit_trend(
     )
 
 
+def half_width(law: Law) -> float:
+    """Half of a 95 % interval in standard errors.
+
+    That of the normal distribution where the stated errors hold; that of Student's t where the
+    size of the errors is taken from the scatter of few points.
+    """
+    return _NORMAL_95 if law.birge <= 1.0 else student_95(law.degrees)
+
+
+def _tail(law: Law, z: float) -> float:
+    """Probability of a larger |z|, by the same distributions."""
+    if law.birge <= 1.0:
+        return 2.0 * NormalDist().cdf(-abs(z))
+    return student_tail(law.degrees, z)
+
+
 def _band(law: Law, x: FloatArray) -> tuple[Place, ...]:
     at = np.linspace(float(np.min(x)), float(np.max(x)), _BAND_POINTS)
     errors = law.widening * law.stated(at)
-    reach = student_95(law.degrees) * errors
+    reach = half_width(law) * errors
     found = zip(at, law.values(at), errors, reach, strict=True)
     return tuple(
         Place(float(p), float(v), float(e), float(v - r), float(v + r), False)
@@ -144,7 +161,7 @@ def prediction(law: Law, x: FloatArray, stderr: FloatArray, at: float) -> Place:
         return Place(at, float("nan"), inf, -inf, inf, True)
     value, known = float(law.values(np.array([at]))[0]), float(law.stated(np.array([at]))[0])
     error = law.widening * sqrt(known**2 + _own(x, stderr, at) ** 2)
-    reach = student_95(law.degrees) * error
+    reach = half_width(law) * error
     return Place(at, value, error, value - reach, value + reach, is_outside)
 
 
@@ -240,7 +257,7 @@ def drift_from_law(
     error = sqrt(known**2 + max(scatter, new.stderr) ** 2)
     difference = new.value - told.value
     z = _ratio(difference, error)
-    return Drift(difference, z, student_tail(law.degrees, z) < _DRIFT / comparisons)
+    return Drift(difference, z, _tail(law, z) < _DRIFT / comparisons)
 
 
 def _ratio(difference: float, error: float) -> float:

@@ -14,6 +14,7 @@ from sysid.trend import (
     drift,
     drift_from_law,
     fit_trend,
+    half_width,
     pooled,
     prediction,
 )  # fmt: skip
@@ -124,7 +125,7 @@ def test_intervals_cover_what_they_say_even_where_errors_are_understated(
         told = prediction(law, X, stderr / understated, 30.0)
         new = 0.3 * 30.0 + 1.0 + 0.02 * 30.0 * draw.normal()
         covered[0] += told.lower <= new <= told.upper
-        error = student_95_of(law) * law.widening * law.stated(np.array([30.0]))[0]
+        error = half_width(law) * law.widening * law.stated(np.array([30.0]))[0]
         covered[1] += abs(law.values(np.array([30.0]))[0] - 10.0) <= error
         covered[2] += told.upper > told.lower
     # 95 % to a binomial error of 0.8 %; wider where the stated errors alone already suffice.
@@ -132,10 +133,6 @@ def test_intervals_cover_what_they_say_even_where_errors_are_understated(
     assert np.all(covered[:2] / n >= 0.925)
     if understated > 1:
         assert np.all(covered[:2] / n <= 0.975)
-
-
-def student_95_of(law: Law) -> float:
-    return float(stats.t.ppf(0.975, law.degrees))
 
 
 def test_the_deleted_residual_is_that_of_a_fit_without_the_point() -> None:
@@ -227,6 +224,14 @@ def test_a_batch_without_change_rarely_drifts_from_its_own_law() -> None:
     assert flags <= 6
     moved = Estimate(0.3 * 30.0 + 30.0, 0.6)
     assert drift_from_law(moved, law, X, stderr, 30.0).has_drifted
+
+
+def test_few_points_that_scatter_as_they_say_are_told_from_a_change_by_three_errors() -> None:
+    exact = fit_line(X, 0.3 * X + 1.0, np.full(5, 0.1))
+    error = prediction(exact, X, np.full(5, 0.1), 30.0).stderr
+    for size, has_drifted in ((2.9, False), (3.1, True)):
+        new = Estimate(10.0 + size * error, 0.1)
+        assert drift_from_law(new, exact, X, np.full(5, 0.1), 30.0).has_drifted is has_drifted
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3.5, 12, 400])
