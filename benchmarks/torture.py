@@ -45,6 +45,7 @@ def torture(minutes: float, seed: int, postgres: Any = None) -> list[Row]:
     stand = Stand(folder / "data", database_url=url, environment=environment)
     known = {**FAULTS, **({} if postgres is None else POSTGRES_FAULTS)}
     recoveries: dict[str, list[float]] = {kind: [] for kind in known}
+    at_risk: list[float] = []
     with standing_service(stand):
         stream = Stream(stand, folder)
         print(f"{name}: undisturbed", {k: round(s, 1) for k, s in stream.measure().items()})
@@ -55,13 +56,15 @@ def torture(minutes: float, seed: int, postgres: Any = None) -> list[Row]:
             time.sleep(pause)
             if time.monotonic() > limit:
                 break
+            at_risk.append(stream.at_risk())
             recoveries[kind].append(known[kind](bench))
             print(f"{name}: {kind}: {recoveries[kind][-1]:.1f} s", flush=True)
         stuck = stream.finish()
     left = stand.leftovers()
     for one in left:
         print(f"{name}: left behind: {one}")
-    return _rows(name, recoveries, stream, stuck, len(left))
+    rows = _rows(name, recoveries, stream, stuck, len(left))
+    return [*rows, Row(f"{name}: work of a long run in no checkpoint, most", max(at_risk), "s", 5)]
 
 
 def _in_random_order(kinds: list[str], draw: random.Random) -> Iterator[tuple[str, float]]:

@@ -138,10 +138,14 @@ class Concluded:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """The run cannot be carried out; `reason` is a sentence for its user."""
+    """The run cannot be carried out; `reason` is a sentence for its user.
+
+    `evaluations` are those of a search that was carried out to its end.
+    """
 
     reason: str
     kind: str = ""
+    evaluations: int = 0
 
 
 Outcome: TypeAlias = Advanced | Evolved | Concluded | Failure

@@ -95,7 +95,10 @@ def _advanced(
     if not is_finished(algorithm, state):
         return Advanced(state)
     noise_free = _without_noise(item.spec.problem, records)
-    found = conclude(problem, algorithm, state, validation)
+    try:
+        found = conclude(problem, algorithm, state, validation)
+    except SysidError as error:
+        return Failure(str(error), type(error).__name__, state.evaluations)
     without = found.rms if noise_free is None else rms_against(problem, found.simulated, noise_free)
     return Concluded(state, found, without)
 

@@ -6,11 +6,14 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy import select
+
 from benchmarks import paper_example
 from benchmarks.breaking.audit import Finding, audit, is_over
 from benchmarks.breaking.stand import Stand, until
 from service.calls import ClientError
 from service.storage.patience import PASSING
+from service.storage.tables import Checkpoint, Job
 
 STUCK_SECONDS = 180.0
 """A job that has not ended so long after the last fault is stuck."""
@@ -42,6 +45,7 @@ class Stream:
         self.undisturbed: dict[str, Finding] = {}
         self.open: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
+        self._rate = 1.0  # evaluations a second of the long run, alone
         self.different: list[str] = []
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._go_on, daemon=True)
@@ -53,7 +57,24 @@ class Stream:
             job = self._stand.client.submit(body)["id"]
             took[kind] = until(lambda job=job: is_over(self._stand, job), f"{kind} ended", 300.0)
             self.undisturbed[kind] = audit(self._stand, job)
+            if kind == "long":
+                self._rate = self._evaluations(job)[0] / took[kind]
         return took
+
+    def at_risk(self) -> float:
+        """Seconds of work of the long run that are in no checkpoint: what a kill now repeats."""
+        job = self.open.get("long")
+        if job is None:
+            return 0.0
+        told, kept = self._evaluations(job)
+        return max(0, told - kept) / self._rate
+
+    def _evaluations(self, job: str) -> tuple[int, int]:
+        """Those of a job of one run so far, and those in its checkpoint."""
+        with self._stand.database.read() as session:
+            told = session.get_one(Job, job).evaluations
+            kept = select(Checkpoint.evaluations).where(Checkpoint.job_id == job)
+            return told, session.scalar(kept) or 0
 
     def start(self) -> None:
         """Begin to submit."""

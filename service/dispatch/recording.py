@@ -148,6 +148,7 @@ class Recorder:
         if live is not None:
             self._collect_history(run, live.state.history, live.state.migrations, live)
             evaluations = live.state.evaluations
+        evaluations = failure.evaluations or evaluations
         self._evaluations += evaluations
         self._pending.outcomes.append(RunOutcome(
             run_id=run, state=State.FAILED, error=failure.reason, evaluations=evaluations

@@ -1,7 +1,8 @@
 """Put first on PYTHONPATH, this breaks a process from inside: its clock, its runs.
 
 ``BREAK_CLOCK`` names a file with seconds that are added to the time of day of rows;
-``BREAK_SEEDS`` lists seeds of runs that kill the worker that computes them.
+``BREAK_SEEDS`` lists seeds of runs that kill the worker that computes them, ``BREAK_MEMORY`` of
+runs that take all the memory they get; while the file ``BREAK_RAY`` is there, Ray does not start.
 """
 
 import functools
@@ -41,9 +42,35 @@ def _break_runs(module):
     module.advance = broken
 
 
+def _break_memory(module):
+    greedy = {int(seed) for seed in os.environ["BREAK_MEMORY"].split(",")}
+    advanced = module._advanced
+
+    def broken(item, *parts):
+        taken = []
+        while item.spec.seed in greedy:
+            taken.append(b"x" * 2**24)
+        return advanced(item, *parts)
+
+    module._advanced = broken
+
+
+def _break_start(module):
+    initialise = module._initialise
+
+    def broken(*arguments):
+        if Path(os.environ["BREAK_RAY"]).exists():
+            raise ConnectionError("nobody answers")
+        initialise(*arguments)
+
+    module._initialise = broken
+
+
 _BREAKERS = {
-    "service.storage.columns": ("BREAK_CLOCK", _break_clock),
-    "workers.tasks": ("BREAK_SEEDS", _break_runs),
+    ("service.storage.columns", "BREAK_CLOCK"): _break_clock,
+    ("workers.tasks", "BREAK_SEEDS"): _break_runs,
+    ("workers.tasks", "BREAK_MEMORY"): _break_memory,
+    ("workers.cluster", "BREAK_RAY"): _break_start,
 }
 
 
@@ -52,8 +79,11 @@ class _Finder(importlib.abc.MetaPathFinder):
 
     def find_spec(self, fullname, path=None, target=None):
         """The usual module, with a loader that breaks it."""
-        variable, breaker = _BREAKERS.get(fullname, ("", None))
-        if breaker is None or not os.environ.get(variable):
+        breakers = [
+            breaker for (module, variable), breaker in _BREAKERS.items()
+            if module == fullname and os.environ.get(variable)
+        ]  # fmt: skip
+        if not breakers:
             return None
         sys.meta_path.remove(self)
         try:
@@ -64,7 +94,8 @@ class _Finder(importlib.abc.MetaPathFinder):
 
         def load(module):
             execute(module)
-            breaker(module)
+            for breaker in breakers:
+                breaker(module)
 
         spec.loader.exec_module = load
         return spec
