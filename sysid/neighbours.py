@@ -111,10 +111,12 @@ def widened(
     changed = []
     for one in estimates:
         if one.name in names and one.stderr and one.interval95 is not None:
-            quantile = (one.interval95[1] - one.value) / one.stderr
-            kept = ratio < quantile**2
+            # On a plateau the interval is around its middle; of noiseless data it has no width.
+            lower, upper = one.interval95
+            quantile, aside = (upper - lower) / (2.0 * one.stderr), (lower + upper) / 2 - one.value
+            kept = ratio <= quantile**2
             half = one.stderr * np.sqrt(quantile**2 - ratio[kept])
-            middle = found.values[kept, names.index(one.name)]
+            middle = found.values[kept, names.index(one.name)] + aside
             low = min(one.interval95[0], float(np.min(middle - half)))
             high = max(one.interval95[1], float(np.max(middle + half)))
             one = replace(one, interval95=(low, high))
