@@ -56,6 +56,13 @@ def test_every_run_of_every_page_is_given(client: Client, dataset: str) -> None:
     assert client.jobs(limit=1)[0]["id"] == job["id"]
 
 
+def test_a_noise_sweep_is_one_job_under_one_key(client: Client, dataset: str) -> None:
+    body = {"model": "fopdt", "datasets": [dataset], "sigma": [0, 0.1], "replicates": 2}
+    first, again = (client.noise_sweep(body, idempotency_key="noise") for _ in range(2))
+    assert first["id"] == again["id"]
+    assert [group["runs"] for group in client.summary(first["id"])["groups"]] == [2] * 4
+
+
 def test_wait_ends_when_the_job_has_and_tells_every_state(client: Client, dataset: str) -> None:
     job = client.submit(job_of(dataset), idempotency_key="wait")
     states: list[str] = []
@@ -106,6 +113,11 @@ def test_the_asynchronous_client_does_the_same(server: TestClient, dataset: str)
             assert (await client.wait(job["id"]))["state"] == "cancelled"
             with pytest.raises(ProblemError, match="no run"):
                 await client.run("run_0")
+            sweep = {"model": "fopdt", "datasets": [dataset], "sigma": [0, 0.1], "replicates": 3}
+            twins = [await client.noise_sweep(sweep, idempotency_key="n") for _ in range(2)]
+            assert twins[0]["id"] == twins[1]["id"]
+            summary = await client.summary(twins[0]["id"], by=["/noise/sigma"])
+            assert [group["runs"] for group in summary["groups"]] == [6, 6]
 
     awaited(work)
 
