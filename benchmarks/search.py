@@ -5,6 +5,7 @@ in the same run.
 """
 
 import time
+from statistics import median
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from sysid.problem import Problem
 from sysid.refinement import refine
 from sysid.run import advance, begin
 from sysid.settings import GeneticAlgorithm
+from sysid.threads import one_thread
 from sysid.types import FloatArray
 from sysid.uncertainty import analyse
 
@@ -75,13 +77,18 @@ def refinement(problem: Problem, repeats: int) -> Row:
     start = 1.02 * np.array(list(paper_example.TRUTH.values()))
 
     def work() -> object:
-        found = refine(problem, [start])[0]
-        return analyse(problem, start if found is None else found.theta)
+        with one_thread():  # as where a run is concluded
+            found = refine(problem, [start])[0]
+            return analyse(problem, start if found is None else found.theta)
 
-    return Row(
-        "refinement with standard errors, 4 parameters × 300 samples",
-        microseconds(work, repeats) / 1e3, "ms", 2.0,
-    )  # fmt: skip
+    work()
+    spent = []
+    for _ in range(5 * repeats):
+        begun = time.process_time()
+        work()
+        spent.append(1e3 * (time.process_time() - begun))
+    name = "refinement with standard errors, 4 parameters × 300 samples: median"
+    return Row(name, median(spent), "ms of CPU", 2.0)
 
 
 def main() -> None:

@@ -1,0 +1,50 @@
+"""Benchmark programs tell their figures as JSON and Markdown and end as the contract says."""
+
+import json
+import sys
+
+import pytest
+
+from benchmarks import collect
+from benchmarks.table import Row, Skipped, parser, report
+
+HOLDS, MISSES = Row("quick", 1.0, "s", 2.0), Row("slow", 3.0, "s", 2.0)
+SHOWN, SKIPPED = Row("shown", 9.0, "ms"), Skipped("peer", "not installed")
+
+
+def ended(rows, skipped, *options):
+    """The exit code of a program that found these figures."""
+    try:
+        report("Title", rows, skipped, parser("a program").parse_args(options))
+    except SystemExit as end:
+        return end.code
+    return 0
+
+
+@pytest.mark.parametrize(
+    ("rows", "skipped", "code"),
+    [([HOLDS, SHOWN], [], 0), ([HOLDS, MISSES], [SKIPPED], 1), ([HOLDS], [SKIPPED], 2)],
+)
+def test_a_check_tells_misses_then_what_was_skipped(rows, skipped, code):
+    assert ended(rows, skipped, "--check") == code
+    assert ended(rows, skipped) == 0
+
+
+def test_figures_with_bars_are_written_as_json_and_all_as_markdown(tmp_path):
+    file = tmp_path / "one.json"
+    ended([SHOWN, MISSES], [SKIPPED], "--json", str(file))
+    assert json.loads(file.read_text()) == [
+        {"name": "slow", "value": 3.0, "unit": "s", "bar": 2.0, "relation": "<=", "holds": False}
+    ]
+    lines = (tmp_path / "one.md").read_text().splitlines()
+    assert [line.split(" | ")[0] for line in lines[4:]] == ["| slow", "| shown", "| peer"]
+
+
+def test_the_table_of_all_names_each_program_and_those_that_wrote_nothing(tmp_path, monkeypatch):
+    ended([HOLDS], [], "--json", str(tmp_path / "one.json"))
+    monkeypatch.setattr(sys, "argv", ["collect", str(tmp_path), "one", "two"])
+    assert collect.main() == 1
+    text = (tmp_path / "bench.md").read_text()
+    assert "| one: quick | 1 | s | <= 2 | yes |" in text
+    assert "| two | did not finish |" in text
+    assert json.loads((tmp_path / "bench.json").read_text())[0]["name"] == "one: quick"
