@@ -180,8 +180,9 @@ def progress(job: Job) -> float:
 
 
 def cell_text(cell: Document, labels: Document) -> str:
-    """What distinguishes a run from the others of its job."""
-    pairs = [(path.rsplit("/", 1)[-1], value) for path, value in cell.items()]
+    """What distinguishes a run from the others of its job; labels tell data better than ids."""
+    told = {path: value for path, value in cell.items() if not (labels and path == "/datasets")}
+    pairs = [(path.rsplit("/", 1)[-1], value) for path, value in told.items()]
     return ", ".join(f"{name} {_plain(value)}" for name, value in [*labels.items(), *pairs])
 
 
