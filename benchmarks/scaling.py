@@ -190,8 +190,8 @@ def beside_a_sweep(runs: int, singles: int) -> list[Row]:
         submitted = time.perf_counter() - start
         _until(lambda: one.client.job(sweep)["progress"]["finished"] > 0)
         at_first = one.wait()
-        _until(lambda: one.client.job(sweep)["progress"]["finished"] > min(2000, runs // 10))
-        beside = waits()
+        _until(lambda: one.client.job(sweep)["progress"]["finished"] > min(5000, 2 * runs // 5))
+        beside = waits()  # by now the sweep has had its head start
         left = one.client.job(sweep)["progress"]
         assert left["finished"] < left["runs"], "the sweep had ended: take more runs"
     rows = [Row(f"submission of a sweep of {runs} runs", submitted, "s")]
