@@ -52,7 +52,7 @@ JOBS: list[tuple[dict[str, Any], str, str]] = [
     ({"validation": {"fraction": 1.5}}, "/validation/fraction", "found 1.5"),
     ({"validation": {"datasets": ["ds_x"]}}, "/validation/datasets/0", "'ds_x'"),
     ({"seed": -1}, "/seed", "found -1"),
-    ({"trend": {"x": "length_m"}}, "/trend", "unknown field"),
+    ({"trends": {"x": "length_m"}}, "/trends", "unknown field"),
     ({"algorithm": {"stop": {"evaluations": 10**40}}}, "/algorithm/stop/evaluations", "10000000"),
     ({"algorithm": {"stagnation": 10**30}}, "/algorithm/stagnation", "1000000000"),
     ({"algorithm": {"mutation": [[0, 0.2], [10**30, 0.8]]}}, "/algorithm/mutation/1/0", "found 1"),
