@@ -1,0 +1,82 @@
+"""References and what a trend reads, on SQLite and on PostgreSQL alike."""
+
+import threading
+
+import pytest
+
+from service.storage.errors import NotFound
+from service.storage.ledger import Cell, RunLedger, RunOutcome
+from service.storage.queue import Queue
+from service.storage.references import ReferenceRepository
+from service.storage.tables import State
+from service.storage.trends import count_succeeded, trend_rows
+from tests.stored import claimed, runs_of, submit
+
+RESULT = {
+    "parameters": [{"name": "L", "value": 0.1, "stderr": 0.25, "status": "identified"}],
+    "onset_delays": [{"input": "u", "output": "y", "delay": 0.5}],
+    "agreement": {"estimation": [{"output": "y", "span": [0.0, 1.5]}]},
+    "warnings": ["T and L not separable"],
+}
+
+
+def accepted(database, name, run, **more):
+    with database.write() as session:
+        return ReferenceRepository(session).accept(name, run, **more).number
+
+
+def test_the_latest_acceptance_is_in_use_and_the_others_stay(database):
+    _, runs = claimed(database, n_runs=3)
+    assert [accepted(database, "tube", run, accepted_by="me") for run in runs[:2]] == [1, 2]
+    assert accepted(database, "tube", runs[1]) == 2  # the one in use
+    assert accepted(database, "tube", runs[0]) == 3  # an earlier one again
+    accepted(database, "other", runs[2], note="narrow")
+    with database.read() as session:
+        repository = ReferenceRepository(session)
+        history = repository.history("tube")
+        assert [one.run_id for one in history] == [runs[0], runs[1], runs[0]]
+        assert [one.accepted_by for one in history] == [None, "me", "me"]
+        assert [(one.name, one.run_id) for one in repository.all()] == [
+            ("other", runs[2]), ("tube", runs[0]),
+        ]  # fmt: skip
+        with pytest.raises(NotFound, match="reference nobody"):
+            repository.history("nobody")
+
+
+def test_acceptances_at_once_have_numbers_of_their_own(database):
+    _, runs = claimed(database, n_runs=6)
+    threads = [threading.Thread(target=accepted, args=(database, "tube", run)) for run in runs]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    with database.read() as session:
+        history = ReferenceRepository(session).history("tube")
+    assert [one.number for one in history] == [6, 5, 4, 3, 2, 1]
+    assert {one.run_id for one in history} == set(runs)
+
+
+def test_a_trend_reads_the_runs_that_succeeded_in_order_with_parts_of_their_results(database):
+    submit(database, n_runs=3)
+    with database.write() as session:
+        lease = Queue(session).claim("d1").lease
+        RunLedger(session, lease).create(
+            Cell(number=i, cell={"/seed": i}, labels={"length_m": 5.0 * i}) for i in range(3)
+        )
+    runs = [run.id for run in runs_of(database, lease.job_id)]
+    ends = [
+        {"state": State.SUCCEEDED, "result": RESULT, "best_rms": 0.5, "evaluations": 7},
+        {"state": State.FAILED, "error": "diverged"},
+        {"state": State.SUCCEEDED, "result": {"parameters": RESULT["parameters"]}},
+    ]
+    with database.write() as session:
+        RunLedger(session, lease).record(
+            [RunOutcome(run_id=run, **end) for run, end in zip(runs, ends, strict=True)]
+        )
+    with database.read() as session:
+        first, last = trend_rows(session, lease.job_id, 10)
+        assert count_succeeded(session, lease.job_id) == 2
+        assert [one.id for one in trend_rows(session, lease.job_id, 1)] == runs[:1]
+    assert (first.id, first.labels, first.evaluations) == (runs[0], {"length_m": 0.0}, 7)
+    assert {name: getattr(first, name) for name in RESULT} == RESULT
+    assert (last.onset_delays, last.agreement, last.warnings) == ([], {}, [])
