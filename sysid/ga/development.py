@@ -56,12 +56,14 @@ TRIALS = 3
 FINE = 1e-6  # of the range: far above rounding, far below what curvature needs
 FACTOR = 10.0  # between the dampings of two trials
 FIRST_DAMPING = 1e-2
+EARLY_DAMPING = 1.0  # far from a minimum: a full step would leave the box
+EARLY_PLACES = 4  # of which an early fresh development begins with the best
 LONGEST_GROWTH = 4.0  # doublings
 N_GROWTHS = 3
 MOST_STEPS = 12
 ENOUGH = 1e-4  # relative gain of a step below which a full-record search ends
 ENOUGH_PART = 1e-2
-EARLY = 3  # developments that follow each other at once and are cheap, before the long ones
+EARLY = 4  # developments that follow each other at once and are cheap, before the long ones
 FAR = 1.1  # of the champion's fitness: above, a search ends at the first small gain
 SHORTEST_HOP, LONGEST_HOP = 0.3, 50.0  # standard errors
 
@@ -150,7 +152,9 @@ def start_development(
     counters[DEVELOPMENTS] += 1
     counters[SEQUENCE], counters[STEP], counters[FAILED] = 1, 0, 0
     counters[PROBES], counters[FRESH], counters[HOP] = 0, 0, 0
-    memory[DAMPING], memory[HORIZON], memory[REACHED] = FIRST_DAMPING, 1.0, np.inf
+    early = counters[DEVELOPMENTS] <= EARLY
+    memory[DAMPING] = EARLY_DAMPING if early else FIRST_DAMPING
+    memory[HORIZON], memory[REACHED] = 1.0, np.inf
     chosen = _choose(plan, words.shape[0], counters, memory)
     # The places of a fresh start, or the slopes of a hop, would pass the budget.
     if counters[EVALUATIONS] + max(words.shape) + 1 > plan.evaluations:
@@ -160,7 +164,8 @@ def start_development(
         begin = decoded(words[chosen : chosen + 1], plan.bits)[0]
     else:
         memory[OLD], counters[FRESH] = np.inf, 1
-        begin = _fresh(evaluator, plan, words.shape, counters, memory[HORIZON])
+        drawn = min(EARLY_PLACES, words.shape[0]) if early else words.shape[0]
+        begin = _fresh(evaluator, plan, (drawn, words.shape[1]), counters, memory[HORIZON])
     for d in range(begin.size):
         memory[POINT + d] = begin[d]
     if counters[HOP]:
