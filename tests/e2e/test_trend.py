@@ -9,7 +9,6 @@ from tests.identified import carried_out
 from tests.integration.rest.test_rest_reidentify import BODY, LENGTHS, recorded
 from tests.rest import CSV
 
-
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 
