@@ -85,7 +85,8 @@ def _children_seconds() -> float:
 
 def never_seen(count: int) -> list[Row]:
     """From equations to the first fitness of a population, in a new process each time."""
-    cold, cached = [], []
+    cold: list[float] = []
+    cached: list[float] = []
     for _ in range(count):
         with TemporaryDirectory() as folder:
             environment = {**os.environ, "LAGID_CACHE_DIR": folder}

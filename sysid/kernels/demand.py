@@ -24,6 +24,10 @@ class Read(NamedTuple):
     halves: int
 
 
+_KEPT = 64
+_reads: dict[int, tuple[Model, tuple[Read, ...]]] = {}  # by identity: a model's hash is a long walk
+
+
 def is_difference(model: Model) -> bool:
     """Whether the model is a recursion over samples (a polynomial is one too)."""
     return model.form != "differential"
@@ -60,8 +64,17 @@ def pasts(expression: Expression) -> Iterator[Past]:
                 yield from pasts(argument)
 
 
-def reads(model: Model) -> list[Read]:
-    """Every past value that the equations and the outputs read."""
+def reads(model: Model) -> tuple[Read, ...]:
+    """Every past value that the equations and the outputs read; kept, since every run asks."""
+    known = _reads.get(id(model))
+    if known is None or known[0] is not model:
+        if len(_reads) >= _KEPT:
+            _reads.clear()
+        known = _reads[id(model)] = (model, tuple(_found(model)))
+    return known[1]
+
+
+def _found(model: Model) -> list[Read]:
     numbers = {state.name: i for i, state in enumerate(model.states)}
     found: list[Read] = []
     for i, equation in enumerate(model.equations):
