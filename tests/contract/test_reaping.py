@@ -1,0 +1,148 @@
+"""Jobs whose dispatcher is gone, or seems to be: on SQLite and on PostgreSQL alike."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from datetime import timedelta
+
+import pytest
+
+from service.reaping import Reaper, identity, is_gone, reap
+from service.storage.dispatchers import DispatcherRepository
+from service.storage.ledger import Cell, RunLedger, RunOutcome
+from service.storage.queue import Queue
+from service.storage.tables import State
+from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
+from workers.processes import standing
+
+LEASE = timedelta(seconds=10)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def announce(database, owner: str, details) -> None:
+    with database.write() as session:
+        DispatcherRepository(session).announce(owner, details)
+
+
+def of_a_process_that_has_ended():
+    """What a dispatcher told that is no more."""
+    code = "import json; from service.reaping import identity; print(json.dumps(identity()))"
+    ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    return json.loads(ran.stdout)
+
+
+needs_proc = pytest.mark.skipif(standing(os.getpid()) is None, reason="there is no /proc")
+
+
+@needs_proc
+def test_jobs_of_a_dispatcher_whose_process_has_ended_are_given_back_at_once(database) -> None:
+    job = submit(database)
+    claim(database, "dead")
+    announce(database, "dead", of_a_process_that_has_ended())
+    assert reap(database, LEASE).requeued == (job,)
+    assert state_of(database, job) is State.QUEUED
+    with database.read() as session:
+        assert DispatcherRepository(session).alive() == []
+
+
+def test_jobs_of_a_dispatcher_that_lives_or_that_cannot_be_seen_are_left_alone(database) -> None:
+    announce(database, "here", identity())
+    announce(database, "elsewhere", {**identity(), "machine": "another", "pid": 2**22 - 1})
+    announce(database, "unknown", {})
+    jobs = {submit(database) for _ in range(3)}
+    for owner in ("here", "elsewhere", "unknown"):
+        claim(database, owner)
+    assert reap(database, LEASE).requeued == ()
+    assert {state_of(database, job) for job in jobs} == {State.RUNNING}
+
+
+@needs_proc
+def test_a_process_that_took_over_the_number_of_another_is_not_taken_for_it() -> None:
+    assert not is_gone(identity())
+    assert is_gone({**identity(), "started": 1})
+
+
+def test_a_lease_written_before_the_clock_was_stepped_back_is_not_waited_for(
+    database, clock: Clock
+) -> None:
+    job = submit(database)
+    claim(database, "silent", clock)
+    clock.advance(-3600)
+    assert reap(database, LEASE, clock).requeued == ()  # its owner has one lease to renew it
+    clock.advance(11)
+    assert reap(database, LEASE, clock).requeued == (job,)
+
+
+def test_a_dispatcher_that_lives_keeps_its_jobs_though_the_clock_is_stepped_back(
+    database, clock: Clock
+) -> None:
+    submit(database)
+    held = claim(database, "alive", clock).lease
+    clock.advance(-3600)
+    reap(database, LEASE, clock)
+    for _ in range(5):
+        clock.advance(3)
+        with database.write() as session:
+            assert [one.lease for one in Queue(session, clock).heartbeat([held], LEASE)] == [held]
+        assert reap(database, LEASE, clock).requeued == ()
+
+
+def test_leases_lost_while_runs_come_to_their_end_are_not_added_up(database, clock: Clock) -> None:
+    job = submit(database, n_runs=3, max_attempts=2)
+    for number in range(3):
+        got = claim(database, "falls", clock)
+        with database.write() as session:
+            ledger = RunLedger(session, got.lease)
+            ledger.create(Cell(number=i) for i in range(3))
+            run = ledger.pending()[0].id
+            ledger.record([RunOutcome(run_id=run, state=State.SUCCEEDED, best_rms=1.0)])
+        clock.advance(11)
+        assert reap(database, LEASE, clock).requeued == (job,), number
+    assert job_of(database, job).lost_leases == 1
+
+
+def test_a_job_given_back_because_the_workers_are_gone_counts_as_lost(database) -> None:
+    got, _ = claimed(database, max_attempts=2)
+    with database.write() as session:
+        Queue(session).release(got.lease, lost=True)
+    assert job_of(database, got.job.id).lost_leases == 1
+    again = claim(database)
+    with database.write() as session:
+        Queue(session).release(again.lease, lost=True)
+    job = job_of(database, got.job.id)
+    assert job.state is State.FAILED
+    assert "lost its workers" in (job.error or "")
+
+
+def test_deaths_over_a_run_outlive_the_dispatcher_that_counted_them(database) -> None:
+    got, (run,) = claimed(database)
+    with database.write() as session:
+        RunLedger(session, got.lease).blame({run: 1})
+    with database.write() as session:
+        Queue(session).release(got.lease)
+    assert [one.kills for one in runs_of(database, got.job.id)] == [1]
+
+
+@needs_proc
+def test_the_web_process_reaps_too(database) -> None:
+    job = submit(database)
+    claim(database, "dead")
+    announce(database, "dead", of_a_process_that_has_ended())
+    stopping = threading.Event()
+    reaper = Reaper(database, LEASE, stopping)
+    reaper.start()
+    try:
+        for _ in range(200):
+            if state_of(database, job) is State.QUEUED:
+                break
+            threading.Event().wait(0.05)
+    finally:
+        stopping.set()
+        reaper.join()
+    assert state_of(database, job) is State.QUEUED

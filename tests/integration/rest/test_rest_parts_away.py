@@ -1,0 +1,36 @@
+"""What the web process answers while its database or its disk is away: 503, never 500."""
+
+import errno
+from typing import Any
+
+import pytest
+from sqlalchemy.exc import OperationalError
+from starlette.testclient import TestClient
+
+from tests.rest import CSV, recording, refused
+
+
+def away(*_args: Any, **_options: Any) -> Any:
+    raise OperationalError("SELECT 1", {}, Exception("connection refused"))
+
+
+@pytest.mark.parametrize("path", ["/v1/jobs", "/v1/datasets", "/v1/runs/run_1", "/metrics"])
+def test_a_database_that_is_away_is_a_part_that_is_down(
+    server: TestClient, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    monkeypatch.setattr(server.app.state.parts.database, "read", away)
+    answer = server.get(path)
+    assert refused(answer, 503, "unavailable") == []
+    assert answer.headers["retry-after"] == "1"
+
+
+def test_a_full_disk_is_a_part_that_is_down(
+    server: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_args: Any, **_options: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("service.api.uploads._save", full)
+    answer = server.post("/v1/datasets", content=recording(), headers=CSV)
+    refused(answer, 503, "unavailable")
+    assert "no space left" in answer.json()["detail"]
