@@ -81,7 +81,7 @@ class StopIn(Body):
     """End conditions besides the generations.
 
     `settled`: `improved` ends when that many searches from new random places, and two thirds of
-    all, have led to the best individual; null: never.
+    all, have led to the best individual, and so have nine of ten from beside it; null: never.
     """
 
     evaluations: Evaluations | None = None

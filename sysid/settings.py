@@ -59,7 +59,8 @@ class Stop:
     """End conditions besides the generations; whichever comes first. None: not used.
 
     `settled`: the best individual was found that often, each time from new random places, and by
-    at least two thirds of all such searches. Only the adaptive sequence search makes these, so
+    at least two thirds of all such searches, and nine of ten searches from beside it, that many at
+    least, led back to it. Only the adaptive sequence search makes these, so
     that the paper's methods never end by it.
     """
 
