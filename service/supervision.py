@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from service.settings import Settings
-from workers.processes import clear_after, kill, of_session
+from workers.processes import clear_after, kill, of_session, standing
 
 _log = logging.getLogger(__name__)
 
@@ -22,6 +22,9 @@ LONGEST_PAUSE_SECONDS = 5.0
 STEADY_SECONDS = 60.0
 """A child that lived so long is restarted after the first pause again."""
 STOP_SECONDS = 2.0
+LOOK_SECONDS = 1.0
+STOPPED_SECONDS = 12.0
+"""A child that was stopped (SIGSTOP) past its lease is killed: it may hold SQLite's write lock."""
 
 SUPERVISED = "LAGID_SUPERVISED"
 """Set for the child: it ends when its standard input does, that is, when this process dies."""
@@ -85,7 +88,7 @@ class Supervisor:
             child = self._spawn()
             if child is None:
                 return
-            code = child.wait()
+            code = _end_of(child)
             clear_family(child.pid)
             assert child.stdin is not None
             child.stdin.close()
@@ -135,6 +138,21 @@ def environment_of(settings: Settings) -> dict[str, str]:
     values = settings.model_dump(mode="json", exclude_none=True)
     values["data_dir"] = str(settings.data_dir.absolute())
     return {f"LAGID_{name.upper()}": str(value) for name, value in values.items()}
+
+
+def _end_of(child: "subprocess.Popen[bytes]") -> int:
+    """Wait for the end of a child; gives its exit code."""
+    awake = time.monotonic()
+    while True:
+        try:
+            return child.wait(LOOK_SECONDS)
+        except subprocess.TimeoutExpired:
+            found = standing(child.pid)
+        if found is None or not found.is_stopped:
+            awake = time.monotonic()
+        elif time.monotonic() - awake > STOPPED_SECONDS:
+            _log.warning("the dispatcher was stopped for %g s: it is killed", STOPPED_SECONDS)
+            child.kill()
 
 
 def clear_family(leader: int) -> None:

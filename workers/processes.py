@@ -17,10 +17,11 @@ _PREFIX = "lagid-ray-"
 
 
 class Standing(NamedTuple):
-    """What a process is: its program, whether it is only waited for, parent, session, start."""
+    """What a process is; dead ones are only waited for, stopped ones wait for SIGCONT."""
 
     command: str
     is_dead: bool
+    is_stopped: bool
     parent: int
     session: int
     started: int
@@ -35,7 +36,9 @@ def standing(pid: int) -> Standing | None:
     head, _, tail = text.rpartition(")")
     fields = tail.split()  # from the third on, as proc_pid_stat(5) counts them
     command = head.partition("(")[2]
-    return Standing(command, fields[0] in "ZX", int(fields[1]), int(fields[3]), int(fields[19]))
+    state, parent, session, started = fields[0], fields[1], fields[3], fields[19]
+    is_dead, is_stopped = state in "ZX", state in "Tt"
+    return Standing(command, is_dead, is_stopped, int(parent), int(session), int(started))
 
 
 def is_running(pid: int) -> bool:

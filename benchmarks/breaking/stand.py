@@ -22,7 +22,7 @@ from service.embedded import free_port
 from service.storage.sessions import Database, sqlite_url
 
 SHIM = Path(__file__).with_name("shim")
-START_SECONDS = 90.0
+START_SECONDS = 180.0
 RESTART_SECONDS = 0.5
 """What the caretaker waits before it starts a web process that has ended."""
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from service import supervision
 from service.settings import Settings
 from service.supervision import Supervisor, environment_of
 from workers.processes import of_session
@@ -82,6 +83,21 @@ def test_a_killed_child_is_started_anew_and_its_orphans_are_killed(tmp_path: Pat
     assert not any(map(is_alive, family))
     supervisor.stop()
     until(lambda: not any(map(is_alive, pids(file))), "the end of all")
+
+
+def test_a_child_that_stays_stopped_is_killed_and_started_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervision, "LOOK_SECONDS", 0.05)
+    monkeypatch.setattr(supervision, "STOPPED_SECONDS", 0.2)
+    file = tmp_path / "pids"
+    supervisor = Supervisor([sys.executable, "-c", CHILD, str(file)], {})
+    supervisor.start()
+    until(lambda: len(pids(file)) == 1, "the start")
+    os.kill(pids(file)[0], signal.SIGSTOP)
+    until(lambda: len(pids(file)) == 2, "the second start")
+    assert not is_alive(pids(file)[0])
+    supervisor.stop()
 
 
 def test_a_child_learns_that_its_supervisor_was_killed(tmp_path: Path) -> None:
