@@ -256,7 +256,9 @@ def _stop_on_signals(stopping: threading.Event, crew: RayCrew) -> None:
 
 
 def _outlive_no_parent(stopping: threading.Event, crew: RayCrew) -> None:
-    sys.stdin.buffer.read()
+    # Not through the buffer: its lock would be held at the interpreter's end.
+    while os.read(sys.stdin.fileno(), 1024):
+        pass
     stopping.set()
     time.sleep(LEAVE_SECONDS)
     _end_at_once(crew)

@@ -85,11 +85,15 @@ class Reaper:
         self._thread.join(5.0)
 
     def _go_on(self) -> None:
+        is_cut_off = False
         while not self._stopping.wait(PAUSE_SECONDS):
             try:
                 reap(self._database, self._lease)
+                is_cut_off = False
             except SQLAlchemyError as error:  # the database may come back
-                _log.warning("cannot look for lost jobs: %s", str(error).splitlines()[0])
+                if not is_cut_off:
+                    _log.warning("cannot look for lost jobs: %s", str(error).splitlines()[0])
+                is_cut_off = True
 
 
 @cache

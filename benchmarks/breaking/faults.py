@@ -7,6 +7,7 @@ again.
 import contextlib
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from sqlalchemy import select
 from benchmarks.breaking.audit import owners, steps
 from benchmarks.breaking.stand import Stand, until
 from service.storage.tables import Dispatcher
+from workers.processes import standing
 
 LIMIT_SECONDS = 180.0
 PAUSED_SECONDS = 11.0
@@ -68,18 +70,23 @@ def kill_postgres(bench: Bench) -> float:
     """Kill the database's server and start it again; meanwhile the web must not answer 500."""
 
     def restart() -> None:
-        _kill([bench.postgres.get_pid()])
-        time.sleep(1.0)
+        killed = bench.postgres.get_pid()
+        _kill([killed])
+        until(lambda: standing(killed) is None, "it was buried", LIMIT_SECONDS)
         status = bench.stand.answers()
         if status not in (200, 503, None):
             raise AssertionError(f"the web answered {status} while its database was away")
-        for _ in range(20):  # the killed one's children hold its memory for a moment
-            with contextlib.suppress(Exception):
-                bench.postgres.ensure_postgres_running()
-                return
-            time.sleep(0.5)
+        until(lambda: _is_started(bench.postgres), "PostgreSQL started again", LIMIT_SECONDS)
 
     return _recovery(bench, restart, lambda: bench.stand.answers() == 200)
+
+
+def _is_started(server: Any) -> bool:
+    """Try to start it: the children of the killed one hold its memory for a moment."""
+    with contextlib.suppress(subprocess.SubprocessError):
+        server.ensure_postgres_running()
+        return True
+    return False
 
 
 def pause_dispatcher(bench: Bench) -> float:

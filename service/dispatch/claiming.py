@@ -153,5 +153,6 @@ class Leases:
                 self.renew()
                 pause, self._is_cut_off = third, False
             except SQLAlchemyError as error:  # it may come back before the leases end
-                _log.warning("no heartbeat could be written: %s", str(error).splitlines()[0])
+                if not self._is_cut_off:
+                    _log.warning("no heartbeat could be written: %s", str(error).splitlines()[0])
                 pause, self._is_cut_off = min(third, AGAIN_SECONDS), True
