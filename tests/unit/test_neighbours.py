@@ -41,6 +41,7 @@ def test_beside_a_minimum_of_a_rough_loss_others_are_found_inside_bounds_and_bud
     found = around(problem, FALSE, 700)
     assert found.rms.size > 5
     assert np.unique(found.rms.round(6)).size > 1
+    assert found.rms[-1] == found.rms.min()
     assert 24 < found.evaluations <= 700
     assert np.all(
         (found.values >= problem.evaluator.lower) & (found.values <= problem.evaluator.upper)
@@ -85,3 +86,8 @@ def test_an_estimate_without_a_standard_error_gets_none_by_its_neighbours() -> N
     blind = replace(ONE, stderr=None, interval95=None)
     found = Neighbourhood(None, np.array([[2.0]]), np.array([1.0]), 0)
     assert widened((blind,), ("a",), 50, found) == (blind,)
+
+
+def test_beside_a_perfect_fit_nothing_else_is_likely() -> None:
+    found = Neighbourhood(None, np.array([[2.0], [1.6]]), np.array([0.0, 1e-9]), 0)
+    assert widened((ONE,), ("a",), 50, found) == (ONE,)
