@@ -70,15 +70,18 @@ class Whiteness(NamedTuple):
 def whiteness(laid: Laid) -> Whiteness:
     """How alike neighbouring residuals are, over `Laid.lags` lags; missing ones leave pairs out."""
     n = np.count_nonzero(laid.present)
-    lags = range(1, laid.lags + 1)
-    values = np.array([laid.values[k:] @ laid.values[:-k] for k in lags])
-    values /= float(laid.values @ laid.values)
+    values = _products(laid.values, laid.lags) / float(laid.values @ laid.values)
     if n == laid.present.size:
-        pairs = n - np.arange(1, laid.lags + 1)
+        pairs = n - np.arange(1.0, laid.lags + 1)
     else:
-        pairs = np.array([np.count_nonzero(laid.present[k:] & laid.present[:-k]) for k in lags])
+        pairs = _products(laid.present.astype(np.float64), laid.lags)
     deviation = np.sqrt(np.maximum(pairs, 1) / (n * (n + 2.0)))
     return Whiteness(values, deviation, float(np.sum(np.square(values / deviation))))
+
+
+def _products(values: FloatArray, lags: int) -> FloatArray:
+    """Σ v(t) v(t + k) for k = 1 … lags."""
+    return np.correlate(np.concatenate([values[1:], np.zeros(lags)]), values, "valid")
 
 
 class LaggedSums(NamedTuple):

@@ -17,7 +17,7 @@ from numpy.fft import rfft
 from sysid.distributions import chi_squared_tail
 from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, laid_out, whiteness
 from sysid.problem import Problem
-from sysid.types import FloatArray, IntArray
+from sysid.types import FloatArray
 
 _CHANCE = 1e-3
 """That white residuals look as little white: below, they are taken for coloured."""
@@ -27,11 +27,11 @@ _STEEPEST = 0.97
 
 
 class _Part(NamedTuple):
-    """One output of one experiment: which of the scored samples are its, and its residuals."""
+    """One output of one experiment: its scored samples among all of them, with their times."""
 
-    rows: IntArray
-    laid: Laid
-    is_coloured: bool
+    rows: slice
+    times: FloatArray
+    size: float
 
 
 def coloured_middle(problem: Problem, seen: FloatArray, columns: FloatArray) -> FloatArray | None:
@@ -46,38 +46,42 @@ def coloured_middle(problem: Problem, seen: FloatArray, columns: FloatArray) -> 
     """
     if problem.arguments[3] == "one-step":
         return None
-    parts = tuple(_parts(problem, seen))
-    if not any(part.is_coloured for part in parts):
+    parts = [
+        (columns[part.rows], seen[part.rows], part.times, _is_coloured(seen[part.rows], part.size))
+        for part in _parts(problem)
+    ]
+    if not any(is_coloured for *_, is_coloured in parts):
         return None
     middle = np.zeros((columns.shape[1], columns.shape[1]))
-    for part in parts:
-        own = columns[part.rows]
-        if part.is_coloured:
-            middle += _with_colour(part.laid, own)
+    for own, values, times, is_coloured in parts:
+        if is_coloured:
+            middle += _with_colour(laid_out(times, values), own)
         else:
-            middle += float(np.mean(np.square(seen[part.rows]))) * (own.T @ own)
+            middle += float(np.mean(np.square(values))) * (own.T @ own)
     return middle
 
 
-def _parts(problem: Problem, seen: FloatArray) -> Iterator[_Part]:
-    weight = problem.evaluator.weight
-    place = np.cumsum(weight > 0) - 1
-    numbers = problem.split(np.where(weight > 0, place, -1).astype(np.float64))
-    sizes = problem.split(weight * problem.evaluator.measured)
-    for record, number, size in zip(problem.records, numbers, sizes, strict=True):
+def _parts(problem: Problem) -> Iterator[_Part]:
+    measured = problem.split(problem.evaluator.weight * problem.evaluator.measured)
+    weights = problem.split(problem.evaluator.weight)
+    first = 0
+    for record, weight, sizes in zip(problem.records, weights, measured, strict=True):
         times = {channel.name: channel.times for channel in record.outputs}
-        for output, one in number.items():
-            rows = one[one >= 0].astype(np.intp)
-            if rows.size:
-                laid = laid_out(times[output][one >= 0], seen[rows])
-                yield _Part(rows, laid, _is_coloured(laid, float(np.nanmax(np.abs(size[output])))))
+        for output, one in weight.items():
+            scored = one > 0
+            n = int(np.count_nonzero(scored))
+            if n:
+                size = float(np.max(np.abs(sizes[output][scored])))
+                yield _Part(slice(first, first + n), times[output][scored], size)
+            first += n
 
 
-def _is_coloured(laid: Laid, size: float) -> bool:
-    n = np.count_nonzero(laid.present)
-    if n < FEWEST or float(np.sqrt(laid.values @ laid.values / n)) <= ROUNDING * size:
+def _is_coloured(values: FloatArray, size: float) -> bool:
+    """By the samples in their order, whatever gaps are between them: gaps only make them whiter."""
+    if values.size < FEWEST or float(np.sqrt(np.mean(np.square(values)))) <= ROUNDING * size:
         return False
-    return chi_squared_tail(laid.lags, whiteness(laid).statistic) < _CHANCE
+    one_by_one = Laid(values, values, np.ones(values.size, dtype=np.bool_), 1.0, is_regular=False)
+    return chi_squared_tail(one_by_one.lags, whiteness(one_by_one).statistic) < _CHANCE
 
 
 def _with_colour(laid: Laid, columns: FloatArray) -> FloatArray:
