@@ -110,13 +110,15 @@ def _is_settled(settled: int, state: RunState) -> bool:
     Nearly all searches that began beside it have to lead back to it: where the fitness is rough
     others nearby may be better.
     Behind a warm start stands an earlier result. So a third of them is enough, and so it is that
-    all of them, and the second half of the generations, have found nothing better.
+    as many, from random places or from beside it, and the second half of the generations have
+    found nothing better.
     """
+    hops, returned = state.hops
     if state.is_warm:
-        if state.independent >= settled and state.is_the_best_since(state.generation // 2):
+        tried = state.independent + hops
+        if tried >= settled and state.is_the_best_since(state.generation // 2):
             return True
         settled = -(-settled // _WARM_SETTLED)
-    hops, returned = state.hops
     if returned < max(settled, _RETURN * hops):
         return False
     return state.confirmed >= max(settled, _AGREE * state.independent)
