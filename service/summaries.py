@@ -12,6 +12,7 @@ from service.storage.jobs import JobRepository
 from service.storage.runs import RunRepository
 from service.storage.summaries import QUANTILES, Group, GroupKey, Quantity, groups
 from service.storage.tables import Job, Run, State
+from service.unmade import all_groups
 from sysid.errors import nearest
 
 MOST_GROUPS = 2_000
@@ -54,7 +55,7 @@ def summary(
     if not errors_only:
         quantities += [RMS, ESTIMATION, VALIDATION]
         quantities += [Quantity("stderr", name) for name in units]
-    found = groups(session, job.id, keys, quantities, MOST_GROUPS)
+    found = all_groups(session, job, keys, quantities, MOST_GROUPS)
     if len(found) > MOST_GROUPS:
         raise InvalidRequest.at(
             "?by", f"gives more than {MOST_GROUPS} groups; name fewer axes, such as no seed"

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from itertools import product
 from math import exp, log, prod
 from typing import Any
 
@@ -34,6 +33,36 @@ class Step:
     cell: Cell
 
 
+@dataclass(frozen=True, slots=True)
+class Steps(Sequence[Step]):
+    """The positions of one group of axes, each made when it is asked for.
+
+    Attributes
+    ----------
+    columns : tuple
+        Number of each axis of the group in the sweep, the axis, and its values.
+    """
+
+    columns: tuple[tuple[int, Axis, Sequence[Any]], ...]
+
+    @classmethod
+    def of(cls, axes: Sequence[Axis], numbers: Sequence[int]) -> "Steps":
+        """The group of the axes of these numbers."""
+        return cls(tuple((number, axes[number], values_of(axes[number])) for number in numbers))
+
+    def __len__(self) -> int:
+        return len(self.columns[0][2])
+
+    def __getitem__(self, position: Any) -> Any:
+        if not -len(self) <= position < len(self):
+            raise IndexError(position)
+        labels: dict[str, float | str] = {}
+        for _, axis, _ in self.columns:
+            labels.update(axis.labels[position] if axis.labels else {})
+        cell = Cell({axis.path: values[position] for _, axis, values in self.columns}, labels)
+        return Step(_pointer(self.columns[0][0], self.columns[0][1], position), cell)
+
+
 def groups_of(job: JobIn) -> list[list[int]]:
     """Numbers of the axes that step together; the groups are crossed.
 
@@ -62,20 +91,31 @@ def count(job: JobIn, groups: list[list[int]]) -> int:
     return prod(length_of(job.sweep.axes[numbers[0]]) for numbers in groups)
 
 
-def steps_of(job: JobIn, groups: list[list[int]]) -> list[list[Step]]:
+def steps_of(axes: Sequence[Axis], groups: list[list[int]]) -> list[Steps]:
     """What each position of each group sets."""
-    return [_zipped(job.sweep.axes, numbers) for numbers in groups]
+    return [Steps.of(axes, numbers) for numbers in groups]
 
 
-def expand(groups: list[list[Step]]) -> Iterator[Cell]:
-    """Cells of the crossed groups, the last group fastest; one empty cell without axes."""
-    for steps in product(*groups):
+def expand(groups: Sequence[Sequence[Step]], start: int = 0) -> Iterator[Cell]:
+    """Cells of the crossed groups from number `start` on; one empty cell without axes."""
+    lengths = [len(steps) for steps in groups]
+    for number in range(start, prod(lengths)):
         values: dict[str, Any] = {}
         labels: dict[str, float | str] = {}
-        for step in steps:
-            values.update(step.cell.values)
-            labels.update(step.cell.labels)
+        for steps, position in zip(groups, positions_of(number, lengths), strict=True):
+            cell = steps[position].cell
+            values.update(cell.values)
+            labels.update(cell.labels)
         yield Cell(values, labels)
+
+
+def positions_of(number: int, lengths: Sequence[int]) -> list[int]:
+    """Position of a cell in each of the crossed groups, the last of which goes fastest."""
+    found = []
+    for length in reversed(lengths):
+        number, position = divmod(number, length)
+        found.append(position)
+    return found[::-1]
 
 
 def body_of(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
@@ -114,12 +154,12 @@ def length_of(axis: Axis) -> int:
     return len(axis.values if axis.values is not None else range(*(axis.range or [0])))
 
 
-def values_of(axis: Axis) -> list[Any]:
+def values_of(axis: Axis) -> Sequence[Any]:
     """Values of an axis."""
     if axis.values is not None:
         return axis.values
     if axis.range is not None:
-        return list(range(*axis.range))
+        return range(*axis.range)
     assert axis.log is not None
     start, stop, points = axis.log
     ratio = log(stop / start) / max(points - 1, 1)
@@ -129,18 +169,6 @@ def values_of(axis: Axis) -> list[Any]:
 def _plain(value: float) -> float | int:
     """A whole number as such, so that fields of whole numbers take it."""
     return int(value) if value.is_integer() and value < 2**53 else value
-
-
-def _zipped(axes: list[Axis], numbers: list[int]) -> list[Step]:
-    columns = [(n, axes[n], values_of(axes[n])) for n in numbers]
-    steps = []
-    for position in range(len(columns[0][2])):
-        labels: dict[str, float | str] = {}
-        for _, axis, _ in columns:
-            labels.update(axis.labels[position] if axis.labels else {})
-        cell = Cell({axis.path: values[position] for _, axis, values in columns}, labels)
-        steps.append(Step(_pointer(numbers[0], axes[numbers[0]], position), cell))
-    return steps
 
 
 def _pointer(number: int, axis: Axis, position: int) -> str:

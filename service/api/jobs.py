@@ -13,7 +13,7 @@ from service.schemas_summaries import SummaryOut
 from service.schemas_trends import TrendOut
 from service.storage.jobs import JobRepository
 from service.storage.runs import RunOrder
-from service.storage.tables import Job, State
+from service.storage.tables import State
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
@@ -29,13 +29,16 @@ Filter = Annotated[
 def submit(
     body: JobIn,
     parts: PartsDep,
-    session: WriteSession,
     response: Response,
     idempotency_key: Key = None,
 ) -> JobOut:
-    """Queue a job. Everything that can be wrong with it is told now."""
-    found = jobs.submit(session, body, parts.settings, idempotency_key)
-    return _accepted(found.job, response)
+    """Queue a job. Everything that can be wrong with it is told now.
+
+    Of a sweep of more than 2,000 runs the others are made while it runs; until then they count as
+    queued, and have no page and no identifier.
+    """
+    job = jobs.submit_to(parts.database, body, parts.settings, idempotency_key)
+    return _accepted(job, response)
 
 
 @router.get("")
@@ -61,13 +64,13 @@ def cancel(job_id: str, session: WriteSession) -> JobOut:
 @router.post("/{job_id}:resume", status_code=status.HTTP_202_ACCEPTED)
 def resume(job_id: str, parts: PartsDep, session: WriteSession, response: Response) -> JobOut:
     """Queue a failed or cancelled job again; it goes on from its last checkpoints."""
-    return _accepted(jobs.resume(session, job_id, parts.settings), response)
+    return _accepted(jobs.told(jobs.resume(session, job_id, parts.settings)), response)
 
 
 @router.post("/{job_id}:clone", status_code=status.HTTP_202_ACCEPTED)
-def clone(job_id: str, parts: PartsDep, session: WriteSession, response: Response) -> JobOut:
+def clone(job_id: str, parts: PartsDep, response: Response) -> JobOut:
     """Queue the same request as a new job."""
-    return _accepted(jobs.clone(session, job_id, parts.settings), response)
+    return _accepted(jobs.clone(parts.database, job_id, parts.settings), response)
 
 
 @router.get("/{job_id}/runs")
@@ -82,7 +85,7 @@ def runs_of(
     order: RunOrder = "number",
     descending: bool = False,
 ) -> Page[RunOut]:
-    """Runs of a job; filter by axis values, labels or state."""
+    """Runs of a job that have been made; filter by axis values, labels or state."""
     choice = runs.Choice(state or [], cell or [], label or [], order, descending)
     return runs.page(session, job_id, cursor, limit, choice)
 
@@ -106,6 +109,6 @@ def trend(job_id: str, session: ReadSession) -> TrendOut:
     return trends.trend(session, job_id)
 
 
-def _accepted(job: Job, response: Response) -> JobOut:
+def _accepted(job: JobOut, response: Response) -> JobOut:
     response.headers["Location"] = f"/v1/jobs/{job.id}"
-    return jobs.told(job)
+    return job

@@ -2,8 +2,7 @@
 
 from fastapi import APIRouter, Response, status
 
-from service import jobs
-from service.api.deps import PartsDep, WriteSession
+from service.api.deps import PartsDep
 from service.api.jobs import Key
 from service.recipes import reidentify
 from service.schemas_jobs import JobOut
@@ -16,11 +15,10 @@ router = APIRouter(prefix="/v1/recipes", tags=["jobs"])
 def batch(
     body: ReidentifyIn,
     parts: PartsDep,
-    session: WriteSession,
     response: Response,
     idempotency_key: Key = None,
 ) -> JobOut:
     """Queue a run for each value of a label, warm-started, with a trend over it."""
-    found = reidentify.submit(session, body, parts.settings, idempotency_key)
-    response.headers["Location"] = f"/v1/jobs/{found.job.id}"
-    return jobs.told(found.job)
+    job = reidentify.submit(parts.database, body, parts.settings, idempotency_key)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    return job

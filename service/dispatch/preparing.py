@@ -4,9 +4,11 @@ import logging
 from collections import OrderedDict, deque
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from itertools import islice
 from typing import Any, NamedTuple
 
 from service import models
+from service.cells import stored_cells, stored_groups
 from service.conversion import algorithm_of, loss_of
 from service.dispatch.checkpoints import unpacked
 from service.dispatch.signals import save_fit
@@ -20,10 +22,12 @@ from service.storage.objects import ObjectStore
 from service.storage.patience import patiently
 from service.storage.queue import Claim
 from service.storage.reuse import computed, mark
+from service.storage.runs import RunRepository
 from service.storage.sessions import Database
+from service.storage.statements import CHUNK
 from service.storage.tables import Dataset, Run
 from service.storage.tally import forget_progress
-from service.sweeps import body_of
+from service.sweeps import Steps, body_of
 from sysid.errors import SysidError
 from sysid.islands.run_state import RunState
 from sysid.models.model import Model
@@ -77,18 +81,19 @@ class JobRuns:
         self._data: dict[str, DataKey] = {}
         self._read: OrderedDict[str, Records] = OrderedDict()
         self._warm = WarmStarts(database, claim.job)
+        self._groups: list[Steps] | None = None
 
     def runs(self) -> Iterator[Coming]:
         """The unfinished runs in order, each from its checkpoint if it has one."""
         try:
             checkpoints = patiently(self._checkpoints)
-            rows = patiently(partial(self._pending, -1))
+            rows = self._following(-1)
             while rows:
                 states = {row.id: unpacked(checkpoints.pop(row.id, None)) for row in rows}
                 fresh = [run for run, state in states.items() if state is None]
                 patiently(partial(self._begin_anew, fresh))
                 yield from self._in_turn([(row, states.pop(row.id)) for row in rows])
-                rows = patiently(partial(self._pending, rows[-1].number))
+                rows = self._following(rows[-1].number)
         except LeaseLost as error:  # the recorder will meet it too, and stop the job
             _log.warning("no more runs: %s", error)
 
@@ -200,6 +205,29 @@ class JobRuns:
     def _checkpoints(self) -> dict[str, bytes]:
         with self._database.write() as session:
             return RunLedger(session, self._lease).checkpoints()
+
+    def _following(self, after: int) -> list[Run]:
+        """Unfinished runs behind that number; the next ones are made where none is left."""
+        while not (rows := patiently(partial(self._pending, after))):
+            if not patiently(self._make_runs):
+                break
+        return rows
+
+    def _make_runs(self) -> bool:
+        """Make the next runs of the sweep; whether some were left to be made.
+
+        Which are made already the database knows, so that any dispatcher goes on from there.
+        """
+        with self._database.read() as session:
+            made = RunRepository(session, self._job.project_id).n_made(self._job.id)
+        if made >= self._job.n_runs:
+            return False
+        if self._groups is None:
+            self._groups = stored_groups(self._job.spec)
+        cells = list(islice(stored_cells(self._job.spec, self._groups, made), CHUNK))
+        with self._database.write() as session:
+            RunLedger(session, self._lease).create(cells)
+        return bool(cells)
 
     def _pending(self, after: int) -> list[Run]:
         with self._database.write() as session:

@@ -43,9 +43,9 @@ def submit(
     _check(body, settings)
     datasets = body.datasets or [_simulated(database, store, body)]
     try:
-        with database.write() as session:
+        with database.read() as session:
             job = _job(session, store, body, datasets)
-            return jobs.told(jobs.submit(session, job, settings, key).job)
+        return jobs.submit_to(database, job, settings, key)
     except InvalidRequest as error:
         raise InvalidRequest(_at_home(one, body) for one in error.errors) from None
 

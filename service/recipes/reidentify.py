@@ -2,21 +2,19 @@
 
 from typing import Any
 
-from sqlalchemy.orm import Session
-
 from service import jobs
 from service.errors import FieldError, InvalidRequest
-from service.schemas_jobs import PREVIOUS, REFERENCE, JobIn
+from service.schemas_jobs import PREVIOUS, REFERENCE, JobIn, JobOut
 from service.schemas_reidentify import ReidentifyIn
 from service.settings import Settings
-from service.storage.jobs import Submission
+from service.storage.sessions import Database
 
 FIRST_AXIS = "/sweep/axes/0"
 
 
 def submit(
-    session: Session, body: ReidentifyIn, settings: Settings, key: str | None = None
-) -> Submission:
+    database: Database, body: ReidentifyIn, settings: Settings, key: str | None = None
+) -> JobOut:
     """Queue the batch as an ordinary job.
 
     Raises
@@ -30,7 +28,7 @@ def submit(
         raise InvalidRequest.at("/warm_start", "'reference' needs one: give \"reference\"")
     order = sorted(range(len(body.batch)), key=lambda number: body.batch[number].x)
     try:
-        return jobs.submit(session, job_of(body, order), settings, key)
+        return jobs.submit_to(database, job_of(body, order), settings, key)
     except InvalidRequest as error:
         raise InvalidRequest(_at_home(one, order) for one in error.errors) from None
 

@@ -13,6 +13,9 @@ from service.storage.queue import Clock, Lease, Outcome, Queue, smaller
 from service.storage.statements import CHUNK, IN_PLACE, chunks, insert_missing, update_by_id, upsert
 from service.storage.tables import OPEN, Checkpoint, Job, MigrationLog, Run, RunHistory, State
 
+# Every default of the table: with one missing, the rows would take the ORM's slow way.
+_FRESH = {"state": State.QUEUED, "attempt": 0, "kills": 0, "evaluations": 0, "generations": 0}
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
@@ -192,8 +195,8 @@ def add_runs(session: Session, job: Job, cells: Iterable[Cell]) -> None:
     now = utc_now()
     for chunk in chunks(cells):
         rows = [
-            {**_shallow(cell), "id": run_id, "project_id": job.project_id, "job_id": job.id,
-             "state": State.QUEUED, "created_at": now}
+            {**_shallow(cell), **_FRESH, "id": run_id, "project_id": job.project_id,
+             "job_id": job.id, "created_at": now}
             for cell, run_id in zip(chunk, new_ids("run", len(chunk)), strict=True)
         ]  # fmt: skip
         insert_missing(session, Run, rows)

@@ -181,7 +181,7 @@ class Queue:
         )  # fmt: skip
         self._settle_best(job)
         if state is State.SUCCEEDED:
-            self._require_finished_runs(job.id)
+            self._require_finished_runs(job)
         else:
             close_runs(self._session, job.id, state, error)
         self._events.append_state(job)
@@ -249,11 +249,12 @@ class Queue:
         if best is not None:
             job.best_rms = best
 
-    def _require_finished_runs(self, job_id: str) -> None:
-        left = select(func.count()).where(Run.job_id == job_id, Run.state.in_(OPEN))
-        n_left = self._session.scalar(left)
+    def _require_finished_runs(self, job: Job) -> None:
+        """Also those that have not been made yet."""
+        ended = select(func.count()).where(Run.job_id == job.id, Run.state.not_in(OPEN))
+        n_left = job.n_runs - (self._session.scalar(ended) or 0)
         if n_left:
-            raise Conflict(f"{job_id} cannot succeed: {n_left} of its runs did not finish")
+            raise Conflict(f"{job.id} cannot succeed: {n_left} of its runs did not finish")
 
     def _bury(self, job: Job) -> State:
         mine = (Run.job_id == job.id, Run.attempt == job.attempt, Run.state.not_in(OPEN))

@@ -84,6 +84,11 @@ class RunRepository:
         cursors = (json.dumps([getattr(run, order), run.number]) for run in found)
         return page_of(found, limit, cursors)
 
+    def n_made(self, job_id: str) -> int:
+        """How many runs of a job have been made: always its first ones."""
+        last = self._session.scalar(select(func.max(Run.number)).where(*self._of(job_id)))
+        return 0 if last is None else int(last) + 1
+
     def counts(self, job_id: str) -> dict[State, int]:
         """How many runs of a job are in each state."""
         query = select(Run.state, func.count()).where(*self._of(job_id)).group_by(Run.state)

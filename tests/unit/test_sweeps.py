@@ -17,7 +17,7 @@ def job(*axes: dict[str, Any], **fields: Any) -> JobIn:
 
 
 def cells(body: JobIn) -> list[Cell]:
-    return list(expand(steps_of(body, groups_of(body))))
+    return list(expand(steps_of(body.sweep.axes, groups_of(body))))
 
 
 def test_without_axes_there_is_one_cell_that_changes_nothing() -> None:

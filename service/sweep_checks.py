@@ -1,0 +1,101 @@
+"""Faults of a job with axes: of the job itself, of every value that an axis gives, of its trend."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+from sqlalchemy.orm import Session
+
+from service.checks import JobChecker, value_faults
+from service.errors import FieldError, InvalidRequest
+from service.schemas_jobs import JobIn, Seed, Sigma
+from service.sweeps import Cell, Step, body_of, value_at
+from service.trend_checks import trend_faults
+
+# Fields that no other field depends on: their values are checked alone, a whole body for each of
+# a hundred thousand seeds would only take time.
+ALONE: Mapping[str, TypeAdapter[Any]] = {
+    "/seed": TypeAdapter(Seed),
+    "/noise/seed": TypeAdapter(Seed),
+    "/noise/sigma": TypeAdapter(Sigma),
+}
+
+
+def check_sweep(
+    checker: JobChecker, document: dict[str, Any], groups: Sequence[Sequence[Step]]
+) -> None:
+    """Refuse a job with faults, or with values of axes that have some.
+
+    Raises
+    ------
+    InvalidRequest
+        With every fault that can be known before the job runs.
+    """
+    errors = checker.errors(body_of(document, {}))
+    if not errors:
+        errors = list(_sweep_faults(checker, document, groups))
+    if errors:
+        unique = dict.fromkeys(errors)
+        raise InvalidRequest(unique)
+
+
+def check_trend(session: Session, checker: JobChecker, body: JobIn) -> None:
+    """Refuse a job whose trend, or chain of warm starts, cannot be made.
+
+    Raises
+    ------
+    InvalidRequest
+        With the reasons.
+    """
+    model = checker.model(body.model)
+    errors = list(trend_faults(session, body, None if isinstance(model, list) else model[0]))
+    if errors:
+        raise InvalidRequest(errors)
+
+
+def _sweep_faults(
+    checker: JobChecker, document: dict[str, Any], groups: Sequence[Sequence[Step]]
+) -> Iterator[FieldError]:
+    """Faults of the values; of a range or a logarithmic axis, those of its first bad value."""
+    told: set[str] = set()
+    for step in (step for group in groups for step in group):
+        if step.pointer in told or _is_good_alone(step.cell):
+            continue
+        found = list(_step_faults(checker, document, step))
+        if found:
+            told.add(step.pointer)
+        yield from found
+
+
+def _of_another_type(step: Step, whole: dict[str, Any]) -> Iterator[FieldError]:
+    """Values that a body would take for others, as '3' for 3: workers take a cell's as they are."""
+    for path, value in step.cell.values.items():
+        if not isinstance(value, str | bool | float):
+            continue
+        taken = value_at(whole, path)
+        if not isinstance(taken, type(value) | list):
+            yield FieldError(step.pointer, f"{path}: found {value!r}; write {taken!r}")
+
+
+def _is_good_alone(cell: Cell) -> bool:
+    return all(path in ALONE and _fits(ALONE[path], value) for path, value in cell.values.items())
+
+
+def _fits(kind: TypeAdapter[Any], value: Any) -> bool:
+    try:
+        kind.validate_python(value, strict=True)
+    except ValidationError:
+        return False
+    return True
+
+
+def _step_faults(checker: JobChecker, document: dict[str, Any], step: Step) -> Iterator[FieldError]:
+    body = body_of(document, step.cell.values)
+    wrong = value_faults(step.pointer, body)
+    yield from wrong
+    if wrong:
+        return
+    whole = JobIn.model_validate(body).normal_form()
+    yield from _of_another_type(step, whole)
+    for fault in checker.errors(whole):
+        yield FieldError(step.pointer, str(fault), fault.column)

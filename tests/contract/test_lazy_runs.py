@@ -1,0 +1,259 @@
+"""Runs of a large sweep are made while it runs: none lost, none doubled, and all as submitted."""
+
+import threading
+import time
+from datetime import timedelta
+
+import pytest
+
+from service import jobs
+from service.dispatch import preparing
+from service.dispatch.claiming import Leases
+from service.dispatch.preparing import JobRuns
+from service.dispatcher import Dispatcher
+from service.runs import Choice, page
+from service.schemas_jobs import JobIn
+from service.storage.errors import Conflict
+from service.storage.jobs import JobRepository
+from service.storage.ledger import RunLedger
+from service.storage.queue import Queue
+from service.storage.runs import RunRepository
+from service.storage.summaries import GroupKey, groups
+from service.storage.tables import OPEN, Dataset, State
+from service.summaries import summary
+from service.unmade import all_groups
+from tests.dispatching import Place
+from workers.inline import InlineCrew
+
+SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
+AXES = [
+    {"path": "/noise/sigma", "values": [0.0, 0.01, 0.3], "labels": [{"x": 1}, {"x": 2}, {"x": 1}]},
+    {"path": "/seed", "range": [3, 7]},
+]
+SWEEP = {"algorithm": SMALL, "sweep": {"axes": AXES}}
+AT_ONCE, N_RUNS = 5, 12
+
+
+@pytest.fixture
+def place(tmp_path, database, monkeypatch):
+    monkeypatch.setattr(jobs, "AT_ONCE", AT_ONCE)
+    monkeypatch.setattr(preparing, "CHUNK", 2)
+    return Place(tmp_path / "data", database)
+
+
+def claim(place, owner="d1"):
+    with place.database.write() as session:
+        return Queue(session).claim(owner)
+
+
+def lose(place, claim):
+    with place.database.write() as session:
+        Queue(session).reap(gone=[claim.lease.owner])
+
+
+def source(place, claim):
+    return JobRuns(place.database, claim, place.store)
+
+
+def cells(place, job):
+    return [(run.number, run.cell, run.labels, run.seed, run.sigma, run.method)
+            for run in place.runs(job)]  # fmt: skip
+
+
+def submit_whole(place, monkeypatch, **body):
+    """A job whose runs are all made at submission."""
+    with monkeypatch.context() as patched:
+        patched.setattr(jobs, "AT_ONCE", 1000)
+        return place.submit(**body)
+
+
+def carry_out(place, job):
+    dispatcher = Dispatcher(place.database, place.store, InlineCrew(), Leases(place.database, 30))
+
+    def stop_at_the_end():
+        while place.job(job).state in OPEN:
+            time.sleep(0.01)
+        dispatcher.stopping.set()
+
+    watcher = threading.Thread(target=stop_at_the_end)
+    watcher.start()
+    dispatcher.run()
+    watcher.join()
+
+
+def numbers_found(run):
+    return run.state, run.best_rms, run.evaluations, run.estimates, run.spec_hash
+
+
+def test_a_submission_makes_the_first_runs_and_the_dispatcher_the_others(place, monkeypatch):
+    whole = submit_whole(place, monkeypatch, **SWEEP)
+    lazily = place.submit(**SWEEP)
+    assert len(place.runs(lazily)) == AT_ONCE
+    assert place.job(lazily).n_runs == len(place.runs(whole)) == N_RUNS
+    carry_out(place, lazily)
+    assert place.job(lazily).state is State.SUCCEEDED
+    assert cells(place, lazily) == cells(place, whole)
+
+
+def test_results_are_those_of_a_job_whose_runs_were_all_made_at_submission(place, monkeypatch):
+    whole, lazily = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
+    carry_out(place, whole)
+    carry_out(place, lazily)
+    found = [[numbers_found(run) for run in place.runs(job)] for job in (whole, lazily)]
+    assert found[0] == found[1]
+    assert all(state is State.SUCCEEDED for state, *_ in found[1])
+
+
+def test_a_chain_of_warm_starts_goes_on_over_runs_that_are_made_later(place, monkeypatch):
+    chained = {**SWEEP, "warm_start": "previous"}
+    whole, lazily = submit_whole(place, monkeypatch, **chained), place.submit(**chained)
+    carry_out(place, whole)
+    carry_out(place, lazily)
+    assert [run.estimates for run in place.runs(lazily)] == [
+        run.estimates for run in place.runs(whole)
+    ]
+
+
+def test_what_was_computed_before_is_taken_over_also_by_runs_that_are_made_later(place):
+    carry_out(place, place.submit(**SWEEP))
+    second = place.submit(**SWEEP, reuse=True)
+    carry_out(place, second)
+    assert place.job(second).n_reused == N_RUNS
+
+
+def test_another_dispatcher_goes_on_making_runs_where_the_first_one_stopped(place, monkeypatch):
+    whole, job = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
+    assert claim(place).job.id == whole
+    first = claim(place, "first")
+    coming = source(place, first).runs()
+    seen = [next(coming).run for _ in range(AT_ONCE + 1)]
+    made = [run.id for run in place.runs(job)]
+    assert len(made) == AT_ONCE + 2  # one chunk more
+    lose(place, first)
+    second = claim(place, "second")
+    again = [one.run for one in source(place, second).runs()]
+    # The first one had read one more, and then learns that it has lost the lease.
+    assert [one.run for one in coming] == made[len(seen) :]
+    assert again[: len(made)] == made
+    assert seen == made[: len(seen)]
+    assert cells(place, job) == cells(place, whole)
+    assert len(set(again)) == N_RUNS
+
+
+def test_a_transaction_that_fails_makes_no_runs_and_the_next_one_makes_them(place, monkeypatch):
+    job = place.submit(**SWEEP)
+    runs = source(place, claim(place))
+    create = RunLedger.create
+
+    def broken(ledger, made):
+        create(ledger, made)
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(RunLedger, "create", broken)
+        with pytest.raises(MemoryError):
+            list(runs.runs())
+    assert len(place.runs(job)) == AT_ONCE
+    assert len(list(runs.runs())) == N_RUNS
+    assert [run.number for run in place.runs(job)] == list(range(N_RUNS))
+
+
+def test_two_sources_of_one_lease_make_each_run_once(place):
+    job = place.submit(**SWEEP)
+    got = claim(place)
+    both = [source(place, got).runs() for _ in range(2)]
+    for _ in range(N_RUNS):
+        assert len({next(coming).run for coming in both}) == 1
+    assert [run.number for run in place.runs(job)] == list(range(N_RUNS))
+
+
+def test_a_job_cannot_succeed_before_all_its_runs_are_made(place):
+    place.submit(**SWEEP)
+    got = claim(place)
+    with place.database.write() as session:
+        for run in RunLedger(session, got.lease).pending():
+            run.state = State.SUCCEEDED
+    left = N_RUNS - AT_ONCE
+    said = f"{left} of its runs did not finish"
+    with pytest.raises(Conflict, match=said), place.database.write() as session:
+        Queue(session).finish(got.lease, State.SUCCEEDED)
+
+
+def test_a_cancelled_job_is_resumed_with_the_runs_that_were_never_made(place, monkeypatch):
+    whole, job = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
+    place.cancel(whole)
+    place.cancel(job)
+    assert len(place.runs(job)) == AT_ONCE
+    with place.database.read() as session:
+        (group,) = all_groups(session, place.job(job), [], [], 10)
+    assert group.states[State.CANCELLED] == N_RUNS
+    with place.database.write() as session:
+        jobs.resume(session, job, place.settings)
+    carry_out(place, job)
+    assert place.job(job).state is State.SUCCEEDED
+    assert cells(place, job) == cells(place, whole)
+
+
+def test_a_clone_has_the_same_cells(place):
+    job = place.submit(**SWEEP)
+    other = jobs.clone(place.database, job, place.settings).id
+    assert place.job(other).n_runs == N_RUNS
+    carry_out(place, job)
+    assert cells(place, other) == cells(place, job)
+
+
+@pytest.mark.parametrize("by", [
+    [], ["/noise/sigma"], ["/seed"], ["x"], ["x", "/seed"], ["/seed", "/noise/sigma"],
+])  # fmt: skip
+def test_groups_count_runs_that_are_not_made_yet_as_queued(place, monkeypatch, by):
+    whole, job = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
+    keys = [GroupKey("label" if one == "x" else "axis", one) for one in by]
+    with place.database.read() as session:
+        expected = groups(session, whole, keys, [], 100)
+        found = all_groups(session, place.job(job), keys, [], 100)
+        told = summary(session, job, by)
+    assert [(one.key, one.first, one.states) for one in found] == [
+        (one.key, one.first, one.states) for one in expected
+    ]
+    assert sum(one.runs for one in told.groups) == told.runs == N_RUNS
+
+
+def test_a_list_of_runs_has_those_that_are_made_and_progress_counts_all(place):
+    job = place.submit(**SWEEP)
+    with place.database.read() as session:
+        listed = page(session, job, None, 100, Choice())
+        progress = jobs.told(JobRepository(session).get(job)).progress
+        assert RunRepository(session).n_made(job) == len(listed.items) == AT_ONCE
+    assert (progress.runs, progress.finished) == (N_RUNS, 0)
+
+
+def test_what_a_name_means_is_settled_at_submission(place):
+    axes = [{"path": "/datasets", "values": [["steps"]] * 8}]
+    job = place.submit(algorithm=SMALL, sweep={"axes": axes})
+    with place.database.write() as session:
+        session.get(Dataset, place.dataset).name = "another name"
+    carry_out(place, job)
+    assert [run.cell for run in place.runs(job)] == [{"/datasets": [place.dataset]}] * 8
+    assert place.job(job).state is State.SUCCEEDED
+
+
+def test_names_inside_objects_and_lists_are_settled_too(place):
+    axes = [
+        {"path": "/validation", "values": [None, {"fraction": 0.5}]},
+        {"path": "/datasets/0", "values": ["steps"]},
+        {"path": "/algorithm", "values": [SMALL]},
+    ]
+    spec = place.job(place.submit(sweep={"axes": axes})).spec
+    stored = [axis["values"] for axis in spec["sweep"]["axes"]]
+    assert stored[:2] == [[None, {"datasets": None, "fraction": 0.5}], [place.dataset]]
+    whole = JobIn(model="m", datasets=["d"], algorithm=SMALL).normal_form()
+    assert stored[2] == [whole["algorithm"]]
+
+
+def test_a_lease_that_has_expired_makes_nothing(place):
+    job = place.submit(**SWEEP)
+    with place.database.write() as session:
+        got = Queue(session).claim("late", timedelta(seconds=0))
+    lose(place, got)
+    assert list(source(place, got).runs()) == []
+    assert len(place.runs(job)) == AT_ONCE
