@@ -7,7 +7,7 @@ that have drifted from a reference.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import inf, isfinite, sqrt
+from math import hypot, inf, isfinite, nan, sqrt
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -110,16 +110,23 @@ def fit_trend(
             reason=f"found {different} different {'value' if different == 1 else 'values'} of x "
             f"with a standard error; a law with errors needs {LEAST_PLACES} or more"
         )
-    line, power = fit_line(places, values, errors), fit_power(places, values, errors)
-    laws = (line,) if power is None else (line, power)
-    chosen = min(laws, key=lambda law: law.aic)  # of equals the line, which comes first
-    return Trend(
-        laws=laws,
-        chosen=chosen,
-        influences=_influences(chosen, places, values, errors),
-        band=_band(chosen, places),
-        predictions=tuple(prediction(chosen, places, errors, float(at)) for at in predict),
-    )
+    with np.errstate(all="ignore"):  # what does not fit into doubles gives no law
+        fitted = fit_line(places, values, errors), fit_power(places, values, errors)
+        laws = tuple(law for law in fitted if law is not None)
+        if not laws:
+            return Trend(
+                reason=f"the {different} values of x, {np.min(places):g} to {np.max(places):g}, "
+                "or the estimates there, are too far apart in size for doubles: no law is "
+                "determined; write x in a unit in which they are of like size"
+            )
+        chosen = min(laws, key=lambda law: law.aic)  # of equals the line, which comes first
+        return Trend(
+            laws=laws,
+            chosen=chosen,
+            influences=_influences(chosen, places, values, errors),
+            band=_band(chosen, places),
+            predictions=predictions(chosen, places, errors, np.asarray(predict, dtype=np.float64)),
+        )
 
 
 def half_width(law: Law) -> float:
@@ -149,27 +156,47 @@ def _band(law: Law, x: FloatArray) -> tuple[Place, ...]:
     )
 
 
-def prediction(law: Law, x: FloatArray, stderr: FloatArray, at: float) -> Place:
-    """What an estimate at a new place would be, with its 95 % interval.
+def predictions(
+    law: Law, x: FloatArray, stderr: FloatArray, at: FloatArray
+) -> tuple[Place, ...]:  # fmt: skip
+    """What estimates at new places would be, with their 95 % intervals.
 
-    Its own stated error is interpolated (geometrically) between those of the points; outside the
-    measured range that of the nearest is taken. All is widened by the Birge ratio. A power law
-    knows nothing of x ≤ 0: there the interval is not finite.
+    Their own stated error is interpolated (geometrically) between those of the points; outside
+    the measured range that of the nearest is taken. All is widened by the Birge ratio. A power
+    law knows nothing of x ≤ 0: there the interval is not finite.
+
+    Parameters
+    ----------
+    x, stderr : FloatArray, shape (n,)
+        The points of the law and their stated standard errors.
+    at : FloatArray, shape (m,)
+        The new places.
     """
-    is_outside = not float(np.min(x)) <= at <= float(np.max(x))
-    if law.kind == "power" and not at > 0:
-        return Place(at, float("nan"), inf, -inf, inf, True)
-    value, known = float(law.values(np.array([at]))[0]), float(law.stated(np.array([at]))[0])
-    error = law.widening * sqrt(known**2 + _own(x, stderr, at) ** 2)
-    reach = half_width(law) * error
-    return Place(at, value, error, value - reach, value + reach, is_outside)
+    reach, low, high = half_width(law), float(np.min(x)), float(np.max(x))
+    known = np.ones(at.shape, dtype=bool) if law.kind == "line" else at > 0
+    inside = np.where(known, at, law.centre)
+    values = law.values(inside)
+    errors = law.widening * np.hypot(law.stated(inside), _own(x, stderr, inside))
+    return tuple(
+        Place(p, v, e, v - reach * e, v + reach * e, not low <= p <= high)
+        if is_known
+        else Place(p, nan, inf, -inf, inf, True)
+        for p, v, e, is_known in zip(
+            at.tolist(), values.tolist(), errors.tolist(), known.tolist(), strict=True
+        )
+    )
 
 
-def _own(x: FloatArray, stderr: FloatArray, at: float) -> float:
-    """The stated error that an estimate at a place would have."""
-    places = np.unique(x)
-    logs = [float(np.mean(np.log(stderr[x == place]))) for place in places]
-    return float(np.exp(np.interp(at, places, logs)))
+def prediction(law: Law, x: FloatArray, stderr: FloatArray, at: float) -> Place:
+    """The same at one new place."""
+    return predictions(law, x, stderr, np.array([at]))[0]
+
+
+def _own(x: FloatArray, stderr: FloatArray, at: FloatArray) -> FloatArray:
+    """The stated errors that estimates at some places would have."""
+    places, which = np.unique(x, return_inverse=True)
+    logs = np.bincount(which, np.log(stderr)) / np.bincount(which)
+    return np.asarray(np.exp(np.interp(at, places, logs)))
 
 
 def _influences(
@@ -187,7 +214,7 @@ def _influences(
 def _influence(law: Law, residual: float, leverage: float, n: int, floor: float) -> Influence:
     """The deleted residual follows from the whole fit: t = e/(s₍ᵢ₎ √(1 - h))."""
     degrees = law.degrees - 1
-    if degrees < 1 or leverage > _NEARLY_ONE:
+    if degrees < 1 or not leverage <= _NEARLY_ONE:
         return Influence(residual, None, None, False)
     square = residual**2 / (1.0 - leverage)
     others = max(law.chi_squared - square, 0.0) / degrees
@@ -212,13 +239,20 @@ def pooled(groups: Sequence[Sequence[Estimate]]) -> tuple[tuple[Estimate, ...], 
     tuple of Estimate, float
         The means, and the ratio; 1 where no group has two runs.
     """
+    with np.errstate(over="ignore"):  # a ratio beyond doubles is infinite
+        return _pooled(groups)
+
+
+def _pooled(groups: Sequence[Sequence[Estimate]]) -> tuple[tuple[Estimate, ...], float]:
     means, square, degrees = [], 0.0, 0
     for group in groups:
-        weights = np.array([one.stderr**-2 for one in group])
+        errors = np.array([one.stderr for one in group])
         values = np.array([one.value for one in group])
+        least = float(np.min(errors))
+        weights = (least / errors) ** 2  # at most 1: no overflow where errors are tiny
         mean = float(weights @ values / np.sum(weights))
-        means.append(Estimate(mean, float(np.sum(weights)) ** -0.5))
-        square += float(weights @ (values - mean) ** 2)
+        means.append(Estimate(mean, least * float(np.sum(weights)) ** -0.5))
+        square += float(np.sum(((values - mean) / errors) ** 2))
         degrees += len(group) - 1
     ratio = sqrt(square / degrees) if degrees else 1.0
     return tuple(Estimate(v, max(1.0, ratio) * s) for v, s in means), ratio
@@ -244,17 +278,43 @@ def drift(new: Estimate, old: Estimate, comparisons: int = 1) -> Drift:
     return Drift(difference, z, abs(z) > limit)
 
 
+def drifts_from_law(
+    new: Sequence[Estimate], law: Law, x: FloatArray, stderr: FloatArray, at: FloatArray,
+    comparisons: int = 1,
+) -> tuple[Drift, ...]:  # fmt: skip
+    """Estimates against what the trend of a reference batch predicts at their places.
+
+    Parameters
+    ----------
+    new : sequence of Estimate, length m
+        The estimates.
+    x, stderr : FloatArray, shape (n,)
+        The points of the reference batch and their stated standard errors.
+    at : FloatArray, shape (m,)
+        The places of the estimates. Where the law says nothing, no number is told.
+    """
+    with np.errstate(all="ignore"):
+        told = predictions(law, x, stderr, at)
+        known = (law.widening * law.stated(at)).tolist()
+    return tuple(
+        _drift_from(one, place, error, law, comparisons)
+        for one, place, error in zip(new, told, known, strict=True)
+    )
+
+
 def drift_from_law(
     new: Estimate, law: Law, x: FloatArray, stderr: FloatArray, at: float, comparisons: int = 1
 ) -> Drift:
-    """An estimate against what the trend of a reference batch (of places `x`) predicts there."""
-    told = prediction(law, x, stderr, at)
-    if not isfinite(told.stderr):
-        return Drift(float("nan"), float("nan"), False)
-    known = law.widening * float(law.stated(np.array([at]))[0])
+    """The same for one estimate."""
+    return drifts_from_law([new], law, x, stderr, np.array([at]), comparisons)[0]
+
+
+def _drift_from(new: Estimate, told: Place, known: float, law: Law, comparisons: int) -> Drift:
+    if not (isfinite(told.value) and isfinite(told.stderr)):
+        return Drift(nan, nan, False)
     # Its own error is the larger of what it says and what points of that batch scatter.
     scatter = sqrt(max(told.stderr**2 - known**2, 0.0))
-    error = sqrt(known**2 + max(scatter, new.stderr) ** 2)
+    error = hypot(known, max(scatter, new.stderr))
     difference = new.value - told.value
     z = _ratio(difference, error)
     return Drift(difference, z, _tail(law, z) < _DRIFT / comparisons)

@@ -88,14 +88,17 @@ class Law:
         if self.kind == "line":
             a, slopes = c - b * self.centre, np.array([1.0, -self.centre])
         else:
-            share = exp(-b * log(self.centre))
+            share = float(np.exp(-b * log(self.centre)))
             a, slopes = c * share, np.array([share, -c * share * log(self.centre)])
         error = self.widening * sqrt(max(float(slopes @ self.covariance @ slopes), 0.0))
         return ("a", a, error), ("b", b, self.widening * sqrt(float(self.covariance[1, 1])))
 
 
-def fit_line(x: FloatArray, y: FloatArray, stderr: FloatArray) -> Law:
-    """The straight line through points (n ≥ 3, of three different x or more)."""
+def fit_line(x: FloatArray, y: FloatArray, stderr: FloatArray) -> Law | None:
+    """The straight line through points (n ≥ 3, of three different x or more).
+
+    None where it is not determined in doubles, as where squares of x overflow.
+    """
     weight = (np.min(stderr) / stderr) ** 2  # at most 1: no overflow where errors are tiny
     centre = float(weight @ x / np.sum(weight))
     slopes = _slopes("line", x, centre, np.zeros(2))
@@ -103,9 +106,7 @@ def fit_line(x: FloatArray, y: FloatArray, stderr: FloatArray) -> Law:
         float(weight @ y / np.sum(weight)),
         float(weight @ (slopes[:, 1] * y) / (weight @ slopes[:, 1] ** 2)),
     ])  # fmt: skip
-    law = _made("line", x, y, stderr, centre, theta)
-    assert law is not None  # the normal equations of three different x have full rank
-    return law
+    return _made("line", x, y, stderr, centre, theta)
 
 
 def fit_power(x: FloatArray, y: FloatArray, stderr: FloatArray) -> Law | None:
@@ -143,6 +144,8 @@ def _stepped(
     """A step that lowers the loss, halved until it does; None at the minimum."""
     slopes = weight[:, None] * _slopes("power", x, centre, theta)
     residual = weight * (y - _values("power", x, centre, theta))
+    if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(residual))):
+        return None
     step = np.linalg.lstsq(slopes, residual, rcond=None)[0]
     before = float(residual @ residual)
     for _ in range(_HALVINGS):
@@ -185,12 +188,15 @@ def _made(
     normal = (slopes / size).T @ (slopes / size)
     if not np.linalg.det(normal) > _SINGULAR:
         return None
-    covariance = np.linalg.inv(normal) * least**2 / np.outer(size, size)
+    covariance = np.linalg.inv(normal) / np.outer(size / least, size / least)
     residual = (y - _values(kind, x, centre, theta)) / stderr
     # What rounding leaves of an exact law is no evidence for it.
     chi_squared = max(float(residual @ residual), rounding(y, stderr))
+    if not (np.isfinite(chi_squared) and np.all(np.isfinite(covariance))):
+        return None
     aic, aicc = _criteria(chi_squared, x.size)
-    return Law(kind, centre, theta, covariance, chi_squared, x.size - 2, aic, aicc)
+    law = Law(kind, centre, theta, covariance, chi_squared, x.size - 2, aic, aicc)
+    return law if np.all(np.isfinite([one[1:] for one in law.coefficients])) else None
 
 
 def rounding(y: FloatArray, stderr: FloatArray) -> float:

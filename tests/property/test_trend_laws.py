@@ -13,10 +13,12 @@ from sysid.trend import (
     Estimate,
     drift,
     drift_from_law,
+    drifts_from_law,
     fit_trend,
     half_width,
     pooled,
     prediction,
+    predictions,
 )  # fmt: skip
 from sysid.trend_laws import Law, fit_line, fit_power
 
@@ -260,3 +262,77 @@ def test_aic_is_that_of_the_formula() -> None:
     n = x.size
     assert law.aic == pytest.approx(n * log(law.chi_squared / n) + 6)
     assert law.aicc == pytest.approx(law.aic + 24 / (n - 4))
+
+
+@pytest.mark.parametrize("kind", ["line", "power"])
+def test_many_places_at_once_are_told_as_one_after_the_other(kind: str) -> None:
+    x, y, stderr = noisy(6, n=30)
+    law = fit_line(x, y, stderr) if kind == "line" else fit_power(x, y, stderr)
+    assert law is not None
+    at = np.array([-1.0, 0.0, 1e-3, 7.0, *x, 90.0])
+    told = predictions(law, x, stderr, at)
+    alone = [prediction(law, x, stderr, float(one)) for one in at]
+    np.testing.assert_allclose(np.array(told, float), np.array(alone, float), rtol=1e-12)
+    new = [Estimate(float(3.0 * one), 0.1) for one in at]
+    found = drifts_from_law(new, law, x, stderr, at, 4)
+    one_by_one = [
+        drift_from_law(one, law, x, stderr, float(place), 4)
+        for one, place in zip(new, at, strict=True)
+    ]
+    np.testing.assert_allclose(
+        np.array(found, float), np.array(one_by_one, float), rtol=1e-9, atol=1e-12
+    )
+
+
+def test_the_error_of_a_new_estimate_lies_between_those_of_its_neighbours() -> None:
+    x = np.array([1.0, 1.0, 3.0])
+    law = fit_line(np.arange(5.0), np.arange(5.0), np.full(5, 1e-9))
+    assert law is not None
+    told = predictions(law, x, np.array([1.0, 4.0, 8.0]), np.array([0.5, 1.0, 2.0, 3.0, 9.0]))
+    assert [one.stderr for one in told] == pytest.approx([2.0, 2.0, 4.0, 8.0, 8.0], rel=1e-6)
+
+
+def test_looking_up_the_errors_of_a_batch_is_done_once_not_for_every_estimate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    x, y, stderr = noisy(7, n=200)
+    law = fit_line(x, y, stderr)
+    assert law is not None
+    looked, unique = [], np.unique
+    monkeypatch.setattr(
+        np, "unique", lambda *given, **more: looked.append(1) or unique(*given, **more)
+    )
+    drifts_from_law([Estimate(1.0, 0.1)] * 200, law, x, stderr, x)
+    assert len(looked) == 1
+
+
+SIZES = st.floats(1e-300, 1e300) | st.floats(-1e300, -1e-300) | st.floats(-10, 10)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.tuples(SIZES, SIZES, st.floats(1e-300, 1e300)), min_size=3, max_size=6))
+def test_points_of_any_size_give_finite_laws_or_a_reason(
+    points: list[tuple[float, float, float]],
+) -> None:
+    x, y, stderr = zip(*points, strict=True)
+    found = fit_trend(x, y, stderr, [1.0, 1e300])
+    assert bool(found.laws) != bool(found.reason)
+    for law in found.laws:
+        assert np.all(np.isfinite([one[1:] for one in law.coefficients]))
+        assert np.all(np.isfinite([law.aic, law.birge]))
+    for one in found.influences:
+        assert one.p_value is None or 0 <= one.p_value <= 1
+
+
+def test_places_that_doubles_cannot_tell_apart_give_no_law_but_a_reason() -> None:
+    found = fit_trend([1e-300, 1.0, 2.0, 1e300], [1.0, 2.0, 3.0, 4.0], np.full(4, 0.1))
+    assert all(law.kind == "power" for law in found.laws)
+    lost = fit_trend([-1e300, 1.0, 2.0, 1e300], [1.0, 2.0, 3.0, 4.0], np.full(4, 0.1))
+    assert (lost.laws, lost.chosen) == ((), None)
+    assert "-1e+300 to 1e+300" in lost.reason
+
+
+def test_the_mean_of_runs_with_tiny_errors_is_as_that_of_others() -> None:
+    tiny, plain = (pooled([[Estimate(s, s), Estimate(3 * s, 2 * s)]])[0] for s in (1e-200, 1.0))
+    assert tiny[0].value == pytest.approx(1e-200 * plain[0].value)
+    assert tiny[0].stderr == pytest.approx(1e-200 * plain[0].stderr)
