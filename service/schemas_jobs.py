@@ -167,6 +167,26 @@ def _reference(value: str) -> str:
     return _warm_start(value)
 
 
+LEAST_PLACE, MOST_PLACE = 1e-100, 1e100
+"""Sizes of x in a trend, whose squares are computed."""
+
+
+def is_place(value: float) -> bool:
+    """Whether a number can be the x of a trend."""
+    return value == 0 or LEAST_PLACE <= abs(value) <= MOST_PLACE
+
+
+def _place(value: float) -> float:
+    if not is_place(value):
+        raise PydanticCustomError(
+            "place", "need 0, or a size from 1e-100 to 1e100; write x in another unit"
+        )
+    return value
+
+
+PlaceIn = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_place)]
+
+
 class TrendIn(Body):
     """How parameters depend on a label.
 
@@ -177,7 +197,7 @@ class TrendIn(Body):
 
     x: str = Field(min_length=1, max_length=64)
     parameters: list[str] = Field(default=[], max_length=100)
-    predict: list[Annotated[float, Field(allow_inf_nan=False)]] = Field(default=[], max_length=100)
+    predict: list[PlaceIn] = Field(default=[], max_length=100)
     reference: Annotated[str, Field(max_length=300), AfterValidator(_reference)] | None = None
 
 

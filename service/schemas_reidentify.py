@@ -10,18 +10,17 @@ from service.schemas_jobs import (
     JobIn,
     LossIn,
     ParameterIn,
+    PlaceIn,
     Seed,
     ValidationIn,
     model_reference,
 )
 
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-
 
 class ExperimentsIn(Body):
     """What was measured at one value of the label: `datasets` are fitted together, as one run."""
 
-    x: Finite
+    x: PlaceIn
     datasets: list[str] = Field(min_length=1, max_length=1000)
 
 
@@ -44,7 +43,7 @@ class ReidentifyIn(Body):
     reference: str | None = Field(default=None, min_length=1, max_length=200)
     warm_start: Literal["reference", "previous", "none"] | None = None
     look_at: list[str] = Field(default=[], max_length=100)
-    predict: list[Finite] = Field(default=[], max_length=100)
+    predict: list[PlaceIn] = Field(default=[], max_length=100)
     channels: dict[str, str] = Field(default={})
     hold: dict[str, Literal["zero", "first", "band-limited"]] = Field(default={})
     validation: ValidationIn | None = None

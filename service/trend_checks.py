@@ -6,7 +6,7 @@ from sqlalchemy.orm import Session
 
 from service import warm_starts
 from service.errors import FieldError
-from service.schemas_jobs import PREVIOUS, JobIn
+from service.schemas_jobs import LEAST_PLACE, MOST_PLACE, PREVIOUS, JobIn, is_place
 from sysid.errors import nearest
 from sysid.models.model import Model
 
@@ -43,9 +43,15 @@ def _label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
         )
     for n, labels in named:
         for position, one in enumerate(labels):
-            if not isinstance(one.get(x), float | int):
+            value = one.get(x)
+            if not isinstance(value, float | int):
                 found = f"found {one[x]!r}" if x in one else "it is missing"
-                yield FieldError(
-                    f"/sweep/axes/{n}/labels/{position}",
-                    f"{x}: {found}; a trend needs a number here",
-                )
+                needed = "a number here"
+            elif not is_place(value):
+                found = f"found {value!r}"
+                needed = f"0, or a size from {LEAST_PLACE:g} to {MOST_PLACE:g}"
+            else:
+                continue
+            yield FieldError(
+                f"/sweep/axes/{n}/labels/{position}", f"{x}: {found}; a trend needs {needed}"
+            )

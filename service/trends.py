@@ -32,7 +32,7 @@ from sysid.trend import (
     Place,
     Trend,
     drift,
-    drift_from_law,
+    drifts_from_law,
     fit_trend,
 )
 from sysid.trend_laws import FORMULAS, Law
@@ -43,11 +43,15 @@ REAL_SCATTER = 1.5  # Birge ratios below that happen by chance in small batches
 
 @dataclass(frozen=True, slots=True)
 class _Reference:
-    """The run a batch is compared with, and the trend of its job, quantity by quantity."""
+    """The run a batch is compared with, and the trend of its job, quantity by quantity.
+
+    `note` is why there is no such trend, where its job has one.
+    """
 
     run: Run
     x: float | None
     trends: Mapping[str, tuple[Trend, Quantity]] = field(default_factory=dict)
+    note: str = ""
 
 
 def has_trend(job: Job) -> bool:
@@ -107,6 +111,11 @@ def _reference(session: Session, job: Job, run_id: str | None) -> _Reference | N
     at = float(label) if isinstance(label, int | float) else None
     if theirs.id == job.id or not has_trend(theirs) or theirs.spec["trend"]["x"] != x:
         return _Reference(run, at)
+    if theirs.n_runs > MOST_RUNS:
+        return _Reference(
+            run, at, note=f"the reference batch {theirs.id} has {theirs.n_runs} runs, and a trend "
+            f"is made of at most {MOST_RUNS}: compared with the reference run only",
+        )  # fmt: skip
     _, known = _gathered(session, theirs)
     return _Reference(run, at, {one.name: (_fitted(one, ()), one) for one in known})
 
@@ -124,9 +133,10 @@ def _told(
     fitted = _fitted(one, predict)
     influences = iter(fitted.influences)
     n = sum(point.estimate is not None for other in all_ for point in other.points)
+    drifts = _drifts(one, reference, n)
     points = [
         _point(point, next(influences, None) if point.estimate is not None else None,
-               _drifts(one.name, point, reference, n), bool(fitted.laws))
+               drifts.get(point.x, []), bool(fitted.laws))
         for point in one.points
     ]  # fmt: skip
     return QuantityOut(
@@ -141,7 +151,7 @@ def _told(
 def _point(
     point: Point, influence: Influence | None, drifts: list[DriftOut], has_laws: bool
 ) -> PointOut:
-    error = None if point.estimate is None else point.estimate.stderr
+    error = None if point.estimate is None else _finite(point.estimate.stderr)
     return PointOut(
         x=point.x, value=point.value, stderr=error, runs=list(point.runs), status=point.status,
         is_used=has_laws and point.estimate is not None,
@@ -152,22 +162,30 @@ def _point(
 
 
 def _drifts(
-    name: str, point: Point, reference: _Reference | None, comparisons: int
-) -> list[DriftOut]:
-    if reference is None or point.estimate is None:
-        return []
-    found: list[DriftOut] = []
-    old = _estimate(reference.run, name)
-    if point.x == reference.x and old is not None:
-        found.append(_drift("run", old.value, drift(point.estimate, old, comparisons)))
-    fitted, theirs = reference.trends.get(name, (None, None))
-    if fitted is not None and theirs is not None and fitted.chosen is not None:
-        used = [(p.x, p.estimate.stderr) for p in theirs.points if p.estimate is not None]
-        x, errors = np.array([at for at, _ in used]), np.array([error for _, error in used])
-        moved = drift_from_law(point.estimate, fitted.chosen, x, errors, point.x, comparisons)
-        if isfinite(moved.difference):
-            expected = point.estimate.value - moved.difference
-            found.append(_drift("trend", expected, moved))
+    one: Quantity, reference: _Reference | None, comparisons: int
+) -> dict[float, list[DriftOut]]:
+    """What is told of each point, by its x."""
+    found: dict[float, list[DriftOut]] = {}
+    if reference is None:
+        return found
+    new = [(point.x, point.estimate) for point in one.points if point.estimate is not None]
+    old = _estimate(reference.run, one.name)
+    for x, estimate in new:
+        if x == reference.x and old is not None:
+            found[x] = [_drift("run", old.value, drift(estimate, old, comparisons))]
+    fitted, theirs = reference.trends.get(one.name, (None, None))
+    if fitted is None or theirs is None or fitted.chosen is None:
+        return found
+    used = [(p.x, p.estimate.stderr) for p in theirs.points if p.estimate is not None]
+    places, errors = np.array([x for x, _ in used]), np.array([error for _, error in used])
+    at = np.array([x for x, _ in new])
+    moved = drifts_from_law(
+        [estimate for _, estimate in new], fitted.chosen, places, errors, at, comparisons
+    )
+    for (x, estimate), so_far in zip(new, moved, strict=True):
+        if isfinite(so_far.difference):
+            expected = estimate.value - so_far.difference
+            found.setdefault(x, []).append(_drift("trend", expected, so_far))
     return found
 
 
@@ -230,6 +248,8 @@ def _quantity_notes(one: Quantity, fitted: Trend) -> list[str]:
 def _notes(reference: _Reference | None, x: str) -> list[str]:
     if reference is None:
         return []
+    if reference.note:
+        return [reference.note]
     if reference.x is None and not reference.trends:
         return [f"the reference run has no label {x!r} and no trend: nothing to compare with"]
     return []

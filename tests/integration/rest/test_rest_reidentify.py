@@ -205,6 +205,8 @@ def test_references_keep_their_history_and_say_what_is_wrong(served: Served) -> 
         ({"look_at": ["Q"]}, "/look_at/0", "no parameter 'Q'"),
         ({"batch": [{"x": 5, "datasets": ["ds_none"]}]}, "/batch/0/datasets", "ds_none"),
         ({"label": 'a"b'}, "/label", "quotation marks"),
+        ({"batch": [{"x": 1e300, "datasets": ["ds_none"]}]}, "/batch/0/x", "1e-100 to 1e100"),
+        ({"predict": [1.0, 1e-300]}, "/predict/1", "1e-100 to 1e100"),
     ],
 )
 def test_a_fault_is_told_at_its_place_in_the_recipe(
@@ -224,6 +226,7 @@ def test_a_fault_is_told_at_its_place_in_the_recipe(
         ([{"width": 1}, {"width": 2}], "/trend/x", "no run has a label 'length_m'"),
         ([{"length_m": 1}, {}], "/sweep/axes/0/labels/1", "it is missing"),
         ([{"length_m": 1}, {"length_m": "two"}], "/sweep/axes/0/labels/1", "found 'two'"),
+        ([{"length_m": 1}, {"length_m": 1e300}], "/sweep/axes/0/labels/1", "1e-100 to 1e+100"),
     ],
 )
 def test_labels_missing_for_a_trend_are_told(
@@ -243,6 +246,30 @@ def test_a_trend_of_too_few_lengths_says_how_many_it_needs(served: Served) -> No
     found = trend(served, batch_of(served.server, served.parts, batch=batch))
     assert quantity(found, "L")["laws"] == []
     assert "needs 3" in quantity(found, "L")["reason"]
+
+
+def test_lengths_that_no_law_can_hold_are_told_and_the_page_is_shown(served: Served) -> None:
+    sizes = (-1e99, 1.0, 2.0, 1e99)
+    batch = [{"x": x, "datasets": served.datasets[2.0][:1]} for x in sizes]
+    job = batch_of(served.server, served.parts, batch=batch)
+    assert [one["x"] for one in trend(served, job)["places"]] == list(sizes)
+    assert served.server.get(f"/jobs/{job}").status_code == 200
+
+
+def test_a_reference_batch_that_is_too_large_for_a_trend_is_a_note(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS[:3]]
+    reference = run_at(served, served.job, 2.0)
+    job = batch_of(served.server, served.parts, batch=batch, reference=reference)
+    monkeypatch.setattr("service.trends.MOST_RUNS", 3)
+    found = trend(served, job)
+    (note,) = found["notes"]
+    assert "has 4 runs" in note
+    assert "at most 3" in note
+    kinds = {drift["kind"] for one in found["quantities"] for point in one["points"]
+             for drift in point["drifts"]}  # fmt: skip
+    assert kinds == {"run"}
 
 
 def test_a_job_without_a_trend_says_so(served: Served) -> None:
