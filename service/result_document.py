@@ -41,19 +41,12 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
         "criteria": _criteria(found.criteria),
         "correlation": _correlation(found.uncertainty),
         "noise_sd": None if found.uncertainty is None else finite(found.uncertainty.noise_sd),
-        "noise_colour": _noise_colour(found.uncertainty),
+        "noise_colour": None if found.uncertainty is None else found.uncertainty.noise_colour,
         "residual_tests": residual_document(found.residual_tests),
         "onset_delays": onset_document(found.onset_delays),
         "warnings": list(found.warnings),
         "selection": [one._asdict() for one in found.selection],
     }
-
-
-def _noise_colour(found: Uncertainty | None) -> str | None:
-    """What the standard errors take the residuals for."""
-    if found is None:
-        return None
-    return "coloured" if found.is_coloured else "white"
 
 
 def _estimate(one: Estimate) -> dict[str, Any]:

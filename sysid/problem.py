@@ -108,6 +108,16 @@ class Problem:
                      None if scored_from is None else tuple(scored_from))  # fmt: skip
         return _built(*arguments)
 
+    @property
+    def prediction(self) -> Prediction:
+        """Free run or one step ahead."""
+        return "simulation" if len(self.arguments) < 4 else self.arguments[3]
+
+    @property
+    def loss(self) -> Loss:
+        """What is minimised."""
+        return Loss() if len(self.arguments) < 5 else self.arguments[4]
+
     def __reduce__(self) -> _Rebuild:
         rebuild = _built if len(self.arguments) > 2 else simulation_problem
         return rebuild, self.arguments

@@ -133,7 +133,7 @@ def residual_tests(
 ) -> ResidualTests:
     """Test the residuals of simulated values (M,) on the records of a problem."""
     found = series_of(problem, simulated)
-    if data == "estimation" and problem.arguments[3] == "one-step":
+    if data == "estimation" and problem.prediction == "one-step":
         counts = coefficients_on_past_outputs(problem.model, problem.all_parameters)
         found = [one._replace(coefficients=counts[one.output]) for one in found]
     return verdict(correlations(found, both_sides=False), data)
@@ -151,7 +151,7 @@ def verdict(
 
 def series_of(problem: "Problem", simulated: FloatArray) -> list[Series]:
     """The residuals of every output of every experiment, from simulated values (M,)."""
-    loss = problem.arguments[4]
+    loss = problem.loss
     scale = loss.scale if loss.kind == "soft-l1" else 0.0
     parts = zip(
         problem.records, problem.split(simulated), problem.split(problem.evaluator.measured),

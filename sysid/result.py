@@ -9,6 +9,7 @@ from sysid.onset import OnsetDelay
 from sysid.residuals import ResidualTests
 from sysid.types import FloatArray
 
+NoiseColour = Literal["white", "coloured", "drifting"]
 EstimateStatus = Literal["identified", "group", "at bound", "unidentifiable", "fixed", "tied"]
 Phase = Literal["start", "genetic", "sequence", "migration", "refinement"]
 
@@ -122,7 +123,8 @@ class Criteria:
 class Uncertainty:
     """Local analysis at the estimate; rows and columns are the free parameters `names`.
 
-    `is_coloured` tells that the covariance allows for residuals that are not white.
+    `noise_colour` tells what the covariance takes the residuals for. Where they drift over the
+    whole record, it is a lower bound.
     """
 
     names: tuple[str, ...]
@@ -132,7 +134,7 @@ class Uncertainty:
     singular_values: FloatArray
     noise_sd: float
     groups: tuple[Group, ...] = ()
-    is_coloured: bool = False
+    noise_colour: NoiseColour = "white"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,6 +6,11 @@ clearly not white, the middle of the sandwich (SᵀS)⁻¹ Ω (SᵀS)⁻¹ becom
 autocovariance R of each series of residuals (output errors: Ljung 1999, sec. 9.3), from a Parzen
 window as wide as their colour asks for after a first-order prewhitening (Andrews and Monahan 1992).
 For free runs only: one step ahead the sensitivities are made of measured outputs and of the noise.
+
+Coloured samples say less than as many white ones: of first-order noise with pole a > 0 those of a
+mean count for n(1 - a)/(1 + a) (Bayley and Hammersley 1946). So many are taken for the degrees of
+freedom. Where a is too near 1 the record is short beside its drift, and the errors are a lower
+bound. Different outputs are taken for independent.
 """
 
 from collections.abc import Iterator
@@ -25,6 +30,19 @@ _CHANCE = 1e-3
 _STEEPEST = 0.97
 """Of the recursion (Andrews and Monahan 1992): one nearer 1 would follow a single drift."""
 
+_EVEN = 1e-3  # of a period: steps that differ by less are equal
+
+
+class Coloured(NamedTuple):
+    """Ω (D, D) of the sandwich, and how many white samples would say as much.
+
+    `drifts` where that number is not known: the residuals wander over the whole record.
+    """
+
+    middle: FloatArray
+    samples: float
+    drifts: bool
+
 
 class _Part(NamedTuple):
     """One output of one experiment: its scored samples among all of them, with their times."""
@@ -34,8 +52,8 @@ class _Part(NamedTuple):
     size: float
 
 
-def coloured_middle(problem: Problem, seen: FloatArray, columns: FloatArray) -> FloatArray | None:
-    """Ω of the sandwich, (D, D); None where the residuals may as well be white.
+def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloured | None:
+    """The middle of the sandwich; None where the residuals may as well be white.
 
     Parameters
     ----------
@@ -44,21 +62,24 @@ def coloured_middle(problem: Problem, seen: FloatArray, columns: FloatArray) -> 
     columns : FloatArray, shape (n, D)
         Their sensitivities.
     """
-    if problem.arguments[3] == "one-step":
+    if problem.prediction == "one-step":
         return None
-    parts = [
-        (columns[part.rows], seen[part.rows], part.times, _is_coloured(seen[part.rows], part.size))
-        for part in _parts(problem)
-    ]
-    if not any(is_coloured for *_, is_coloured in parts):
+    parts = [(part, _in_order(part, seen[part.rows])) for part in _parts(problem)]
+    told = [_is_coloured(laid, part.size) for part, laid in parts]
+    if not any(told):
         return None
-    middle = np.zeros((columns.shape[1], columns.shape[1]))
-    for own, values, times, is_coloured in parts:
+    whole = Coloured(np.zeros((columns.shape[1], columns.shape[1])), 0.0, drifts=False)
+    for (part, _), is_coloured in zip(parts, told, strict=True):
+        own, values = columns[part.rows], seen[part.rows]
         if is_coloured:
-            middle += _with_colour(laid_out(times, values), own)
+            one = _with_colour(laid_out(part.times, values), own)
         else:
-            middle += float(np.mean(np.square(values))) * (own.T @ own)
-    return middle
+            mean = float(np.mean(np.square(values)))
+            one = Coloured(mean * (own.T @ own), float(values.size), drifts=False)
+        whole = Coloured(
+            whole.middle + one.middle, whole.samples + one.samples, whole.drifts or one.drifts
+        )
+    return whole
 
 
 def _parts(problem: Problem) -> Iterator[_Part]:
@@ -76,24 +97,34 @@ def _parts(problem: Problem) -> Iterator[_Part]:
             first += n
 
 
-def _is_coloured(values: FloatArray, size: float) -> bool:
-    """By the samples in their order, whatever gaps are between them: gaps only make them whiter."""
-    if values.size < FEWEST or float(np.sqrt(np.mean(np.square(values)))) <= ROUNDING * size:
+def _in_order(part: _Part, values: FloatArray) -> Laid:
+    """The residuals one after the other; laid out anew only where samples are missing."""
+    steps = np.diff(part.times)
+    if steps.size and np.ptp(steps) > _EVEN * steps[0]:
+        return laid_out(part.times, values)
+    return Laid(part.times, values, np.ones(values.size, dtype=np.bool_), 1.0, is_regular=True)
+
+
+def _is_coloured(laid: Laid, size: float) -> bool:
+    n = np.count_nonzero(laid.present)
+    if n < FEWEST or float(np.sqrt(laid.values @ laid.values / n)) <= ROUNDING * size:
         return False
-    one_by_one = Laid(values, values, np.ones(values.size, dtype=np.bool_), 1.0, is_regular=False)
-    return chi_squared_tail(one_by_one.lags, whiteness(one_by_one).statistic) < _CHANCE
+    return chi_squared_tail(laid.lags, whiteness(laid).statistic) < _CHANCE
 
 
-def _with_colour(laid: Laid, columns: FloatArray) -> FloatArray:
-    """SᵀRS of one series; R of what a first-order recursion leaves, coloured again by it."""
+def _with_colour(laid: Laid, columns: FloatArray) -> Coloured:
+    """Of one series SᵀRS; R of what a first-order recursion leaves, coloured again by it."""
     spread = np.zeros((columns.shape[1], laid.values.size))
     spread[:, laid.present] = columns.T
     both = laid.present[1:] & laid.present[:-1]
     before, after = laid.values[:-1][both], laid.values[1:][both]
-    pole = float(np.clip(before @ after / (before @ before), -_STEEPEST, _STEEPEST))
+    found = float(before @ after / (before @ before))
+    pole = min(max(found, -_STEEPEST), _STEEPEST)
     left = np.where(both, laid.values[1:] - pole * laid.values[:-1], 0.0)
     colour = colour_of(left, both)
     frequency = np.linspace(0.0, np.pi, colour.size)
     colour /= np.abs(1.0 - pole * np.exp(-1j * frequency))
     moved = rfft(spread, 2 * (colour.size - 1), axis=1) * colour
-    return np.asarray((moved @ moved.conj().T).real)
+    slow = max(pole, 0.0)
+    samples = np.count_nonzero(laid.present) * (1.0 - slow) / (1.0 + slow)
+    return Coloured(np.asarray((moved @ moved.conj().T).real), samples, found > _STEEPEST)

@@ -29,9 +29,9 @@ from sysid.groups import Block, blocks, written
 from sysid.islands.archipelago import loss_scale
 from sysid.problem import Problem
 from sysid.pulls import AT_BOUND, Pull, pulls
-from sysid.result import Criteria, Estimate, EstimateStatus, Uncertainty
+from sysid.result import Criteria, Estimate, EstimateStatus, NoiseColour, Uncertainty
 from sysid.sensitivities import BudgetSpentError, Sensitivities, sensitivities
-from sysid.serial import coloured_middle
+from sysid.serial import Coloured, coloured
 from sysid.symmetries import scalings
 from sysid.translations import translations
 from sysid.types import BoolArray, FloatArray
@@ -41,6 +41,39 @@ _SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
 # Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
 # about, and of one that has no effect at all, which is known to many digits.
 _WEAK_MEMBER, NULL_MEMBER = 0.05, 1e-5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linear:
+    """The sum of squares that linear outputs would have around an estimate.
+
+    A parameter on a plateau is held: from plateau to plateau the outputs are no line.
+
+    Attributes
+    ----------
+    covariance : FloatArray, shape (D, D)
+        s²(SᵀS)⁻¹, whatever the colour of the residuals; 0 for those held.
+    root : FloatArray, shape (k, D)
+        With abs(root · move)² = abs(S · move)².
+    slope : FloatArray, shape (D,)
+        Sᵀe of those at a bound that the data pull beyond it; 0 for the others.
+    error : float
+        Σe².
+    share : FloatArray, shape (D,)
+        Variance by s²(SᵀS)⁻¹ over the one stated; nan for those held and for those not told.
+    """
+
+    covariance: FloatArray
+    root: FloatArray
+    slope: FloatArray
+    error: float
+    share: FloatArray
+
+    def excess(self, moves: FloatArray) -> FloatArray:
+        """By what part of itself the sum grows for moves (P, D) of the parameters, (P,)."""
+        gains = np.einsum("pk,pk->p", moves @ self.root.T, moves @ self.root.T)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray((gains + 2.0 * moves @ self.slope) / self.error)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +99,8 @@ class Analysis:
     criteria: Criteria
     pulls: tuple[Pull, ...] = ()
     """Bounds that hold parameters back, the costliest first."""
+    linear: Linear | None = None
+    """None where there is no uncertainty or the loss is not that of squares."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,8 +165,8 @@ def _analysed(
     kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
     kept[d - known :] = False
     inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
-    middle = coloured_middle(problem, _influence(error, loss_scale(problem)), columns)
-    covariance, noise = _covariance(error, columns, inverse, loss_scale(problem), middle)
+    colour = coloured(problem, influence, columns)
+    covariance, noise = _covariance(error, columns, inverse, loss_scale(problem), colour)
     member = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | np.any(powers != 0.0, axis=0)
     member |= np.any(shifts != 0.0, axis=0)
     spread = np.sqrt(np.maximum(np.einsum("id,de,ie->i", rows, covariance, rows), 0.0))
@@ -147,12 +182,12 @@ def _analysed(
         condition=float(singular[0] / singular[-1]) if kept.all() else float("inf"),
         singular_values=singular,
         noise_sd=noise,
-        is_coloured=middle is not None,
+        noise_colour=_named(colour),
         groups=tuple(g for one in found for g in written(one, names, theta, scale, physical)),
     )
     statuses = _statuses(place, found, [p.name for p in pulled], problem)
     told = Known(
-        theta, statuses, physical, student_95(n - d), member,
+        theta, statuses, physical, student_95(_degrees(n, d, colour)), member,
         uncertainty.groups, rows[~kept], scale,
     )  # fmt: skip
     estimates = estimates_of(problem, told)
@@ -160,7 +195,41 @@ def _analysed(
     estimates = tuple(_on_one_side(e) if e.name in jumps else e for e in estimates)
     moved = {p.name: by for p, by in zip(problem.space, aside * scale, strict=True) if by}
     estimates = tuple(_centred(e, moved[e.name]) if e.name in moved else e for e in estimates)
-    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, pulled)
+    linear = _linear(error, columns, plateau > 0, place, inverse, covariance, scale)
+    robust = loss_scale(problem) > 0
+    return Analysis(
+        estimates, uncertainty, min(gain, 1.0), count, criteria, pulled, None if robust else linear
+    )
+
+
+def _linear(
+    error: FloatArray, columns: FloatArray, held: BoolArray, place: FloatArray,
+    inverse: FloatArray, covariance: FloatArray, scale: FloatArray,
+) -> Linear:  # fmt: skip
+    """The linear model of the output, in the parameters' units.
+
+    `inverse` and the stated `covariance` are those of the places.
+    """
+    n, d = columns.shape
+    total = float(error @ error)
+    stated = np.diag(covariance)
+    told = (stated > 0) & ~held
+    share = np.where(told, total / (n - d) * np.diag(inverse), np.nan) / np.where(told, stated, 1.0)
+    sloping = np.where(held, 0.0, columns)
+    singular, rows = np.linalg.svd(sloping, full_matrices=False)[1:]
+    kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
+    if held.any():
+        inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
+    slope = sloping.T @ error
+    leads_out = ((place < AT_BOUND) & (slope > 0)) | ((place > 1.0 - AT_BOUND) & (slope < 0))
+    unit = np.where(scale > 0, scale, 1.0)
+    return Linear(
+        covariance=total / (n - d) * inverse * np.outer(scale, scale),
+        root=singular[:, None] * rows / unit,
+        slope=np.where(leads_out, slope, 0.0) / unit,
+        error=total,
+        share=share,
+    )
 
 
 def criteria_of(error: FloatArray, parameters: int) -> Criteria:
@@ -239,24 +308,33 @@ def _possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray
 
 def _covariance(
     error: FloatArray, columns: FloatArray, inverse: FloatArray, scale: float,
-    middle: FloatArray | None,
+    colour: Coloured | None,
 ) -> tuple[FloatArray, float]:  # fmt: skip
-    """Covariance of the places, and the standard deviation of the noise.
-
-    `middle` is that of the sandwich where the residuals are coloured.
-    """
+    """Covariance of the places, and the standard deviation of the noise."""
     n, d = columns.shape
+    widening = n / (n - d) if colour is None else colour.samples / _degrees(n, d, colour)
     if scale == 0.0:
         variance = float(error @ error) / (n - d)
-        if middle is not None:
-            return n / (n - d) * inverse @ middle @ inverse, float(np.sqrt(variance))
+        if colour is not None:
+            return widening * inverse @ colour.middle @ inverse, float(np.sqrt(variance))
         return variance * inverse, float(np.sqrt(variance))
     influence = _influence(error, scale)
     share = 1.0 / np.sqrt(1.0 + (error / scale) ** 2)
     bread = np.linalg.pinv((columns.T * share**3) @ columns, rcond=RANK**2, hermitian=True)
-    filling = (columns.T * influence**2) @ columns if middle is None else middle
+    filling = (columns.T * influence**2) @ columns if colour is None else colour.middle
     noise = 1.4826 * median(np.abs(error))  # of the bulk, not of the outliers
-    return n / (n - d) * bread @ filling @ bread, noise
+    return widening * bread @ filling @ bread, noise
+
+
+def _degrees(n: int, d: int, colour: Coloured | None) -> float:
+    """Degrees of freedom of the t distribution; of coloured residuals one at least."""
+    return float(n - d) if colour is None else max(colour.samples - d, 1.0)
+
+
+def _named(colour: Coloured | None) -> NoiseColour:
+    if colour is None:
+        return "white"
+    return "drifting" if colour.drifts else "coloured"
 
 
 def _statuses(

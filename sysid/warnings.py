@@ -1,12 +1,14 @@
 """What a user should be told about a result, in whole sentences."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from sysid.islands.archipelago import of_island
 from sysid.kernels.demand import is_difference, lags
 from sysid.problem import Problem
 from sysid.residuals import ResidualTests
-from sysid.result import Estimate, Group, Uncertainty
+from sysid.result import Estimate, Group, NoiseColour, Uncertainty
 from sysid.settings import GeneticAlgorithm
 from sysid.ties import names_in
 from sysid.types import FloatArray
@@ -19,6 +21,13 @@ _SEPARABLE = 2.0  # standard errors: a lag on a ridge that is less than that
 _VAGUE = 0.5  # of its value: standard error of a group of which next to nothing is known
 _CHANCE = 1e-3  # that a true model's residuals look as little white: below, it is worth a sentence
 _ROUNDING = 1e-9  # of the output: below, the residual is rounding and has no optimum
+
+_ALLOWED: Mapping[NoiseColour, str] = {
+    "white": "the standard errors are too small",
+    "coloured": "the standard errors allow for the colour of the residuals, not for what the model "
+    "lacks",
+    "drifting": "the residuals drift over the whole record, so the standard errors are too small",
+}
 
 
 def warnings_of(
@@ -47,8 +56,7 @@ def warnings_of(
     if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING * problem.output_scale:
         found.append(_not_an_optimum(algorithm, analysis.possible_gain))
     elif tests is not None and lagged:
-        allowed = analysis.uncertainty is not None and analysis.uncertainty.is_coloured
-        found += _coloured(tests, lagged, allowed)
+        found += _coloured(tests, lagged, analysis.uncertainty)
     return tuple(found)
 
 
@@ -200,7 +208,9 @@ def _is_vague_lag(estimate: Estimate) -> bool:
     return estimate.stderr is not None and abs(estimate.value) < _SEPARABLE * estimate.stderr
 
 
-def _coloured(tests: ResidualTests, lagged: set[str], allowed: bool) -> list[str]:
+def _coloured(
+    tests: ResidualTests, lagged: set[str], uncertainty: Uncertainty | None
+) -> list[str]:
     """Residuals that are clearly not white: the model lacks something, most often an order.
 
     A lag makes up for an order that is missing. Of whether the tests are passed the result tells
@@ -208,15 +218,11 @@ def _coloured(tests: ResidualTests, lagged: set[str], allowed: bool) -> list[str
     """
     if all(one.kind != "whiteness" or one.p is None or one.p > _CHANCE for one in tests.tests):
         return []
-    errors = (
-        "the standard errors allow for the colour of the residuals, not for what the model lacks"
-        if allowed
-        else "the standard errors are too small"
-    )
+    colour = "white" if uncertainty is None else uncertainty.noise_colour
     return [
         f"the residuals are not white (on the {tests.data} data): something of the dynamics is "
         f"not in the model, the estimate of {', '.join(sorted(lagged))} depends on the order of "
-        f"the model, and {errors}"
+        f"the model, and {_ALLOWED[colour]}"
     ]
 
 

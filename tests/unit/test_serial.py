@@ -50,21 +50,21 @@ def test_the_standard_error_of_a_mean_is_that_of_its_long_run_variance(pole: flo
     found = [level(coloured(N, pole, seed)) for seed in range(20)]
     theory = np.sqrt((1 + pole) / (1 - pole) / N)
     assert np.mean([standard_error(one) for one in found]) == pytest.approx(theory, rel=0.15)
-    assert all(one.uncertainty and one.uncertainty.is_coloured for one in found)
+    assert all(one.uncertainty and one.uncertainty.noise_colour == "coloured" for one in found)
 
 
 def test_of_white_residuals_the_covariance_is_the_plain_one() -> None:
     noise = np.random.default_rng(3).standard_normal(N)
     found = level(noise)
     assert found.uncertainty is not None
-    assert not found.uncertainty.is_coloured
+    assert found.uncertainty.noise_colour == "white"
     assert standard_error(found) == pytest.approx(np.std(noise[1:], ddof=1) / np.sqrt(N - 1))
 
 
 def test_one_step_ahead_residuals_keep_the_plain_covariance() -> None:
     found = level(coloured(N, POLE, 0), prediction="one-step")
     assert found.uncertainty is not None
-    assert not found.uncertainty.is_coloured
+    assert found.uncertainty.noise_colour == "white"
 
 
 def test_a_robust_loss_is_allowed_for_as_squares_are() -> None:
@@ -79,7 +79,25 @@ def test_two_equal_halves_give_what_the_halves_say_together() -> None:
     one = Record((Channel("u", times, times),), (Channel("y", times, noise),))
     both = Problem.build(load_model(STEADY), [one, replace(one)], skip=1)
     joint = standard_error(analyse(both, np.array([np.mean(noise[1:])])))
-    assert joint == pytest.approx(standard_error(level(noise)) / np.sqrt(2), rel=1e-3)
+    assert joint == pytest.approx(standard_error(level(noise)) / np.sqrt(2), rel=5e-3)
+
+
+def test_residuals_that_wander_over_the_whole_record_are_told_as_such() -> None:
+    wandering = np.cumsum(np.random.default_rng(0).standard_normal(N)) / 20
+    found = level(wandering - np.mean(wandering)).uncertainty
+    assert found is not None
+    assert found.noise_colour == "drifting"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("pole", "n"), [(0.9, 100), (0.5, 100), (0.0, 40)])
+def test_the_interval_of_a_mean_holds_it_in_short_records(pole: float, n: int) -> None:
+    held = 0
+    for seed in range(200):
+        estimate = level(coloured(n, pole, seed)).estimates[0]
+        assert estimate.interval95 is not None
+        held += estimate.interval95[0] <= 0.0 <= estimate.interval95[1]
+    assert held >= 0.87 * 200
 
 
 @pytest.mark.slow
