@@ -61,14 +61,16 @@ def floor(problem: Problem, theta: FloatArray) -> Floor:
     powers = scalings(problem.model, problem.all_parameters)
     shifts, _ = translations(problem, theta, found.columns, scale)
     columns, known = without_symmetries(found.columns, np.vstack([powers * theta, shifts]) / scale)
-    singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
+    n, d = columns.shape
+    # Rows of zeros make the directions complete where there are fewer samples than parameters.
+    square = np.vstack([columns, np.zeros((max(d - n, 0), d))])
+    singular, rows = np.linalg.svd(square, full_matrices=False)[1:]
     kept = singular > RANK * max(float(singular[0]), np.finfo(float).tiny)
-    kept[theta.size - known :] = False
+    kept[d - known :] = False
     variance = np.sum((rows[kept] / singular[kept, None]) ** 2, axis=0)
     untold = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | found.one_sided
     untold |= np.any(powers != 0.0, axis=0) | np.any(shifts != 0.0, axis=0) | (found.plateau > 0)
     stderr = np.where(untold, np.inf, np.sqrt(variance) * np.abs(scale))
-    n = columns.shape[0]
     return Floor(
         tuple(p.name for p in problem.space), stderr,
         float(np.sqrt(np.count_nonzero(kept) / n)), n,

@@ -72,3 +72,41 @@ def test_weights_that_are_not_one_are_refused():
     weighted = Problem.build(model, [record], weights={"y": 1.0, "z": 2.0})
     with pytest.raises(InvalidSettings, match="weight 1"):
         floor(weighted, np.array([2.0, 1.0]))
+
+
+LAGGED = {
+    "name": "lagged", "form": "differential", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "parameters": {
+        "K": {"lower": 0.1, "upper": 10}, "T": {"lower": 0.1, "upper": 10, "unit": "s"},
+        "L": {"lower": 0, "upper": 1, "unit": "s"}, "y0": {"lower": -1, "upper": 1},
+    },
+    "equations": {"x": "(K*u(t - L) - x)/T"}, "outputs": {"y": "x + y0"},
+    "initial": {"x": {"lower": -1, "upper": 1}},
+}  # fmt: skip
+
+
+def few(samples: int, document=LAGGED) -> Problem:
+    times = 2.0 * np.arange(samples)
+    signals = Channel("u", times, np.where(times > 0.5, 1.0, 0.0)), Channel("y", times, times)
+    return Problem.build(
+        parse_model(document), [Record(signals[:1], signals[1:])], weights={"y": 1.0}
+    )
+
+
+@pytest.mark.parametrize("samples", [2, 3])
+def test_fewer_samples_than_parameters_tell_none_of_those_they_mix(samples):
+    found = floor(few(samples), np.array([0.5, 1.0, 0.3, 0.1, 0.2]))
+    assert found.samples == samples
+    assert found.response <= 1.0
+    assert np.isinf(found.stderr).all()
+
+
+def test_what_few_samples_tell_by_itself_keeps_its_floor():
+    document = {**LINE, "inputs": {}, "outputs": {"y": "a + b*c*0 + x"},
+                "parameters": {**LINE["parameters"], "c": {"lower": 0.1, "upper": 10}}}  # fmt: skip
+    times = np.array([0.0, 1.0])
+    record = Record((), (Channel("y", times, np.ones(2)),))
+    posed = Problem.build(parse_model(document), [record], weights={"y": 1.0})
+    found = dict(zip(["a", "b", "c"], floor(posed, np.array([1.0, 1.0, 2.0])).stderr, strict=True))
+    assert found["a"] == pytest.approx(np.sqrt(1 / 2), rel=1e-6)
+    assert np.isinf([found["b"], found["c"]]).all()
