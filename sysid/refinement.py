@@ -12,13 +12,13 @@ from sysid.kernels.evaluation import partial_predictions
 from sysid.kernels.evaluator import Evaluator
 from sysid.least_squares import TRIED, Loss, solve
 from sysid.problem import Problem
+from sysid.pulls import AT_BOUND
 from sysid.types import FloatArray, IntArray
 
 _SAME = 1e-3  # of the range: nearer champions lie in one valley
 _DIFFERENCE = 1e-6  # of the range
 _STEPS = 60
 _LONG = 2_000_000  # measured values times parameters: from here on, few starts and steps
-_AT_BOUND = 1e-6
 _ENDS = 3  # simulations of a start and of an end, besides the steps
 
 
@@ -141,7 +141,7 @@ class _LeastSquares:
 
     def best(self, place: FloatArray) -> tuple[FloatArray, float]:
         """The solution, moved onto a bound that it only approaches if that is not worse."""
-        snapped = np.where(place < _AT_BOUND, 0.0, np.where(place > 1 - _AT_BOUND, 1.0, place))
+        snapped = np.where(place < AT_BOUND, 0.0, np.where(place > 1 - AT_BOUND, 1.0, place))
         theta = located(self.problem.evaluator, np.vstack([snapped, place]))
         values = self.problem.fitness(theta)
         self.evaluations += 2
