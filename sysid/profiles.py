@@ -11,6 +11,9 @@ With the soft-l1 loss its sum R stands in place of S, and the ratio is scaled so
 one of χ²: by R₀ ΣK / (n Σψ²), ψ and K as in `sysid.uncertainty` (the ratio test of an M-estimator,
 Hampel et al. 1986, ch. 7), which is 1 where no residual is an outlier.
 
+Where the residuals are coloured the ratio is divided by how much wider that makes the square of the
+interval (`sysid.serial`), so that profile and standard error mean the same noise.
+
 The others are found by least squares from a neighbour: a lag that is rounded to samples, whose
 output moves in jumps only, stays as it is while another parameter is profiled.
 """
@@ -26,10 +29,8 @@ from sysid.islands.archipelago import loss_scale
 from sysid.problem import Problem
 from sysid.refinement import Refined, refine
 from sysid.sensitivities import sensitivities
+from sysid.serial import QUANTILE, coloured
 from sysid.types import FloatArray
-
-QUANTILE = 3.841458820694124
-"""95 % of χ² with one degree of freedom."""
 
 _SPAN = 1.5  # of the half width that the covariance promises: where the outermost value lies
 _BEYOND = 1.3  # growth of a step that does not reach the threshold, and how often
@@ -48,7 +49,7 @@ class Profile:
     values : FloatArray, shape (V,)
         Rising; the estimate among them.
     ratio : FloatArray, shape (V,)
-        n ln(S(v)/S₀), S₀ the least sum of all; 0 at the best value. ``inf``: it diverges.
+        n ln(S(v)/S₀), scaled, S₀ the least sum of all; 0 at the best value. ``inf``: it diverges.
     rms : FloatArray, shape (V,)
     others : FloatArray, shape (V, D - 1)
         The other free parameters, in the problem's order.
@@ -186,16 +187,31 @@ class _Walk:
     def _half_width(self, theta: FloatArray) -> float:
         """What the covariance promises, at most the range and at least what can be told apart."""
         columns, error = (sensed := sensitivities(self._problem, theta)).columns, sensed.error
-        self._factor = _factor(error, loss_scale(self._problem))
         self.evaluations += sensed.evaluations
+        direction = np.zeros(columns.shape[1])
+        direction[self._d] = 1.0
         others = np.delete(columns, self._d, axis=1)
-        own = columns[:, self._d]
         if others.shape[1]:
-            own = own - others @ np.linalg.lstsq(others, own, rcond=1e-7)[0]
-        slope = float(np.linalg.norm(own))
+            made_up = np.linalg.lstsq(others, columns[:, self._d], rcond=1e-7)[0]
+            direction[np.arange(direction.size) != self._d] = -made_up
+        own = columns @ direction
+        norm = float(own @ own)
+        self._factor = self._scaling(error, columns, direction, norm)
         spread = float(np.linalg.norm(error)) / np.sqrt(max(error.size - columns.shape[1], 1))
-        wide = np.sqrt(QUANTILE) * spread / slope if slope > 0 else 1.0
+        wide = np.sqrt(QUANTILE / (norm * self._factor)) * spread if norm > 0 else 1.0
         return float(min(max(wide, 1e-9), 1.0))
+
+    def _scaling(
+        self, error: FloatArray, columns: FloatArray, direction: FloatArray, norm: float
+    ) -> float:
+        """What makes n ln(R/R₀) a ratio of χ², also where the residuals are coloured."""
+        scale = loss_scale(self._problem)
+        seen = error if scale == 0.0 else error / np.sqrt(1.0 + (error / scale) ** 2)
+        colour = coloured(self._problem, seen, columns)
+        factor = _factor(error, scale)
+        if colour is None or not norm > 0:
+            return factor
+        return factor / colour.widening(direction, float(np.mean(np.square(seen))), norm)
 
     def _is_over(self, place: float, taken: int, count: int) -> bool:
         self.stopped = self.stopped or bool(self._should_stop and self._should_stop())

@@ -19,13 +19,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.fft import rfft
 
-from sysid.distributions import chi_squared_tail
+from sysid.distributions import chi_squared_tail, student_95
 from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, laid_out, whiteness
 from sysid.problem import Problem
 from sysid.types import FloatArray
 
 _CHANCE = 1e-3
 """That white residuals look as little white: below, they are taken for coloured."""
+
+QUANTILE = 3.841458820694124
+"""95 % of χ² with one degree of freedom."""
 
 _STEEPEST = 0.97
 """Of the recursion (Andrews and Monahan 1992): one nearer 1 would follow a single drift."""
@@ -42,6 +45,25 @@ class Coloured(NamedTuple):
     middle: FloatArray
     samples: float
     drifts: bool
+
+    @property
+    def degrees(self) -> float:
+        """Degrees of freedom of the t distribution: those of white samples, one at least."""
+        return max(self.samples - self.middle.shape[0], 1.0)
+
+    def widening(self, direction: FloatArray, power: float, norm: float) -> float:
+        """Square of how much wider than of white residuals an interval of one parameter is.
+
+        Parameters
+        ----------
+        direction : FloatArray, shape (D,)
+            Combination of the sensitivities that the other parameters cannot make up for.
+        power, norm : float
+            Mean square of the residuals; sum of squares of that combination.
+        """
+        told = float(direction @ self.middle @ direction) / (power * norm)
+        reach = student_95(self.degrees) ** 2 / QUANTILE
+        return float(told * reach * self.samples / self.degrees)
 
 
 class _Part(NamedTuple):

@@ -27,6 +27,7 @@ from sysid.estimates import Known, estimates_of
 from sysid.ga.chromosome import placed
 from sysid.groups import Block, blocks, written
 from sysid.islands.archipelago import loss_scale
+from sysid.linear import Linear, linear_model
 from sysid.problem import Problem
 from sysid.pulls import AT_BOUND, Pull, pulls
 from sysid.result import Criteria, Estimate, EstimateStatus, NoiseColour, Uncertainty
@@ -41,39 +42,6 @@ _SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
 # Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
 # about, and of one that has no effect at all, which is known to many digits.
 _WEAK_MEMBER, NULL_MEMBER = 0.05, 1e-5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Linear:
-    """The sum of squares that linear outputs would have around an estimate.
-
-    A parameter on a plateau is held: from plateau to plateau the outputs are no line.
-
-    Attributes
-    ----------
-    covariance : FloatArray, shape (D, D)
-        s²(SᵀS)⁻¹, whatever the colour of the residuals; 0 for those held.
-    root : FloatArray, shape (k, D)
-        With abs(root · move)² = abs(S · move)².
-    slope : FloatArray, shape (D,)
-        Sᵀe of those at a bound that the data pull beyond it; 0 for the others.
-    error : float
-        Σe².
-    share : FloatArray, shape (D,)
-        Variance by s²(SᵀS)⁻¹ over the one stated; nan for those held and for those not told.
-    """
-
-    covariance: FloatArray
-    root: FloatArray
-    slope: FloatArray
-    error: float
-    share: FloatArray
-
-    def excess(self, moves: FloatArray) -> FloatArray:
-        """By what part of itself the sum grows for moves (P, D) of the parameters, (P,)."""
-        gains = np.einsum("pk,pk->p", moves @ self.root.T, moves @ self.root.T)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray((gains + 2.0 * moves @ self.slope) / self.error)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,6 +69,8 @@ class Analysis:
     """Bounds that hold parameters back, the costliest first."""
     linear: Linear | None = None
     """None where there is no uncertainty or the loss is not that of squares."""
+    is_cut_short: bool = False
+    """Whether minima beside the estimate were not looked for because the time was over."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,41 +165,11 @@ def _analysed(
     estimates = tuple(_on_one_side(e) if e.name in jumps else e for e in estimates)
     moved = {p.name: by for p, by in zip(problem.space, aside * scale, strict=True) if by}
     estimates = tuple(_centred(e, moved[e.name]) if e.name in moved else e for e in estimates)
-    linear = _linear(error, columns, plateau > 0, place, inverse, covariance, scale)
-    robust = loss_scale(problem) > 0
-    return Analysis(
-        estimates, uncertainty, min(gain, 1.0), count, criteria, pulled, None if robust else linear
-    )
-
-
-def _linear(
-    error: FloatArray, columns: FloatArray, held: BoolArray, place: FloatArray,
-    inverse: FloatArray, covariance: FloatArray, scale: FloatArray,
-) -> Linear:  # fmt: skip
-    """The linear model of the output, in the parameters' units.
-
-    `inverse` and the stated `covariance` are those of the places.
-    """
-    n, d = columns.shape
-    total = float(error @ error)
-    stated = np.diag(covariance)
-    told = (stated > 0) & ~held
-    share = np.where(told, total / (n - d) * np.diag(inverse), np.nan) / np.where(told, stated, 1.0)
-    sloping = np.where(held, 0.0, columns)
-    singular, rows = np.linalg.svd(sloping, full_matrices=False)[1:]
-    kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
-    if held.any():
-        inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
-    slope = sloping.T @ error
-    leads_out = ((place < AT_BOUND) & (slope > 0)) | ((place > 1.0 - AT_BOUND) & (slope < 0))
-    unit = np.where(scale > 0, scale, 1.0)
-    return Linear(
-        covariance=total / (n - d) * inverse * np.outer(scale, scale),
-        root=singular[:, None] * rows / unit,
-        slope=np.where(leads_out, slope, 0.0) / unit,
-        error=total,
-        share=share,
-    )
+    linear = None
+    if loss_scale(problem) == 0.0:
+        stated = np.diag(covariance)
+        linear = linear_model(error, columns, plateau > 0, place, stated, scale, RANK)
+    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, pulled, linear)
 
 
 def criteria_of(error: FloatArray, parameters: int) -> Criteria:
@@ -327,8 +267,8 @@ def _covariance(
 
 
 def _degrees(n: int, d: int, colour: Coloured | None) -> float:
-    """Degrees of freedom of the t distribution; of coloured residuals one at least."""
-    return float(n - d) if colour is None else max(colour.samples - d, 1.0)
+    """Degrees of freedom of the t distribution."""
+    return float(n - d) if colour is None else colour.degrees
 
 
 def _named(colour: Coloured | None) -> NoiseColour:

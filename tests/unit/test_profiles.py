@@ -7,9 +7,10 @@ from sysid.errors import InvalidRecord, InvalidSettings
 from sysid.models.library import load_model
 from sysid.models.spec import parse_model
 from sysid.problem import Problem
-from sysid.profiles import QUANTILE, profile
+from sysid.profiles import profile
 from sysid.records import Channel, Record
 from sysid.refinement import refine
+from sysid.serial import QUANTILE
 from sysid.settings import Loss
 from sysid.types import FloatArray
 from sysid.uncertainty import analyse
@@ -18,8 +19,13 @@ from tests.searching import DUFFING, STEP, example, noisy, record
 TRUTH = np.array([DUFFING[name] for name in ("c", "L", "b", "a")])
 
 
-def linear(n: int = 400, sd: float = 0.3, **bounds: float) -> tuple[Problem, FloatArray]:
-    """A straight line in sin and cos of the sample number, and its estimate."""
+def linear(
+    n: int = 400, sd: float = 0.3, pole: float = 0.0, **bounds: float
+) -> tuple[Problem, FloatArray]:
+    """A straight line in sin and cos of the sample number, and its estimate.
+
+    With a `pole` the input and the noise are of the first order.
+    """
     rng = np.random.default_rng(5)
     times = 0.1 * np.arange(n)
     interval = {"lower": -5.0, "upper": 5.0} | bounds
@@ -30,7 +36,11 @@ def linear(n: int = 400, sd: float = 0.3, **bounds: float) -> tuple[Problem, Flo
         "initial": {"x": 0},
     })  # fmt: skip
     u = rng.standard_normal(n)
-    y = u + 0.5 * np.sin(np.arange(n)) + 0.5 * u + sd * rng.standard_normal(n)
+    noise = rng.standard_normal(n)
+    for k in range(1, n if pole else 0):
+        u[k] += pole * u[k - 1]
+        noise[k] += pole * noise[k - 1]
+    y: FloatArray = u + 0.5 * np.sin(np.arange(n)) + 0.5 * u + sd * noise
     data = Record((Channel("u", times, u),), (Channel("y", times, y),))
     problem = Problem.build(model, [data], skip=1)
     end = refine(problem, [np.array([0.5, 0.5])])[0]
@@ -47,6 +57,22 @@ def test_where_the_model_is_linear_the_interval_is_that_of_the_t_distribution(na
     assert estimate.stderr is not None
     for end, expected in zip(found.interval, estimate.interval95, strict=True):
         assert end == pytest.approx(expected, abs=0.02 * estimate.stderr)
+
+
+@pytest.mark.parametrize("name", ["p", "q"])
+def test_where_the_residuals_are_coloured_profile_and_standard_error_mean_the_same(
+    name: str,
+) -> None:
+    problem, theta = linear(pole=0.8)
+    analysis = analyse(problem, theta)
+    assert analysis.uncertainty is not None
+    assert analysis.uncertainty.noise_colour == "coloured"
+    [estimate] = [e for e in analysis.estimates if e.name == name]
+    found = profile(problem, theta, name)
+    assert estimate.interval95 is not None
+    assert estimate.stderr is not None
+    for end, expected in zip(found.interval, estimate.interval95, strict=True):
+        assert end == pytest.approx(expected, abs=0.05 * estimate.stderr)
 
 
 def test_the_ratio_is_that_of_the_sums_of_squares_with_the_others_at_their_best() -> None:
