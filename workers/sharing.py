@@ -6,7 +6,8 @@ The rules, in this order (`docs/decisions/0017-who-goes-next.md`):
 2. A job's first `HEADSTART_SECONDS` of compute go before the work of those that had theirs, so a
    single identification does not wait for a sweep. A project that had so much more than another
    one loses this privilege until that one has caught up.
-3. Projects share equally, and the jobs of a project share its part equally.
+3. Projects share equally, and the jobs of a project share its part equally. What a project had
+   more than the others stays known while it has no jobs, until these have caught up.
 4. Every sixteenth pack goes to the job that has waited longest, whatever the rules above say:
    nobody starves.
 """
@@ -22,6 +23,9 @@ HEADSTART_SECONDS = 30.0
 
 MOST_SAVED_SECONDS = 2 * HEADSTART_SECONDS
 """Nobody falls further behind than this: unused time is not saved for later."""
+
+MOST_ABSENT = 1000
+"""Projects without jobs whose accounts are kept: those that are furthest ahead."""
 
 PATIENT_TURN = 16
 """Each so many packs, one goes to who has waited longest."""
@@ -60,18 +64,33 @@ class Shares(Generic[Key]):
     _packs: int = 0
 
     def enter(self, job: Key, *, priority: int = 0, project: str = "") -> None:
-        """Open an account: nobody begins ahead of those who are here, or behind them."""
-        active = {one.project for one in self._jobs.values()}
-        if project not in active:
-            floor = min((self._projects[name].level for name in active), default=0.0)
-            self._projects[project] = _Account(floor)
+        """Open an account: nobody begins ahead of those who are here, or behind them.
+
+        A project that comes back goes on with its own: else one job after another, each within
+        its head start, would always begin anew.
+        """
+        floor = self._floor()
+        account = self._projects.setdefault(project, _Account(floor))
+        account.level = max(account.level, floor)
         self._jobs[job] = _Member(priority=priority, project=project, served=self._packs)
 
     def leave(self, job: Key) -> None:
-        """Close the account of a job that has ended."""
-        project = self._jobs.pop(job).project
-        if all(one.project != project for one in self._jobs.values()):
-            del self._projects[project]
+        """Close the account of a job that has ended.
+
+        That of its project stays while it is ahead of a project with jobs.
+        """
+        del self._jobs[job]
+        active, floor = self._active(), self._floor()
+        ahead = sorted(
+            (name for name in self._projects.keys() - active if self._projects[name].level > floor),
+            key=lambda name: (-self._projects[name].level, name),
+        )
+        kept = active | set(ahead[:MOST_ABSENT]) if active else set()
+        self._projects = {name: one for name, one in self._projects.items() if name in kept}
+
+    def __len__(self) -> int:
+        """Number of projects whose accounts are kept."""
+        return len(self._projects)
 
     def project_of(self, job: Key) -> str:
         """The project that a job belongs to."""
@@ -125,8 +144,13 @@ class Shares(Generic[Key]):
             ordered.insert(0, patient)
         return ordered
 
+    def _active(self) -> set[str]:
+        """Projects with jobs."""
+        return {one.project for one in self._jobs.values()}
+
     def _floor(self) -> float:
-        return min((project.level for project in self._projects.values()), default=0.0)
+        """The least that a project with jobs has had."""
+        return min((self._projects[name].level for name in self._active()), default=0.0)
 
     def _rank(self, one: _Member, floor: float) -> Rank:
         privileged = self._projects[one.project].level - floor < HEADSTART_SECONDS

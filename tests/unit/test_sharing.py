@@ -6,7 +6,13 @@ from hypothesis import strategies as st
 
 from tests.simulated_crew import Theatre
 from workers.packing import PACK_SECONDS, PACKS_PER_CPU
-from workers.sharing import HEADSTART_SECONDS, MOST_SAVED_SECONDS, PATIENT_TURN, Shares
+from workers.sharing import (
+    HEADSTART_SECONDS,
+    MOST_ABSENT,
+    MOST_SAVED_SECONDS,
+    PATIENT_TURN,
+    Shares,
+)  # fmt: skip
 
 DELAY_SECONDS = 2.0
 """A single identification is delayed by no more than this."""
@@ -86,6 +92,49 @@ def test_a_project_cannot_get_more_by_cutting_its_sweep_into_short_jobs() -> Non
         theatre.step()
     cut = sum(theatre.had(f"cut{n}") for n in range(1, number + 1))
     assert cut - theatre.had("whole") <= HEADSTART_SECONDS + 5 * PACK_SECONDS
+
+
+@pytest.mark.parametrize("slots", [1, 2])
+@pytest.mark.parametrize("seconds", [3.0, 29.0, 45.0])
+def test_a_project_cannot_get_more_by_sending_short_jobs_one_after_another(
+    slots: int, seconds: float
+) -> None:
+    theatre = Theatre(slots)
+    theatre.add("sweep", 5 * SWEEP, 0.1, project="sweep")
+    number = 0
+    while theatre.crew.now < 600.0 / slots:
+        if len(theatre.feeder) < 2:  # the last one has ended, and its project has no job
+            number += 1
+            theatre.add(f"short{number}", int(10 * seconds), 0.1, project="short")
+        theatre.step()
+    short = sum(theatre.had(f"short{n}") for n in range(1, number + 1))
+    assert short - theatre.had("sweep") <= HEADSTART_SECONDS + 5 * PACK_SECONDS
+    assert theatre.had("sweep") - short <= 5 * PACK_SECONDS
+
+
+def test_what_a_project_had_is_forgotten_when_the_others_have_caught_up() -> None:
+    shares: Shares[str] = Shares()
+    shares.enter("sweep", project="sweep")
+    shares.enter("short", project="short")
+    shares.charge("short", 29.0)
+    shares.leave("short")
+    assert len(shares) == 2
+    shares.charge("sweep", 30.0)
+    shares.enter("other", project="other")
+    shares.leave("other")
+    assert len(shares) == 1
+    shares.leave("sweep")
+    assert len(shares) == 0
+
+
+def test_accounts_of_projects_without_jobs_are_bounded_in_number() -> None:
+    shares: Shares[int] = Shares()
+    shares.enter(-1, project="sweep")
+    for number in range(3 * MOST_ABSENT):
+        shares.enter(number, project=f"p{number}")
+        shares.charge(number, 1.0 + number % 7)
+        shares.leave(number)
+    assert len(shares) == MOST_ABSENT + 1
 
 
 def test_a_project_that_asked_for_little_cannot_save_the_rest_for_later() -> None:
