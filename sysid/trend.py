@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.distributions import student_95, student_tail
+from sysid.distributions import chi_squared_tail, student_95, student_tail
 from sysid.trend_laws import Law, fit_line, fit_power, rounding
 from sysid.types import FloatArray
 
@@ -22,6 +22,7 @@ LEAST_PLACES = 3
 
 _OUTLIER = 0.05  # of all batches without an outlier, the part that are told of one
 _DRIFT = 2.0 * (1.0 - NormalDist().cdf(3.0))  # outside three standard deviations
+_CHANCE = 0.05  # of batches whose errors are right, the part whose scatter these do not explain
 _NORMAL_95 = NormalDist().inv_cdf(0.975)
 _BAND_POINTS = 101
 _NEARLY_ONE = 1.0 - 1e-9
@@ -138,13 +139,6 @@ def half_width(law: Law) -> float:
     return _NORMAL_95 if law.birge <= 1.0 else student_95(law.degrees)
 
 
-def _tail(law: Law, z: float) -> float:
-    """Probability of a larger |z|, by the same distributions."""
-    if law.birge <= 1.0:
-        return 2.0 * NormalDist().cdf(-abs(z))
-    return student_tail(law.degrees, z)
-
-
 def _band(law: Law, x: FloatArray) -> tuple[Place, ...]:
     at = np.linspace(float(np.min(x)), float(np.max(x)), _BAND_POINTS)
     errors = law.widening * law.stated(at)
@@ -259,23 +253,38 @@ def _pooled(groups: Sequence[Sequence[Estimate]]) -> tuple[tuple[Estimate, ...],
 
 
 class Drift(NamedTuple):
-    """How far an estimate is from what a reference says, in standard errors of the difference."""
+    """How far an estimate is from what a reference says, in standard errors of the difference.
+
+    It has drifted where |z| is above `limit`.
+    """
 
     difference: float
     z: float
     has_drifted: bool
+    limit: float
+
+
+def drift_limit(law: Law | None = None, comparisons: int = 1) -> float:
+    """From how many standard errors on an estimate has drifted.
+
+    Three; of many comparisons more, so that a batch that has not changed is flagged as seldom as
+    one comparison would be (Bonferroni). Where the stated errors do not explain how the points
+    scatter about a law (χ², 5 %), their size is known from few points only: the limit is then
+    wider by as much as Student's 95 % interval is. Student's own tail that far out comes from
+    batches that happen to scatter little, and these have their stated errors.
+    """
+    limit = -NormalDist().inv_cdf(_DRIFT / (2.0 * comparisons))
+    if law is None or chi_squared_tail(law.degrees, law.chi_squared) >= _CHANCE:
+        return limit
+    return limit * student_95(law.degrees) / _NORMAL_95
 
 
 def drift(new: Estimate, old: Estimate, comparisons: int = 1) -> Drift:
-    """An estimate against that of a reference run.
-
-    Flagged beyond three standard errors; of many comparisons beyond more, so that a batch that
-    has not changed is flagged as seldom as one comparison would be (Bonferroni).
-    """
-    difference, error = new.value - old.value, sqrt(new.stderr**2 + old.stderr**2)
-    limit = -NormalDist().inv_cdf(_DRIFT / (2.0 * comparisons))
+    """An estimate against that of a reference run."""
+    difference, error = new.value - old.value, hypot(new.stderr, old.stderr)
+    limit = drift_limit(None, comparisons)
     z = _ratio(difference, error)
-    return Drift(difference, z, abs(z) > limit)
+    return Drift(difference, z, abs(z) > limit, limit)
 
 
 def drifts_from_law(
@@ -296,8 +305,9 @@ def drifts_from_law(
     with np.errstate(all="ignore"):
         told = predictions(law, x, stderr, at)
         known = (law.widening * law.stated(at)).tolist()
+    limit = drift_limit(law, comparisons)
     return tuple(
-        _drift_from(one, place, error, law, comparisons)
+        _drift_from(one, place, error, limit)
         for one, place, error in zip(new, told, known, strict=True)
     )
 
@@ -309,15 +319,15 @@ def drift_from_law(
     return drifts_from_law([new], law, x, stderr, np.array([at]), comparisons)[0]
 
 
-def _drift_from(new: Estimate, told: Place, known: float, law: Law, comparisons: int) -> Drift:
+def _drift_from(new: Estimate, told: Place, known: float, limit: float) -> Drift:
     if not (isfinite(told.value) and isfinite(told.stderr)):
-        return Drift(nan, nan, False)
+        return Drift(nan, nan, False, limit)
     # Its own error is the larger of what it says and what points of that batch scatter.
     scatter = sqrt(max(told.stderr**2 - known**2, 0.0))
     error = hypot(known, max(scatter, new.stderr))
     difference = new.value - told.value
     z = _ratio(difference, error)
-    return Drift(difference, z, _tail(law, z) < _DRIFT / comparisons)
+    return Drift(difference, z, abs(z) > limit, limit)
 
 
 def _ratio(difference: float, error: float) -> float:

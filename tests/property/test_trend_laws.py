@@ -13,6 +13,7 @@ from sysid.trend import (
     Estimate,
     drift,
     drift_from_law,
+    drift_limit,
     drifts_from_law,
     fit_trend,
     half_width,
@@ -234,6 +235,39 @@ def test_few_points_that_scatter_as_they_say_are_told_from_a_change_by_three_err
     for size, has_drifted in ((2.9, False), (3.1, True)):
         new = Estimate(10.0 + size * error, 0.1)
         assert drift_from_law(new, exact, X, np.full(5, 0.1), 30.0).has_drifted is has_drifted
+
+
+def test_of_five_points_a_gross_change_is_seen_whether_their_errors_are_right_or_not() -> None:
+    stderr = 0.02 * X
+    for understated in (1.0, 3.0):
+        draw, seen, false = np.random.default_rng(2), 0, 0
+        for _ in range(300):
+            y = 0.3 * X + 1.0 + understated * stderr * draw.normal(size=5)
+            law = fit_line(X, y, stderr)
+            new = [
+                Estimate(0.3 * x + 1.0 + understated * s * draw.normal(), s)
+                for x, s in zip(X, stderr, strict=True)
+            ]
+            found = drifts_from_law(new, law, X, stderr, X, comparisons=15)
+            false += any(one.has_drifted for one in found)
+            error = understated * stderr[3]
+            moved = Estimate(new[3].value + 15 * error, new[3].stderr)
+            seen += drift_from_law(moved, law, X, stderr, 40.0, comparisons=15).has_drifted
+        assert seen >= 0.95 * 300
+        assert false <= (0.01 if understated == 1 else 0.15) * 300
+
+
+def test_the_limit_is_three_and_moderately_more_for_many_comparisons_and_few_points() -> None:
+    right, wrong = (fit_line(X, 0.3 * X + np.array([0, 1, -1, 1, 0]), np.full(5, s))
+                    for s in (1.0, 0.2))  # fmt: skip
+    assert drift_limit() == pytest.approx(3.0)
+    assert drift_limit(right) == pytest.approx(3.0)
+    assert drift_limit(None, 15) == pytest.approx(-stats.norm.ppf(stats.norm.sf(3) / 15))
+    ratio = stats.t.ppf(0.975, 3) / stats.norm.ppf(0.975)
+    assert drift_limit(wrong, 15) == pytest.approx(ratio * drift_limit(right, 15))
+    assert drift_limit(wrong, 15) < 6.2
+    told = drift_from_law(Estimate(1.0, 0.1), wrong, X, np.full(5, 0.2), 20.0, 15)
+    assert told.limit == drift_limit(wrong, 15)
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3.5, 12, 400])
