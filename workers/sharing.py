@@ -24,7 +24,7 @@ HEADSTART_SECONDS = 30.0
 MOST_SAVED_SECONDS = 2 * HEADSTART_SECONDS
 """Nobody falls further behind than this: unused time is not saved for later."""
 
-MOST_ABSENT = 1000
+MOST_ABSENT = 256
 """Projects without jobs whose accounts are kept: those that are furthest ahead."""
 
 PATIENT_TURN = 16
