@@ -49,7 +49,7 @@ class Coloured(NamedTuple):
     @property
     def degrees(self) -> float:
         """Degrees of freedom of the t distribution: those of white samples, one at least."""
-        return max(self.samples - self.middle.shape[0], 1.0)
+        return max(self.samples - len(self.middle), 1.0)
 
     def widening(self, direction: FloatArray, power: float, norm: float) -> float:
         """Square of how much wider than of white residuals an interval of one parameter is.
