@@ -43,6 +43,17 @@ class Chain:
         first = number // self.stride % self.length == 0
         return None if first else number - self.stride
 
+    def of(self, number: int) -> int:
+        """Number of the chain of a run: chains are counted in the order of their first runs."""
+        block, place = divmod(number, self.stride * self.length)
+        return block * self.stride + place % self.stride
+
+    def numbers(self, chain: int) -> range:
+        """Numbers of the runs of a chain, in its order."""
+        block, place = divmod(chain, self.stride)
+        first = block * self.stride * self.length + place
+        return range(first, first + self.stride * self.length, self.stride)
+
 
 def _rank(axes: Sequence[Axis]) -> int:
     if any(axis.labels for axis in axes):

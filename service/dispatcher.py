@@ -110,6 +110,8 @@ class Dispatcher:
         for lease in self._feeder.step(STEP_SECONDS if has_time else 0.0):
             self._end(lease)
         for recorder in self._kept():
+            if not self._leases.is_sure(recorder.lease):
+                continue  # the heartbeat that waits, or the next one, tells whose it is
             try:
                 patiently(recorder.flush)
             except LeaseLost as error:
@@ -151,7 +153,9 @@ class Dispatcher:
     def _take(self, claim: Claim) -> None:
         source = JobRuns(self._database, claim, self._store)
         floors = patiently(partial(floors_for, self._database, claim, source))
-        recorder = patiently(partial(Recorder, self._database, claim, source.save, floors))
+        recorder = patiently(
+            partial(Recorder, self._database, claim, source.save, floors, source.failed)
+        )
         self._recorders[claim.lease] = recorder
         job = claim.job
         self._priorities[claim.lease] = job.priority

@@ -1,7 +1,7 @@
 """From a job's rows to specifications that workers can carry out."""
 
 import logging
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import islice
@@ -11,6 +11,7 @@ from service import models
 from service.cells import stored_cells, stored_groups
 from service.conversion import algorithm_of, loss_of
 from service.dispatch.checkpoints import unpacked
+from service.dispatch.open_chains import OpenChains
 from service.dispatch.signals import save_fit
 from service.dispatch.warm_starts import WarmStarts
 from service.errors import ServiceError
@@ -52,6 +53,8 @@ from workers.tasks import prepared
 _log = logging.getLogger(__name__)
 
 READ_AHEAD = 200
+TOGETHER = 64
+"""Runs of different chains that are read at a time."""
 KEPT_SAMPLES = 1_000_000
 """Of records that a job keeps in memory, 16 bytes each, besides those last asked for."""
 
@@ -84,38 +87,55 @@ class JobRuns:
         self._groups: list[Steps] | None = None
 
     def runs(self) -> Iterator[Coming]:
-        """The unfinished runs in order, each from its checkpoint if it has one."""
+        """The unfinished runs, each from its checkpoint if it has one.
+
+        In order; where runs wait for others in their chains, those come first that need not wait.
+        """
         try:
             checkpoints = patiently(self._checkpoints)
-            rows = self._following(-1)
-            while rows:
+            chains = patiently(self._warm.chains)
+            for rows in self._in_order() if chains is None else self._along(chains):
+                if not rows:
+                    yield NotYet()
+                    continue
                 states = {row.id: unpacked(checkpoints.pop(row.id, None)) for row in rows}
                 fresh = [run for run, state in states.items() if state is None]
                 patiently(partial(self._begin_anew, fresh))
-                yield from self._in_turn([(row, states.pop(row.id)) for row in rows])
-                rows = self._following(rows[-1].number)
+                yield from self._coming([(row, states.pop(row.id)) for row in rows])
         except LeaseLost as error:  # the recorder will meet it too, and stop the job
             _log.warning("no more runs: %s", error)
 
-    def _in_turn(self, rows: list[tuple[Run, RunState | None]]) -> Iterator[Coming]:
-        """As many runs at once as need not wait for others; those that do, when these are over."""
-        waiting = deque(rows)
-        while waiting:
-            queued: list[QueuedRun | RefusedRun] = []
-            while waiting and (one := patiently(partial(self._queued, *waiting[0]))) is not None:
-                queued.append(one)
-                waiting.popleft()
-            if not queued:
-                yield NotYet()
-                continue
-            sources = patiently(partial(self._computed, queued))
-            for one in queued:
-                source = sources.get(one.run)
-                if source is not None:
-                    self._warm.note_known(one.run, source)
-                elif isinstance(one, QueuedRun):
-                    self._problems[one.run] = one.spec.problem
-                yield one if source is None else KnownRun(one.run, source)
+    def _in_order(self) -> Iterator[list[Run]]:
+        rows = self._following(-1)
+        while rows:
+            yield rows
+            rows = self._following(rows[-1].number)
+
+    def _along(self, chains: OpenChains) -> Iterator[list[Run]]:
+        """Runs that may begin, of many chains; no runs while all that are left wait."""
+        made = patiently(self._n_made)
+        while not chains.is_done:
+            numbers = chains.ready(TOGETHER, made)
+            if not numbers and chains.has_free and patiently(self._make_runs):
+                made = patiently(self._n_made)
+            rows = patiently(partial(self._unfinished, numbers)) if numbers else []
+            for row in rows:
+                self._warm.given(row)
+            for number in set(numbers).difference(row.number for row in rows):
+                chains.over(number)
+            yield rows
+
+    def _coming(self, rows: list[tuple[Run, RunState | None]]) -> Iterator[Coming]:
+        """The runs of these rows, or what is known of them already."""
+        queued = [patiently(partial(self._queued, row, state)) for row, state in rows]
+        sources = patiently(partial(self._computed, queued))
+        for one in queued:
+            source = sources.get(one.run)
+            if source is not None:
+                patiently(partial(self._warm.note_known, one.run, source))
+            elif isinstance(one, QueuedRun):
+                self._problems[one.run] = one.spec.problem
+            yield one if source is None else KnownRun(one.run, source)
 
     def specification(self, cell: Mapping[str, Any], warm: Warm = ()) -> RunSpec:
         """The run of one cell, with what it begins with.
@@ -202,6 +222,11 @@ class JobRuns:
             parts.append(("validation", validation, found.simulated_validation))
         return save_fit(self._store, run, parts)
 
+    def failed(self, run: str) -> None:
+        """Nothing will be saved of a run: those behind it in its chain wait no longer."""
+        self._problems.pop(run, None)
+        self._warm.note_failed(run)
+
     def _checkpoints(self) -> dict[str, bytes]:
         with self._database.write() as session:
             return RunLedger(session, self._lease).checkpoints()
@@ -218,8 +243,7 @@ class JobRuns:
 
         Which are made already the database knows, so that any dispatcher goes on from there.
         """
-        with self._database.read() as session:
-            made = RunRepository(session, self._job.project_id).n_made(self._job.id)
+        made = self._n_made()
         if made >= self._job.n_runs:
             return False
         if self._groups is None:
@@ -228,6 +252,14 @@ class JobRuns:
         with self._database.write() as session:
             RunLedger(session, self._lease).create(cells)
         return bool(cells)
+
+    def _n_made(self) -> int:
+        with self._database.read() as session:
+            return RunRepository(session, self._job.project_id).n_made(self._job.id)
+
+    def _unfinished(self, numbers: list[int]) -> list[Run]:
+        with self._database.write() as session:
+            return RunLedger(session, self._lease).unfinished(numbers)
 
     def _pending(self, after: int) -> list[Run]:
         with self._database.write() as session:
@@ -238,12 +270,9 @@ class JobRuns:
             with self._database.write() as session:
                 forget_progress(session, self._lease, runs)
 
-    def _queued(self, row: Run, state: RunState | None) -> QueuedRun | RefusedRun | None:
-        """The run of a row; None if it waits for another."""
+    def _queued(self, row: Run, state: RunState | None) -> QueuedRun | RefusedRun:
         try:
             warm = self._warm.of(row, body_of(self._job.spec, row.cell))
-            if warm is None:
-                return None
             spec = self.specification(row.cell, warm)
         except (SysidError, ServiceError, StorageError) as error:
             return RefusedRun(row.id, Failure(str(error), type(error).__name__))

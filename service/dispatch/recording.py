@@ -37,6 +37,10 @@ SaveSignals = Callable[[str, Identification], str | None]
 """Stores the fitted signals of a run; gives the object's hash."""
 
 
+def _nobody(_run: str) -> None:
+    """Where nothing waits for the end of a run."""
+
+
 @dataclass(slots=True)
 class _Live:
     """A run in progress: its latest state, and how much of it is written."""
@@ -80,8 +84,10 @@ class Recorder:
         claim: Claim,
         save_signals: SaveSignals,
         floors: MakeFloors | None = None,
+        tell_failed: Callable[[str], None] = _nobody,
     ) -> None:
         self.lease = claim.lease
+        self._tell_failed = tell_failed
         self._floors = floors
         self.is_stopped = False
         with database.write() as session:
@@ -144,6 +150,7 @@ class Recorder:
 
     def failure(self, run: str, failure: Failure) -> None:
         """The run cannot be carried out."""
+        self._tell_failed(run)
         live, evaluations = self._live.pop(run, None), self._waiting.pop(run, 0)
         if live is not None:
             self._collect_history(run, live.state.history, live.state.migrations, live)

@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
+from service.storage.clocks import Clock
 from service.storage.columns import Document, utc_now
 from service.storage.ids import new_ids
-from service.storage.queue import Clock, Lease, Outcome, Queue, smaller
+from service.storage.queue import Lease, Outcome, Queue, smaller
 from service.storage.statements import CHUNK, IN_PLACE, chunks, insert_missing, update_by_id, upsert
 from service.storage.tables import OPEN, Checkpoint, Job, MigrationLog, Run, RunHistory, State
 
@@ -94,6 +95,15 @@ class RunLedger:
             Run.job_id == self._lease.job_id, Run.state.in_(OPEN), Run.number > after
         )
         return list(self._session.scalars(left.order_by(Run.number).limit(limit)))
+
+    def unfinished(self, numbers: Sequence[int]) -> list[Run]:
+        """Those of the runs of these numbers that are unfinished, in their order."""
+        self._queue.hold(self._lease)
+        found: list[Run] = []
+        for chunk in chunks(numbers):
+            mine = (Run.job_id == self._lease.job_id) & Run.number.in_(chunk)
+            found += self._session.scalars(select(Run).where(mine, Run.state.in_(OPEN)))
+        return sorted(found, key=lambda run: run.number)
 
     def start(self, run_ids: Collection[str]) -> None:
         """Mark queued runs as running."""
