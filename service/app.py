@@ -25,6 +25,7 @@ from service.api import (
     reidentify,
     runs,
 )
+from service.api.body_limit import BodyLimit
 from service.api.deps import Parts
 from service.reaping import Reaper
 from service.settings import Settings
@@ -56,6 +57,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redoc_url=None,
     )
     problems.install(app)
+    app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
     # Exact REST paths come first: a page's path may have parameters.
     for module in (
         health, datasets, models, jobs, noise, reidentify, references, events, comparison, runs,

@@ -116,6 +116,10 @@ class AlgorithmIn(Body):
     stop: StopIn = StopIn()
 
 
+MOST_VALUES = 1_000_000
+Labels = Annotated[dict[str, float | str], Field(max_length=32)]
+
+
 class Axis(Body):
     """One axis of a sweep: the field it changes and the values it takes.
 
@@ -125,11 +129,11 @@ class Axis(Body):
     """
 
     path: Pointer
-    values: list[Any] | None = Field(default=None, min_length=1)
+    values: list[Any] | None = Field(default=None, min_length=1, max_length=MOST_VALUES)
     range: list[Whole] | None = Field(default=None, min_length=2, max_length=3)
     log: tuple[float, float, int] | None = None
-    zip: str | None = None
-    labels: list[dict[str, float | str]] | None = None
+    zip: str | None = Field(default=None, max_length=100)
+    labels: list[Labels] | None = Field(default=None, max_length=MOST_VALUES)
 
     @model_validator(mode="after")
     def _one_kind_of_values(self) -> Self:

@@ -29,6 +29,8 @@ class Settings(BaseSettings):
         None: API keys are off on loopback and required elsewhere.
     allow_open_host : bool
         Serve other hosts although this version has no API keys yet.
+    max_upload_bytes, max_body_bytes : int
+        The longest recording, and the longest body of any other request; 413 beyond them.
     max_open_jobs, max_open_runs : int
         What one project may have unfinished; a submission beyond it is refused with 429.
     project_cores : int or None
@@ -52,6 +54,7 @@ class Settings(BaseSettings):
     require_keys: bool | None = None
     allow_open_host: bool = False
     max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
+    max_body_bytes: int = Field(default=32 * 1024**2, ge=1)
     max_runs_per_job: int = Field(default=100_000, ge=1)
     max_open_jobs: int = Field(default=1000, ge=1)
     max_open_runs: int = Field(default=1_000_000, ge=1)

@@ -116,6 +116,8 @@ def _sysid_error(request: Request, error: Exception) -> Response:
 
 def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
+    if isinstance(error.__cause__, ServiceError):  # from where FastAPI reads the body
+        return _service_error(request, error.__cause__)
     reason = _unreadable(error.__cause__)
     if error.status_code == HTTPStatus.BAD_REQUEST and reason:
         return _service_error(request, InvalidRequest.at("", reason))

@@ -1,0 +1,108 @@
+"""Bodies that are too large: refused before they are read, or as soon as they are too long."""
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.api.body_limit import BodyLimit
+from service.app import create_app
+from service.errors import TooLarge
+from service.settings import Settings
+from tests.rest import CSV, awaited, recording, refused, settings_of
+
+LIMIT = 20_000
+
+
+@pytest.fixture(scope="module")
+def limited(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    settings = settings_of(tmp_path_factory.mktemp("limited"), max_body_bytes=LIMIT)
+    with TestClient(create_app(settings), raise_server_exceptions=False) as client:
+        yield client
+
+
+ROUTES = ["/v1/jobs", "/v1/recipes/noise-sweep", "/v1/recipes/reidentify", "/v1/runs:compare",
+          "/v1/datasets:simulate", "/v1/models"]  # fmt: skip
+JSON = {"content-type": "application/json"}
+
+
+@pytest.mark.parametrize("route", ROUTES)
+@pytest.mark.parametrize("is_chunked", [False, True])
+def test_a_body_over_the_limit_is_a_problem_document_that_tells_the_limit(
+    limited: TestClient, route: str, is_chunked: bool
+) -> None:
+    pieces = [b"[", b" " * LIMIT, b"]"]
+    content: Any = iter(pieces) if is_chunked else b"".join(pieces)
+    answer = limited.post(route, content=content, headers=JSON)
+    refused(answer, 413, "too-large")
+    assert str(LIMIT) in answer.json()["detail"]
+    assert "LAGID_MAX_BODY_BYTES" in answer.json()["detail"]
+
+
+def test_a_body_within_the_limit_and_an_upload_are_read(limited: TestClient) -> None:
+    body = json.dumps({"model": "fopdt", "datasets": ["none"]}).encode().ljust(LIMIT)
+    refused(limited.post("/v1/jobs", content=body, headers=JSON), 422, "invalid")
+    long = recording(3000)
+    assert len(long) > LIMIT
+    assert limited.post("/v1/datasets", content=long, headers=CSV).status_code == 201
+
+
+def read(headers: list[tuple[bytes, bytes]], pieces: int) -> int:
+    """How many pieces of 10 bytes an application is given that reads all of a body."""
+    taken = 0
+
+    async def receive() -> dict[str, Any]:
+        nonlocal taken
+        taken += 1
+        return {"type": "http.request", "body": b"x" * 10, "more_body": taken < pieces}
+
+    async def application(scope: Any, receive: Any, send: Any) -> None:
+        while (await receive())["more_body"]:
+            await asyncio.sleep(0)
+
+    async def play() -> None:
+        scope = {"type": "http", "method": "POST", "path": "/v1/jobs", "headers": headers}
+        with pytest.raises(TooLarge):
+            await BodyLimit(application, 35)(scope, receive, receive)
+
+    awaited(play)
+    return taken
+
+
+def test_nothing_of_a_long_body_is_read_and_of_one_of_unknown_length_no_more_than_the_limit() -> (
+    None
+):
+    assert read([(b"content-length", b"1000")], 100) == 0
+    assert read([], 100) == 4
+
+
+def test_a_sweep_over_a_hundred_thousand_labelled_values_is_within_the_limit(
+    tmp_path: Path,
+) -> None:
+    axis = {
+        "path": "/datasets", "values": [["ds_0123456789abcdefghjkmnpqrs"]] * 100_000,
+        "labels": [{"pressure_bar": 1.2345678901234567 + k, "length_m": k} for k in range(100_000)],
+    }  # fmt: skip
+    body = {"model": "fopdt", "datasets": ["ds"], "sweep": {"axes": [axis]}}
+    assert len(json.dumps(body)) < Settings(data_dir=tmp_path).max_body_bytes
+
+
+@pytest.mark.parametrize(
+    ("axis", "pointer"),
+    [
+        ({"zip": "z" * 101}, "/sweep/axes/0/zip"),
+        ({"labels": [{f"l{n}": n for n in range(33)}]}, "/sweep/axes/0/labels/0"),
+        ({"values": [0] * 1_000_001}, "/sweep/axes/0/values"),
+    ],
+)
+def test_lengths_of_an_axis_are_bounded(own: TestClient, axis: Any, pointer: str) -> None:
+    body = {
+        "model": "fopdt", "datasets": ["none"],
+        "sweep": {"axes": [{"path": "/seed", "values": [1], **axis}]},
+    }  # fmt: skip
+    faults = refused(own.post("/v1/jobs", json=body), 422, "invalid")
+    assert [one["pointer"] for one in faults] == [pointer]
