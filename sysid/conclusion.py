@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.errors import DivergedEverywhere, NothingIdentifiable
-from sysid.islands.archipelago import analysis_budget, loss_scale, of_island
+from sysid.islands.archipelago import analysis_budget, of_island
 from sysid.islands.run_state import RunState
 from sysid.metrics import Metrics
-from sysid.neighbours import neighbourhood, widened
+from sysid.neighbours import affordable, neighbourhood, widened
 from sysid.onset import onset_delays
 from sysid.problem import Problem, metrics_of
 from sysid.refinement import Refined, refine
@@ -20,8 +20,6 @@ from sysid.threads import one_thread
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis, analyse
 from sysid.warnings import warnings_of
-
-_AROUND = 1800  # simulations at most for minima beside the estimate
 
 
 def conclude(
@@ -131,21 +129,30 @@ def _with_neighbours(
     known = next((one for one in refined if one is not None and one.theta is theta), None)
     before = 0 if known is None else known.evaluations
     unchanged = Refined(theta, rms, before)
-    if analysis.uncertainty is None or loss_scale(problem) > 0:
+    if analysis.linear is None:
         return unchanged, analysis
     left = _left(algorithm, state, refined)
     kept = analysis.evaluations + analysis_budget(theta.size)
-    most = _AROUND if left is None else min(max(0, left - kept), _AROUND)
-    covariance = analysis.uncertainty.covariance
-    found = neighbourhood(problem, theta, rms, covariance, state.seed, most)
+    seconds = algorithm.stop.seconds
+    is_late = seconds is not None and state.seconds >= seconds
+    most = affordable(problem, is_late)
+    if most == 0 and is_late:
+        return unchanged, replace(analysis, is_cut_short=True)
+    if left is not None:
+        most = min(most, max(0, left - kept))
+    found = neighbourhood(problem, theta, rms, analysis.linear, state.seed, most)
     spent = before + found.evaluations
     if found.best is not None:
         spent += analysis.evaluations
         theta, rms = found.best.theta, found.best.rms
-        analysis = analyse(problem, theta)
-    names = tuple(p.name for p in problem.space)
-    estimates = widened(analysis.estimates, names, problem.n_scored, found)
-    return Refined(theta, rms, spent), replace(analysis, estimates=estimates)
+        left = None if left is None else left - analysis.evaluations - found.evaluations
+        analysis = analyse(problem, theta, left)
+    if analysis.linear is not None:
+        names = tuple(p.name for p in problem.space)
+        share = analysis.linear.share
+        estimates = widened(analysis.estimates, names, problem.n_scored, found, share)
+        analysis = replace(analysis, estimates=estimates)
+    return Refined(theta, rms, spent), analysis
 
 
 def _left(

@@ -53,6 +53,11 @@ def warnings_of(
         found += [text for e in analysis.estimates if (text := _vague(e))]
         found += [text for group in analysis.uncertainty.groups if (text := _of_group(group))]
         found += _correlated(analysis.uncertainty, analysis.estimates, lagged)
+    if analysis.is_cut_short:
+        found.append(
+            "the time was over, so minima beside the estimate were not looked for: where the loss "
+            "is rough the intervals are too narrow"
+        )
     if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING * problem.output_scale:
         found.append(_not_an_optimum(algorithm, analysis.possible_gain))
     elif tests is not None and lagged:

@@ -1,18 +1,25 @@
 """Minima beside an estimate: looked for where the loss is rough, told by the intervals."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from sysid.identify import identify
+from sysid.linear import linear_model
 from sysid.models.library import load_model
-from sysid.neighbours import Neighbourhood, neighbourhood, widened
+from sysid.neighbours import Neighbourhood, affordable, neighbourhood, widened
 from sysid.problem import Problem
 from sysid.refinement import refine
 from sysid.result import Estimate
+from sysid.run import advance, begin, conclude
+from sysid.settings import GeneticAlgorithm, Stop
 from sysid.uncertainty import analyse
-from tests.searching import COULOMB, example, noisy, record
+from tests.searching import COULOMB, clean, example, noisy, record
 
+TRUTH = np.array([0.2, 0.5, 5.0, 1.0])  # of Example 1
 FALSE = np.array([0.192, 0.495, 5.002, 0.485])
 
 
@@ -24,9 +31,9 @@ def rough(seed: int = 70_043) -> Problem:
 def around(problem: Problem, start: np.ndarray, left: int | None = None) -> Neighbourhood:
     end = refine(problem, [start])[0]
     assert end is not None
-    known = analyse(problem, end.theta).uncertainty
-    assert known is not None
-    return neighbourhood(problem, end.theta, end.rms, known.covariance, 1, left)
+    linear = analyse(problem, end.theta).linear
+    assert linear is not None
+    return neighbourhood(problem, end.theta, end.rms, linear, 1, left)
 
 
 def test_beside_the_optimum_of_a_smooth_loss_nothing_more_than_a_look_is_spent() -> None:
@@ -34,6 +41,92 @@ def test_beside_the_optimum_of_a_smooth_loss_nothing_more_than_a_look_is_spent()
     assert found.best is None
     assert found.rms.size == 1
     assert found.evaluations == 24
+
+
+@pytest.mark.parametrize("pole", [0.5, 0.9])
+def test_coloured_residuals_do_not_make_a_smooth_loss_rough(pole: float) -> None:
+    white = np.random.default_rng(1).normal(0.0, 0.01, 300)
+    problem = Problem.build(
+        load_model("duffing-eq16"), [record(clean() + lfilter([1.0], [1.0, -pole], white))]
+    )
+    known = analyse(problem, TRUTH).uncertainty
+    assert known is not None
+    assert known.noise_colour == "coloured"
+    assert around(problem, TRUTH).evaluations == 24
+
+
+def test_an_estimate_held_at_a_bound_does_not_make_a_smooth_loss_rough() -> None:
+    narrow = {"b": {"upper": 4.9}}
+    problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], parameters=narrow)
+    assert around(problem, np.array([0.2, 0.5, 4.9, 1.0])).evaluations == 24
+
+
+@pytest.mark.parametrize(("n", "d"), [(12, 4), (30, 4), (60, 8)])
+def test_few_samples_do_not_make_a_linear_regression_rough(n: int, d: int) -> None:
+    class Regression:
+        n_scored = n
+        evaluator = SimpleNamespace(lower=np.full(d, -1e9), upper=np.full(d, 1e9))
+
+        def fitness(self, theta: np.ndarray) -> np.ndarray:
+            return np.asarray(np.sqrt(np.mean((theta @ columns.T - measured) ** 2, axis=1)))
+
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        columns, measured = random.standard_normal((n, d)), random.standard_normal(n)
+        theta = np.linalg.lstsq(columns, measured, rcond=None)[0]
+        error, one = columns @ theta - measured, np.ones(d)
+        linear = linear_model(error, columns, one < 0, 0.5 * one, one, one, 1e-7)
+        rms = float(np.sqrt(np.mean(error**2)))
+        found = neighbourhood(Regression(), theta, rms, linear, seed)  # type: ignore[arg-type]
+        assert found.evaluations == 24
+
+
+def test_moves_cut_off_at_bounds_are_expected_where_they_end() -> None:
+    near = {"b": {"upper": 5.001}}
+    problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], parameters=near)
+    assert around(problem, np.array([0.2, 0.5, 5.0, 1.0])).evaluations == 24
+
+
+def test_the_longer_a_simulation_takes_the_fewer_are_spent() -> None:
+    spent = [affordable(lasting(steps), is_late=False) for steps in (300, 100_000, 1_000_000)]
+    late = [affordable(lasting(steps), is_late=True) for steps in (300, 100_000, 1_000_000)]
+    assert spent == [1800, 500, 50]
+    assert late == [1800, 50, 0]
+
+
+def lasting(steps: int) -> Problem:
+    """Only what is asked of a problem here."""
+    grid = SimpleNamespace(points=steps // 2, substeps=2)
+    return SimpleNamespace(experiments=(SimpleNamespace(grid=grid),))  # type: ignore[return-value]
+
+
+def test_a_run_out_of_time_says_that_it_has_not_looked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sysid.neighbours._LATE", 0)
+    problem = example()
+    algorithm = GeneticAlgorithm(generations=20, stop=Stop(seconds=1e9))
+    state = advance(problem, algorithm, begin(problem, algorithm, 1))
+    said = "minima beside the estimate were not looked for"
+    in_time = conclude(problem, algorithm, replace(state, seconds=0.0))
+    late = conclude(problem, algorithm, replace(state, seconds=1e9))
+    assert not any(said in text for text in in_time.warnings)
+    assert any(said in text for text in late.warnings)
+    assert late.evaluations == in_time.evaluations - 24
+
+
+def test_where_on_its_plateau_a_search_ends_says_nothing_of_a_rounded_lag() -> None:
+    document = load_model("duffing-eq16").document
+    assert document is not None
+    solver = {"history": "constant", "interpolation": "nearest"}
+    model = load_model({**document, "solver": solver})
+    found = []
+    for seed in (1, 2, 3):
+        result = identify(model, record(noisy()), seed=seed)
+        found.append(next(one for one in result.estimates if one.name == "L"))
+    first = found[0].interval95
+    assert first is not None
+    assert len({one.value for one in found}) > 1
+    for one in found:
+        assert one.interval95 == pytest.approx(first, abs=0.002)
 
 
 def test_beside_a_minimum_of_a_rough_loss_others_are_found_inside_bounds_and_budget() -> None:
@@ -67,6 +160,7 @@ def test_without_a_budget_nothing_is_simulated() -> None:
     assert around(rough(), FALSE, 0).evaluations == 0
 
 
+SAME = np.ones(1)
 ONE = Estimate("a", "1", 2.0, 0.0, 5.0, 0.1, (1.8, 2.2), "identified", "")
 
 
@@ -77,17 +171,31 @@ def test_an_interval_holds_the_values_of_minima_that_the_data_do_not_rule_out(
     n = 50
     rms = np.array([1.0, np.exp(ratio / (2 * n))])
     found = Neighbourhood(None, np.array([[2.0], [1.6]]), rms, 0)
-    wide = widened((ONE,), ("a",), n, found)[0]
+    wide = widened((ONE,), ("a",), n, found, SAME)[0]
     assert wide == replace(ONE, interval95=wide.interval95)
     assert wide.interval95 == pytest.approx((low, 2.2))
+
+
+def test_of_coloured_residuals_a_minimum_is_as_likely_as_their_variance_says() -> None:
+    n, share = 50, np.array([0.25])  # standard errors twice those of white residuals
+    found = Neighbourhood(None, np.array([[2.0], [1.6]]), np.array([1.0, np.exp(8.0 / (2 * n))]), 0)
+    white = widened((ONE,), ("a",), n, found, SAME)[0]
+    assert white.interval95 == pytest.approx((1.8, 2.2))
+    wide = widened((ONE,), ("a",), n, found, share)[0]
+    assert wide.interval95 == pytest.approx((1.6 - 0.1 * np.sqrt(2.0), 2.2))
+
+
+def test_the_interval_of_a_parameter_on_a_plateau_stays_around_its_middle() -> None:
+    found = Neighbourhood(None, np.array([[2.0], [1.6]]), np.array([1.0, 1.0]), 0)
+    assert widened((ONE,), ("a",), 50, found, np.array([np.nan])) == (ONE,)
 
 
 def test_an_estimate_without_a_standard_error_gets_none_by_its_neighbours() -> None:
     blind = replace(ONE, stderr=None, interval95=None)
     found = Neighbourhood(None, np.array([[2.0]]), np.array([1.0]), 0)
-    assert widened((blind,), ("a",), 50, found) == (blind,)
+    assert widened((blind,), ("a",), 50, found, SAME) == (blind,)
 
 
 def test_beside_a_perfect_fit_nothing_else_is_likely() -> None:
     found = Neighbourhood(None, np.array([[2.0], [1.6]]), np.array([0.0, 1e-9]), 0)
-    assert widened((ONE,), ("a",), 50, found)[0].interval95 == pytest.approx((1.8, 2.2))
+    assert widened((ONE,), ("a",), 50, found, SAME)[0].interval95 == pytest.approx((1.8, 2.2))
