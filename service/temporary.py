@@ -1,12 +1,16 @@
-"""Temporary files that name the process that made them, so that those of the dead can go."""
+"""Temporary files that name the process that made them, so that those of the dead can go.
+
+The name holds the machine (boot and PID namespace), the number and the start of the process:
+containers that share a folder have the same host name and numbers, but not these.
+"""
 
 import os
+import re
 import shutil
-import socket
 import time
 from pathlib import Path
 
-from workers.processes import is_running
+from workers.processes import has_ended, standing, tag
 
 STALE_SECONDS = 24 * 3600
 """After so long a file is nobody's, whichever machine it came from."""
@@ -14,20 +18,20 @@ STALE_SECONDS = 24 * 3600
 
 def prefix() -> str:
     """What the names of this process's temporary files begin with."""
-    return f"{_prefix_here()}{os.getpid()}-"
+    here = standing(os.getpid())
+    return f"lagid-tmp-{tag()}-{os.getpid()}-{0 if here is None else here.started}-"
 
 
 def clear(folder: Path, pattern: str = "lagid-tmp-*") -> None:
     """Remove files and folders of processes of this machine that are gone, and stale ones."""
     for path in folder.glob(pattern):
-        owner = path.name.removeprefix(_prefix_here()).partition("-")[0]
-        is_ours = path.name.startswith(_prefix_here()) and owner.isdigit()
-        if (is_ours and not is_running(int(owner))) or _is_stale(path):
+        if _is_of_the_dead(path.name) or _is_stale(path):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def _prefix_here() -> str:
-    return f"lagid-tmp-{socket.gethostname()}-"
+def _is_of_the_dead(name: str) -> bool:
+    found = re.match(rf"lagid-tmp-{tag()}-(\d+)-(\d+)-", name)
+    return found is not None and has_ended(int(found[1]), int(found[2]) or None)
 
 
 def _is_stale(path: Path) -> bool:

@@ -5,7 +5,6 @@ What Ray 2.60 does unasked, and what is done about it, stands in
 when its raylet is gone, and listens on every interface (therefore the token).
 """
 
-import contextlib
 import logging
 import os
 import secrets
@@ -294,6 +293,11 @@ def _fresh_folder() -> Path:
     clear_after_the_dead()
     folder = folder_of(os.getpid())
     shutil.rmtree(folder, ignore_errors=True)
-    with contextlib.suppress(FileExistsError):
-        folder.mkdir(mode=0o700)
+    try:
+        folder.mkdir(mode=0o700)  # fails for whatever is there, so that it is ours and new
+    except OSError as error:
+        raise ClusterUnavailable(
+            f"Ray's folder {folder} cannot be made ({error.strerror}): remove it if it is there, "
+            "or set TMPDIR to a folder of your own"
+        ) from error
     return folder

@@ -4,16 +4,19 @@ Where there is no ``/proc``, nothing is known of a process but whether its numbe
 """
 
 import contextlib
+import hashlib
 import os
 import shutil
 import signal
+import socket
 import tempfile
 from collections.abc import Collection
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 _PROC = Path("/proc")
-_PREFIX = "lagid-ray-"
+_TAG_LENGTH = 6
 
 
 class Standing(NamedTuple):
@@ -55,6 +58,36 @@ def is_running(pid: int) -> bool:
     return True
 
 
+@cache
+def machine() -> str | None:
+    """Names this boot and the namespace in which its processes are numbered; None if unknown.
+
+    Two processes of one number are the same, or one after the other, only if this is the same.
+    """
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return f"{boot} {Path('/proc/self/ns/pid').readlink()}"
+    except OSError:
+        return None
+
+
+def tag() -> str:
+    """A short name of the machine for the names of files; that of the host if it is unknown."""
+    name = machine() or f"host {socket.gethostname()}"
+    return hashlib.sha256(name.encode()).hexdigest()[:_TAG_LENGTH]
+
+
+def has_ended(pid: int, started: int | None) -> bool:
+    """Whether the process of this machine that had the number `pid` has ended.
+
+    Another one may have its number by now: `started` tells them apart, unless it is None.
+    """
+    found = standing(pid)
+    if found is None or started is None:
+        return not is_running(pid)
+    return found.is_dead or found.started != started
+
+
 def children(commands: Collection[str]) -> tuple[int, ...]:
     """Living children of this process that run one of these programs; none without ``/proc``."""
     here = os.getpid()
@@ -88,7 +121,7 @@ def folder_of(pid: int) -> Path:
 
     Its path must be short: Ray puts sockets below it, and a socket's path has 107 bytes at most.
     """
-    return _base() / f"{_PREFIX}{pid}"
+    return _base() / f"{_prefix()}{pid}"
 
 
 def of_folder(pid: int) -> tuple[int, ...]:
@@ -107,11 +140,18 @@ def clear_after(pid: int) -> None:
 
 
 def clear_after_the_dead() -> None:
-    """Do so for every dispatcher of this machine that is gone."""
-    for folder in _base().glob(f"{_PREFIX}*"):
-        owner = folder.name.removeprefix(_PREFIX)
+    """Do so for every dispatcher of this machine that is gone.
+
+    Folders of others are left alone: in another PID namespace the number is somebody else's.
+    """
+    for folder in _base().glob(f"{_prefix()}*"):
+        owner = folder.name.removeprefix(_prefix())
         if owner.isdigit() and not is_running(int(owner)):
             clear_after(int(owner))
+
+
+def _prefix() -> str:
+    return f"lagid-{tag()}-"
 
 
 def _base() -> Path:

@@ -14,11 +14,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.reaping import identity, reap
 from service.storage.admission import Admission
-from service.storage.columns import Document, utc_now
-from service.storage.dispatchers import DispatcherRepository
+from service.storage.clocks import Clock
+from service.storage.columns import Document
+from service.storage.dispatchers import LEASE_SECONDS, DispatcherRepository
 from service.storage.errors import LeaseLost
 from service.storage.patience import patiently
-from service.storage.queue import Claim, Clock, Lease, Queue
+from service.storage.queue import Claim, Lease, Queue
 from service.storage.sessions import Database
 from service.storage.watch import Signals, look
 
@@ -32,15 +33,17 @@ class Leases:
     """The jobs this dispatcher may write for.
 
     A thread renews all leases with one statement, three times within their length, and reaps the
-    expired ones of anybody. A lease that did not come back is `is_lost` at once; one that was
-    forgotten is renewed no longer, and expires.
+    expired ones of anybody. A lease that did not come back `is_lost`; one that was forgotten is
+    renewed no longer, and expires. While a heartbeat waits for the database, of a lease that is
+    late nothing is known: nothing should be written under it, but it may still be ours.
 
     Parameters
     ----------
     seconds : float
         Length of a lease.
     clock, stopwatch : callable
-        The time of day as rows have it, and the seconds that pass for this process.
+        The time of day as rows have it (by default the database's), and the seconds that pass for
+        this process.
     """
 
     def __init__(
@@ -48,13 +51,14 @@ class Leases:
         database: Database,
         seconds: float,
         *,
-        clock: Clock = utc_now,
+        clock: Clock | None = None,
         stopwatch: Callable[[], float] = time.monotonic,
     ) -> None:
         self.owner = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
         self._database, self._length = database, timedelta(seconds=seconds)
         self._clock, self._stopwatch = clock, stopwatch
         self._held: dict[Lease, float] = {}  # when each was renewed
+        self._has_asked = False  # for a job, and was not answered
         self._is_cut_off = False  # the last heartbeat did not reach the database
         self._lock = threading.Lock()
         self._ending = threading.Event()
@@ -62,7 +66,8 @@ class Leases:
 
     def start(self, details: dict[str, object]) -> None:
         """Announce the dispatcher and begin to beat."""
-        patiently(partial(self._announce, {**identity(), **details}))
+        told = {LEASE_SECONDS: self._length.total_seconds(), **identity(), **details}
+        patiently(partial(self._announce, told))
         self._thread.start()
 
     def _announce(self, details: Document) -> None:
@@ -73,8 +78,15 @@ class Leases:
     def claim(self, admission: Admission | None = None) -> Claim | None:
         """Take the next job that `admission` lets in, if one waits."""
         begun = self._stopwatch()
+        claim, had_asked = None, self._has_asked
+        self._has_asked = True  # a claim whose answer is lost may have been made
         with self._database.write() as session:
-            claim = Queue(session, self._clock).claim(self.owner, self._length, admission)
+            queue = Queue(session, self._clock)
+            if had_asked:
+                claim = queue.regain(self.owner, self._jobs())
+            if claim is None:
+                claim = queue.claim(self.owner, self._length, admission)
+        self._has_asked = False
         if claim is not None:
             with self._lock:
                 self._held[claim.lease] = begun
@@ -85,15 +97,20 @@ class Leases:
         with self._database.read() as session:
             return look(session, self.owner, admission)
 
+    def _jobs(self) -> list[str]:
+        with self._lock:
+            return [lease.job_id for lease in self._held]
+
     def is_lost(self, lease: Lease) -> bool:
-        """Whether the lease is known to be lost, or was not renewed in time."""
+        """Whether the lease is known to be another's by now, or was forgotten."""
+        with self._lock:
+            return lease not in self._held
+
+    def is_sure(self, lease: Lease) -> bool:
+        """Whether the lease is ours: it was renewed within its length."""
         with self._lock:
             renewed = self._held.get(lease)
-        if renewed is None:
-            return True
-        if self._is_cut_off:  # the next write that gets through will tell
-            return False
-        return self._stopwatch() - renewed > self._length.total_seconds()
+        return renewed is not None and self._stopwatch() - renewed <= self._length.total_seconds()
 
     def forget(self, lease: Lease) -> None:
         """The job has ended, or was dropped: renew its lease no longer."""
@@ -133,7 +150,7 @@ class Leases:
         begun = self._stopwatch()
         with self._lock:
             before = tuple(self._held)
-        with self._database.write() as session:
+        with self._database.write(self._third) as session:
             DispatcherRepository(session, self._clock).beat(self.owner)
             held = Queue(session, self._clock).heartbeat(before, self._length)
         renewed = {one.lease for one in held}
@@ -143,10 +160,14 @@ class Leases:
                     self._held.pop(lease, None)
                 elif lease in self._held:
                     self._held[lease] = begun
-        reap(self._database, self._length, self._clock)
+        reap(self._database, self._length, self._clock, busy_seconds=self._third)
+
+    @property
+    def _third(self) -> float:
+        return self._length.total_seconds() / 3
 
     def _beat(self) -> None:
-        third = self._length.total_seconds() / 3
+        third = self._third
         pause = third
         while not self._ending.wait(pause):
             try:

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from sqlalchemy import ColumnElement, func, or_, select
-from sqlalchemy.orm import InstrumentedAttribute, Session, aliased
+from sqlalchemy import ColumnElement, Subquery, func, or_, select
+from sqlalchemy.orm import Session
 
 from service.storage.tables import OPEN, Job, State
 
@@ -45,8 +45,11 @@ def unfinished(session: Session, project_id: str) -> Unfinished:
     return Unfinished(int(jobs), int(runs))
 
 
-def in_hand(project_id: InstrumentedAttribute[str]) -> ColumnElement[int]:
-    """How many jobs of that project dispatchers have in hand: who has fewest goes first."""
-    mate = aliased(Job)
-    count = select(func.count()).where(mate.state == State.RUNNING, mate.project_id == project_id)
-    return count.scalar_subquery()
+def in_hand() -> Subquery:
+    """How many jobs of each project dispatchers have in hand, counted once: who has fewest is next.
+
+    Columns ``project_id`` and ``n``; a project that has none is not among them.
+    """
+    count = func.count().label("n")
+    running = select(Job.project_id, count).where(Job.state == State.RUNNING)
+    return running.group_by(Job.project_id).subquery("in_hand")

@@ -5,19 +5,22 @@ from datetime import timedelta
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from service.storage.columns import Document, utc_now
-from service.storage.queue import LEASE, Clock
+from service.storage.clocks import Clock, clock_of
+from service.storage.columns import Document
+from service.storage.queue import LEASE
 from service.storage.statements import upsert
 from service.storage.tables import Dispatcher
 
 _FORGET_AFTER = timedelta(days=1)
+LEASE_SECONDS = "lease_seconds"
+"""Under this name a dispatcher tells how long its leases are."""
 
 
 class DispatcherRepository:
     """The dispatchers in one session."""
 
-    def __init__(self, session: Session, clock: Clock = utc_now) -> None:
-        self._session, self._clock = session, clock
+    def __init__(self, session: Session, clock: Clock | None = None) -> None:
+        self._session, self._clock = session, clock or clock_of(session)
 
     def announce(self, owner: str, details: Document) -> None:
         """Tell that a dispatcher has started, and forget those long silent."""
@@ -40,6 +43,15 @@ class DispatcherRepository:
         return list(self._session.scalars(select(Dispatcher).order_by(Dispatcher.owner)))
 
     def alive(self, within: timedelta = LEASE) -> list[Dispatcher]:
-        """Dispatchers seen within that time, by name."""
-        recent = select(Dispatcher).where(Dispatcher.seen_at >= self._clock() - within)
-        return list(self._session.scalars(recent.order_by(Dispatcher.owner)))
+        """Dispatchers seen within the length of their leases, by name.
+
+        `within` is that of a dispatcher that has not told its own.
+        """
+        now = self._clock()
+        return [one for one in self.all() if one.seen_at >= now - length_of(one, within)]
+
+
+def length_of(dispatcher: Dispatcher, usual: timedelta) -> timedelta:
+    """How long the leases of a dispatcher are; the usual length if it has not told."""
+    told = dispatcher.details.get(LEASE_SECONDS)
+    return timedelta(seconds=told) if isinstance(told, int | float) else usual

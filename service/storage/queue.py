@@ -4,30 +4,48 @@ A dispatcher claims a job for a time and renews all its leases with one statemen
 silent, the reaper gives its jobs back. Each claim raises the job's `attempt`, and every later
 write carries it: a dispatcher that comes back late hits no row and learns that it must stop.
 
-Times are those of the caller's clock: a wrong clock delays or hastens the reaper, but which
-dispatcher may write is decided by the attempt alone.
+Times are those of the one clock that all have: PostgreSQL's, or with SQLite that of the host.
+A wrong clock delays or hastens the reaper, but which dispatcher may write is decided by the
+attempt alone.
 """
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, and_, case, exists, false, func, or_, select, true, update
-from sqlalchemy.orm import Session, aliased
+from sqlalchemy import (
+    ColumnElement,
+    and_,
+    case,
+    exists,
+    false,
+    func,
+    literal,
+    or_,
+    select,
+    true,
+    update,
+)
+from sqlalchemy.orm import Session, aliased, defer
 
 from service.storage.admission import Admission, in_hand
-from service.storage.columns import Document, utc_now
+from service.storage.clocks import Clock, clock_of
+from service.storage.columns import Document, UtcDateTime
 from service.storage.errors import Conflict, LeaseLost
 from service.storage.events import EventKind, EventRepository
 from service.storage.jobs import close_runs, notify_queue
 from service.storage.statements import IN_PLACE
-from service.storage.tables import OPEN, Job, Run, State
+from service.storage.tables import OPEN, Checkpoint, Job, Run, State
 
 LEASE = timedelta(seconds=10)
 LONGEST = 2
 """No lease ends later than after so many of its lengths, unless a clock was stepped back."""
-Clock = Callable[[], datetime]
+HUNG = timedelta(seconds=60)
+"""A dispatcher whose process lives keeps its jobs so long after its lease has ended: it waits for
+the database, and lost nothing. Then it counts as hung."""
+_NO_SPEC = defer(Job.spec)
+"""A specification of many cells has megabytes; it is read where it is wanted."""
 Outcome = Literal[State.SUCCEEDED, State.FAILED, State.CANCELLED]
 
 
@@ -71,19 +89,40 @@ class Progress:
 
 
 @dataclass(frozen=True, slots=True)
+class Owners:
+    """What is known of those who hold leases.
+
+    Attributes
+    ----------
+    gone, living : frozenset of str
+        Known to have ended, and known to be there and awake; of others only their leases tell.
+    lengths : mapping
+        How long the leases of each are.
+    usual : timedelta
+        How long they are of one who has not told.
+    """
+
+    gone: frozenset[str] = frozenset()
+    living: frozenset[str] = frozenset()
+    lengths: Mapping[str, timedelta] = field(default_factory=dict)
+    usual: timedelta = LEASE
+
+
+@dataclass(frozen=True, slots=True)
 class Reaped:
-    """What became of the jobs whose leases had expired."""
+    """What became of the jobs whose leases had expired, and whose they were."""
 
     requeued: tuple[str, ...] = ()
     failed: tuple[str, ...] = ()
     cancelled: tuple[str, ...] = ()
+    owners: frozenset[str] = frozenset()
 
 
 class Queue:
     """The jobs of all projects as dispatchers see them, in one writing session."""
 
-    def __init__(self, session: Session, clock: Clock = utc_now) -> None:
-        self._session, self._clock = session, clock
+    def __init__(self, session: Session, clock: Clock | None = None) -> None:
+        self._session, self._clock = session, clock or clock_of(session)
         self._events = EventRepository(session)
 
     def claim(
@@ -94,14 +133,16 @@ class Queue:
         First comes the highest priority, then the project that has fewest jobs running, then the
         oldest.
         """
-        waiting = aliased(Job)
+        waiting, mates = aliased(Job), in_hand()
         first = (
             select(waiting.id)
+            .outerjoin(mates, mates.c.project_id == waiting.project_id)
             .where(waiting.state == State.QUEUED)
             .where(true() if admission is None else admission.holds(waiting))
-            .order_by(waiting.priority.desc(), in_hand(waiting.project_id), waiting.id)
+            .order_by(waiting.priority.desc(), func.coalesce(mates.c.n, 0), waiting.id)
             .limit(1)
-            .with_for_update(skip_locked=True)  # rivals take the next one; SQLite has no rivals
+            # Rivals take the next one; SQLite has no rivals.
+            .with_for_update(skip_locked=True, of=waiting)
         )
         now = self._clock()
         taken = update(Job).where(Job.id == first.scalar_subquery()).values(
@@ -113,6 +154,18 @@ class Queue:
             return None
         self._events.append_state(job)
         return Claim(Lease(job.id, job.attempt, owner), job)
+
+    def regain(self, owner: str, held: Collection[str]) -> Claim | None:
+        """A job that this owner has claimed without learning of it; None if there is none.
+
+        Parameters
+        ----------
+        held : collection of str
+            The jobs that it knows to be its own.
+        """
+        mine = (Job.lease_owner == owner, Job.state == State.RUNNING, Job.id.not_in(held))
+        job = self._session.scalar(select(Job).where(*mine).limit(1).with_for_update())
+        return None if job is None else Claim(Lease(job.id, job.attempt, owner), job)
 
     def heartbeat(self, held: Collection[Lease], lease: timedelta = LEASE) -> tuple[Held, ...]:
         """Renew these leases; those that do not come back are lost.
@@ -138,7 +191,9 @@ class Queue:
             When the job has another attempt or is no longer running.
         """
         held = select(Job).where(*lease.fence()).with_for_update(key_share=True)
-        job = self._session.scalar(held, execution_options={"populate_existing": True})
+        job = self._session.scalar(
+            held.options(_NO_SPEC), execution_options={"populate_existing": True}
+        )
         if job is None:
             raise LeaseLost(lease.job_id, lease.attempt)
         return job
@@ -197,51 +252,49 @@ class Queue:
         else:
             self._requeue(job)
 
-    def has_silent(self, lease: timedelta = LEASE) -> bool:
-        """Whether a lease has expired, or seems to end later than any that is given."""
+    def has_silent(self, owners: Owners) -> bool:
+        """Whether a lease is to be reaped, or seems to end later than any that is given."""
         now = self._clock()
-        silent = or_(Job.lease_until < now, Job.lease_until > now + LONGEST * lease)
-        found = select(exists().where(Job.state == State.RUNNING, silent))
+        wrong = or_(_silent(now, owners), _ahead(now, owners))
+        found = select(exists().where(Job.state == State.RUNNING, wrong))
         return bool(self._session.scalar(found))
 
-    def reap(self, gone: Collection[str] = (), lease: timedelta = LEASE) -> Reaped:
+    def reap(self, owners: Owners | None = None) -> Reaped:
         """Give back the jobs whose leases have expired, or end them.
 
-        A job that was to be cancelled is cancelled; one that lost its lease `max_attempts` times
-        while no run of it ended fails with that reason; any other is queued and goes on from its
-        checkpoints.
-
-        Parameters
-        ----------
-        gone : collection of str
-            Dispatchers known to have ended: their leases are not waited for.
-        lease : timedelta
-            How long leases are. One that ends more than `LONGEST` of them from now was written
-            by a clock that was stepped back since: it is shortened to one, from now.
+        A job that was to be cancelled is cancelled; one that was lost `max_attempts` times while
+        no run of it went on or ended fails with that reason; any other is queued and goes on
+        from its checkpoints. The leases of owners that are gone are not waited for, those of
+        living ones `HUNG` longer. A lease that ends more than `LONGEST` lengths from now was
+        written by a clock that was stepped back since: it is shortened to one, from now.
         """
-        now = self._clock()
-        ahead = update(Job).where(
-            Job.state == State.RUNNING, Job.lease_until > now + LONGEST * lease
-        )
-        self._session.execute(ahead.values(lease_until=now + lease), execution_options=IN_PLACE)
-        silent = or_(Job.lease_until < now, Job.lease_owner.in_(gone))
+        now, known = self._clock(), owners or Owners()
+        ahead = update(Job).where(Job.state == State.RUNNING, _ahead(now, known))
+        ends = _by_owner({one: now + length for one, length in known.lengths.items()},
+                         now + known.usual)  # fmt: skip
+        self._session.execute(ahead.values(lease_until=ends), execution_options=IN_PLACE)
         expired = (
             select(Job)
-            .where(Job.state == State.RUNNING, silent)
+            .where(Job.state == State.RUNNING, _silent(now, known))
             .with_for_update(skip_locked=True, key_share=True)
+            .options(_NO_SPEC)
         )
         fates: dict[State, list[str]] = {state: [] for state in State}
+        whose: set[str] = set()
         for job in self._session.scalars(expired, execution_options={"populate_existing": True}):
+            whose.add(str(job.lease_owner))
             fates[self._bury(job)].append(job.id)
-        queued, failed, cancelled = State.QUEUED, State.FAILED, State.CANCELLED
-        return Reaped(tuple(fates[queued]), tuple(fates[failed]), tuple(fates[cancelled]))
+        queued, failed, cancelled = (
+            tuple(fates[one]) for one in (State.QUEUED, State.FAILED, State.CANCELLED)
+        )
+        return Reaped(queued, failed, cancelled, frozenset(whose))
 
     def _change(self, lease: Lease, values: dict[str, Any]) -> Job:
-        changed = update(Job).where(*lease.fence()).values(values).returning(Job)
-        job = self._session.scalar(changed, execution_options=IN_PLACE)
-        if job is None:
+        changed = update(Job).where(*lease.fence()).values(values).returning(Job.id)
+        if self._session.scalar(changed, execution_options=IN_PLACE) is None:
             raise LeaseLost(lease.job_id, lease.attempt)
-        return job
+        mine = select(Job).where(Job.id == lease.job_id).options(_NO_SPEC)
+        return self._session.scalars(mine, execution_options={"populate_existing": True}).one()
 
     def _settle_best(self, job: Job) -> None:
         """Take the best RMS from the results: while a run goes on it tells its fitness only."""
@@ -257,21 +310,27 @@ class Queue:
             raise Conflict(f"{job.id} cannot succeed: {n_left} of its runs did not finish")
 
     def _bury(self, job: Job) -> State:
-        mine = (Run.job_id == job.id, Run.attempt == job.attempt, Run.state.not_in(OPEN))
-        went_on = self._session.scalar(select(exists().where(*mine)))
-        job.lost_leases = 1 if went_on else job.lost_leases + 1
+        job.lost_leases = 1 if self._went_on(job) else job.lost_leases + 1
         if job.cancel_requested:
             self._end(job, State.CANCELLED, None)
         elif job.lost_leases >= job.max_attempts:
             self._end(
                 job, State.FAILED,
-                f"the dispatcher fell silent {job.lost_leases} times, or lost its workers; the "
-                f"last was {job.lease_owner}; see its log, and resume the job when the cause is "
-                "gone",
+                f"the dispatcher ended or fell silent {job.lost_leases} times, or lost its "
+                f"workers, and the job did not go on between; the last was {job.lease_owner}; "
+                "see its log, and resume the job when the cause is gone",
             )  # fmt: skip
         else:
             self._requeue(job)
         return job.state
+
+    def _went_on(self, job: Job) -> bool:
+        """Whether a run ended or came further in this attempt: only then has it a checkpoint."""
+        ended = exists().where(
+            Run.job_id == job.id, Run.attempt == job.attempt, Run.state.not_in(OPEN)
+        )
+        further = exists().where(Checkpoint.job_id == job.id, Checkpoint.attempt == job.attempt)
+        return bool(self._session.scalar(select(or_(ended, further))))
 
     def _end(self, job: Job, state: State, error: str | None) -> None:
         job.state, job.error, job.finished_at = state, error, self._clock()
@@ -285,6 +344,25 @@ class Queue:
         self._session.execute(running.values(state=State.QUEUED), execution_options=IN_PLACE)
         self._events.append_state(job)
         notify_queue(self._session)
+
+
+def _silent(now: datetime, owners: Owners) -> ColumnElement[bool]:
+    """Condition that a job's lease is not waited for any longer."""
+    overdue = Job.lease_until < _by_owner(dict.fromkeys(owners.living, now - HUNG), now)
+    return or_(overdue, Job.lease_owner.in_(owners.gone))
+
+
+def _ahead(now: datetime, owners: Owners) -> ColumnElement[bool]:
+    """Condition that a job's lease ends later than any that could be given now."""
+    latest = {one: now + LONGEST * length for one, length in owners.lengths.items()}
+    return Job.lease_until > _by_owner(latest, now + LONGEST * owners.usual)
+
+
+def _by_owner(times: Mapping[str, datetime], other: datetime) -> ColumnElement[datetime]:
+    """A time for each owner of a lease, and one for all others."""
+    known = {owner: literal(time, UtcDateTime()) for owner, time in times.items()}
+    otherwise = literal(other, UtcDateTime())
+    return case(known, value=Job.lease_owner, else_=otherwise) if known else otherwise
 
 
 def smaller(rms: float) -> ColumnElement[Any]:

@@ -17,6 +17,7 @@ from service.storage.columns import to_json
 BUSY_SECONDS = 30.0
 CONNECT_SECONDS = 5
 _READ = {"lagid_reads": True, "postgresql_readonly": True}
+_BUSY = "lagid_busy_seconds"
 
 
 class Database:
@@ -40,9 +41,20 @@ class Database:
         return self.engine.dialect.name == "sqlite"
 
     @contextmanager
-    def write(self) -> Iterator[Session]:
-        """A session that commits when the block ends well."""
-        with self._write.begin() as session:
+    def write(self, busy_seconds: float | None = None) -> Iterator[Session]:
+        """A session that commits when the block ends well.
+
+        Parameters
+        ----------
+        busy_seconds : float, optional
+            How long it waits for what others have locked; by default `BUSY_SECONDS` on SQLite,
+            and on PostgreSQL until they let go. A longer time than the default is not waited.
+        """
+        make = self._write
+        if busy_seconds is not None:
+            hasty = self.engine.execution_options(**{_BUSY: min(busy_seconds, BUSY_SECONDS)})
+            make = sessionmaker(hasty, expire_on_commit=False)
+        with make.begin() as session:
             yield session
 
     @contextmanager
@@ -73,9 +85,11 @@ def _engine(url: str, **options: Any) -> Engine:
         address = address.set(drivername="postgresql+psycopg")
     # A pooled connection may have died with a restarted server: ask before use.
     settings = {"connect_timeout": CONNECT_SECONDS}
-    return create_engine(
+    engine = create_engine(
         address, json_serializer=to_json, pool_pre_ping=True, connect_args=settings, **options
     )
+    event.listen(engine, "begin", _begin_postgresql)
+    return engine
 
 
 def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) -> None:
@@ -103,6 +117,15 @@ def _enter_wal(connection: sqlite3.Connection) -> None:
 
 
 def _begin_sqlite(connection: Connection) -> None:
-    reads = connection.get_execution_options().get("lagid_reads", False)
+    options = connection.get_execution_options()
+    reads = options.get("lagid_reads", False)
+    busy = int(1000 * options.get(_BUSY, BUSY_SECONDS))
+    connection.exec_driver_sql(f"PRAGMA busy_timeout = {busy}")
     connection.exec_driver_sql(f"PRAGMA query_only = {'ON' if reads else 'OFF'}")
     connection.exec_driver_sql("BEGIN" if reads else "BEGIN IMMEDIATE")
+
+
+def _begin_postgresql(connection: Connection) -> None:
+    busy = connection.get_execution_options().get(_BUSY)
+    if busy is not None:
+        connection.exec_driver_sql(f"SET LOCAL lock_timeout = {int(1000 * busy)}")

@@ -160,15 +160,15 @@ def test_models_stored_at_once_get_different_versions(database):
 
 
 def test_a_dispatcher_is_alive_while_it_beats(database):
-    clock = Clock()
+    clock, lease = Clock(), timedelta(seconds=30)
     with database.write() as session:
         dispatchers = DispatcherRepository(session, clock)
         dispatchers.announce("d1", {"cpus": 2})
         clock.advance(20)
         dispatchers.announce("d2", {"cpus": 4})
-        assert [one.owner for one in dispatchers.alive()] == ["d1", "d2"]
+        assert [one.owner for one in dispatchers.alive(lease)] == ["d1", "d2"]
         clock.advance(20)
-        assert [one.owner for one in dispatchers.alive()] == ["d2"]
+        assert [one.owner for one in dispatchers.alive(lease)] == ["d2"]
         dispatchers.beat("d1")
         assert [one.owner for one in dispatchers.alive(timedelta(seconds=5))] == ["d1"]
         dispatchers.leave("d1")

@@ -16,7 +16,7 @@ from service.schemas_jobs import JobIn
 from service.storage.errors import Conflict
 from service.storage.jobs import JobRepository
 from service.storage.ledger import RunLedger
-from service.storage.queue import Queue
+from service.storage.queue import Owners, Queue
 from service.storage.runs import RunRepository
 from service.storage.summaries import GroupKey, groups
 from service.storage.tables import OPEN, Dataset, State
@@ -48,7 +48,7 @@ def claim(place, owner="d1"):
 
 def lose(place, claim):
     with place.database.write() as session:
-        Queue(session).reap(gone=[claim.lease.owner])
+        Queue(session).reap(Owners(gone=frozenset({claim.lease.owner})))
 
 
 def source(place, claim):

@@ -1,13 +1,18 @@
 """A dispatcher's leases and what it does when one is late or lost; the clock is the test's."""
 
+import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from sqlalchemy import update
+from sqlalchemy.exc import OperationalError
 
 from service.dispatch.claiming import Leases
 from service.dispatcher import Dispatcher
-from service.storage.tables import State
+from service.storage.sessions import BUSY_SECONDS
+from service.storage.tables import Job, State
 from tests.dispatching import Place
 from tests.stored import Clock, claim, job_of, state_of, submit
 from tests.unit.test_feeding import ScriptedCrew, fails
@@ -34,12 +39,17 @@ def test_a_lease_renewed_in_time_is_kept(database, clock: Clock) -> None:
     assert state_of(database, job) is State.RUNNING
 
 
-def test_a_lease_that_is_late_is_lost_though_nobody_has_reaped_it(database, clock: Clock) -> None:
+def test_a_lease_that_is_late_is_unknown_until_a_heartbeat_tells_that_it_is_still_ours(
+    database, clock: Clock
+) -> None:
     submit(database)
     leases = leases_of(database, clock)
     lease = leases.claim().lease
     clock.advance(31)
-    assert leases.is_lost(lease)
+    assert (leases.is_sure(lease), leases.is_lost(lease)) == (False, False)
+    leases.renew()
+    assert (leases.is_sure(lease), leases.is_lost(lease)) == (True, False)
+    assert job_of(database, lease.job_id).lost_leases == 0
 
 
 def test_a_late_heartbeat_of_other_leases_does_not_make_a_new_one_late(
@@ -50,7 +60,7 @@ def test_a_late_heartbeat_of_other_leases_does_not_make_a_new_one_late(
     old = leases.claim().lease
     clock.advance(31)
     young = leases.claim().lease
-    assert (leases.is_lost(old), leases.is_lost(young)) == (True, False)
+    assert (leases.is_sure(old), leases.is_sure(young)) == (False, True)
 
 
 def test_a_forgotten_lease_expires_while_the_others_of_its_owner_live(
@@ -77,7 +87,7 @@ def test_a_lease_that_a_rival_took_is_lost_and_the_rivals_is_not_renewed(
     rival.renew()
     assert claim(database, "d2", clock).lease.attempt == 2
     leases.renew()
-    assert leases.is_lost(lease)
+    assert (leases.is_lost(lease), leases.is_sure(lease)) == (True, False)
     clock.advance(31)
     leases.renew()
     assert (state_of(database, lease.job_id), job_of(database, lease.job_id).lost_leases) == (
@@ -120,20 +130,88 @@ def stand(tmp_path: Path, clock: Clock) -> Iterator[Stand]:
     made.place.database.dispose()
 
 
-def test_a_job_dropped_because_the_heartbeat_was_late_is_taken_up_again(stand: Stand) -> None:
+def test_a_job_whose_heartbeat_was_late_goes_on_and_meanwhile_nothing_is_written(
+    stand: Stand,
+) -> None:
     job = stand.place.submit()
     stand.turn_until_sent(1)
-    stand.clock.advance(31)  # the process slept
+    stand.clock.advance(31)  # the heartbeat waits for the database
+    (recorder,) = stand.dispatcher._recorders.values()
+    flushes = []
+    recorder.flush = lambda: flushes.append(stand.clock.now)  # type: ignore[method-assign]
+    for _ in range(20):
+        stand.dispatcher.turn()
+    assert (stand.crew.cancelled, flushes) == ([], [])
+    stand.leases.renew()
+    stand.dispatcher.turn()
+    assert (stand.crew.cancelled, len(flushes)) == ([], 1)
+    row = stand.place.job(job)
+    assert (row.state, row.attempt, row.lost_leases) == (State.RUNNING, 1, 0)
+
+
+def test_a_job_that_was_lost_while_its_heartbeat_was_late_is_taken_up_again(
+    stand: Stand,
+) -> None:
+    job = stand.place.submit()
+    stand.turn_until_sent(1)
+    stand.clock.advance(31)
+    leases_of(stand.place.database, stand.clock).renew()  # another reaps it
+    stand.leases.renew()
     for _ in range(200_000):
         stand.dispatcher.turn()
         if stand.crew.cancelled:
             break
     assert stand.crew.cancelled
-    for _ in range(2):
-        stand.clock.advance(20)
-        stand.leases.renew()
-    assert (stand.place.job(job).state, stand.place.job(job).lost_leases) == (State.QUEUED, 1)
+    assert stand.place.job(job).lost_leases == 1
     stand.turn_until(job, State.RUNNING, attempt=2)
+
+
+class Unanswered:
+    """A database whose answer to one commit is lost."""
+
+    def __init__(self, database) -> None:
+        self._database, self.is_deaf = database, True
+        self.read = database.read
+
+    @contextmanager
+    def write(self, *given: float):
+        with self._database.write(*given) as session:
+            yield session
+        if self.is_deaf:
+            self.is_deaf = False
+            raise OperationalError("COMMIT", {}, Exception("server closed the connection"))
+
+
+def test_a_claim_that_was_made_but_not_answered_is_found_by_the_next(
+    database, clock: Clock
+) -> None:
+    job, other = submit(database), submit(database)
+    leases = leases_of(Unanswered(database), clock)
+    with pytest.raises(OperationalError):
+        leases.claim()
+    found = leases.claim()
+    assert (found.job.id, found.lease.attempt) == (job, 1)
+    assert state_of(database, other) is State.QUEUED
+    leases.renew()
+    assert leases.is_sure(found.lease)
+    assert leases.claim().job.id == other
+
+
+def test_a_heartbeat_waits_for_the_database_no_longer_than_a_third_of_the_lease(
+    database, clock: Clock
+) -> None:
+    job = submit(database)
+    leases = Leases(database, 0.6)  # by the true clock
+    lease = leases.claim().lease
+    with database.write() as other:
+        other.execute(update(Job).where(Job.id == job).values(name="held"))
+        begun = time.monotonic()
+        with pytest.raises(OperationalError):
+            leases.renew()
+        took = time.monotonic() - begun
+    assert took < BUSY_SECONDS / 2
+    leases.renew()
+    assert leases.is_sure(lease)
 
 
 @pytest.mark.slow

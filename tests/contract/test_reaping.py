@@ -1,7 +1,9 @@
 """Jobs whose dispatcher is gone, or seems to be: on SQLite and on PostgreSQL alike."""
 
 import json
+import logging
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -9,10 +11,12 @@ from datetime import timedelta
 
 import pytest
 
-from service.reaping import Reaper, identity, is_gone, reap
-from service.storage.dispatchers import DispatcherRepository
+from service.reaping import Reaper, identity, is_awake, is_gone, reap
+from service.storage.clocks import clock_of
+from service.storage.columns import utc_now
+from service.storage.dispatchers import LEASE_SECONDS, DispatcherRepository
 from service.storage.ledger import Cell, RunLedger, RunOutcome
-from service.storage.queue import Queue
+from service.storage.queue import HUNG, Queue
 from service.storage.tables import State
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
 from workers.processes import standing
@@ -146,3 +150,118 @@ def test_the_web_process_reaps_too(database) -> None:
         stopping.set()
         reaper.join()
     assert state_of(database, job) is State.QUEUED
+
+
+def expired(database, owner: str, details, seconds: float = 0.1) -> str:
+    """A job whose owner has told these details, and whose lease has ended since then."""
+    job = submit(database)
+    announce(database, owner, details)
+    with database.write() as session:
+        ago = timedelta(seconds=-seconds)
+        assert Queue(session).claim(owner, ago).job.id == job
+    return job
+
+
+@needs_proc
+def test_a_dispatcher_that_lives_here_is_not_reaped_while_it_waits_for_the_database(
+    database,
+) -> None:
+    job = expired(database, "here", identity(), HUNG.total_seconds() - 10)
+    lost = expired(database, "elsewhere", {**identity(), "machine": "another"})
+    assert reap(database, LEASE).requeued == (lost,)
+    assert state_of(database, job) is State.RUNNING
+    assert job_of(database, job).lost_leases == 0
+
+
+@needs_proc
+def test_a_dispatcher_that_lives_but_hangs_is_reaped_at_last_and_not_called_gone(
+    database, caplog: pytest.LogCaptureFixture
+) -> None:
+    job = expired(database, "here", identity(), HUNG.total_seconds() + 1)
+    with caplog.at_level(logging.WARNING):
+        assert reap(database, LEASE).requeued == (job,)
+    (told,) = caplog.messages
+    assert "here lives, but has not renewed its leases" in told
+    assert "gone" not in told
+    assert "ended" not in told
+
+
+@needs_proc
+def test_a_dispatcher_that_is_stopped_is_reaped_when_its_lease_ends(database) -> None:
+    code = (
+        "import json; from service.reaping import identity\n"
+        "print(json.dumps(identity()), flush=True); input()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        details = json.loads(process.stdout.readline())
+        assert is_awake(details)
+        os.kill(process.pid, signal.SIGSTOP)
+        os.waitid(os.P_PID, process.pid, os.WSTOPPED)
+        assert not is_awake(details)
+        assert not is_gone(details)
+        job = expired(database, "stopped", details)
+        assert reap(database, LEASE).requeued == (job,)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_leases_lost_while_a_run_came_further_are_not_added_up(database, clock: Clock) -> None:
+    job = submit(database, max_attempts=2)
+    for number in range(4):
+        got = claim(database, "falls", clock)
+        with database.write() as session:
+            ledger = RunLedger(session, got.lease)
+            ledger.create([Cell(number=0)])
+            ledger.save([(ledger.pending()[0].id, 100 * (number + 1), b"state")])
+        clock.advance(11)
+        assert reap(database, LEASE, clock).requeued == (job,), number
+        assert job_of(database, job).lost_leases == 1
+    claim(database, "falls", clock)  # and now it does not come further
+    clock.advance(11)
+    assert reap(database, LEASE, clock).failed == (job,)
+
+
+def test_how_long_a_lease_is_tells_its_dispatcher_and_not_the_one_who_reaps(
+    database, clock: Clock
+) -> None:
+    job = submit(database)
+    announce(database, "slow", {LEASE_SECONDS: 60.0})
+    with database.write() as session:
+        Queue(session, clock).claim("slow", timedelta(seconds=60))
+    assert reap(database, LEASE, clock).requeued == ()
+    assert job_of(database, job).lease_until == clock.now + timedelta(seconds=60)
+    clock.advance(-3600)
+    reap(database, LEASE, clock)
+    assert job_of(database, job).lease_until == clock.now + timedelta(seconds=60)
+    clock.advance(59)
+    assert reap(database, LEASE, clock).requeued == ()
+    clock.advance(2)
+    assert reap(database, LEASE, clock).requeued == (job,)
+
+
+def test_a_dispatcher_with_long_leases_counts_as_alive_as_long(database, clock: Clock) -> None:
+    with database.write() as session:
+        repository = DispatcherRepository(session, clock)
+        repository.announce("slow", {LEASE_SECONDS: 60.0})
+        repository.announce("quick", {LEASE_SECONDS: 10.0})
+        clock.advance(30)
+        assert [one.owner for one in repository.alive(LEASE)] == ["slow"]
+
+
+@pytest.mark.postgres
+def test_leases_follow_the_clock_of_the_server_not_those_of_its_clients(
+    postgres_database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = utc_now() - timedelta(seconds=1000)
+    monkeypatch.setattr("service.storage.columns.utc_now", lambda: wrong)
+    job = submit(postgres_database)
+    with postgres_database.write() as session:
+        assert clock_of(session)() > wrong + timedelta(seconds=500)
+        Queue(session).claim("behind")
+    monkeypatch.undo()
+    assert reap(postgres_database, LEASE).requeued == ()
+    assert state_of(postgres_database, job) is State.RUNNING

@@ -1,0 +1,25 @@
+"""The clock by which leases are given and reaped: one for all who share a database."""
+
+from collections.abc import Callable
+from datetime import datetime
+from functools import partial
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from service.storage import columns
+from service.storage.columns import UtcDateTime
+
+Clock = Callable[[], datetime]
+
+
+def clock_of(session: Session) -> Clock:
+    """PostgreSQL's own clock: those of its hosts may differ. SQLite is used on one host only."""
+    if session.get_bind().dialect.name == "postgresql":
+        return partial(_server_time, session)
+    return columns.utc_now
+
+
+def _server_time(session: Session) -> datetime:
+    # Not now(), which is when the transaction began: it may have waited since.
+    return session.scalars(select(func.clock_timestamp(type_=UtcDateTime))).one()
