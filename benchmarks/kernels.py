@@ -27,8 +27,9 @@ from benchmarks.equivalents import (
 from benchmarks.table import Row, Skipped, parser, report
 from sysid.kernels.compiler import kernel_key
 from sysid.kernels.emission import kernel_code
+from sysid.kernels.keeping import store, stored
 from sysid.kernels.layout import Variant
-from sysid.kernels.machine import object_code, store, stored
+from sysid.kernels.machine import object_code
 from sysid.models.model import Model
 from sysid.models.spec import parse_model
 from sysid.problem import Problem

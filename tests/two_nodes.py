@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from sysid.kernels.keeping import cache_folder
 from workers.processes import kill, of_session
 
 
@@ -80,7 +81,8 @@ def _serve(folder: Path, temporary: Path) -> None:
     node = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
     head = {**node, "include_dashboard": False, "temp_dir": str(temporary)}
     cluster = Cluster(initialize_head=True, connect=False, head_node_args=head)
-    elsewhere = {"LAGID_CACHE_DIR": str(folder / "cache")}
+    loops = os.environ.get("NUMBA_CACHE_DIR") or str(cache_folder())  # half a minute to compile
+    elsewhere = {"LAGID_CACHE_DIR": str(folder / "cache"), "NUMBA_CACHE_DIR": loops}
     second: Any = cluster.add_node(**node, env_vars=elsewhere)
     _answer(json.dumps({"address": cluster.address}))
     for line in sys.stdin:

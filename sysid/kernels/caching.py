@@ -1,28 +1,39 @@
 """Compiled functions that are kept on disk until any source of compiled code changes.
 
-Numba keys a cached function by its own file only. A compiled function contains those that it
+Numba's own cache keys a function by its own file only. A compiled function contains those that it
 calls, so after an update of another file the old machine code would run on, silently. Here the
-key holds a digest of all the files that compiled functions come from.
+key holds a digest of all the files that compiled functions come from, and the code lies where
+kernels lie (`sysid.kernels.keeping`): private, whole, with a digest.
+
+What a compiled function consists of is known only to Numba's insides. Where these are not as
+expected, functions are compiled as without a cache and the log says so.
 """
 
+import pickle
+import sys
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import llvmlite
 import numba
-from numba.core.caching import CompileResultCacheImpl, FunctionCache
-from numba.core.runtime.nrt import rtsys
+import numpy as np
 
-_SOURCES = (
-    "ga/*.py", "kernels/caching.py", "kernels/calls.py", "kernels/evaluation.py",
-    "kernels/evaluator.py", "plants/*.py", "least_squares.py", "refinement.py",
+from sysid.kernels.keeping import store, stored, tell
+
+_SOURCES = ("ga/*.py", "kernels/*.py", "plants/*.py", "least_squares.py", "refinement.py")
+_VERSIONS = (numba.__version__, llvmlite.__version__, np.__version__, sys.version)
+_PARTS = 9  # of a compiled function; the last are environments
+_UNEXPECTED = (
+    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError,
+    OSError, RuntimeError, TypeError, ValueError, pickle.PickleError,
 )  # fmt: skip
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-@lru_cache(maxsize=1)
+@cache
 def fingerprint() -> str:
     """Digest of the sources of all compiled functions."""
     package = Path(__file__).parents[1]
@@ -34,37 +45,78 @@ def fingerprint() -> str:
     return digest.hexdigest()
 
 
-class _LightImpl(CompileResultCacheImpl):
-    """What is kept of a compiled function: nothing that makes its loading import the compiler."""
-
-    def reduce(self, cres: Any) -> tuple[Any, ...]:
-        """The function without empty environments of others.
-
-        An environment holds a function's Python constants, and to make it again imports the
-        function's module: for Numba's own versions of NumPy a good part of the compiler.
-        """
-        *kept, environments = super().reduce(cres)  # type: ignore[no-untyped-call]
-        return (*kept, tuple(one for one in environments if one.consts))
+@cache
+def _digest_of(source: str) -> str:
+    return sha256(Path(source).read_bytes()).hexdigest()
 
 
-class _SourcesCache(FunctionCache):
-    """Numba's cache of one function, its key widened by the digest of the sources."""
+class _Kept:
+    """What Numba asks of the cache of one function, by its dispatcher."""
 
-    _impl_class = _LightImpl
+    cache_path = None
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._code = function.__code__
+        self._name = f"{function.__module__}.{function.__qualname__}"
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Machine code from the cache, None if it holds none.
+        """The function for some types of arguments, None if none is kept that can be used."""
+        try:
+            content = stored(self._key(sig, target_context), "loop")
+            return None if content is None else _rebuilt(content, target_context)
+        except _UNEXPECTED as error:
+            tell(f"{self._name} is not loaded ({error!r})")
+            return None
 
-        Numba's own method first registers all that could be compiled, a quarter of a second; what
-        is loaded needs the memory management alone. The compiler registers it where it runs.
-        """
-        rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+    def save_overload(self, sig: Any, compiled_: Any) -> None:
+        """Keep what was compiled, except code with addresses of this process in it."""
+        try:
+            if not compiled_.library.has_dynamic_globals:
+                store(self._key(sig, compiled_.target_context), _reduced(compiled_), "loop")
+        except _UNEXPECTED as error:
+            tell(f"{self._name} is not saved ({error!r})")
 
-    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
-        key: tuple[Any, ...] = super()._index_key(sig, codegen)  # type: ignore[no-untyped-call]
-        return (*key, fingerprint())
+    def flush(self) -> None:
+        """Nothing: what is compiled anew replaces what was kept."""
+
+    def _key(self, sig: Any, target_context: Any) -> str:
+        parts = (
+            fingerprint(), _VERSIONS, target_context.codegen().magic_tuple(), self._name,
+            self._code.co_firstlineno, _digest_of(self._code.co_filename), str(sig),
+        )  # fmt: skip
+        return sha256(repr(parts).encode()).hexdigest()
+
+
+def _reduced(compiled_: Any) -> bytes:
+    """The function without empty environments of others.
+
+    An environment holds a function's Python constants, and to make it again imports the
+    function's module: for Numba's own versions of NumPy a good part of the compiler.
+    """
+    from numba.core.serialize import dumps
+
+    parts = compiled_._reduce()
+    if len(parts) == _PARTS:
+        parts = (*parts[:-1], tuple(one for one in parts[-1] if one.consts))
+    return bytes(dumps(parts))  # type: ignore[no-untyped-call]
+
+
+def _rebuilt(content: bytes, target_context: Any) -> Any:
+    """The function in this process.
+
+    Numba's own cache first registers all that could be compiled, a quarter of a second; what is
+    loaded needs the memory management alone. The compiler registers it where it runs.
+    """
+    from numba.core.compiler import CompileResult
+    from numba.core.runtime.nrt import rtsys
+
+    inside: Any = CompileResult
+    initialize = getattr(rtsys, "initialize", None)
+    if initialize is None:
+        target_context.refresh()
+    else:
+        initialize(target_context)
+    return inside._rebuild(target_context, *pickle.loads(content))
 
 
 def compiled(function: _Function) -> _Function:
@@ -73,5 +125,8 @@ def compiled(function: _Function) -> _Function:
     No `fastmath`: ``isfinite`` must work, and a run must give the same bits on every worker.
     """
     made: Any = numba.njit(nogil=True, error_model="numpy")(function)
-    made._cache = _SourcesCache(function)  # type: ignore[no-untyped-call]
+    if hasattr(made, "_cache"):
+        made._cache = _Kept(function)
+    elif made is not function:  # as it is where NUMBA_DISABLE_JIT is set
+        tell(f"Numba {numba.__version__} keeps no cache of functions where it is looked for")
     return cast(_Function, made)

@@ -6,8 +6,9 @@ from functools import cache
 from pathlib import Path
 
 from sysid.kernels.emission import KERNEL, kernel_code
+from sysid.kernels.keeping import store, stored
 from sysid.kernels.layout import Variant
-from sysid.kernels.machine import loaded, machine_name, object_code, store, stored
+from sysid.kernels.machine import loaded, machine_name, object_code
 from sysid.models.model import EstimatedInitial, Model
 
 _addresses: dict[str, int] = {}

@@ -1,15 +1,6 @@
-"""From LLVM assembly to an address: compiled for this machine, kept on disk as object code.
+"""From LLVM assembly to object code for this machine, and from that to an address."""
 
-The cache folder is private to the user (mode 0700), because what lies there is run: a file that
-somebody else owns, or whose digest does not fit, is thrown away and made again.
-"""
-
-import contextlib
-import hashlib
-import os
-import tempfile
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import llvmlite
@@ -17,7 +8,6 @@ import llvmlite.binding as llvm
 
 from sysid.kernels.vectormath import vector_functions
 
-_MAGIC = b"lagid-kernel-1\n"
 _LEVEL = 3
 _engines: list[Any] = []  # an engine owns the memory of its code: it lives as long as the process
 
@@ -66,52 +56,3 @@ def loaded(code: bytes, function: str) -> int:
     engine.finalize_object()
     _engines.append(engine)
     return int(engine.get_function_address(function))
-
-
-def cache_folder() -> Path:
-    """Folder of compiled kernels: `LAGID_CACHE_DIR`, or ``~/.cache/lagid``."""
-    chosen = os.environ.get("LAGID_CACHE_DIR")
-    if chosen:
-        return Path(chosen)
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "lagid"
-
-
-def stored(key: str) -> bytes | None:
-    """Object code kept under a key; None if there is none that can be trusted."""
-    path = cache_folder() / f"{key}.o"
-    try:
-        with path.open("rb") as file:
-            if hasattr(os, "getuid") and os.fstat(file.fileno()).st_uid != os.getuid():
-                return None
-            content = file.read()
-    except OSError:
-        return None
-    header, digest, code = content[: len(_MAGIC)], content[len(_MAGIC) :][:32], content[47:]
-    if header != _MAGIC or digest != hashlib.sha256(key.encode() + code).digest():
-        with contextlib.suppress(OSError):
-            path.unlink()
-        return None
-    return code
-
-
-def store(key: str, code: bytes) -> None:
-    """Keep object code under a key; a folder that cannot be written to is no error."""
-    folder = cache_folder()
-    with contextlib.suppress(OSError):
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not _is_private(folder):
-            return
-        digest = hashlib.sha256(key.encode() + code).digest()
-        handle, temporary = tempfile.mkstemp(dir=folder)
-        with os.fdopen(handle, "wb") as file:
-            file.write(_MAGIC + digest + code)
-        os.replace(temporary, folder / f"{key}.o")  # whole or not at all
-
-
-def _is_private(folder: Path) -> bool:
-    """Whether nobody else may write there."""
-    if not hasattr(os, "getuid"):
-        return True
-    status = folder.stat()
-    return status.st_uid == os.getuid() and not status.st_mode & 0o022

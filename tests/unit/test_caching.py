@@ -1,13 +1,25 @@
-"""Machine code on disk is used only with the sources it came from."""
+"""Machine code on disk is used only with the sources it came from, and only if it is whole."""
 
+import ast
+import logging
+import os
 import subprocess
 import sys
+import tomllib
+from collections.abc import Callable, Iterable
+from importlib import metadata
 from pathlib import Path
+from typing import Any
 
+import numba
 import pytest
+from numba.core.compiler import CompileResult
+from numba.core.runtime import nrt
+from packaging.requirements import Requirement
 
-from sysid.kernels import caching
+from sysid.kernels import caching, keeping
 
+ROOT = Path(caching.__file__).parents[2]
 PROGRAM = """
 import sys
 sys.path.insert(0, sys.argv[1])
@@ -25,11 +37,81 @@ def doubled(x):
 """
 
 
-def test_the_fingerprint_covers_the_search_and_the_evaluation() -> None:
-    package = Path(caching.__file__).parents[1]
+def doubled(x: float) -> float:
+    return 2.0 * x
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache folder, and a process that has told nothing yet."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(keeping, "_told", [])
+    return tmp_path / "cache"
+
+
+def hits() -> int:
+    """How often a new copy of the function was found on disk; its result is right anyway."""
+    copy: Any = caching.compiled(doubled)
+    assert copy(2.0) == 4.0
+    return sum(copy.stats.cache_hits.values())
+
+
+class Names:
+    """What the names at the top of a module stand for."""
+
+    def __init__(self, path: Path) -> None:
+        self.imported: dict[str, tuple[Path, str]] = {}
+        self.made: dict[str, ast.AST] = {}
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sysid."):
+                source = ROOT.joinpath(*str(node.module).split(".")).with_suffix(".py")
+                for alias in node.names:
+                    self.imported[alias.asname or alias.name] = (source, alias.name)
+            elif isinstance(node, ast.FunctionDef):
+                self.made[node.name] = node
+            elif isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                for name in {one for target in targets for one in names_in(target)}:
+                    self.made[name] = node.value
+
+
+def frozen_by_compiled(modules: Iterable[Path]) -> set[Path]:
+    """Modules that compiled functions come from or take values from, however indirectly."""
+    known = {path: Names(path) for path in modules}
+    waiting = [
+        (path, name) for path, names in known.items() for name, node in names.made.items()
+        if isinstance(node, ast.FunctionDef) and is_compiled(node)
+    ]  # fmt: skip
+    seen: set[tuple[Path, str]] = set()
+    while waiting:
+        path, name = one = waiting.pop()
+        if one in seen:
+            continue
+        seen.add(one)
+        if name in known[path].imported:
+            waiting.append(known[path].imported[name])
+        elif name in known[path].made:
+            waiting += [(path, used) for used in names_in(known[path].made[name])]
+    return {path for path, name in seen if name in known[path].made}
+
+
+def is_compiled(function: ast.FunctionDef) -> bool:
+    marks = {one.id for one in function.decorator_list if isinstance(one, ast.Name)}
+    return bool(marks & {"compiled", "intrinsic"})
+
+
+def names_in(node: ast.AST) -> set[str]:
+    """Names read there, except in annotations, which are not compiled."""
+    parts = node.body if isinstance(node, ast.FunctionDef) else [node]
+    return {one.id for part in parts for one in ast.walk(part) if isinstance(one, ast.Name)}
+
+
+def test_the_fingerprint_covers_all_that_compiled_functions_take_values_from() -> None:
+    package = ROOT / "sysid"
     covered = {path for pattern in caching._SOURCES for path in package.glob(pattern)}
-    assert package / "ga" / "gauss_newton.py" in covered
-    assert package / "kernels" / "evaluation.py" in covered
+    frozen = frozen_by_compiled(package.rglob("*.py"))
+    assert {package / "kernels" / "layout.py", package / "ga" / "state.py"} <= frozen
+    assert frozen <= covered
     assert len(caching.fingerprint()) == 64
 
 
@@ -39,11 +121,151 @@ def test_another_fingerprint_compiles_anew(tmp_path: Path) -> None:
 
     def run(fingerprint: str) -> str:
         command = [sys.executable, "-c", PROGRAM, str(tmp_path), fingerprint]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+        return subprocess.run(
+            command, check=True, capture_output=True, text=True,
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+        ).stdout.strip()  # fmt: skip
 
     assert run("a") == "4.0 0"
     assert run("a") == "4.0 1"
     assert run("b") == "4.0 0"
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "cut late", "flipped", "longer"])
+def test_a_damaged_loop_is_compiled_anew_and_replaced(folder: Path, damage: str) -> None:
+    assert [hits(), hits()] == [0, 1]
+    (path,) = folder.iterdir()
+    whole = path.read_bytes()
+    middle = len(whole) // 2
+    flipped = whole[:middle] + bytes([whole[middle] ^ 255]) + whole[middle + 1 :]
+    path.write_bytes(
+        {"empty": b"", "cut": whole[:100], "cut late": whole[:-2000], "longer": whole + b"x"}.get(
+            damage, flipped
+        )
+    )
+    assert [hits(), hits()] == [0, 1]
+    assert os.listdir(folder) == [path.name]
+
+
+def test_what_is_whole_but_no_compiled_function_is_replaced(folder: Path) -> None:
+    hits()
+    (path,) = folder.iterdir()
+    for content in (b"", b"no pickle", b"\x80\x04]\x94."):
+        keeping.store(path.stem, content, "loop")
+        assert [hits(), hits()] == [0, 1]
+
+
+def test_loops_are_private_to_the_user(folder: Path) -> None:
+    hits()
+    (path,) = folder.iterdir()
+    assert [folder.stat().st_mode & 0o777, path.stat().st_mode & 0o777] == [0o700, 0o600]
+
+
+def test_what_another_user_owns_or_may_have_written_is_not_loaded(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert [hits(), hits()] == [0, 1]
+    folder.chmod(0o777)
+    assert hits() == 0
+    folder.chmod(0o700)
+    assert hits() == 1
+    monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
+    assert hits() == 0
+    assert len(caplog.records) == 1
+
+
+@pytest.mark.parametrize("place", ["below a file", "no home"])
+def test_without_a_folder_loops_work_and_one_warning_says_what_to_do(
+    folder: Path, place: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    if place == "no home":
+        for name in ("NUMBA_CACHE_DIR", "LAGID_CACHE_DIR", "XDG_CACHE_HOME"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setattr(Path, "home", no_home)
+    else:
+        folder.write_text("not a folder")
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder / "cache"))
+    assert [hits(), hits()] == [0, 0]
+    (told,) = caplog.records
+    assert told.levelno == logging.WARNING
+    assert "LAGID_CACHE_DIR" in told.getMessage()
+
+
+def no_home() -> Path:
+    raise RuntimeError("Could not determine home directory.")
+
+
+@pytest.mark.parametrize(
+    "absent",
+    [(CompileResult, "_reduce"), (CompileResult, "_rebuild"), (nrt, "rtsys")],
+    ids=lambda one: one[1],
+)
+def test_without_an_inside_of_numba_functions_are_compiled_as_without_a_cache(
+    folder: Path, absent: tuple[Any, str], monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:  # fmt: skip
+    monkeypatch.delattr(*absent)
+    assert [hits(), hits()] == [0, 0]
+    assert len(caplog.records) == 1
+
+
+def test_without_the_start_of_memory_management_numbas_own_is_used(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert hits() == 0
+    monkeypatch.setattr(nrt, "rtsys", object())
+    assert hits() == 1
+
+
+def test_a_function_of_numba_that_has_no_cache_works(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Plain:
+        __slots__ = ("call",)
+
+        def __init__(self, function: Callable[[float], float]) -> None:
+            self.call = function
+
+        def __call__(self, x: float) -> float:
+            return self.call(x)
+
+    monkeypatch.setattr(keeping, "_told", [])
+    monkeypatch.setattr(numba, "njit", lambda **_: Plain)
+    assert caching.compiled(doubled)(2.0) == 4.0
+    assert len(caplog.records) == 1
+
+
+def test_the_newest_files_are_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(keeping, "_MOST_FILES", 2)
+    folder.mkdir(mode=0o700)
+    (folder / "a letter.o").write_text("somebody else's")
+    for number in range(4):
+        keeping.store(f"{number:064x}", b"code", "loop")
+        os.utime(folder / f"{number:064x}.loop", ns=(number, number))
+    kept = sorted(one.name for one in folder.iterdir())
+    assert kept == [f"{2:064x}.loop", f"{3:064x}.loop", "a letter.o"]
+
+
+@pytest.mark.slow
+def test_processes_that_compile_at_once_leave_one_whole_file(tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text(MODULE)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-c", PROGRAM, str(tmp_path), "a"]
+
+    def started() -> subprocess.Popen[str]:
+        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+
+    racing = [started() for _ in range(3)]
+    assert {one.communicate()[0].split()[0] for one in racing} == {"4.0"}
+    assert len(os.listdir(tmp_path / "cache")) == 1
+    assert started().communicate()[0].split() == ["4.0", "1"]
+
+
+def test_numba_is_bounded_where_its_insides_are_known() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = {one.name: one for one in map(Requirement, project["dependencies"])}["numba"]
+    assert any(one.operator == "<" for one in wanted.specifier)
+    assert metadata.version("numba") in wanted.specifier
 
 
 WARM = """

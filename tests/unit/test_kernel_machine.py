@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sysid.kernels import compiler, machine
+from sysid.kernels import compiler, keeping
 from sysid.kernels.layout import Variant
 from sysid.problem import Problem
 from tests.models import difference, duffing, individuals, record
@@ -15,6 +15,8 @@ from tests.models import difference, duffing, individuals, record
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache folder, and a process that has loaded no kernel."""
+    loops = os.environ.get("NUMBA_CACHE_DIR") or str(keeping.cache_folder())
+    monkeypatch.setenv("NUMBA_CACHE_DIR", loops)  # these are not what is looked at here
     monkeypatch.setenv("LAGID_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(compiler, "_addresses", {})
     return tmp_path / "cache"
@@ -62,7 +64,7 @@ def test_a_damaged_file_is_made_again(
         content[len(content) // 2] ^= 1
     elif damage == "another kernel":
         key = compiler.kernel_key(difference({"x": "c*x(k-1)"}, "x"), Variant())
-        machine.store(key, b"something else")
+        keeping.store(key, b"something else")
         content = bytearray((folder / f"{key}.o").read_bytes())
     path.write_bytes(bytes({"cut": content[:100], "empty": content[:0]}.get(damage, content)))
     monkeypatch.setattr(compiler, "_addresses", {})

@@ -1,0 +1,129 @@
+"""Machine code on disk, in a folder private to the user, because what lies there is run.
+
+Each file holds a digest. One that is damaged or that somebody else owns is made again; a folder
+that cannot be used costs time only, and is told of once in a process.
+"""
+
+import contextlib
+import hashlib
+import logging
+import os
+import re
+import tempfile
+from pathlib import Path
+from typing import Literal
+
+Kind = Literal["o", "loop"]
+"""Object code of kernels, or loops that Numba compiled."""
+
+_MAGIC = b"lagid-kernel-1\n"
+_DIGEST_SIZE = 32
+_MOST_FILES = 2_000  # each update of lagid leaves some fifty behind; the oldest are removed
+_OURS = re.compile(r"[0-9a-f]{64}\.(o|loop)")
+_ADVICE = "set LAGID_CACHE_DIR to a folder that this user alone can write to"
+_log = logging.getLogger(__name__)
+_told: list[str] = []
+
+
+def cache_folder() -> Path:
+    """Folder of compiled code: `LAGID_CACHE_DIR`, or ``~/.cache/lagid``.
+
+    Raises
+    ------
+    OSError
+        If the user has no home.
+    """
+    chosen = os.environ.get("LAGID_CACHE_DIR")
+    if chosen:
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME")
+    if base:
+        return Path(base) / "lagid"
+    try:
+        return Path.home() / ".cache" / "lagid"
+    except RuntimeError as error:
+        raise OSError("this user has no home folder") from error
+
+
+def _folder(kind: Kind) -> Path:
+    """Where a kind is kept: as Numba's own cache, loops follow `NUMBA_CACHE_DIR` if it is set."""
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    return Path(chosen) if chosen and kind == "loop" else cache_folder()
+
+
+def stored(key: str, kind: Kind = "o") -> bytes | None:
+    """Code kept under a key; None if there is none that can be trusted."""
+    name = f"{key}.{kind}"
+    try:
+        folder = _folder(kind)
+        if not _is_private(folder):
+            return None
+        with (folder / name).open("rb") as file:
+            if _belongs_to_another(os.fstat(file.fileno())):
+                return None
+            content = file.read()
+    except OSError:
+        return None
+    start = len(_MAGIC) + _DIGEST_SIZE
+    if content[:start] == _MAGIC + _digest(name, content[start:]):
+        return content[start:]
+    with contextlib.suppress(OSError):
+        (folder / name).unlink()
+    return None
+
+
+def store(key: str, code: bytes, kind: Kind = "o") -> None:
+    """Keep code under a key, whole or not at all; a folder that cannot be used is no error."""
+    try:
+        folder = _folder(kind)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not _is_private(folder):
+            tell(f"{folder} belongs to another user, or others may write to it; {_ADVICE}")
+            return
+        _write(folder, f"{key}.{kind}", code)
+        _prune(folder)
+    except OSError as error:
+        tell(f"{error}; {_ADVICE}")
+
+
+def _write(folder: Path, name: str, code: bytes) -> None:
+    handle, temporary = tempfile.mkstemp(dir=folder)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(_MAGIC + _digest(name, code) + code)
+        os.replace(temporary, folder / name)
+    except OSError:
+        os.unlink(temporary)
+        raise
+
+
+def tell(why: str) -> None:
+    """Log why compiled code is not kept, once in a process."""
+    if not _told:
+        _told.append(why)
+        _log.warning("compiled code is not kept, so every process compiles it anew: %s", why)
+
+
+def _digest(name: str, code: bytes) -> bytes:
+    return hashlib.sha256(name.encode() + code).digest()
+
+
+def _belongs_to_another(status: os.stat_result) -> bool:
+    return hasattr(os, "getuid") and status.st_uid != os.getuid()
+
+
+def _is_private(folder: Path) -> bool:
+    """Whether nobody else may write there."""
+    if not hasattr(os, "getuid"):
+        return True
+    status = folder.stat()
+    return not _belongs_to_another(status) and not status.st_mode & 0o022
+
+
+def _prune(folder: Path) -> None:
+    """Remove the oldest files beyond the most that are kept."""
+    files = [one for one in os.scandir(folder) if _OURS.fullmatch(one.name)]
+    if len(files) > _MOST_FILES:
+        files.sort(key=lambda one: one.stat().st_mtime_ns)
+        for one in files[: len(files) - _MOST_FILES]:
+            os.unlink(one.path)
