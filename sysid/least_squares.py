@@ -92,11 +92,13 @@ def _solved(
     damping, idle = 1e-3, 0
     error = residuals(place[None])[0]
     value = float(loss.total(error[None])[0])
+    columns = None
     for _ in range(steps):
         tried = np.maximum(_DAMPINGS * damping, _LEAST)
-        columns = np.ascontiguousarray(jacobian(place, error))
+        if columns is None:
+            columns = np.ascontiguousarray(jacobian(place, error))
         places, promised = _proposals(error, columns, place, tried, loss.scale)
-        if promised <= tolerance * value:  # by the largest step
+        if promised <= tolerance * value:
             return Solution(place, True)
         errors = residuals(places)
         values = loss.total(errors)
@@ -107,7 +109,7 @@ def _solved(
                 return Solution(place, True)
             continue
         gained = (value - values[best]) / value
-        place, error, value = places[best], errors[best], float(values[best])
+        place, error, value, columns = places[best], errors[best], float(values[best]), None
         damping = float(np.clip(tried[best] if best else damping * 1e-2, _LEAST, _MOST))
         idle = idle + 1 if gained <= tolerance else 0
         if idle == _STOPPED:
@@ -137,10 +139,16 @@ def _normal_equations(
 def _proposals(
     error: FloatArray, columns: FloatArray, place: FloatArray, damping: FloatArray, scale: float
 ) -> tuple[FloatArray, float]:
-    """Places (P, D) after the step of each damping (P,), and the gain that the first promises."""
+    """Places (P, D) after the step of each damping (P,), and the largest gain that one promises.
+
+    That of a step cut off at the bounds is less than the whole step's.
+    """
     normal, slope = _normal_equations(error, columns, scale)
     places, promised = np.empty((damping.size, place.size)), 0.0
     for p in range(damping.size):
-        gain = damped_step(normal, slope, place, damping[p], places[p])
-        promised = gain if p == 0 else promised
+        damped_step(normal, slope, place, damping[p], places[p])
+        gain = 0.0
+        for d in range(place.size):
+            gain -= slope[d] * (places[p, d] - place[d])
+        promised = max(promised, gain)
     return places, promised

@@ -85,3 +85,33 @@ def test_the_steps_allowed_bound_the_simulations():
 
     solve(residuals, jacobian_of(residuals), np.full(4, 0.9), Loss(), steps=3)
     assert counted <= 1 + 3 * (4 + TRIED)
+
+
+def test_the_slopes_of_a_place_are_taken_once_however_often_steps_from_it_are_refused():
+    places = []
+
+    def residuals(tried):
+        first = tried[:, :1]
+        return np.where(first == 0.5, first * TIMES, 1e3 * np.ones(TIMES.size))
+
+    def jacobian(place, error):
+        places.append(place.tobytes())
+        return TIMES[:, None]
+
+    ended = solve(residuals, jacobian, np.array([0.5]), Loss(), steps=20)
+    assert ended.place[0] == 0.5
+    assert len(places) == len(set(places)) == 1
+
+
+@pytest.mark.parametrize("start", [1.0, 1.0 - 1e-15])
+def test_a_step_that_a_bound_cuts_off_promises_only_what_is_left_of_it(start):
+    batches = []
+
+    def residuals(places):
+        batches.append(len(places))
+        return places[:, :1] * np.ones(5) - 3.0
+
+    ended = solve(residuals, lambda *_: np.ones((5, 1)), np.array([start]), Loss(), steps=20)
+    assert ended.is_converged
+    assert ended.place[0] == start
+    assert batches == [1]
