@@ -49,12 +49,13 @@ class OpenChains:
         self._chain, self._waits, self._ended = chain, waits, ended
         self._n_chains, self._opened = n_runs // chain.length, 0
         self._open: dict[int, _Open] = {}
+        self._n_unfinished = 0  # open chains of which not every run was given
         self._free: deque[int] = deque()  # chains whose next run may begin
 
     @property
-    def is_done(self) -> bool:
-        """Whether every run was given and is over."""
-        return self._opened == self._n_chains and not self._open
+    def is_empty(self) -> bool:
+        """Whether every run was given."""
+        return self._opened == self._n_chains and self._n_unfinished == 0
 
     @property
     def has_free(self) -> bool:
@@ -112,6 +113,7 @@ class OpenChains:
             self._pass_over(one)
             if one.at < len(one.numbers):
                 self._open[key] = one
+                self._n_unfinished += 1
                 self._free.append(key)
                 room -= 1
 
@@ -120,6 +122,7 @@ class OpenChains:
         one.flying.add(number)
         one.at += 1
         self._pass_over(one)
+        self._n_unfinished -= one.at == len(one.numbers)
         return number
 
     def _pass_over(self, one: _Open) -> None:

@@ -114,7 +114,7 @@ class JobRuns:
     def _along(self, chains: OpenChains) -> Iterator[list[Run]]:
         """Runs that may begin, of many chains; no runs while all that are left wait."""
         made = patiently(self._n_made)
-        while not chains.is_done:
+        while not chains.is_empty:
             numbers = chains.ready(TOGETHER, made)
             if not numbers and chains.has_free and patiently(self._make_runs):
                 made = patiently(self._n_made)

@@ -2,19 +2,25 @@
 
 import threading
 import time
+from itertools import takewhile
 
 import pytest
+from sqlalchemy import event
 
 from service.conversion import algorithm_of
 from service.dispatch.claiming import Leases
+from service.dispatch.preparing import JobRuns
 from service.dispatcher import Dispatcher
 from service.errors import InvalidRequest
 from service.references import accept
 from service.schemas_references import ReferenceIn
+from service.storage.ledger import RunLedger
+from service.storage.queue import Queue
 from service.storage.tables import OPEN, State
 from sysid.errors import InvalidSettings
 from tests.dispatching import Place
 from workers.inline import InlineCrew
+from workers.ports import NotYet
 
 QUICK = {"population": 16, "generations": 40, "islands": 2, "stop": {"settled": 2}}
 
@@ -164,3 +170,90 @@ def test_a_run_of_another_model_or_one_that_did_not_succeed_is_refused(place):
             place.submit(warm_start=warm, model=model, parameters={})
         assert [one.pointer for one in caught.value.errors] == ["/warm_start"]
         assert said in caught.value.errors[0].detail
+
+
+LABELLED = {**NOISE, "labels": [{"x": 1}, {"x": 2}, {"x": 3}]}
+SEEDS = {"path": "/seed", "values": [1, 2, 3, 4]}
+
+
+def before_the_first_wait(place, body):
+    """Numbers of the runs that come before one waits for another."""
+    place.submit(**{"algorithm": QUICK, **body})
+    with place.database.write() as session:
+        claim = Queue(session).claim("d1")
+    numbers = {run.id: run.number for run in place.runs(claim.job.id)}
+    coming = takewhile(
+        lambda one: not isinstance(one, NotYet),
+        JobRuns(place.database, claim, place.store).runs(),
+    )
+    return [numbers[one.run] for one in coming]
+
+
+@pytest.mark.parametrize(
+    ("axes", "first"), [([SEEDS, LABELLED], [0, 3, 6, 9]), ([LABELLED, SEEDS], [0, 1, 2, 3])]
+)
+def test_every_chain_begins_at_once_whichever_axis_goes_fastest(place, axes, first):
+    assert before_the_first_wait(place, chained(*axes)) == first
+
+
+def test_a_chain_begins_also_where_its_first_run_was_not_made_yet(place, monkeypatch):
+    monkeypatch.setattr("service.jobs.AT_ONCE", 2)
+    monkeypatch.setattr("service.dispatch.preparing.CHUNK", 2)
+    runs, warm = carried_out(place, **chained(SEEDS, LABELLED))
+    assert [one == () for one in warm] == [True, False, False] * 4
+    assert {run.state for run in runs} == {State.SUCCEEDED}
+
+
+def test_the_results_of_chains_do_not_depend_on_the_order_of_the_axes(place):
+    fastest, _ = carried_out(place, 2, **chained(SEEDS, LABELLED))
+    slowest, _ = carried_out(place, 1, **chained(LABELLED, SEEDS))
+    assert by_cell(fastest) == by_cell(slowest)
+
+
+def by_cell(runs):
+    cells = [tuple(run.cell[axis["path"]] for axis in (SEEDS, LABELLED)) for run in runs]
+    return {cell: (values(run), run.evaluations) for cell, run in zip(cells, runs, strict=True)}
+
+
+def test_runs_that_begin_cold_do_not_wait_beside_those_that_follow_one_another(place):
+    cold_or_warm = {"path": "/warm_start", "values": [None, "previous"]}
+    axes = {"sweep": {"axes": [cold_or_warm, LABELLED]}}
+    assert before_the_first_wait(place, axes) == [0, 3, 1, 2]
+    runs, warm = carried_out(place, **axes)
+    assert warm == [(), (), (), (), (values(runs[3]),), (values(runs[4]),)]
+
+
+def statements_behind(place, n_failed):
+    """SQL statements that it takes to learn what the last of a chain begins with."""
+    job = place.submit(**chained({"path": "/seed", "range": [0, n_failed + 2]}, algorithm=QUICK))
+    with place.database.write() as session:
+        claim = Queue(session).claim("d1")
+        rows = RunLedger(session, claim.lease).pending()
+        rows[0].state, rows[0].estimates = State.SUCCEEDED, {"T": {"value": 2.0, "stderr": None}}
+        for row in rows[1:-1]:
+            row.state = State.FAILED
+    seen = []
+    with place.database.read() as session:
+        engine = session.get_bind()
+    event.listen(engine, "before_cursor_execute", lambda *told: seen.append(told[2]))
+    (last,) = JobRuns(place.database, claim, place.store).runs()
+    assert last.spec.warm == ({"T": 2.0},)
+    place.cancel(job)
+    return len(seen)
+
+
+def test_what_a_chain_goes_on_from_is_found_as_quickly_behind_many_failures(place):
+    assert statements_behind(place, 60) == statements_behind(place, 3)
+
+
+def test_a_chain_of_runs_that_fail_asks_the_database_for_none_of_them(place, monkeypatch):
+    def refused(*_):
+        raise AssertionError("an earlier attempt is looked for")
+
+    def broken(body):
+        raise InvalidSettings("/algorithm", "as told")
+
+    monkeypatch.setattr("service.dispatch.warm_starts.WarmStarts._stored", refused)
+    monkeypatch.setattr("service.dispatch.preparing.algorithm_of", broken)
+    runs, _ = carried_out(place, **chained({"path": "/seed", "range": [0, 50]}))
+    assert {one.state for one in runs} == {State.FAILED}
