@@ -48,6 +48,7 @@ class JobWork:
         self._shared: dict[str, Any] = {}
         self._cost = Cost()
         self._exhausted = False
+        self._has_no_more = False  # at present: what follows waits for runs that are not over
 
     @property
     def is_done(self) -> bool:
@@ -66,6 +67,7 @@ class JobWork:
         """
         while not self._exhausted and len(self._ready) < wanted:
             queued = next(self._coming, None)
+            self._has_no_more = queued is None or isinstance(queued, NotYet)
             if queued is None:
                 self._exhausted = True
             elif isinstance(queued, NotYet):
@@ -91,7 +93,7 @@ class JobWork:
         elif run.goes_alone:
             self._send([self._ready.popleft().whole()])
         else:
-            shared_by = self._crew.slots if self._exhausted else 1  # else more follow
+            shared_by = self._crew.slots if self._has_no_more else 1  # else more follow
             size = pack_size(self._cost, len(self._ready), shared_by)
             self._send([run.whole() for run in self._take_fresh(size)])
 

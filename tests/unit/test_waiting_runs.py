@@ -2,6 +2,10 @@
 
 from collections.abc import Iterator
 
+import pytest
+
+from service.chains import Chain
+from service.dispatch.open_chains import OpenChains
 from tests.runs import RECORDS, Notebook, spec
 from tests.unit.test_feeding import ScriptedCrew, fails, finish, jobs
 from workers.feeding import Feeder
@@ -50,3 +54,47 @@ def test_a_job_that_waits_can_be_cancelled() -> None:
     feeder.step(0.0)
     notebook.is_stopped = True
     assert finish(feeder) == ["chain"]
+
+
+class SeveralChains:
+    """Crossed chains as the dispatcher has them; each run is named by chain and number."""
+
+    def __init__(self, notebook: Notebook, chain: Chain, n_runs: int) -> None:
+        self._notebook, self._chain, self._n_runs = notebook, chain, n_runs
+        self._chains = OpenChains(chain, n_runs, lambda number: True)
+
+    def runs(self) -> Iterator[Coming]:
+        seen: set[str] = set()
+        while not self._chains.is_empty:
+            for run in set(self._notebook.failures) - seen:
+                seen.add(run)
+                self._chains.over(int(run.split("-")[1]))
+            for number in self._chains.ready(3, self._n_runs):
+                yield QueuedRun(f"{self._chain.of(number)}-{number}", spec())
+            yield NotYet()
+
+    def records(self, key: str) -> Records:
+        return RECORDS[key]
+
+
+@pytest.mark.parametrize("chain", [Chain(1, 5), Chain(4, 5)])
+def test_chains_go_side_by_side_and_each_run_by_run(chain: Chain) -> None:
+    crew, notebook = ScriptedCrew(fails), Notebook()
+    feeder: Feeder[str] = Feeder(crew)
+    feeder.add("chains", SeveralChains(notebook, chain, 20), notebook)
+    assert finish(feeder) == ["chains"]
+    numbers = [int(run.split("-")[1]) for pack in crew.sent for run in pack]
+    assert sorted(numbers) == list(range(20))
+    firsts = {numbers.index(chain.numbers(key)[0]) for key in range(4)}
+    last_steps = [numbers.index(chain.numbers(key)[-1]) for key in range(4)]
+    assert max(firsts) < min(last_steps)
+    for key in range(4):
+        assert [n for n in numbers if chain.of(n) == key] == list(chain.numbers(key))
+
+
+def test_runs_that_nothing_follows_at_present_are_shared_by_all_cores() -> None:
+    crew, notebook = ScriptedCrew(fails), Notebook()
+    feeder: Feeder[str] = Feeder(crew)
+    feeder.add("chains", SeveralChains(notebook, Chain(1, 5), 20), notebook)
+    finish(feeder)
+    assert max(map(len, crew.sent)) <= 2
