@@ -24,7 +24,7 @@ from sysid.language.checker import check
 from sysid.language.scope import Scope
 from sysid.records import Channel, Hold
 from sysid.types import FloatArray
-from sysid.units import difference, factor, is_blank
+from sysid.units import difference, factor
 
 MOST_DRAWS = 10_000_000
 """Values of one random binary signal at most."""
@@ -103,12 +103,13 @@ class Signals:
     def _converted(self, pointer: str, name: str, unit: str, signal: DatasetInput) -> Channel:
         """A recorded channel as an input: in its unit, where both have one."""
         found = self._recorded(pointer, signal)
-        times = 1.0 if is_blank(found.unit) or is_blank(unit) else factor(found.unit, unit)
+        told = difference(found.unit, unit)
+        times = factor(found.unit, unit) if told else 1.0
         if times is None:
             raise InvalidRequest.at(
                 f"{pointer}/channel",
                 f"channel {found.name!r} of {signal.dataset} is in {found.unit}, but "
-                f"{name!r} is in {unit}: {difference(found.unit, unit)}",
+                f"{name!r} is in {unit}: {told}",
             )
         return Channel(name, found.times, found.values * times, unit, found.hold)
 

@@ -17,7 +17,7 @@ from sysid.pooling import pool, select
 from sysid.records import HOLDS, Channel, Hold, Recording, Segment, time_of_cut
 from sysid.resampling import resample
 from sysid.types import FloatArray
-from sysid.units import difference, factor, is_blank
+from sysid.units import difference, factor, is_blank, is_read
 
 KINDS = ("gaussian", "uniform-sum")
 _HOLDS: Mapping[str, Hold] = {hold: hold for hold in HOLDS}
@@ -169,7 +169,9 @@ def set_unit(recording: Recording, given: Arguments) -> Recording:
         channel = recording.channel(name)
         times = 1.0 if is_blank(channel.unit) or is_blank(unit) else factor(channel.unit, unit)
         if times is None:
-            given.fail(name, f"{difference(channel.unit, unit)}; need a unit of the same quantity")
+            unread = [f"{one!r}" for one in (channel.unit, unit) if not is_read(one)]
+            told = difference(channel.unit, unit) or f"{' and '.join(unread)} cannot be read"
+            given.fail(name, f"{told}; need a unit of the same quantity as {channel.unit}")
         values = channel.values if times == 1.0 else channel.values * times
         changed[name] = replace(channel, unit=unit.strip() or "1", values=values)
     channels = tuple(changed.get(one.name, one) for one in recording.channels)

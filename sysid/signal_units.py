@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from sysid.errors import InvalidRecord
 from sysid.models.model import Model
 from sysid.records import Record
-from sysid.units import difference, factor, is_blank
+from sysid.units import difference, factor, is_blank, is_read
 
 
 class SignalUnits:
     """Unit of every signal of a model: its own, or where it has none that of the first record.
 
-    A channel without a unit, or with the unit 1, may be anything.
+    A channel without a unit, with the unit 1, or with one that cannot be read may be anything.
     """
 
     def __init__(self, model: Model) -> None:
@@ -31,6 +31,8 @@ class SignalUnits:
         if unit is None or is_blank(unit):
             return ""
         own, whose = self._known.setdefault(signal, (unit, where))
+        if is_read(unit) and not is_read(own):  # which tells more of the records that follow
+            self._known[signal] = (unit, where)
         found = difference(unit, own)
         if not found:
             return ""
@@ -60,3 +62,20 @@ def check_units(model: Model, records: Sequence[Record]) -> None:
             fault = units.fault(channel.name, channel.name, channel.unit, where)
             if fault:
                 raise InvalidRecord(fault)
+
+
+def unread_units(model: Model, records: Sequence[Record]) -> list[str]:
+    """Channels of which nobody can tell whether they are in the unit of the model."""
+    found = {}
+    known = {one.name: one.unit for one in model.inputs}
+    known |= {one.name: one.unit for one in model.outputs}
+    for record in records:
+        for channel in (*record.inputs, *record.outputs):
+            unit, own = channel.unit, known.get(channel.name, "")
+            unread = [one for one in (unit, own) if not is_read(one)]
+            if unread and not (is_blank(unit) or is_blank(own) or unit.strip() == own.strip()):
+                found[channel.name, unit] = (
+                    f"channel {channel.name!r} is in {unit}, and in the model it is in {own}: "
+                    f"{' and '.join(unread)} could not be read as a unit, so they were not compared"
+                )
+    return list(found.values())

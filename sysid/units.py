@@ -2,8 +2,12 @@
 
 A unit is a product of powers such as ``kg·m²/s``, ``N*m``, ``1/(V s)`` or ``mbar``. It is read
 into seven whole-numbered powers of the SI base units and a factor, so that ``kPa`` and ``Pa``, or
-``m/s^2`` and ``N/kg``, can be compared. A text that is no such product is a unit of its own: it is
-equal to itself only. Temperatures in °C are of this kind, since an offset is no factor.
+``m/s^2`` and ``N/kg``, can be compared. °C and °F have an offset, which no factor is: each is a
+unit of its own. Of a text that is no such product nothing is known: it may be any unit.
+
+A radian is 1, and so is a revolution where it is counted: 1 rpm is 1/60 Hz, but π/30 rad/s. Whether
+a signal in Hz is meant as a rate of cycles or of radians nobody can tell, so that between ``Hz``
+and ``rad/s`` there is no number.
 """
 
 import re
@@ -17,25 +21,35 @@ _NONE: _Powers = (0, 0, 0, 0, 0, 0, 0)  # of m, kg, s, A, K, mol, cd
 
 _BLANK = ("", "1", "-", "–")
 _LONGEST = 80  # characters of a text that is looked at
+_FARTHEST = 1e300  # a factor beyond it, or its inverse, is none
 
 
 class _Unit(NamedTuple):
-    """`factor` base units; `turns` is the power of π in it, so that factors stay exact."""
+    """`factor` base units.
+
+    `pi` is the power of π in it, so that factors stay exact; `around` are those of radians,
+    revolutions and hertz; `scale` names a unit with an offset.
+    """
 
     powers: _Powers
     factor: Fraction = Fraction(1)
-    turns: int = 0
+    pi: int = 0
+    around: tuple[int, int, int] = (0, 0, 0)
+    scale: str = ""
 
     def times(self, other: "_Unit", power: int) -> "_Unit":
         """Multiply by a power of another."""
         powers = tuple(a + power * b for a, b in zip(self.powers, other.powers, strict=True))
+        around = tuple(a + power * b for a, b in zip(self.around, other.around, strict=True))
         return _Unit(
             powers,  # type: ignore[arg-type]
             self.factor * other.factor**power,
-            self.turns + power * other.turns,
+            self.pi + power * other.pi,
+            around,  # type: ignore[arg-type]
         )
 
 
+_RADIANS, _REVOLUTIONS, _HERTZ = (1, 0, 0), (0, 1, 0), (0, 0, 1)
 _PREFIXED = {
     "m": _Unit((1, 0, 0, 0, 0, 0, 0)),
     "g": _Unit((0, 1, 0, 0, 0, 0, 0), Fraction(1, 1000)),
@@ -44,7 +58,7 @@ _PREFIXED = {
     "K": _Unit((0, 0, 0, 0, 1, 0, 0)),
     "mol": _Unit((0, 0, 0, 0, 0, 1, 0)),
     "cd": _Unit((0, 0, 0, 0, 0, 0, 1)),
-    "Hz": _Unit((0, 0, -1, 0, 0, 0, 0)),
+    "Hz": _Unit((0, 0, -1, 0, 0, 0, 0), around=_HERTZ),
     "N": _Unit((1, 1, -2, 0, 0, 0, 0)),
     "Pa": _Unit((-1, 1, -2, 0, 0, 0, 0)),
     "bar": _Unit((-1, 1, -2, 0, 0, 0, 0), Fraction(100_000)),
@@ -60,26 +74,50 @@ _PREFIXED = {
     "H": _Unit((2, 1, -2, -2, 0, 0, 0)),
     "L": _Unit((3, 0, 0, 0, 0, 0, 0), Fraction(1, 1000)),
     "l": _Unit((3, 0, 0, 0, 0, 0, 0), Fraction(1, 1000)),
-    "rad": _Unit(_NONE),
+    "rad": _Unit(_NONE, around=_RADIANS),
+    "S": _Unit((-2, -1, 3, 2, 0, 0, 0)),
+    "Wb": _Unit((2, 1, -2, -1, 0, 0, 0)),
+    "sec": _Unit((0, 0, 1, 0, 0, 0, 0)),
+    "Nm": _Unit((2, 1, -2, 0, 0, 0, 0)),
+    "Ws": _Unit((2, 1, -2, 0, 0, 0, 0)),
+    "Wh": _Unit((2, 1, -2, 0, 0, 0, 0), Fraction(3600)),
+    "As": _Unit((0, 0, 1, 1, 0, 0, 0)),
+    "Ah": _Unit((0, 0, 1, 1, 0, 0, 0), Fraction(3600)),
+    "Vs": _Unit((2, 1, -2, -1, 0, 0, 0)),
 }
 _ALONE = {
-    "deg": _Unit(_NONE, Fraction(1, 180), 1),
-    "°": _Unit(_NONE, Fraction(1, 180), 1),
-    "rev": _Unit(_NONE, Fraction(2), 1),
-    "rpm": _Unit((0, 0, -1, 0, 0, 0, 0), Fraction(1, 30), 1),
+    "deg": _Unit(_NONE, Fraction(1, 180), 1, _RADIANS),
+    "°": _Unit(_NONE, Fraction(1, 180), 1, _RADIANS),
+    "rev": _Unit(_NONE, around=_REVOLUTIONS),
+    "rpm": _Unit((0, 0, -1, 0, 0, 0, 0), Fraction(1, 60), around=_REVOLUTIONS),
+    "RPM": _Unit((0, 0, -1, 0, 0, 0, 0), Fraction(1, 60), around=_REVOLUTIONS),
+    "rps": _Unit((0, 0, -1, 0, 0, 0, 0), around=_REVOLUTIONS),
     "%": _Unit(_NONE, Fraction(1, 100)),
     "min": _Unit((0, 0, 1, 0, 0, 0, 0), Fraction(60)),
     "h": _Unit((0, 0, 1, 0, 0, 0, 0), Fraction(3600)),
+    "hr": _Unit((0, 0, 1, 0, 0, 0, 0), Fraction(3600)),
+    "t": _Unit((0, 1, 0, 0, 0, 0, 0), Fraction(1000)),
+    "in": _Unit((1, 0, 0, 0, 0, 0, 0), Fraction(254, 10_000)),
+    "inch": _Unit((1, 0, 0, 0, 0, 0, 0), Fraction(254, 10_000)),
+    "ft": _Unit((1, 0, 0, 0, 0, 0, 0), Fraction(3048, 10_000)),
+    "kgf": _Unit((1, 1, -2, 0, 0, 0, 0), Fraction(980_665, 100_000)),
     "atm": _Unit((-1, 1, -2, 0, 0, 0, 0), Fraction(101_325)),
     "psi": _Unit((-1, 1, -2, 0, 0, 0, 0), Fraction(8_896_443_230_521, 1_290_320_000)),
 }
 _PREFIXES = {"p": -12, "n": -9, "µ": -6, "u": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3,
              "M": 6, "G": 9, "T": 12}  # fmt: skip
 
+_SCALES = {
+    "°C": "°C", "℃": "°C", "degC": "°C", "Celsius": "°C", "celsius": "°C",
+    "°F": "°F", "℉": "°F", "degF": "°F", "Fahrenheit": "°F", "fahrenheit": "°F",
+}  # fmt: skip
+
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _TOKEN = re.compile(
-    r"\s*(?:(?P<name>[A-Za-zµΩ]+|[°%])|(?P<one>1(?!\d))"
-    r"|(?P<power>(?:\^|\*\*)\s*[-−]?\d{1,2}|[⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹]{1,2})|(?P<sign>[·⋅*/()]))\s*"
+    r"\s*(?:(?P<name>[A-Za-zµΩ]+|°(?!\s*[A-Za-zµΩ])|%)"
+    r"|(?P<power>(?:\^|\*\*)\s*[-−]?\d{1,2}|[⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹]{1,2}"
+    r"|(?<=[A-Za-zµΩ])(?:[-−]?[2-9]|[-−]1)(?!\d))"
+    r"|(?P<one>1(?!\d))|(?P<sign>[·⋅*/()]))\s*"
 )
 
 
@@ -88,37 +126,73 @@ def is_blank(unit: str | None) -> bool:
     return unit is None or unit.strip() in _BLANK
 
 
+def is_read(unit: str) -> bool:
+    """Whether it is known what a unit means."""
+    return _read(unit) is not None
+
+
 def factor(unit: str, other: str) -> float | None:
-    """By what a value in `unit` is multiplied to be in `other`; None if there is no such number.
+    """By what a value in `unit` is multiplied to be in `other`; None if no such number is known.
 
     Two equal texts give 1, whatever they mean.
     """
     if unit.strip() == other.strip():
         return 1.0
     a, b = _read(unit), _read(other)
-    if a is None or b is None or a.powers != b.powers:
+    if a is None or b is None or not _are_of_a_kind(a, b):
+        return None
+    turned = _radians_of_revolutions(a, b)
+    if turned is None:
         return None
     try:
-        return float(a.factor / b.factor) * pi ** (a.turns - b.turns) or None  # 0: it underflowed
+        times = float(a.factor / b.factor * Fraction(2) ** turned) * pi ** (a.pi - b.pi + turned)
     except OverflowError:
         return None
+    return times if 1 / _FARTHEST < times < _FARTHEST else None
 
 
 def difference(unit: str | None, other: str | None) -> str:
-    """What to say of two units that are not one: empty where they are, or where one is blank."""
+    """What to say of two units that are not one: empty where they are, or where they may be.
+
+    They may where one is blank, or cannot be read.
+    """
     if unit is None or other is None or is_blank(unit) or is_blank(other):
         return ""
     times = factor(unit, other)
     if times == 1.0:
         return ""
-    if times is None:
-        return f"{unit} is not {other}, and no number makes one of the other"
-    return f"1 {unit} is {times:.12g} {other}"
+    if times is not None:
+        return f"1 {unit} is {times:.12g} {other}"
+    a, b = _read(unit), _read(other)
+    if a is None or b is None:
+        return ""
+    if _are_of_a_kind(a, b) and _radians_of_revolutions(a, b) is None:
+        return f"between {unit} and {other} it is open whether cycles or radians are meant"
+    return f"{unit} is not {other}, and no number makes one of the other"
+
+
+def _are_of_a_kind(a: _Unit, b: _Unit) -> bool:
+    return a.powers == b.powers and a.scale == b.scale
+
+
+def _radians_of_revolutions(a: _Unit, b: _Unit) -> int | None:
+    """How many revolutions of `a` are radians in `b`, each of 2π; None if that is open."""
+    radians, revolutions, hertz = (x - y for x, y in zip(a.around, b.around, strict=True))
+    if revolutions == -radians and hertz == 0:
+        return revolutions
+    if radians == 0:
+        # Counted, as in 1/min and Hz. Of what else is per revolution, as N·m, it is open.
+        is_rate = a.powers[2] and not any((*a.powers[:2], *a.powers[3:]))
+        return 0 if is_rate or revolutions + hertz == 0 or revolutions == 0 else None
+    return 0 if revolutions == hertz == 0 else None
 
 
 @lru_cache(maxsize=256)
 def _read(text: str) -> _Unit | None:
     """The unit that a text means; None if it is no product of powers of known ones."""
+    scale = _SCALES.get(text.replace(" ", ""))
+    if scale is not None:
+        return _Unit(_NONE, scale=scale)
     tokens = _tokens(text.replace("μ", "µ").replace("Ω", "Ω").strip())
     if tokens is None:
         return None

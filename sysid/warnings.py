@@ -10,6 +10,7 @@ from sysid.problem import Problem
 from sysid.residuals import ResidualTests
 from sysid.result import Estimate, Group, NoiseColour, Uncertainty
 from sysid.settings import GeneticAlgorithm
+from sysid.signal_units import unread_units
 from sysid.ties import names_in
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis
@@ -62,7 +63,7 @@ def warnings_of(
         found.append(_not_an_optimum(algorithm, analysis.possible_gain))
     elif tests is not None and lagged:
         found += _coloured(tests, lagged, analysis.uncertainty)
-    return tuple(found)
+    return (*found, *unread_units(problem.model, problem.records))
 
 
 def _held_back(analysis: Analysis) -> list[str]:
@@ -213,9 +214,7 @@ def _is_vague_lag(estimate: Estimate) -> bool:
     return estimate.stderr is not None and abs(estimate.value) < _SEPARABLE * estimate.stderr
 
 
-def _coloured(
-    tests: ResidualTests, lagged: set[str], uncertainty: Uncertainty | None
-) -> list[str]:
+def _coloured(tests: ResidualTests, lagged: set[str], uncertainty: Uncertainty | None) -> list[str]:
     """Residuals that are clearly not white: the model lacks something, most often an order.
 
     A lag makes up for an order that is missing. Of whether the tests are passed the result tells

@@ -25,6 +25,15 @@ TINY = GeneticAlgorithm(population=8, generations=2, islands=1)
      ("1/(V·s)", "1/V/s", 1.0), ("s⁻¹", "Hz", 1.0), ("µm", "mm", 1e-3), ("min", "s", 60.0),
      ("m", "min", None), ("V", "N", None), ("°C", "K", None), ("counts", "counts", 1.0),
      ("counts", "V", None), ("(m", "m", None),
+     ("rpm", "Hz", 1 / 60), ("rev/s", "Hz", 1.0), ("rpm", "1/min", 1.0), ("rpm", "deg/s", 6.0),
+     ("rps", "1/s", 1.0), ("rev", "rad", 2 * np.pi), ("N·m/rad", "N·m/rev", 2 * np.pi),
+     ("N·m/rad", "N·m", 1.0), ("V/Hz", "V·s", 1.0), ("Hz", "rad/s", None), ("deg/s", "kHz", None),
+     ("N·m/rev", "N·m", None), ("°C", "C", None), ("°C", "degC", 1.0), ("° C", "℃", 1.0),
+     ("deg C", "C", None), ("°F", "°C", None), ("°/s", "rad/s", np.pi / 180), ("°", "deg", 1.0),
+     ("Nm", "N·m", 1.0), ("kNm", "N*m", 1e3), ("sec", "s", 1.0), ("RPM", "rpm", 1.0),
+     ("m/s2", "m/s^2", 1.0), ("m s-2", "m/s²", 1.0), ("m3/hr", "m^3/h", 1.0), ("kWh", "J", 3.6e6),
+     ("mAh", "C", 3.6), ("S", "1/ohm", 1.0), ("t", "kg", 1e3), ("inch", "mm", 25.4),
+     ("volt", "V", None), ("H2O", "m", None), ("°C/s", "K/s", None),
      ("km^99 km^99 km^99 km^99", "m^396", None), ("m/", "m", None), ("2 m", "m", None)],
 )  # fmt: skip
 def test_units_differ_by_a_factor_or_by_their_kind(
@@ -39,6 +48,28 @@ def test_no_text_breaks_the_comparison_and_a_factor_turns_round(unit: str, other
     assert (there is None) == (back is None)
     if there is not None and back is not None:
         assert there * back == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("unit", "other"),
+    [("counts", "V"), ("V", "counts"), ("volt", "V"), ("Bar", "bar"), ("dB", "%"), ("A", "a"),
+     ("°C/s", "K/s"), ("2 m", "m")],
+)  # fmt: skip
+def test_of_a_unit_that_cannot_be_read_nothing_is_asserted(unit: str, other: str) -> None:
+    assert not difference(unit, other)
+
+
+@pytest.mark.parametrize(
+    ("unit", "other", "said"),
+    [("V", "N", "V is not N"), ("°C", "C", "°C is not C"), ("°C", "K", "°C is not K"),
+     ("Hz", "rad/s", "between Hz and rad/s it is open"),
+     ("deg/s", "kHz", "between deg/s and kHz it is open")],
+)  # fmt: skip
+def test_units_that_are_known_to_differ_are_told_with_both_names_and_no_number(
+    unit: str, other: str, said: str
+) -> None:
+    assert said in difference(unit, other)
+    assert not any(char.isdigit() for char in difference(unit, other))
 
 
 @given(st.sampled_from(["", " ", "1", "-", None]), st.text(max_size=10))
@@ -67,6 +98,23 @@ def test_a_record_in_another_unit_than_the_model_is_refused_with_both_units() ->
         identify(model(), record("kPa", "1", "old"), TINY)
 
 
+@pytest.mark.parametrize(("u", "y"), [("Hz", "C"), ("rad/s", "°C")])
+def test_cycles_for_radians_and_degrees_for_coulombs_are_refused(u: str, y: str) -> None:
+    with pytest.raises(InvalidRecord, match=r"correct the one that is wrong"):
+        identify(model("rad/s", "C"), record(u, y), TINY)
+
+
+def test_a_unit_that_cannot_be_read_is_accepted_with_a_warning() -> None:
+    found = identify(model("Pa"), record("counts", "1"), TINY)
+    assert "'u' is in counts, and in the model it is in Pa: counts could not" in found.warnings[-1]
+    assert "read as a unit" not in "".join(identify(model(), record("Pa", "1"), TINY).warnings)
+
+
+def test_a_record_after_one_whose_unit_cannot_be_read_is_compared_with_the_next() -> None:
+    with pytest.raises(InvalidRecord, match=r"'y' is in V in record 3, but in record 2 it is in m"):
+        identify(model(), [record("Pa", "counts"), record("Pa", "m"), record("Pa", "V")], TINY)
+
+
 def test_records_fitted_together_are_in_one_unit_where_the_model_has_none() -> None:
     with pytest.raises(
         InvalidRecord, match=r"'y' is in mm in record 2, but in record 1 it is in m"
@@ -93,5 +141,12 @@ def test_a_derivation_converts_exactly_and_writes_down_a_unit_that_is_missing() 
     np.testing.assert_array_equal(found.channel("q").values, times)
     with pytest.raises(InvalidSettings, match=r"/steps/0/unit/p: kPa is not V"):
         derive(made, [{"unit": {"p": "V"}}])
+    spinning = Recording((Channel("f", times, times, "rpm"), Channel("c", times, times, "counts")))
+    turned = derive(spinning, [{"unit": {"f": "Hz"}}])
+    np.testing.assert_allclose(turned.channel("f").values, times / 60)
+    with pytest.raises(InvalidSettings, match=r"between Hz and rad/s it is open"):
+        derive(turned, [{"unit": {"f": "rad/s"}}])
+    with pytest.raises(InvalidSettings, match=r"/steps/0/unit/c: 'counts' cannot be read"):
+        derive(spinning, [{"unit": {"c": "V"}}])
     with pytest.raises(InvalidSettings, match="no channel 'z'"):
         derive(made, [{"unit": {"z": "V"}}])
