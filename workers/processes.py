@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 _PROC = Path("/proc")
 _TAG_LENGTH = 6
+_LONGEST_BASE = 22  # what Ray's names and numbers of seven digits leave of a socket's path
 
 
 class Standing(NamedTuple):
@@ -156,7 +157,7 @@ def _prefix() -> str:
 
 def _base() -> Path:
     base = Path(tempfile.gettempdir())
-    return base if len(str(base)) <= 30 else Path("/tmp")
+    return base if len(str(base)) <= _LONGEST_BASE else Path("/tmp")
 
 
 def _listed() -> tuple[int, ...]:

@@ -159,8 +159,9 @@ class Job(Base):
     __tablename__ = "jobs"
     __table_args__ = (
         Index("ix_jobs_project_id_id", "project_id", "id"),
-        Index("ix_jobs_state_priority_id", "state", "priority", "id"),
-        Index("ix_jobs_lease_owner_state", "lease_owner", "state"),
+        # These two hold all that a dispatcher's looks and claims ask for.
+        Index("ix_jobs_queue", "state", "priority", "id", "project_id", "n_runs"),
+        Index("ix_jobs_owned", "lease_owner", "state", "cancel_requested", "id"),
     )
 
     id: Mapped[str] = mapped_column(primary_key=True)

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from sqlalchemy import exists, select, true
+from sqlalchemy import select, true
 from sqlalchemy.orm import Session
 
 from service.storage.admission import Admission
@@ -19,7 +19,9 @@ class Signals(NamedTuple):
 def look(session: Session, owner: str, admission: Admission | None = None) -> Signals:
     """What a dispatcher should attend to: waiting jobs that `admission` lets in, and cancelled."""
     admitted = true() if admission is None else admission.holds(Job)
-    waiting = session.scalar(select(exists().where(Job.state == State.QUEUED, admitted)))
+    # The key, not every column: so the index alone answers.
+    queued = select(Job.id).where(Job.state == State.QUEUED, admitted)
+    waiting = session.scalar(select(queued.exists()))
     asked = select(Job.id).where(
         Job.lease_owner == owner, Job.state == State.RUNNING, Job.cancel_requested
     )

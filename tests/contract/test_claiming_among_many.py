@@ -1,0 +1,114 @@
+"""What a claim reads does not grow with the jobs there ever were; on both databases."""
+
+from datetime import timedelta
+
+import pytest
+from sqlalchemy import Connection, Engine, event, insert, text
+
+from service.storage.admission import Admission
+from service.storage.columns import utc_now
+from service.storage.queue import Queue
+from service.storage.tables import Job, Project, State
+from service.storage.watch import look
+
+PROJECTS = [f"p{number}" for number in range(4)]
+N_ENDED, N_QUEUED, N_RUNNING = 4000, 400, 128
+
+
+@pytest.fixture
+def crowded(database):
+    """A database with thousands of ended jobs, hundreds of queued ones, and many that run."""
+    states = [State.SUCCEEDED] * N_ENDED + [State.QUEUED] * N_QUEUED + [State.RUNNING] * N_RUNNING
+    until = utc_now() + timedelta(hours=1)
+    rows = [
+        {"id": f"job_{number:05d}", "project_id": PROJECTS[number % 3], "name": "j",
+         "spec": {"model": "tube"}, "n_runs": 1, "state": state, "priority": 0,
+         "lease_owner": "d1" if state is State.RUNNING else None,
+         "lease_until": until if state is State.RUNNING else None}
+        for number, state in enumerate(states)
+    ]  # fmt: skip
+    with database.write() as session:
+        session.execute(insert(Project), [{"id": one, "name": one} for one in PROJECTS])
+        session.execute(insert(Job), rows)
+    with database.engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        connection.exec_driver_sql(
+            "ANALYZE" if database.is_sqlite else "VACUUM ANALYZE"
+        )  # as the database itself does from time to time
+    return database
+
+
+def plans_of(database, work) -> list[str]:
+    """How the database carries out each statement on `jobs` that `work` makes."""
+    plans: list[str] = []
+    explain = "EXPLAIN QUERY PLAN " if database.is_sqlite else "EXPLAIN "
+    engine: Engine = database.engine
+
+    def note(connection: Connection, cursor, statement, parameters, *_) -> None:
+        if "jobs" in statement and not statement.startswith(explain):
+            cursor.execute(explain + statement, parameters)
+            plans.append("\n".join(str(row[-1]) for row in cursor.fetchall()))
+
+    event.listen(engine, "before_cursor_execute", note)
+    try:
+        work()
+    finally:
+        event.remove(engine, "before_cursor_execute", note)
+    return plans
+
+
+def claim(database, admission=None):
+    with database.write() as session:
+        return Queue(session).claim("d2", admission=admission)
+
+
+@pytest.mark.parametrize("admission", [None, Admission(8, 0)], ids=["all", "short"])
+def test_a_claim_scans_no_table_and_counts_running_jobs_once(crowded, admission) -> None:
+    plans = plans_of(crowded, lambda: claim(crowded, admission))
+    assert plans
+    whole = "SCAN jobs" if crowded.is_sqlite else "Seq Scan on jobs"
+    assert not [plan for plan in plans if whole in plan], plans
+    assert not [plan for plan in plans if "CORRELATED" in plan or "SubPlan" in plan], plans
+    if crowded.is_sqlite:
+        assert "COVERING INDEX ix_jobs_queue" in plans[0]
+
+
+def test_a_look_at_the_queue_scans_no_table(crowded) -> None:
+    def work() -> None:
+        with crowded.read() as session:
+            look(session, "d1")
+
+    plans = plans_of(crowded, work)
+    assert len(plans) == 2
+    for plan in plans:
+        wanted = "COVERING INDEX" if crowded.is_sqlite else "Index"
+        assert wanted in plan, plans
+        assert "Seq Scan" not in plan, plans
+
+
+def test_a_claim_reads_each_running_job_once_and_not_for_every_waiting_one(crowded) -> None:
+    if not crowded.is_sqlite:
+        pytest.skip("the work of a statement is counted by SQLite's virtual machine")
+    steps = 0
+
+    def count() -> int:
+        nonlocal steps
+        steps += 1
+        return 0
+
+    with crowded.write() as session:
+        session.connection().connection.driver_connection.set_progress_handler(count, 100)
+        assert Queue(session).claim("d2") is not None
+        session.connection().connection.driver_connection.set_progress_handler(None, 0)
+    assert 100 * steps < 100 * (N_QUEUED + N_RUNNING)
+
+
+def test_a_project_that_has_nothing_running_comes_first_among_many(crowded) -> None:
+    with crowded.write() as session:
+        session.execute(text("UPDATE jobs SET project_id = 'p3' WHERE id = 'job_04399'"))
+    first = claim(crowded)
+    assert job_of_project(crowded, first) == "p3"
+
+
+def job_of_project(database, got) -> str:
+    with database.read() as session:
+        return str(session.get_one(Job, got.job.id).project_id)
