@@ -123,9 +123,13 @@ class AsyncClient:
 
     async def runs(self, job: str) -> AsyncIterator[Document]:
         """Runs of a job, page by page."""
+        async for item in self._items("jobs", job, "runs"):
+            yield item
+
+    async def _items(self, *parts: str) -> AsyncIterator[Document]:
         cursor: str | None = None
         while True:
-            page = await self._json(calls.read("jobs", job, "runs", cursor=cursor, limit=PAGE))
+            page = await self._json(calls.read(*parts, cursor=cursor, limit=PAGE))
             for item in page["items"]:
                 yield item
             cursor = page["next"]
@@ -143,7 +147,7 @@ class AsyncClient:
 
     async def references(self) -> list[Document]:
         """The references in use, by name."""
-        return list((await self._json(calls.read("references")))["items"])
+        return [one async for one in self._items("references")]
 
     async def reference(self, name: str) -> Document:
         """One reference with its history."""

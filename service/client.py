@@ -283,7 +283,7 @@ class Client:
     # ---- references
     def references(self) -> list[Document]:
         """The references in use, by name."""
-        return list(self._json(calls.read("references"))["items"])
+        return self._all("references")
 
     def reference(self, name: str) -> Document:
         """One reference with its history."""

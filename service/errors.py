@@ -29,7 +29,8 @@ class FieldError:
     Attributes
     ----------
     pointer : str
-        JSON pointer into the body, such as ``/algorithm/population``; ``?name`` for a query value.
+        JSON pointer into the body, such as ``/algorithm/population``; ``?name`` for a query value,
+        ``{name}`` for a part of the path.
     detail : str
         What was wrong, what was found, what would be right.
     column : int or None

@@ -5,10 +5,11 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.errors import InvalidRequest
-from service.schemas_jobs import REFERENCE
-from service.schemas_references import AcceptedOut, ReferenceIn, ReferenceOut, ReferencesOut
+from service.schemas import Page
+from service.schemas_jobs import REFERENCE, RUN
+from service.schemas_references import AcceptedOut, ReferenceIn, ReferenceOut
 from service.storage.errors import NotFound
-from service.storage.references import ReferenceRepository
+from service.storage.references import InUse, ReferenceRepository
 from service.storage.runs import RunRepository
 from service.storage.tables import AcceptedReference, Run, State
 from sysid.errors import nearest
@@ -24,11 +25,7 @@ def accept(session: Session, name: str, body: ReferenceIn) -> ReferenceOut:
     InvalidRequest
         If the name cannot be used, or there is no such run, or it did not succeed.
     """
-    if not 1 <= len(name) <= MOST_NAME or not name.isprintable() or name != name.strip():
-        raise InvalidRequest.at(
-            "?name",
-            f"found {name!r:.120}; need 1 to {MOST_NAME} printable characters, no blank at an end",
-        )
+    _check_name(name)
     run = _succeeded(session, body.run, "/run")
     ReferenceRepository(session).accept(name, run.id, body.by, body.note)
     return one(session, name)
@@ -41,13 +38,14 @@ def one(session: Session, name: str) -> ReferenceOut:
         latest, *before = repository.history(name)
     except NotFound:
         raise NotFound("reference", f"{name!r}{_nearest(session, name)}") from None
-    return _told(session, latest, before)
+    run = RunRepository(session).get(latest.run_id)
+    return _told(InUse(latest, run.job_id, run.labels, run.estimates), before)
 
 
-def page(session: Session) -> ReferencesOut:
-    """All references in use, by name."""
-    found = ReferenceRepository(session).all()
-    return ReferencesOut(items=[_told(session, one, []) for one in found])
+def page(session: Session, cursor: str | None, limit: int) -> Page[ReferenceOut]:
+    """References in use, by name."""
+    found = ReferenceRepository(session).page(cursor=cursor, limit=limit)
+    return Page(items=[_told(one, []) for one in found.items], next=found.next)
 
 
 def run_of(session: Session, reference: str, pointer: str = "/warm_start") -> Run:
@@ -62,13 +60,26 @@ def run_of(session: Session, reference: str, pointer: str = "/warm_start") -> Ru
     if named == reference:
         return _succeeded(session, reference, pointer)
     try:
-        latest, *_ = ReferenceRepository(session).history(named)
+        latest = ReferenceRepository(session).latest(named)
     except NotFound:
         raise InvalidRequest.at(
             pointer, f"there is no reference {named!r}{_nearest(session, named)}; accept a run "
             "under this name first",
         ) from None  # fmt: skip
     return _succeeded(session, latest.run_id, pointer)
+
+
+def _check_name(name: str) -> None:
+    """Refuse names that could not be told from a run, or from the parts of a path."""
+    if not 1 <= len(name) <= MOST_NAME or not name.isprintable() or name != name.strip():
+        wanted = f"1 to {MOST_NAME} printable characters, no blank at an end"
+    elif name.startswith((RUN, REFERENCE)):
+        wanted = f"one that does not begin with {RUN!r} (a run's id does) or {REFERENCE!r}"
+    elif "/" in name or not name.strip("."):
+        wanted = "one without '/', and not of dots only"
+    else:
+        return
+    raise InvalidRequest.at("{name}", f"the name in the path: found {name!r:.120}; need {wanted}")
 
 
 def _succeeded(session: Session, run_id: str, pointer: str) -> Run:
@@ -84,19 +95,16 @@ def _succeeded(session: Session, run_id: str, pointer: str) -> Run:
 
 
 def _nearest(session: Session, name: str) -> str:
-    return nearest(name, [one.name for one in ReferenceRepository(session).all()])
+    return nearest(name, ReferenceRepository(session).names())
 
 
-def _told(
-    session: Session, latest: AcceptedReference, before: list[AcceptedReference]
-) -> ReferenceOut:
-    run = RunRepository(session).get(latest.run_id)
-    estimates: dict[str, Any] = run.estimates or {}
+def _told(one: InUse, before: list[AcceptedReference]) -> ReferenceOut:
+    latest, estimates = one.accepted, dict[str, Any](one.estimates or {})
     return ReferenceOut(
-        name=latest.name, run=run.id, job=run.job_id, by=latest.accepted_by, note=latest.note,
-        at=latest.accepted_at, labels=run.labels, estimates=estimates,
+        name=latest.name, run=latest.run_id, job=one.job_id, by=latest.accepted_by,
+        note=latest.note, at=latest.accepted_at, labels=one.labels, estimates=estimates,
         history=[
-            AcceptedOut(run=one.run_id, by=one.accepted_by, note=one.note, at=one.accepted_at)
-            for one in before
+            AcceptedOut(run=old.run_id, by=old.accepted_by, note=old.note, at=old.accepted_at)
+            for old in before
         ],
     )  # fmt: skip

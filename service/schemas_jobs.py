@@ -153,12 +153,12 @@ class SweepIn(Body):
     axes: list[Axis] = Field(default=[], max_length=16)
 
 
-PREVIOUS, REFERENCE = "previous", "reference:"
+PREVIOUS, REFERENCE, RUN = "previous", "reference:", "run_"
 
 
 def _warm_start(value: str) -> str:
     named = value.removeprefix(REFERENCE)
-    if value != PREVIOUS and not value.startswith("run_") and (named == value or not named):
+    if value != PREVIOUS and not value.startswith(RUN) and (named == value or not named):
         raise PydanticCustomError(
             "warm_start", "need 'previous', the id of a run (run_…), or 'reference:' and a name"
         )

@@ -36,10 +36,4 @@ class ReferenceOut(Answer):
     at: datetime
     labels: dict[str, Any] = Field(default={})
     estimates: dict[str, dict[str, float | None]] = Field(default={})
-    history: list[AcceptedOut] = Field(default=[], description="earlier ones, latest first")
-
-
-class ReferencesOut(Answer):
-    """All references, by name."""
-
-    items: list[ReferenceOut]
+    history: list[AcceptedOut] = Field(default=[], description="the 1,000 before, latest first")

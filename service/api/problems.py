@@ -24,7 +24,7 @@ from service.errors import (
 )
 from service.pointers import body_type, detail_of, explained
 from service.storage.errors import StorageError
-from service.storage.patience import PASSING
+from service.storage.patience import PASSING, is_passing
 from sysid.errors import SysidError
 
 log = logging.getLogger(__name__)
@@ -95,6 +95,8 @@ def _storage_error(request: Request, error: Exception) -> Response:
 
 
 def _database_away(request: Request, error: Exception) -> Response:
+    if isinstance(error, PASSING) and not is_passing(error):
+        return _unexpected(request, error)
     log.error("%s %s: %s", request.method, request.url.path, str(error).splitlines()[0])
     detail = "the database does not answer, or its disk is full; nothing was changed, try again"
     away = Unavailable(detail)
@@ -168,5 +170,7 @@ def _field_errors(request: Request, error: RequestValidationError) -> Iterator[F
             entries.append({**entry, "loc": loc})
         else:
             # What follows the name is a position among its values.
-            yield FieldError(f"?{loc[0] if loc else ''}", detail_of(entry, ()))
+            name = loc[0] if loc else ""
+            pointer = f"{{{name}}}" if place == "path" else f"?{name}"
+            yield FieldError(pointer, detail_of(entry, ()))
     yield from explained(entries, error.body, body_type(request.scope.get("endpoint")))

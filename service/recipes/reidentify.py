@@ -4,7 +4,7 @@ from typing import Any
 
 from service import jobs
 from service.errors import FieldError, InvalidRequest
-from service.schemas_jobs import PREVIOUS, REFERENCE, JobIn, JobOut
+from service.schemas_jobs import PREVIOUS, REFERENCE, RUN, JobIn, JobOut
 from service.schemas_reidentify import ReidentifyIn
 from service.settings import Settings
 from service.storage.sessions import Database
@@ -60,7 +60,7 @@ def job_of(body: ReidentifyIn, order: list[int]) -> JobIn:
 
 def _reference(given: str | None) -> str | None:
     """As a job names it: runs by their id, all else is the name of an accepted reference."""
-    if given is None or given.startswith(("run_", REFERENCE)):
+    if given is None or given.startswith((RUN, REFERENCE)):
         return given
     return REFERENCE + given
 

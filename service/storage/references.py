@@ -1,15 +1,31 @@
 """Accepted references: which run stands for a name now, and which ones did before."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from sqlalchemy import ColumnElement, func, select
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from service.storage.columns import Document
 from service.storage.errors import Conflict, NotFound
-from service.storage.tables import DEFAULT_PROJECT, AcceptedReference
+from service.storage.statements import Page, page_of
+from service.storage.tables import DEFAULT_PROJECT, AcceptedReference, Run
+
+MOST_HISTORY = 1000
+"""Acceptances of one name that are told."""
 
 _RIVALS = 20
+_MOST_NAMES = 10_000
+
+
+class InUse(NamedTuple):
+    """The reference in use of a name, with what is told of its run."""
+
+    accepted: AcceptedReference
+    job_id: str
+    labels: Document
+    estimates: Document | None
 
 
 class ReferenceRepository:
@@ -21,10 +37,13 @@ class ReferenceRepository:
     def accept(
         self, name: str, run_id: str, accepted_by: str | None = None, note: str | None = None
     ) -> AcceptedReference:
-        """Make a run the reference of a name; the one in use again changes nothing."""
+        """Make a run the reference of a name.
+
+        The one in use again changes nothing, unless by whom or why is given and is another.
+        """
         for _ in range(_RIVALS):
             latest = self._latest(name)
-            if latest is not None and latest.run_id == run_id:
+            if latest is not None and _says(latest, run_id, accepted_by, note):
                 return latest
             new = AcceptedReference(
                 project_id=self._project_id, name=name, run_id=run_id, accepted_by=accepted_by,
@@ -40,29 +59,61 @@ class ReferenceRepository:
             return new
         raise Conflict(f"reference {name!r} is being accepted by others; try again")
 
+    def latest(self, name: str) -> AcceptedReference:
+        """What is in use under a name; `NotFound` if nothing is."""
+        found = self._latest(name)
+        if found is None:
+            raise NotFound("reference", name)
+        return found
+
     def history(self, name: str) -> Sequence[AcceptedReference]:
-        """All that was accepted under a name, the one in use first; `NotFound` if nothing was."""
-        query = select(AcceptedReference).where(*self._named(name))
+        """What was accepted under a name, the one in use first, at most `MOST_HISTORY` of them.
+
+        Raises
+        ------
+        NotFound
+            If nothing was.
+        """
+        query = select(AcceptedReference).where(*self._named(name)).limit(MOST_HISTORY)
         found = self._session.scalars(query.order_by(AcceptedReference.number.desc())).all()
         if not found:
             raise NotFound("reference", name)
         return found
 
-    def all(self) -> Sequence[AcceptedReference]:
+    def page(self, *, cursor: str | None = None, limit: int = 50) -> Page[InUse]:
         """The reference in use of every name, by name."""
+        mine = AcceptedReference.project_id == self._project_id
         last = (
             select(AcceptedReference.name, func.max(AcceptedReference.number).label("number"))
-            .where(AcceptedReference.project_id == self._project_id)
-            .group_by(AcceptedReference.name).subquery()
+            .where(mine).group_by(AcceptedReference.name)
+            .order_by(AcceptedReference.name).limit(limit + 1)
         )  # fmt: skip
+        if cursor is not None:
+            last = last.where(AcceptedReference.name > cursor)
+        chosen = last.subquery()
         query = (
-            select(AcceptedReference)
-            .join(last, (AcceptedReference.name == last.c.name)
-                  & (AcceptedReference.number == last.c.number))
-            .where(AcceptedReference.project_id == self._project_id)
-            .order_by(AcceptedReference.name)
+            select(AcceptedReference, Run.job_id, Run.labels, Run.estimates)
+            .join(chosen, (AcceptedReference.name == chosen.c.name)
+                  & (AcceptedReference.number == chosen.c.number))
+            .join(Run, Run.id == AcceptedReference.run_id)
+            .where(mine).order_by(AcceptedReference.name)
+        )  # fmt: skip
+        found = [InUse(*row) for row in self._session.execute(query)]
+        return page_of(found, limit, (one.accepted.name for one in found))
+
+    def names(self) -> Sequence[str]:
+        """Names in use."""
+        query = (
+            select(AcceptedReference.name).distinct()
+            .where(AcceptedReference.project_id == self._project_id).limit(_MOST_NAMES)
         )  # fmt: skip
         return self._session.scalars(query).all()
+
+    def names_of(self, run_id: str) -> Sequence[str]:
+        """Names under which a run was accepted, now or before."""
+        mine = AcceptedReference.project_id == self._project_id
+        query = select(AcceptedReference.name).where(mine, AcceptedReference.run_id == run_id)
+        return self._session.scalars(query.distinct().order_by(AcceptedReference.name)).all()
 
     def _latest(self, name: str) -> AcceptedReference | None:
         query = select(AcceptedReference).where(*self._named(name))
@@ -73,3 +124,8 @@ class ReferenceRepository:
     def _named(self, name: str) -> tuple[ColumnElement[bool], ColumnElement[bool]]:
         mine = AcceptedReference.project_id == self._project_id
         return mine, AcceptedReference.name == name
+
+
+def _says(latest: AcceptedReference, run_id: str, by: str | None, note: str | None) -> bool:
+    is_new_word = by not in (None, latest.accepted_by) or note not in (None, latest.note)
+    return latest.run_id == run_id and not is_new_word

@@ -8,7 +8,7 @@ from service.storage.errors import NotFound
 from service.storage.ledger import Cell, RunLedger, RunOutcome
 from service.storage.queue import Queue
 from service.storage.references import ReferenceRepository
-from service.storage.tables import State
+from service.storage.tables import Run, State
 from service.storage.trends import count_succeeded, trend_rows
 from tests.stored import claimed, runs_of, submit
 
@@ -36,11 +36,46 @@ def test_the_latest_acceptance_is_in_use_and_the_others_stay(database):
         history = repository.history("tube")
         assert [one.run_id for one in history] == [runs[0], runs[1], runs[0]]
         assert [one.accepted_by for one in history] == [None, "me", "me"]
-        assert [(one.name, one.run_id) for one in repository.all()] == [
+        page = repository.page()
+        assert [(one.accepted.name, one.accepted.run_id) for one in page.items] == [
             ("other", runs[2]), ("tube", runs[0]),
         ]  # fmt: skip
         with pytest.raises(NotFound, match="reference nobody"):
             repository.history("nobody")
+
+
+def test_the_same_run_again_is_kept_where_it_is_said_by_another_or_why(database):
+    _, (run,) = claimed(database)
+    assert accepted(database, "tube", run, note="first") == 1
+    assert accepted(database, "tube", run, note="first") == 1
+    assert accepted(database, "tube", run) == 1  # nothing new is said
+    assert accepted(database, "tube", run, note="second") == 2
+    assert accepted(database, "tube", run, accepted_by="me", note="second") == 3
+    with database.read() as session:
+        repository = ReferenceRepository(session)
+        assert repository.latest("tube").number == 3
+        assert [one.note for one in repository.history("tube")] == ["second", "second", "first"]
+        assert repository.names_of(run) == ["tube"]
+
+
+def test_references_are_listed_page_by_page_without_the_results_of_their_runs(database):
+    claim, runs = claimed(database, n_runs=5)
+    for number, run in enumerate(runs):
+        accepted(database, f"n{number}", runs[0])
+        accepted(database, f"n{number}", run)
+    found, cursor = [], None
+    with database.read() as session:
+        repository = ReferenceRepository(session)
+        for _ in range(3):
+            page = repository.page(cursor=cursor, limit=2)
+            found += page.items
+            cursor = page.next
+        assert not any(isinstance(one, Run) for one in session.identity_map.values())
+    assert cursor is None
+    assert [(one.accepted.name, one.accepted.run_id) for one in found] == [
+        (f"n{number}", run) for number, run in enumerate(runs)
+    ]
+    assert {one.job_id for one in found} == {claim.lease.job_id}
 
 
 def test_acceptances_at_once_have_numbers_of_their_own(database):

@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -194,6 +195,33 @@ def test_references_keep_their_history_and_say_what_is_wrong(served: Served) -> 
     missing = served.server.get("/v1/references/kep")
     assert missing.status_code == 404
     assert "did you mean 'kept'" in missing.json()["detail"]
+
+
+@pytest.mark.parametrize("name", ["run_mine", "reference:x", "a/b", "..", " blank", "n" * 101])
+def test_a_name_that_means_something_else_is_refused_at_the_path(served: Served, name: str) -> None:
+    run = run_at(served, served.job, 2.0)
+    path = f"/v1/references/{quote(name, safe='')}".replace("..", "%2E%2E")
+    (fault,) = refused(served.server.put(path, json={"run": run}), 422, "invalid")
+    assert fault["pointer"] == "{name}"
+    assert "the name in the path: found" in fault["detail"]
+    assert "need" in fault["detail"]
+
+
+def test_references_are_paged_and_a_new_note_is_kept(served: Served) -> None:
+    run = run_at(served, served.job, 2.0)
+    for name in ("p1", "p2", "p3"):
+        for note in ("first", "second"):
+            body = {"run": run, "note": note}
+            assert served.server.put(f"/v1/references/{name}", json=body).status_code == 200
+    pages = served.server.get("/v1/references?limit=1&cursor=p1").json()
+    assert ([one["name"] for one in pages["items"]], pages["next"]) == (["p2"], "p2")
+    assert pages["items"][0]["note"] == "second"
+    assert set(pages["items"][0]["estimates"]) == {"K", "T", "L"}
+    told = served.server.get("/v1/references/p3").json()
+    assert [one["note"] for one in told["history"]] == ["first"]
+    client = Client("http://testserver", transport=Through(served.server))
+    assert {"p1", "p2", "p3"} <= {one["name"] for one in client.references()}
+    refused(served.server.get("/v1/references?limit=0"), 422, "invalid")
 
 
 @pytest.mark.parametrize(
