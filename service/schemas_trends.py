@@ -26,6 +26,7 @@ class DriftOut(Answer):
     expected: float
     difference: float
     z: float = Field(description="in standard errors of the difference")
+    limit: float = Field(description="size of z from which on it is told as drifted")
     drifted: bool
 
 
@@ -114,6 +115,7 @@ class TrendOut(Answer):
     x: str
     reference: str | None = Field(default=None, description="run that the batch is compared with")
     reference_x: float | None = None
+    reference_names: list[str] = Field(default=[], description="under which it was accepted")
     places: list[BatchPlaceOut]
     quantities: list[QuantityOut]
     missing: int = Field(default=0, description="runs that failed or are not over")

@@ -80,7 +80,7 @@ def quantities(places: Mapping[float, Sequence[TrendRow]], names: Sequence[str])
                 if one["name"] in names or (not names and one["status"] not in ("fixed", "tied")):
                     entry = _Entry(row.id, one["value"], one["stderr"], one["status"])
                     _add(columns, one["name"], one["unit"], "parameter", x, entry)
-            for name, unit, entry in _onsets(row):
+            for name, unit, entry in _onsets(row.id, row.onset_delays):
                 _add(columns, name, unit, "onset delay", x, entry)
     order = {name: number for number, name in enumerate(names)}
     named = sorted(columns.items(), key=lambda one: order.get(one[0], len(order)))
@@ -94,23 +94,29 @@ def _add(
     column.entries.setdefault(x, []).append(entry)
 
 
-def _onsets(row: TrendRow) -> list[tuple[str, str, _Entry]]:
+def onset_estimates(told: Sequence[Mapping[str, Any]]) -> dict[str, Estimate]:
+    """The onset delays of a result that have standard errors, by the names of a trend."""
+    known = {name: _estimate(entry) for name, _, entry in _onsets("", told)}
+    return {name: one for name, one in known.items() if one is not None}
+
+
+def _onsets(run: str, told: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, _Entry]]:
     """Onset delays of a run; the mean over its experiments, and what they differ by."""
     pairs: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    for one in row.onset_delays:
+    for one in told:
         pairs.setdefault((one["input"], one["output"]), []).append(one)
     found = []
     for (first, then), several in pairs.items():
         known = [one for one in several if one["delay"] is not None]
         name = "onset delay" if len(pairs) == 1 else f"onset delay {first} → {then}"
         if not known:
-            found.append((name, several[0]["unit"], _Entry(row.id, None, None, "not told")))
+            found.append((name, several[0]["unit"], _Entry(run, None, None, "not told")))
             continue
         n = len(known)
         value = sum(one["delay"] for one in known) / n
         errors = [_onset_error(one) for one in known]
         error = None if None in errors else sum(e**2 for e in errors if e is not None) ** 0.5 / n
-        found.append((name, known[0]["unit"], _Entry(row.id, value, error, "measured")))
+        found.append((name, known[0]["unit"], _Entry(run, value, error, "measured")))
     return found
 
 

@@ -30,8 +30,26 @@ def _flags(point: dict[str, Any]) -> list[str]:
     for drift in point["drifts"]:
         if drift["drifted"]:
             whom = "the reference" if drift["kind"] == "run" else "the reference's trend"
-            found.append(f"drifted from {whom} (z = {drift['z']:+.1f})")
+            found.append(f"drifted from {whom} (z = {drift['z']:+.1f}, limit {drift['limit']:.1f})")
     return found
+
+
+def limit_text(quantities: list[Quantity]) -> str:
+    """From how many standard errors on drift is flagged; empty where nothing is compared."""
+    found: dict[str, dict[str, None]] = {}
+    for one in quantities:
+        for drift in (drift for point in one["points"] for drift in point["drifts"]):
+            against = "its trend" if drift["kind"] == "trend" else "the reference run"
+            found.setdefault(f"{drift['limit']:.1f} against {against}", {})[one["name"]] = None
+    told = "; ".join(f"{limit} ({', '.join(names)})" for limit, names in found.items())
+    return f"drift is flagged where z, in standard errors, is beyond {told}" if told else ""
+
+
+def reference_text(trend: dict[str, Any]) -> str:
+    """Names and label of the reference: ``'tube' (length_m = 40)``; empty where it has none."""
+    names = ", ".join(f"{name!r}" for name in trend["reference_names"])
+    label = "" if trend["reference_x"] is None else f"{trend['x']} = {trend['reference_x']:g}"
+    return " ".join(filter(None, (names, f"({label})" if label else "")))
 
 
 def span_text(one: dict[str, Any]) -> str:
@@ -58,4 +76,5 @@ def notes(trend: dict[str, Any]) -> list[str]:
     found += [f"{trend['x']} {', '.join(at)}: {text}" for text, at in by_text.items()]
     if trend["missing"]:
         found.append(f"{trend['missing']} runs failed or are not over: they are not in the table")
-    return [*found, *trend["notes"]]
+    limits = limit_text(trend["quantities"])
+    return [*found, *trend["notes"], *([limits] if limits else [])]

@@ -1,14 +1,13 @@
 """Use case of trends: a batch of re-identifications over one label, and against its reference."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from math import isfinite
-from typing import Any
 
-import numpy as np
 from sqlalchemy.orm import Session
 
+from service.drifts import Reference, drifts_of
 from service.errors import Conflict, InvalidRequest
+from service.reference_differences import channels_of, differences
 from service.schemas_trends import (
     CoefficientOut,
     DriftOut,
@@ -18,40 +17,18 @@ from service.schemas_trends import (
     QuantityOut,
     TrendOut,
 )
-from service.storage.datasets import DatasetRepository
 from service.storage.jobs import JobRepository
+from service.storage.lookups import references_of
 from service.storage.runs import RunRepository
-from service.storage.tables import Job, Run
+from service.storage.tables import Job
 from service.storage.trends import TrendRow, count_succeeded, trend_rows
 from service.sweeps import body_of
-from service.trend_points import Channels, Point, Quantity, by_label, place, quantities
-from sysid.trend import (
-    Drift,
-    Estimate,
-    Influence,
-    Place,
-    Trend,
-    drift,
-    drifts_from_law,
-    fit_trend,
-)
+from service.trend_points import Point, Quantity, by_label, place, quantities
+from sysid.trend import Influence, Place, Trend, fit_trend
 from sysid.trend_laws import FORMULAS, Law
 
 MOST_RUNS = 5_000
 REAL_SCATTER = 1.5  # Birge ratios below that happen by chance in small batches
-
-
-@dataclass(frozen=True, slots=True)
-class _Reference:
-    """The run a batch is compared with, and the trend of its job, quantity by quantity.
-
-    `note` is why there is no such trend, where its job has one.
-    """
-
-    run: Run
-    x: float | None
-    trends: Mapping[str, tuple[Trend, Quantity]] = field(default_factory=dict)
-    note: str = ""
 
 
 def has_trend(job: Job) -> bool:
@@ -78,15 +55,26 @@ def trend(session: Session, job_id: str) -> TrendOut:
         )
     asked = job.spec["trend"]
     places, found = _gathered(session, job)
+    bodies = {row.id: body_of(job.spec, row.cell) for rows in places.values() for row in rows}
+    datasets = {run: body["datasets"] for run, body in bodies.items()}
+    known = channels_of(session, {one for many in datasets.values() for one in many})
     reference = _reference(session, job, asked.get("reference"))
     told = [_told(one, asked["predict"], reference, found) for one in found]
+    notes = [] if reference is None else [
+        reference.note(asked["x"], places),
+        differences(session, reference.run, list(bodies.values()), known),
+    ]  # fmt: skip
     return TrendOut(
         job=job.id, x=asked["x"],
         reference=None if reference is None else reference.run.id,
         reference_x=None if reference is None else reference.x,
-        places=_places(session, job, places), quantities=told,
-        missing=job.n_runs - count_succeeded(session, job.id),
-        notes=_notes(reference, asked["x"]),
+        reference_names=[] if reference is None else list(reference.names),
+        places=[
+            place(x, rows, datasets, known, bodies[rows[0].id]["channels"])
+            for x, rows in places.items()
+        ],
+        quantities=told, missing=job.n_runs - count_succeeded(session, job.id),
+        notes=[note for note in notes if note],
     )  # fmt: skip
 
 
@@ -100,7 +88,7 @@ def _gathered(session: Session, job: Job) -> tuple[dict[float, list[TrendRow]], 
     return places, quantities(places, asked["parameters"])
 
 
-def _reference(session: Session, job: Job, run_id: str | None) -> _Reference | None:
+def _reference(session: Session, job: Job, run_id: str | None) -> Reference | None:
     """The reference of a batch, and the laws of its job where that asks for the same trend."""
     if run_id is None:
         return None
@@ -109,15 +97,27 @@ def _reference(session: Session, job: Job, run_id: str | None) -> _Reference | N
     x = job.spec["trend"]["x"]
     label = run.labels.get(x)
     at = float(label) if isinstance(label, int | float) else None
-    if theirs.id == job.id or not has_trend(theirs) or theirs.spec["trend"]["x"] != x:
-        return _Reference(run, at)
-    if theirs.n_runs > MOST_RUNS:
-        return _Reference(
-            run, at, note=f"the reference batch {theirs.id} has {theirs.n_runs} runs, and a trend "
-            f"is made of at most {MOST_RUNS}: compared with the reference run only",
-        )  # fmt: skip
+    names = tuple(references_of(session, run.id))
+    why = _why_no_trend(theirs, x)
+    if why:
+        return Reference(run, at, why_no_trend=why, names=names)
     _, known = _gathered(session, theirs)
-    return _Reference(run, at, {one.name: (_fitted(one, ()), one) for one in known})
+    trends = {one.name: (_fitted(one, ()), one) for one in known}
+    return Reference(run, at, trends, names=names)
+
+
+def _why_no_trend(theirs: Job, x: str) -> str:
+    """Why there is none over the axis x to compare with; empty if there is."""
+    if not has_trend(theirs):
+        return "its job has no trend"
+    if theirs.spec["trend"]["x"] != x:
+        return f"the trend of its job is over {theirs.spec['trend']['x']!r}"
+    if theirs.n_runs > MOST_RUNS:
+        return (
+            f"the reference batch {theirs.id} has {theirs.n_runs} runs, and a trend is made of at "
+            f"most {MOST_RUNS}"
+        )
+    return ""
 
 
 def _fitted(one: Quantity, predict: Sequence[float]) -> Trend:
@@ -128,12 +128,12 @@ def _fitted(one: Quantity, predict: Sequence[float]) -> Trend:
 
 
 def _told(
-    one: Quantity, predict: Sequence[float], reference: _Reference | None, all_: Sequence[Quantity]
+    one: Quantity, predict: Sequence[float], reference: Reference | None, all_: Sequence[Quantity]
 ) -> QuantityOut:
     fitted = _fitted(one, predict)
     influences = iter(fitted.influences)
     n = sum(point.estimate is not None for other in all_ for point in other.points)
-    drifts = _drifts(one, reference, n)
+    drifts = drifts_of(one, reference, n)
     points = [
         _point(point, next(influences, None) if point.estimate is not None else None,
                drifts.get(point.x, []), bool(fitted.laws))
@@ -159,46 +159,6 @@ def _point(
         p_value=None if influence is None else influence.p_value,
         is_outlier=influence is not None and influence.is_outlier, drifts=drifts,
     )  # fmt: skip
-
-
-def _drifts(
-    one: Quantity, reference: _Reference | None, comparisons: int
-) -> dict[float, list[DriftOut]]:
-    """What is told of each point, by its x."""
-    found: dict[float, list[DriftOut]] = {}
-    if reference is None:
-        return found
-    new = [(point.x, point.estimate) for point in one.points if point.estimate is not None]
-    old = _estimate(reference.run, one.name)
-    for x, estimate in new:
-        if x == reference.x and old is not None:
-            found[x] = [_drift("run", old.value, drift(estimate, old, comparisons))]
-    fitted, theirs = reference.trends.get(one.name, (None, None))
-    if fitted is None or theirs is None or fitted.chosen is None:
-        return found
-    used = [(p.x, p.estimate.stderr) for p in theirs.points if p.estimate is not None]
-    places, errors = np.array([x for x, _ in used]), np.array([error for _, error in used])
-    at = np.array([x for x, _ in new])
-    moved = drifts_from_law(
-        [estimate for _, estimate in new], fitted.chosen, places, errors, at, comparisons
-    )
-    for (x, estimate), so_far in zip(new, moved, strict=True):
-        if isfinite(so_far.difference):
-            expected = estimate.value - so_far.difference
-            found.setdefault(x, []).append(_drift("trend", expected, so_far))
-    return found
-
-
-def _estimate(run: Run, name: str) -> Estimate | None:
-    one: Any = (run.estimates or {}).get(name)
-    return None if not one or not one["stderr"] else Estimate(one["value"], one["stderr"])
-
-
-def _drift(kind: Any, expected: float, moved: Drift) -> DriftOut:
-    z = max(min(moved.z, 1e300), -1e300)
-    return DriftOut(
-        kind=kind, expected=expected, difference=moved.difference, z=z, drifted=moved.has_drifted
-    )
 
 
 def _law(law: Law, is_chosen: bool) -> LawOut:
@@ -243,29 +203,3 @@ def _quantity_notes(one: Quantity, fitted: Trend) -> list[str]:
     if outside:
         notes.append(f"{', '.join(outside)} is outside the measured range: an extrapolation")
     return notes
-
-
-def _notes(reference: _Reference | None, x: str) -> list[str]:
-    if reference is None:
-        return []
-    if reference.note:
-        return [reference.note]
-    if reference.x is None and not reference.trends:
-        return [f"the reference run has no label {x!r} and no trend: nothing to compare with"]
-    return []
-
-
-def _places(session: Session, job: Job, places: Mapping[float, list[TrendRow]]) -> list[Any]:
-    rows = [row for many in places.values() for row in many]
-    bodies = {row.id: body_of(job.spec, row.cell) for row in rows}
-    datasets = {run: body["datasets"] for run, body in bodies.items()}
-    known = _channels(session, {one for many in datasets.values() for one in many})
-    return [
-        place(x, many, datasets, known, bodies[many[0].id]["channels"])
-        for x, many in places.items()
-    ]
-
-
-def _channels(session: Session, datasets: set[str]) -> Channels:
-    found = DatasetRepository(session).get_all(sorted(datasets)) if datasets else ()
-    return {one.id: {channel["name"]: channel for channel in one.channels} for one in found}

@@ -3,7 +3,7 @@
 from typing import Any
 
 from service.cli.common import estimate, out, print_table
-from service.trend_text import Quantity, flags, law_text, notes, span_text
+from service.trend_text import Quantity, flags, law_text, notes, reference_text, span_text
 
 
 def print_trend(trend: dict[str, Any]) -> None:
@@ -27,6 +27,10 @@ def print_trend(trend: dict[str, Any]) -> None:
         above = ("predicted", f">{trend['x']}", ">value", "95 % interval for a new estimate", "")
         print_table(above, predicted, empty="")
         out.print()
+    if trend["reference"] is not None:
+        named = reference_text(trend)
+        text = f"compared with {trend['reference']}{named and ', '}{named}"
+        out.print(text, markup=False, soft_wrap=True)
     for note in notes(trend):
         out.print(f"note: {note}", markup=False, soft_wrap=True)
 

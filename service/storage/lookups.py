@@ -1,4 +1,4 @@
-"""Small questions that the use cases ask: datasets by name, and how far open runs are."""
+"""Small questions that the use cases ask: datasets by name, names of a run, how far runs are."""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -6,7 +6,7 @@ from typing import NamedTuple
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from service.storage.tables import DEFAULT_PROJECT, Dataset, RunHistory
+from service.storage.tables import DEFAULT_PROJECT, AcceptedReference, Dataset, RunHistory
 
 
 class Reached(NamedTuple):
@@ -31,6 +31,16 @@ def dataset_names(session: Session, project_id: str = DEFAULT_PROJECT) -> list[s
         Dataset.project_id == project_id, Dataset.deleted_at.is_(None)
     )
     return list(session.scalars(query.order_by(Dataset.id.desc()).limit(200)))
+
+
+def references_of(
+    session: Session, run_id: str, project_id: str = DEFAULT_PROJECT
+) -> list[str]:  # fmt: skip
+    """Names under which a run was accepted as a reference, now or before."""
+    query = select(AcceptedReference.name).where(
+        AcceptedReference.project_id == project_id, AcceptedReference.run_id == run_id
+    )
+    return list(session.scalars(query.distinct().order_by(AcceptedReference.name)))
 
 
 def reached(session: Session, run_ids: Collection[str]) -> dict[str, Reached]:

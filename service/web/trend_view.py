@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from service.errors import InvalidRequest
 from service.schemas_trends import TrendOut
 from service.storage.tables import Job
-from service.trend_text import Quantity, flags, law_text, notes, span_text
+from service.trend_text import Quantity, flags, law_text, notes, reference_text, span_text
 from service.trends import has_trend, trend
 from service.web import formats
 from service.web.figures_trend import trend_height
@@ -39,6 +39,7 @@ class TrendView:
     reasons: Sequence[str]
     notes: Sequence[str]
     reference: str | None
+    reference_text: str
     height: int
 
 
@@ -69,7 +70,7 @@ def trend_view(found: TrendOut) -> TrendView:
         ],
         predictions=[_prediction(one, at) for one in shown for at in one["predictions"]],
         reasons=[f"{one['name']}: {one['reason']}" for one in shown if one["reason"]],
-        notes=notes(document), reference=found.reference,
+        notes=notes(document), reference=found.reference, reference_text=reference_text(document),
         height=trend_height(max(len(shown), 1)),
     )  # fmt: skip
 

@@ -1,0 +1,96 @@
+"""What a batch is compared with, and what it is not to be: of another model, otherwise made."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.app import create_app
+from tests.integration.rest.test_rest_reidentify import (
+    LENGTHS,
+    Served,
+    batch_of,
+    quantity,
+    run_at,
+    stored,
+    trend,
+)
+from tests.rest import settings_of
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Four lengths, two experiments each; the first are a batch whose 8 m are a reference."""
+    app = create_app(settings_of(tmp_path_factory.mktemp("compared")))
+    with TestClient(app, raise_server_exceptions=False) as server:
+        datasets = {x: [stored(server, x, seed) for seed in (1, 2)] for x in LENGTHS}
+        parts = app.state.parts
+        batch = [{"x": x, "datasets": datasets[x][:1]} for x in LENGTHS]
+        found = Served(server, parts, datasets, batch_of(server, parts, batch=batch))
+        told = server.put("/v1/references/tube", json={"run": run_at(found, found.job, 8.0)})
+        assert told.status_code == 200, told.text
+        yield found
+
+
+def against(served: Served, **fields: Any) -> dict[str, Any]:
+    """The trend of the second experiments, compared with the reference."""
+    batch = [{"x": x, "datasets": served.datasets[x][1:]} for x in LENGTHS]
+    body = {"batch": batch, "reference": "tube", **fields}
+    return trend(served, batch_of(served.server, served.parts, **body))
+
+
+def drifts(found: dict[str, Any], name: str) -> dict[tuple[float, str], dict[str, Any]]:
+    return {
+        (point["x"], one["kind"]): one
+        for point in quantity(found, name)["points"] for one in point["drifts"]
+    }  # fmt: skip
+
+
+def test_a_file_of_another_length_is_told_as_drifted_in_every_quantity(served: Served) -> None:
+    batch = [{"x": x, "datasets": served.datasets[4.0 if x == 8 else x][1:]}
+             for x in LENGTHS if x != 4]  # fmt: skip
+    found = against(served, batch=batch)
+    for name in ("L", "T", "onset delay"):
+        told = drifts(found, name)
+        assert told[8.0, "trend"]["drifted"], name
+        assert told[8.0, "trend"]["limit"] < 6.5
+        assert not any(one["drifted"] for (x, _), one in told.items() if x != 8), name
+
+
+def test_the_onset_delay_is_compared_with_the_reference_run_too(served: Served) -> None:
+    found = against(served)
+    told = drifts(found, "onset delay")[8.0, "run"]
+    first = quantity(trend(served, served.job), "onset delay")["points"][2]
+    assert told["expected"] == pytest.approx(first["value"])
+    assert abs(told["z"]) < told["limit"]
+
+
+def test_the_limit_of_drift_and_the_name_of_the_reference_are_told(served: Served) -> None:
+    found = against(served)
+    assert found["reference_names"] == ["tube"]
+    page = served.server.get(f"/jobs/{found['job']}").text
+    assert "Compared with &#39;tube&#39; (length_m = 8)" in page
+    assert "drift is flagged where z, in standard errors, is beyond" in page
+
+
+def test_what_the_reference_was_made_with_otherwise_is_told(served: Served) -> None:
+    assert against(served)["notes"] == []
+    other = against(
+        served, hold={"u": "zero"}, parameters={"K": {"fixed": 1.0}},
+        loss={"kind": "soft-l1", "scale": 0.05}, channels={"u": "y"},
+    )  # fmt: skip
+    (note,) = other["notes"]
+    assert note.startswith("the reference was made with ")
+    for told in ("hold of u = first (here zero)", "K = none (here 1, fixed)", "u = u (here y)",
+                 "loss = squares (here soft-l1 of scale 0.05)"):  # fmt: skip
+        assert told in note
+
+
+def test_why_there_is_nothing_to_compare_with_is_told(served: Served) -> None:
+    found = against(served, label="bore_mm")
+    (note,) = found["notes"]
+    assert note == (
+        "the reference run has no label 'bore_mm', and the trend of its job is over 'length_m': "
+        "nothing to compare with"
+    )
