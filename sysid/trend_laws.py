@@ -86,11 +86,12 @@ class Law:
         """Names, values and standard errors (widened) of a and b of `FORMULAS`."""
         c, b = (float(one) for one in self.theta)
         if self.kind == "line":
-            a, slopes = c - b * self.centre, np.array([1.0, -self.centre])
+            a, share, slopes = c - b * self.centre, 1.0, np.array([1.0, -self.centre])
         else:
-            share = float(np.exp(-b * log(self.centre)))
-            a, slopes = c * share, np.array([share, -c * share * log(self.centre)])
-        error = self.widening * sqrt(max(float(slopes @ self.covariance @ slopes), 0.0))
+            share = float(np.exp(-b * log(self.centre)))  # may be large: it is never squared
+            a, slopes = c * share, np.array([1.0, -c * log(self.centre)])
+        variance = max(float(slopes @ self.covariance @ slopes), 0.0)
+        error = self.widening * sqrt(variance) * share
         return ("a", a, error), ("b", b, self.widening * sqrt(float(self.covariance[1, 1])))
 
 
@@ -102,10 +103,10 @@ def fit_line(x: FloatArray, y: FloatArray, stderr: FloatArray) -> Law | None:
     weight = (np.min(stderr) / stderr) ** 2  # at most 1: no overflow where errors are tiny
     centre = float(weight @ x / np.sum(weight))
     slopes = _slopes("line", x, centre, np.zeros(2))
-    theta = np.array([
-        float(weight @ y / np.sum(weight)),
-        float(weight @ (slopes[:, 1] * y) / (weight @ slopes[:, 1] ** 2)),
-    ])  # fmt: skip
+    mean = float(weight @ y / np.sum(weight))
+    # y less its mean: else the rounding of the centre of x would enter times that mean
+    product = weight @ (slopes[:, 1] * (y - mean))
+    theta = np.array([mean, float(product / (weight @ slopes[:, 1] ** 2))])
     return _made("line", x, y, stderr, centre, theta)
 
 

@@ -370,3 +370,26 @@ def test_the_mean_of_runs_with_tiny_errors_is_as_that_of_others() -> None:
     tiny, plain = (pooled([[Estimate(s, s), Estimate(3 * s, 2 * s)]])[0] for s in (1e-200, 1.0))
     assert tiny[0].value == pytest.approx(1e-200 * plain[0].value)
     assert tiny[0].stderr == pytest.approx(1e-200 * plain[0].stderr)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e3])
+@pytest.mark.parametrize("least", [1e-5, 1e-7, 1e-10, 1e-13])
+def test_a_line_turns_about_a_point_that_is_nearly_exact(least: float, offset: float) -> None:
+    x, y = np.array([1.0, 2.0, 3.0, 4.0]), np.array([1.0, 2.0, 3.0, 4.1]) + offset
+    law = fit_line(x, y, np.array([least, 1.0, 1.0, 1.0]))
+    assert law is not None
+    far, high = x[1:] - x[0], y[1:] - y[0]
+    # of order least² from that point free to move; the rest is what rounding of y gives
+    assert law.theta[1] == pytest.approx(float(far @ high / (far @ far)), rel=1e-10)
+
+
+def test_a_steep_decay_is_a_power_law_although_the_square_of_its_factor_overflows() -> None:
+    x = [1000.0, 1100.0, 1200.0, 1300.0]
+    y = [1000.0 * (one / 1000.0) ** -97.0 for one in x]
+    found = fit_trend(x, y, [1e-3 * one for one in y])
+    assert found.chosen is not None
+    assert found.chosen.kind == "power"
+    (_, a, error), (_, b, _) = found.chosen.coefficients
+    assert b == pytest.approx(-97.0)
+    assert np.isfinite([a, error]).all()
+    assert error > 0
