@@ -74,6 +74,7 @@ def stored(key: str, kind: Kind = "o") -> bytes | None:
 
 def store(key: str, code: bytes, kind: Kind = "o") -> None:
     """Keep code under a key, whole or not at all; a folder that cannot be used is no error."""
+    folder = None
     try:
         folder = _folder(kind)
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -83,7 +84,8 @@ def store(key: str, code: bytes, kind: Kind = "o") -> None:
         _write(folder, f"{key}.{kind}", code)
         _prune(folder)
     except OSError as error:
-        tell(f"{error}; {_ADVICE}")
+        why = error if folder is None else f"{folder}: {error.strerror}"
+        tell(f"{why}; {_ADVICE}")
 
 
 def _write(folder: Path, name: str, code: bytes) -> None:
