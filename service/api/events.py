@@ -13,7 +13,7 @@ from service.api.deps import Parts, PartsDep
 from service.errors import InvalidRequest
 from service.storage.events import EventRepository
 from service.storage.jobs import JobRepository
-from service.storage.patience import PASSING
+from service.storage.patience import PASSING, is_passing
 from service.storage.tables import Event
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -42,8 +42,10 @@ async def _stream(parts: Parts, job_id: str, last: int) -> AsyncIterator[str]:
     while not parts.stopping.is_set():
         try:
             batch, is_over = await run_in_threadpool(_look, parts, job_id, last)
-        except PASSING:  # the database may come back; the stream waits for it
-            batch, is_over = [], False
+        except PASSING as error:
+            if not is_passing(error):
+                raise
+            batch, is_over = [], False  # the database may come back; the stream waits for it
         for event in batch:
             last, quiet = event.id, 0.0
             yield _text(event)
@@ -59,8 +61,8 @@ async def _stream(parts: Parts, job_id: str, last: int) -> AsyncIterator[str]:
 def _look(parts: Parts, job_id: str, last: int) -> tuple[list[Event], bool]:
     """Newer events, and whether the job has ended, as of one moment."""
     with parts.database.read() as session:
-        job = JobRepository(session).get(job_id)
-        return EventRepository(session).after(job_id, last, BATCH), job.state.is_terminal
+        state = JobRepository(session).state_of(job_id)
+        return EventRepository(session).after(job_id, last, BATCH), state.is_terminal
 
 
 def _text(event: Event) -> str:

@@ -81,6 +81,14 @@ class JobRepository:
             raise NotFound("job", job_id)
         return job
 
+    def state_of(self, job_id: str) -> State:
+        """The state of such a job, without the rest of it; `NotFound` as `get` does."""
+        found = select(Job.state).where(Job.id == job_id, *self._mine())
+        state = self._session.scalar(found)
+        if state is None:
+            raise NotFound("job", job_id)
+        return state
+
     def page(
         self, *, cursor: str | None = None, limit: int = 50, states: Sequence[State] = ()
     ) -> Page[Job]:

@@ -1,15 +1,19 @@
 """What a claim reads does not grow with the jobs there ever were; on both databases."""
 
 from datetime import timedelta
+from types import SimpleNamespace
 
 import pytest
 from sqlalchemy import Connection, Engine, event, insert, text
 
+from service.api.events import _look
 from service.storage.admission import Admission
 from service.storage.columns import utc_now
-from service.storage.queue import Queue
+from service.storage.jobs import JobRepository
+from service.storage.queue import Owners, Progress, Queue
 from service.storage.tables import Job, Project, State
 from service.storage.watch import look
+from tests.stored import claimed
 
 PROJECTS = [f"p{number}" for number in range(4)]
 N_ENDED, N_QUEUED, N_RUNNING = 4000, 400, 128
@@ -107,6 +111,43 @@ def test_a_project_that_has_nothing_running_comes_first_among_many(crowded) -> N
         session.execute(text("UPDATE jobs SET project_id = 'p3' WHERE id = 'job_04399'"))
     first = claim(crowded)
     assert job_of_project(crowded, first) == "p3"
+
+
+def statements_of(database, work) -> list[str]:
+    """The statements on `jobs` that `work` makes."""
+    found: list[str] = []
+
+    def note(connection: Connection, cursor, statement, *_) -> None:
+        if "jobs" in statement:
+            found.append(statement)
+
+    event.listen(database.engine, "before_cursor_execute", note)
+    try:
+        work()
+    finally:
+        event.remove(database.engine, "before_cursor_execute", note)
+    return found
+
+
+def test_a_job_that_is_held_told_of_reaped_or_watched_does_not_bring_its_specification(
+    database,
+) -> None:
+    got, _ = claimed(database)
+
+    def work() -> None:
+        with database.write() as session:
+            queue = Queue(session)
+            queue.hold(got.lease)
+            queue.report(got.lease, Progress(1))
+            queue.tell(got.lease, "log", {"message": "told"})
+            queue.reap(Owners(gone=frozenset({got.lease.owner})))
+        with database.read() as session:
+            assert JobRepository(session).state_of(got.job.id) is State.QUEUED
+        _look(SimpleNamespace(database=database), got.job.id, 0)
+
+    found = statements_of(database, work)
+    assert len(found) > 5
+    assert not [one for one in found if "spec" in one]
 
 
 def job_of_project(database, got) -> str:

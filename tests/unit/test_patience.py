@@ -1,9 +1,15 @@
 """Work on a database that is away for a while is done when it is back."""
 
+import sqlite3
+from pathlib import Path
+
+import psycopg
 import pytest
-from sqlalchemy.exc import IntegrityError, OperationalError
+from sqlalchemy import text
+from sqlalchemy.exc import IntegrityError, InterfaceError, OperationalError
 
 from service.storage import patience
+from service.storage.sessions import Database, sqlite_url
 
 
 def away() -> OperationalError:
@@ -43,3 +49,84 @@ def test_a_fault_of_the_statement_is_not_tried_again() -> None:
     with pytest.raises(IntegrityError):
         patience.patiently(work)
     assert len(tries) == 1
+
+
+def raised(database: Database, statement: str, **values: object) -> OperationalError:
+    """What a statement that cannot be carried out raises."""
+    with (
+        pytest.raises((OperationalError, InterfaceError)) as caught,
+        database.write(busy_seconds=0.05) as session,
+    ):
+        session.execute(text(statement), values)
+    return caught.value
+
+
+@pytest.fixture
+def database(tmp_path: Path):
+    made = Database(sqlite_url(tmp_path / "a.db"))
+    yield made
+    made.dispose()
+
+
+def test_a_mistake_in_a_statement_is_not_taken_for_a_database_that_is_away(
+    database: Database,
+) -> None:
+    mistake = raised(database, "SELECT nothing FROM nowhere")
+    assert isinstance(mistake, OperationalError)
+    assert not patience.is_passing(mistake)
+    tries = []
+
+    def work() -> None:
+        tries.append(1)
+        raise mistake
+
+    with pytest.raises(OperationalError):
+        patience.patiently(work)
+    assert len(tries) == 1
+
+
+def test_a_locked_file_and_one_that_cannot_be_opened_may_pass(
+    database: Database, tmp_path: Path
+) -> None:
+    with database.write() as session:
+        session.execute(text("SELECT 1"))  # a transaction begins with its first statement
+        assert patience.is_passing(raised(database, "SELECT 1"))
+    other = Database(sqlite_url(tmp_path / "absent" / "a.db"))
+    assert patience.is_passing(raised(other, "SELECT 1"))
+    other.dispose()
+
+
+def test_a_disk_that_is_full_may_pass(database: Database) -> None:
+    with database.write() as session:
+        session.execute(text("CREATE TABLE t (x)"))
+    with database.write() as session:
+        session.execute(text("PRAGMA max_page_count = 3"))
+        with pytest.raises(OperationalError) as caught:
+            session.execute(text("INSERT INTO t VALUES (zeroblob(100000))"))
+        session.rollback()
+    assert patience.is_passing(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("cause", "passes"),
+    [
+        (psycopg.OperationalError("the connection is lost"), True),
+        (psycopg.errors.AdminShutdown("terminating"), True),
+        (psycopg.errors.CannotConnectNow("starting up"), True),
+        (psycopg.errors.DiskFull("no space"), True),
+        (psycopg.errors.DeadlockDetected("deadlock"), True),
+        (psycopg.errors.LockNotAvailable("lock timeout"), True),
+        (psycopg.errors.ObjectInUse("in use"), False),
+        (psycopg.errors.ObjectNotInPrerequisiteState("state"), False),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_postgresql_tells_by_its_state_whether_an_error_may_pass(
+    cause: psycopg.Error, passes: bool
+) -> None:
+    assert patience.is_passing(OperationalError("SELECT 1", {}, cause)) is passes
+
+
+def test_a_value_that_sqlite_cannot_take_does_not_pass() -> None:
+    cause = sqlite3.InterfaceError("Error binding parameter")
+    assert not patience.is_passing(InterfaceError("SELECT ?", {}, cause))

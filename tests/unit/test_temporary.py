@@ -5,13 +5,27 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from service import temporary
+from workers import cluster, processes
+from workers.errors import ClusterUnavailable
 
 LEAVE = "import sys; from service import temporary; open(sys.argv[1] + temporary.prefix(), 'w')"
+ELSEWHERE = "another boot pid:[4026531836]"
+
+
+@pytest.fixture
+def ended() -> int:
+    """The number of a process that has ended."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
 
 
 def test_what_a_dead_process_left_goes_and_what_a_living_one_has_stays(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", LEAVE, f"{tmp_path}/"], check=True, timeout=60)
+    assert len(list(tmp_path.iterdir())) == 1
     mine = tmp_path / f"{temporary.prefix()}file"
     mine.touch()
     other = tmp_path / "lagid-tmp-another-host-1-file"
@@ -22,3 +36,54 @@ def test_what_a_dead_process_left_goes_and_what_a_living_one_has_stays(tmp_path:
     os.utime(other, (other.stat().st_mtime - old, other.stat().st_mtime - old))
     temporary.clear(tmp_path)
     assert list(tmp_path.iterdir()) == [mine]
+
+
+def test_a_living_process_of_another_pid_namespace_keeps_its_files_and_rays_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ended: int
+) -> None:
+    monkeypatch.setattr(processes, "_base", lambda: tmp_path)
+    with monkeypatch.context() as there:  # its number is there one that has ended here
+        there.setattr(processes, "machine", lambda: ELSEWHERE)
+        there.setattr(os, "getpid", lambda: ended)
+        theirs = [tmp_path / f"{temporary.prefix()}file", processes.folder_of(ended)]
+    for path in theirs:
+        path.mkdir()
+    gone = processes.folder_of(ended)
+    gone.mkdir()
+    temporary.clear(tmp_path)
+    processes.clear_after_the_dead()
+    assert set(tmp_path.iterdir()) == set(theirs)
+
+
+@pytest.mark.skipif(processes.standing(os.getpid()) is None, reason="there is no /proc")
+def test_files_of_a_process_whose_number_another_has_by_now_go(tmp_path: Path) -> None:
+    number = os.getpid()
+    former = tmp_path / f"lagid-tmp-{processes.tag()}-{number}-1-file"
+    former.touch()
+    temporary.clear(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_rays_folder_is_not_one_that_somebody_else_has_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "_base", lambda: tmp_path)
+    folder, target = processes.folder_of(os.getpid()), tmp_path / "elsewhere"
+    target.mkdir()
+    folder.symlink_to(target)  # as what another has made, it cannot be removed as a folder is
+    with pytest.raises(ClusterUnavailable, match="cannot be made"):
+        cluster._fresh_folder()
+    folder.unlink()
+    made = cluster._fresh_folder()
+    assert made == folder
+    assert made.stat().st_mode & 0o077 == 0
+
+
+def test_the_paths_of_rays_sockets_are_short_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = "/" + "b" * (processes._LONGEST_BASE - 1)
+    monkeypatch.setattr(processes.tempfile, "gettempdir", lambda: base)
+    most = 2**22 - 1  # the highest number of a process
+    session = f"session_2026-01-01_00-00-00_000000_{most}/sockets/plasma_store"
+    path = processes.folder_of(most) / session
+    assert str(path).startswith(base)
+    assert len(str(path)) <= 107

@@ -1,6 +1,7 @@
 """What the web process answers while its database or its disk is away: 503, never 500."""
 
 import errno
+import sqlite3
 from typing import Any
 
 import pytest
@@ -34,3 +35,16 @@ def test_a_full_disk_is_a_part_that_is_down(
     answer = server.post("/v1/datasets", content=recording(), headers=CSV)
     refused(answer, 503, "unavailable")
     assert "no space left" in answer.json()["detail"]
+
+
+def test_a_mistake_in_a_statement_is_not_told_as_a_database_that_is_away(
+    server: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def mistaken(*_args: Any, **_options: Any) -> None:
+        try:
+            sqlite3.connect(":memory:").execute("SELECT nothing FROM nowhere")
+        except sqlite3.OperationalError as error:
+            raise OperationalError("SELECT", {}, error) from error
+
+    monkeypatch.setattr(server.app.state.parts.database, "read", mistaken)
+    refused(server.get("/v1/jobs"), 500, "internal")
