@@ -14,6 +14,7 @@ from types import FrameType
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.dispatch.aside import Aside, Make
 from service.dispatch.claiming import Leases
 from service.dispatch.floors import floors_for
 from service.dispatch.preparing import JobRuns
@@ -28,7 +29,7 @@ from service.storage.patience import patiently
 from service.storage.queue import Claim, Lease
 from service.storage.sessions import Database
 from service.storage.wakeup import new_waker
-from service.supervision import SUPERVISED
+from service.supervision import AGAIN, SUPERVISED
 from workers.cluster import ClusterSettings, RayCrew
 from workers.errors import ClusterLost, WorkersError
 from workers.feeding import Feeder
@@ -73,6 +74,8 @@ class Dispatcher:
         self._recorders: dict[Lease, Recorder] = {}
         self._priorities: dict[Lease, int] = {}
         self._is_filling = False
+        self._floors: dict[Lease, Make] = {}  # of jobs with noise, to be made when their runs end
+        self._aside: Aside[Lease] = Aside()
         self._lost: set[Lease] = set()
         self._looked = 0.0
         self._waking = threading.Thread(target=self._listen, name="waker", daemon=True)
@@ -109,6 +112,8 @@ class Dispatcher:
         has_time = self._recorders and not self._is_filling
         for lease in self._feeder.step(STEP_SECONDS if has_time else 0.0):
             self._end(lease)
+        for lease in self._over():
+            self._conclude(lease)
         for recorder in self._kept():
             if not self._leases.is_sure(recorder.lease):
                 continue  # the heartbeat that waits, or the next one, tells whose it is
@@ -153,9 +158,9 @@ class Dispatcher:
     def _take(self, claim: Claim) -> None:
         source = JobRuns(self._database, claim, self._store)
         floors = patiently(partial(floors_for, self._database, claim, source))
-        recorder = patiently(
-            partial(Recorder, self._database, claim, source.save, floors, source.failed)
-        )
+        recorder = patiently(partial(Recorder, self._database, claim, source.save, source.failed))
+        if floors is not None:
+            self._floors[claim.lease] = floors
         self._recorders[claim.lease] = recorder
         job = claim.job
         self._priorities[claim.lease] = job.priority
@@ -171,21 +176,41 @@ class Dispatcher:
         recorder.is_stopped = True
 
     def _end(self, lease: Lease) -> None:
+        """The runs of a job are over: its floors are made before it ends, if it has any."""
+        recorder, floors = self._recorders[lease], self._floors.pop(lease, None)
+        if floors is None or recorder.is_stopped:
+            self._conclude(lease)
+            return
+        try:
+            patiently(recorder.store)
+        except LeaseLost as error:
+            self._lose(recorder, error)
+            self._conclude(lease)
+        else:
+            self._aside.begin(lease, floors)
+
+    def _over(self) -> list[Lease]:
+        """Jobs whose floors were made, or are no longer wanted."""
+        stopped = [one for one in self._aside.keys if self._recorders[one].is_stopped]
+        for lease in stopped:
+            self._aside.drop(lease)
+        return [*stopped, *self._aside.ended()]
+
+    def _conclude(self, lease: Lease) -> None:
+        floors = self._aside.take(lease) if lease in self._aside else None
         recorder = self._recorders.pop(lease)
         del self._priorities[lease]
         if lease in self._lost:
             self._lost.discard(lease)
             return
         try:
-            if recorder.is_stopped:
-                patiently(recorder.cancel)
-            else:
-                patiently(recorder.finish)
+            patiently(recorder.cancel if recorder.is_stopped else partial(recorder.finish, floors))
         except LeaseLost as error:
             _log.warning("its end was not written: %s", error)
         self._leases.forget(lease)
 
     def _give_back(self, *, lost: bool = False) -> None:
+        self._aside.stop()
         for recorder in self._kept():
             try:
                 patiently(recorder.keep)
@@ -280,7 +305,7 @@ def _end_at_once(crew: RayCrew) -> None:
     """End the process without Ray's own end, which waits for what may be gone."""
     crew.abandon()
     logging.shutdown()
-    os._exit(1)
+    os._exit(AGAIN)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ class Floors:
 
     def __init__(self, stored: Document | None) -> None:
         self._axes: Sequence[str] = (stored or {}).get("axes", ())
+        self._note: str = (stored or {}).get("note", "")
         self.problems: Sequence[Document] = (stored or {}).get("problems", ())
 
     def problem_of(self, key: Mapping[str, Any]) -> Document | None:
@@ -41,6 +42,8 @@ class Floors:
                 "best run with the least noise, and floors are those at that estimate"
             )
         yield from dict.fromkeys(one["note"] for one in self.problems if one["note"])
+        if self._note:
+            yield self._note
 
 
 def at_sigma(per_sigma: float | None, sigma: tuple[float, float] | None) -> float | None:

@@ -31,12 +31,13 @@ def carried_out(parts: Parts, job: str, steps: int = 5000) -> list[str]:
     assert claim is not None
     source = JobRuns(parts.database, claim, parts.store)
     floors = floors_for(parts.database, claim, source)
-    recorder = Recorder(parts.database, claim, source.save, floors)
+    recorder = Recorder(parts.database, claim, source.save, source.failed)
     feeder: Feeder[str] = Feeder(InlineCrew())
     feeder.add(job, source, recorder)
     for _ in range(steps):
         if feeder.step(0.05):
-            recorder.finish()
+            recorder.store()
+            recorder.finish(None if floors is None else list(floors())[-1])
             break
     with parts.database.read() as session:
         return [run.id for run in RunRepository(session).page(job, limit=100).items]

@@ -2,26 +2,31 @@
 
 A job may pose several problems (axes over datasets or bounds, say); each has a truth of its own.
 σ enters in proportion, so one floor a problem serves every σ. It is made here, in the dispatcher
-and when the job ends, so that the web process need not compute (decision 15).
+and when all runs of the job are over, so that the web process need not compute (decision 15); in a
+thread of its own, problem by problem, so that the workers are fed
+meanwhile (`service.dispatch.aside`).
 """
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from sqlalchemy.orm import Session
 
+from service.dispatch.aside import Make
 from service.dispatch.preparing import JobRuns
 from service.errors import ServiceError
 from service.result_document import finite
 from service.storage.columns import Document
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import StorageError
+from service.storage.patience import patiently
 from service.storage.queue import Claim
 from service.storage.sessions import Database
-from service.storage.summaries import GroupKey, groups, quietest_run
+from service.storage.summaries import Group, GroupKey, groups, quietest_run
 from service.storage.tables import Job, Run
 from service.sweeps import body_of
 from service.truth import truth_of
@@ -41,14 +46,20 @@ _log = logging.getLogger(__name__)
 # Fields of a run that do not change what its parameters are measured by.
 SETTINGS = ("/noise", "/seed", "/algorithm", "/loss", "/weights", "/prediction", "/warm_start")
 MOST_PROBLEMS = 64
+LEFT_OUT = (
+    f"the sweep poses more than {MOST_PROBLEMS} problems: the first {MOST_PROBLEMS} have floors "
+    "and values to tell errors from, the others none"
+)
 MOST_WORK = 10_000_000
 """Samples to simulate for the floors of one job: below a second in most models."""
 
 
-def floors_for(database: Database, claim: Claim, source: JobRuns) -> Callable[[], Document] | None:
-    """Makes the document of a job's floors; None for a job without noise.
+def floors_for(database: Database, claim: Claim, source: JobRuns) -> Make | None:
+    """Makes the document of a job's floors, a problem a step; None for a job without noise.
 
-    The document has ``axes``, the paths that tell the problems apart, and ``problems``, each with
+    All runs of the job must be over, and their results written. The document has ``axes``, the
+    paths that tell the problems apart, ``note`` on problems that it leaves out, and ``problems``,
+    each with
 
     - ``cell``: its values of the axes;
     - ``reference``: ``kind`` (``truth``, or ``estimate``: the best run at the smallest σ), the
@@ -61,7 +72,7 @@ def floors_for(database: Database, claim: Claim, source: JobRuns) -> Callable[[]
     axes = spec.get("sweep", {}).get("axes", [])
     if not spec["noise"]["sigma"] and not any(axis["path"].startswith("/noise") for axis in axes):
         return None
-    return _Floors(database, claim.job, source).document
+    return _Floors(database, claim.job, source).steps
 
 
 class _Floors:
@@ -71,26 +82,32 @@ class _Floors:
         self._database, self._job, self._source = database, job, source
         self._left = MOST_WORK
 
-    def document(self) -> Document:
+    def steps(self) -> Iterator[Document | None]:
+        """Nothing after each problem, and then the document."""
         axes = [
             axis["path"] for axis in self._job.spec["sweep"]["axes"]
             if not axis["path"].startswith(SETTINGS)
         ]  # fmt: skip
-        with self._database.read() as session:
-            found = groups(
-                session, self._job.id, [GroupKey("axis", path) for path in axes], [],
-                MOST_PROBLEMS, self._job.project_id,
-            )  # fmt: skip
+        found = patiently(partial(self._groups, axes))
         cells = [dict(zip(axes, one.key, strict=True)) for one in found[:MOST_PROBLEMS]]
-        return {"axes": axes, "problems": [self._problem(cell) for cell in cells]}
+        problems = []
+        for cell in cells:
+            problems.append(self._problem(cell))
+            yield None
+        left_out = len(found) > MOST_PROBLEMS
+        yield {"axes": axes, "problems": problems, "note": LEFT_OUT if left_out else ""}
+
+    def _groups(self, axes: list[str]) -> list[Group]:
+        keys = [GroupKey("axis", path) for path in axes]
+        with self._database.read() as session:
+            return groups(session, self._job.id, keys, [], MOST_PROBLEMS, self._job.project_id)
 
     def _problem(self, cell: Mapping[str, Any]) -> Document:
         entry: Document = {
             "cell": dict(cell), "reference": None, "stderr": {}, "rms": None, "note": "",
         }  # fmt: skip
         try:
-            with self._database.read() as session:
-                entry["reference"] = self._reference(session, cell)
+            entry["reference"] = patiently(partial(self._reference, cell))
             if entry["reference"] is None:
                 return {**entry, "note": "no run succeeded whose values errors could be told from"}
             spec = self._source.specification(cell).problem
@@ -98,8 +115,15 @@ class _Floors:
         except (SysidError, ServiceError, StorageError, RecordsUnavailable) as error:
             _log.warning("%s: no floor: %s", self._job.id, error)
             return {**entry, "note": f"there is no floor: {error}"}
+        except Exception as error:  # noqa: BLE001 - the results are there; a floor is not worth them
+            _log.exception("%s: no floor", self._job.id)
+            return {**entry, "note": f"there is no floor: internal error: {type(error).__name__}"}
 
-    def _reference(self, session: Session, cell: Mapping[str, Any]) -> Document | None:
+    def _reference(self, cell: Mapping[str, Any]) -> Document | None:
+        with self._database.read() as session:
+            return self._reference_in(session, cell)
+
+    def _reference_in(self, session: Session, cell: Mapping[str, Any]) -> Document | None:
         body = body_of(self._job.spec, cell)
         rows = DatasetRepository(session, self._job.project_id).get_all(body["datasets"])
         true = truth_of(session, body["model"], rows)

@@ -30,9 +30,6 @@ PROGRESS_SECONDS = 1.0
 CHECKPOINT_SECONDS = 4.0
 KEPT_REASONS = 3
 
-MakeFloors = Callable[[], Document]
-"""Makes the document of the job's floors, when all its results are stored."""
-
 SaveSignals = Callable[[str, Identification], str | None]
 """Stores the fitted signals of a run; gives the object's hash."""
 
@@ -83,12 +80,10 @@ class Recorder:
         database: Database,
         claim: Claim,
         save_signals: SaveSignals,
-        floors: MakeFloors | None = None,
         tell_failed: Callable[[str], None] = _nobody,
     ) -> None:
         self.lease = claim.lease
         self._tell_failed = tell_failed
-        self._floors = floors
         self.is_stopped = False
         with database.write() as session:
             before = tally(session, claim.lease, KEPT_REASONS)
@@ -202,12 +197,11 @@ class Recorder:
             self._write(session, tell=True, keep=True)
         self._written(time.monotonic(), tell=True, keep=True)
 
-    def finish(self) -> None:
+    def finish(self, floors: Document | None = None) -> None:
         """Write the last results and end the job, in one transaction.
 
-        Where floors are told, the results are written before: they are made of them.
+        Where floors are told, the results were written before (`store`): they are made of them.
         """
-        floors = None if self._floors is None else self._made_floors(self._floors)
         with self._database.write() as session:
             self._write(session, tell=True, keep=False)
             queue = Queue(session)
@@ -224,11 +218,11 @@ class Recorder:
             else:
                 queue.finish(self.lease, State.SUCCEEDED, complaint)
 
-    def _made_floors(self, make: MakeFloors) -> Document:
+    def store(self) -> None:
+        """Write the last results; the job goes on."""
         with self._database.write() as session:
             self._write(session, tell=True, keep=False)
         self._written(time.monotonic(), tell=True, keep=False)
-        return make()
 
     def cancel(self) -> None:
         """End the job as cancelled; what its runs gave before stays."""

@@ -1,0 +1,101 @@
+"""What the dispatcher makes beside its turns: documents of ended jobs, in a thread of their own."""
+
+import logging
+import threading
+from collections.abc import Callable, Hashable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from queue import SimpleQueue
+from typing import Generic, TypeVar
+
+from service.storage.columns import Document
+
+_log = logging.getLogger(__name__)
+
+STOP_SECONDS = 2.0
+"""Longest wait for the step in progress when the dispatcher stops."""
+
+Key = TypeVar("Key", bound=Hashable)
+Steps = Iterator[Document | None]
+"""The making of a document, step by step: the last thing it gives is the document."""
+Make = Callable[[], Steps]
+
+
+@dataclass(slots=True, eq=False)
+class _Making:
+    steps: Steps
+    made: "Future[Document | None]" = field(default_factory=Future)
+    latest: Document | None = None
+
+
+class Aside(Generic[Key]):
+    """One thread for all jobs: each has a step in turn, so that a short one is not held up.
+
+    Compiling a model takes a tenth of a second and simulating a long record more; the workers must
+    be fed meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self._making: dict[Key, _Making] = {}
+        self._queue: SimpleQueue[_Making | None] = SimpleQueue()
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self._making
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """Keys whose documents were begun, and neither taken nor dropped."""
+        return tuple(self._making)
+
+    def begin(self, key: Key, make: Make) -> None:
+        """Make a document for that key."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._work, name="aside", daemon=True)
+            self._thread.start()
+        self._making[key] = one = _Making(make())
+        self._queue.put(one)
+
+    def ended(self) -> tuple[Key, ...]:
+        """Keys whose documents are there to be taken."""
+        return tuple(key for key, one in self._making.items() if one.made.done())
+
+    def take(self, key: Key) -> Document | None:
+        """The document that was made; whatever its making raised is raised here."""
+        return self._making.pop(key).made.result()
+
+    def drop(self, key: Key) -> None:
+        """The document is no longer wanted."""
+        one = self._making.pop(key, None)
+        if one is not None:
+            one.made.cancel()
+
+    def stop(self) -> None:
+        """Make nothing more."""
+        self._ending.set()
+        self._queue.put(None)
+        if self._thread is not None:
+            self._thread.join(STOP_SECONDS)
+
+    def _work(self) -> None:
+        while (one := self._queue.get()) is not None and not self._ending.is_set():
+            if one.made.cancelled():
+                continue
+            try:
+                one.latest = next(one.steps)
+            except StopIteration:
+                _settle(one, None)
+            except Exception as error:  # noqa: BLE001 - the thread's border: raised where it is taken
+                _settle(one, error)
+            else:
+                self._queue.put(one)
+
+
+def _settle(one: _Making, error: Exception | None) -> None:
+    if not one.made.set_running_or_notify_cancel():
+        return
+    if error is None:
+        one.made.set_result(one.latest)
+    else:
+        one.made.set_exception(error)

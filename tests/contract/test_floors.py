@@ -1,0 +1,121 @@
+"""Floors of a job with noise: made beside the dispatcher's turns, which no error ends."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from service.dispatch import floors
+from service.dispatch.claiming import Leases
+from service.dispatcher import Dispatcher
+from service.floors import Floors
+from service.storage.tables import OPEN, State
+from tests.dispatching import Place
+from workers.inline import InlineCrew
+
+SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
+NOISY = {"algorithm": SMALL, "noise": {"sigma": 0.1}}
+
+
+@pytest.fixture
+def place(tmp_path):
+    made = Place(tmp_path / "data")
+    yield made
+    made.database.dispose()
+
+
+def carried_out(place, *jobs, meanwhile=lambda: None):
+    """Carry out jobs; `meanwhile` is called in another thread."""
+    dispatcher = Dispatcher(place.database, place.store, InlineCrew(), Leases(place.database, 30))
+
+    def stop_at_the_end():
+        try:
+            meanwhile()
+            while any(place.job(job).state in OPEN for job in jobs):
+                time.sleep(0.01)
+        finally:
+            dispatcher.stopping.set()
+
+    watcher = threading.Thread(target=stop_at_the_end)
+    watcher.start()
+    dispatcher.run()
+    watcher.join()
+    return [place.job(job) for job in jobs]
+
+
+def notes(job):
+    return list(Floors(job.floors).notes())
+
+
+def test_other_jobs_are_carried_out_while_floors_are_made(place, monkeypatch):
+    may_go_on, begun = threading.Event(), threading.Event()
+    made = floors.floor
+
+    def held(problem, theta):
+        begun.set()
+        assert may_go_on.wait(60)
+        return made(problem, theta)
+
+    monkeypatch.setattr(floors, "floor", held)
+    noisy = place.submit(**NOISY)
+    states = []
+
+    def meanwhile():
+        assert begun.wait(60)
+        quiet = place.submit(algorithm=SMALL)
+        states.append(place.until(quiet, State.SUCCEEDED).state)
+        states.append(place.job(noisy).state)
+        may_go_on.set()
+
+    (job,) = carried_out(place, noisy, meanwhile=meanwhile)
+    assert states == [State.SUCCEEDED, State.RUNNING]
+    assert job.state is State.SUCCEEDED
+    assert job.floors["problems"][0]["stderr"]["T"] > 0
+
+
+def test_a_job_is_cancelled_while_its_floors_are_made(place, monkeypatch):
+    may_go_on, begun = threading.Event(), threading.Event()
+
+    def held(problem, theta):
+        begun.set()
+        assert may_go_on.wait(60)
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(floors, "floor", held)
+    noisy = place.submit(**NOISY)
+
+    def meanwhile():
+        assert begun.wait(60)
+        place.cancel(noisy)
+        place.until(noisy, State.CANCELLED)
+        may_go_on.set()
+
+    (job,) = carried_out(place, noisy, meanwhile=meanwhile)
+    assert job.state is State.CANCELLED
+    assert job.floors is None
+    assert {run.state for run in place.runs(noisy)} == {State.SUCCEEDED}
+
+
+@pytest.mark.parametrize(
+    "error", [np.linalg.LinAlgError("as told"), ZeroDivisionError(), MemoryError(), ValueError()]
+)
+def test_an_error_of_the_numerics_is_a_note_and_the_job_succeeds(place, monkeypatch, error):
+    def broken(problem, theta):
+        raise error
+
+    monkeypatch.setattr(floors, "floor", broken)
+    (job,) = carried_out(place, place.submit(**NOISY))
+    assert job.state is State.SUCCEEDED
+    assert any("there is no floor: internal error" in one for one in notes(job))
+
+
+def test_of_more_problems_than_floors_are_made_of_a_note_tells(place, monkeypatch):
+    monkeypatch.setattr(floors, "MOST_PROBLEMS", 2)
+    (few,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[0]]}))
+    (many,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[1]]}))
+    assert [len(job.floors["problems"]) for job in (few, many)] == [2, 2]
+    assert [floors.LEFT_OUT in notes(job) for job in (few, many)] == [False, True]
+
+
+SKIPS = [{"path": "/skip", "values": [1, 2]}, {"path": "/skip", "values": [1, 2, 3]}]
