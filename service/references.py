@@ -5,6 +5,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.errors import InvalidRequest
+from service.same_model import model_in, says_the_same
 from service.schemas import Page
 from service.schemas_jobs import REFERENCE, RUN
 from service.schemas_references import AcceptedOut, ReferenceIn, ReferenceOut
@@ -23,10 +24,12 @@ def accept(session: Session, name: str, body: ReferenceIn) -> ReferenceOut:
     Raises
     ------
     InvalidRequest
-        If the name cannot be used, or there is no such run, or it did not succeed.
+        If the name cannot be used, or there is no such run, or it did not succeed, or the name
+        stands for another model.
     """
     _check_name(name)
     run = _succeeded(session, body.run, "/run")
+    _check_model(session, name, run)
     ReferenceRepository(session).accept(name, run.id, body.by, body.note)
     return one(session, name)
 
@@ -80,6 +83,22 @@ def _check_name(name: str) -> None:
     else:
         return
     raise InvalidRequest.at("{name}", f"the name in the path: found {name!r:.120}; need {wanted}")
+
+
+def _check_model(session: Session, name: str, run: Run) -> None:
+    """Refuse a run of another model than the one that a name stands for."""
+    try:
+        latest = ReferenceRepository(session).latest(name)
+    except NotFound:
+        return
+    before = model_in(session, RunRepository(session).get(latest.run_id))
+    new = model_in(session, run)
+    if before is not None and new is not None and not says_the_same(before, new):
+        raise InvalidRequest.at(
+            "/run",
+            f"run {run.id} is of the model {new.name!r}, and {name!r} stands for runs of another, "
+            f"{before.name!r} (now {latest.run_id}); accept it under a name of its own",
+        )
 
 
 def _succeeded(session: Session, run_id: str, pointer: str) -> Run:

@@ -7,7 +7,8 @@ from sqlalchemy.orm import Session
 
 from service import references
 from service.errors import FieldError, InvalidRequest
-from service.schemas_jobs import PREVIOUS
+from service.same_model import model_in, says_the_same
+from service.schemas_jobs import PREVIOUS, REFERENCE
 from service.storage.tables import Run
 from sysid.models.model import Model
 
@@ -17,14 +18,21 @@ POINTER = "/warm_start"
 def faults(
     session: Session, reference: str | None, model: Model, pointer: str = POINTER
 ) -> list[FieldError]:
-    """Why a body's warm start cannot be used: no such run, or one of another model."""
+    """Why a body's warm start, or reference, cannot be used: no such run, or of another model.
+
+    A reference stands for a model. A run that is named as the place to begin from needs no more
+    than the same parameters: it may be of an earlier version of the equations.
+    """
     if reference in (None, PREVIOUS):
         return []
     try:
         run = references.run_of(session, str(reference), pointer)
     except InvalidRequest as error:
         return list(error.errors)
-    return [FieldError(pointer, text) for text in [_of_another_model(run, model)] if text]
+    text = _of_another_model(session, run, model)
+    if not text and (pointer != POINTER or str(reference).startswith(REFERENCE)):
+        text = _of_other_equations(session, run, model)
+    return [FieldError(pointer, text)] if text else []
 
 
 def resolved(session: Session, reference: str | None) -> str | None:
@@ -34,7 +42,17 @@ def resolved(session: Session, reference: str | None) -> str | None:
     return references.run_of(session, str(reference), POINTER).id
 
 
-def _of_another_model(run: Run, model: Model) -> str | None:
+def _of_other_equations(session: Session, run: Run, model: Model) -> str:
+    theirs = model_in(session, run)
+    if theirs is None or says_the_same(theirs, model):
+        return ""
+    return (
+        f"run {run.id} is of another model, {theirs.name!r}, whose equations are not those of "
+        f"{model.name!r}; need a run of {model.name!r}"
+    )
+
+
+def _of_another_model(session: Session, run: Run, model: Model) -> str:
     """What differs between the run's parameters and the model's, by names and units."""
     known: Mapping[str, Any] = {one["name"]: one for one in (run.result or {})["parameters"]}
     names = [one.name for one in model.parameters]
@@ -42,8 +60,10 @@ def _of_another_model(run: Run, model: Model) -> str | None:
         names = [name for name in names if name in known] or names[:1]
     missing = [name for name in names if name not in known]
     if missing:
+        theirs = model_in(session, run)
+        whose = "" if theirs is None else f" of {theirs.name!r}"
         return (
-            f"run {run.id} is of another model: it has the parameters {_listed(known)}, "
+            f"run {run.id}{whose} is of another model: it has the parameters {_listed(known)}, "
             f"{model.name!r} has {_listed(names)}; need a run with {_listed(missing)}"
         )
     for one in model.parameters:
@@ -53,7 +73,7 @@ def _of_another_model(run: Run, model: Model) -> str | None:
                 f"run {run.id} is of another model: {one.name} is in {unit}, in {model.name!r} "
                 f"it is in {one.unit}"
             )
-    return None
+    return ""
 
 
 def _listed(names: Any) -> str:

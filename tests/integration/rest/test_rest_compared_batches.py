@@ -8,6 +8,7 @@ from starlette.testclient import TestClient
 
 from service.app import create_app
 from tests.integration.rest.test_rest_reidentify import (
+    BODY,
     LENGTHS,
     Served,
     batch_of,
@@ -16,7 +17,7 @@ from tests.integration.rest.test_rest_reidentify import (
     stored,
     trend,
 )
-from tests.rest import settings_of
+from tests.rest import refused, settings_of
 
 
 @pytest.fixture(scope="module")
@@ -94,3 +95,51 @@ def test_why_there_is_nothing_to_compare_with_is_told(served: Served) -> None:
         "the reference run has no label 'bore_mm', and the trend of its job is over 'length_m': "
         "nothing to compare with"
     )
+
+
+def fopdt_run(served: Served) -> str:
+    """A run of a model that has the tube's parameters and another."""
+    job = batch_of(
+        served.server, served.parts, model="fopdt", look_at=["L"],
+        batch=[{"x": 8.0, "datasets": served.datasets[8.0][:1]}],
+    )  # fmt: skip
+    return run_at(served, job, 8.0)
+
+
+def test_a_name_that_stands_for_a_model_takes_no_run_of_another(served: Served) -> None:
+    run = fopdt_run(served)
+    (fault,) = refused(
+        served.server.put("/v1/references/tube", json={"run": run}), 422, "invalid"
+    )  # fmt: skip
+    assert fault["pointer"] == "/run"
+    assert "'fopdt'" in fault["detail"]
+    assert "'tube' stands for runs of another, 'tube'" in fault["detail"]
+    assert served.server.get("/v1/references/tube").json()["run"] != run
+    assert served.server.put("/v1/references/lag", json={"run": run}).status_code == 200
+
+
+def test_a_batch_is_not_begun_at_or_compared_with_a_run_of_another_model(served: Served) -> None:
+    run = fopdt_run(served)
+    batch = [{"x": 8.0, "datasets": served.datasets[8.0][:1]}]
+    for warm in ("reference", "none"):
+        answer = served.server.post(
+            "/v1/recipes/reidentify",
+            json={**BODY, "batch": batch, "reference": run, "warm_start": warm},
+        )
+        (fault,) = refused(answer, 422, "invalid")
+        assert fault["pointer"] == "/reference"
+        assert "another model, 'fopdt', whose equations are not those of 'tube'" in fault["detail"]
+
+
+def test_the_same_equations_under_another_name_with_other_bounds_are_the_same_model(
+    served: Served,
+) -> None:
+    document = served.server.get("/v1/models/tube").json()["document"]
+    document = {**document, "name": "my-tube", "description": "mine"}
+    document["parameters"]["T"]["upper"] = 1.5
+    answer = served.server.post(
+        "/v1/recipes/reidentify",
+        json={**BODY, "model": document, "reference": "tube",
+              "batch": [{"x": 8.0, "datasets": served.datasets[8.0][:1]}]},
+    )  # fmt: skip
+    assert answer.status_code == 202, answer.text
