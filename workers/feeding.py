@@ -7,7 +7,7 @@ from typing import Generic, TypeVar
 
 from workers.errors import PackFailed, PackLost
 from workers.jobwork import JobWork
-from workers.packing import PACKS_PER_CPU
+from workers.packing import PACK_SECONDS, PACKS_PER_CPU
 from workers.ports import Crew, Handle, JobSource, RunObserver
 from workers.sharing import Shares
 
@@ -24,6 +24,14 @@ LEAST_AHEAD = 128
 
 READ_SECONDS = 0.05
 """Time that a step gives to reading runs: known ones cost no worker's time, and may be many."""
+
+TELL_SECONDS = 0.02
+MOST_TELL_SECONDS = 0.25
+"""Time that a step gives to telling of results, at which signals are stored: as long as all else
+took since the last time, but within these bounds. So half of a busy driver's time goes to it."""
+
+MOST_UNTOLD_SECONDS = PACK_SECONDS
+"""Compute time for each core of the results that a job may leave untold; then it gets no pack."""
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -45,6 +53,7 @@ class Feeder(Generic[Key]):
         self._crew = crew
         self._grace, self._project_cores = grace_seconds, project_cores
         self._shares: Shares[Key] = Shares()
+        self._told_at = time.monotonic()
         self._jobs: dict[Key, JobWork] = {}
         self._stopped: dict[Key, float] = {}  # when the job was told to stop; inf once forced
 
@@ -80,9 +89,13 @@ class Feeder(Generic[Key]):
         """
         self._stop_where_asked()
         self._feed()
-        for handle in self._crew.finished(timeout):
+        has_news = any(work.has_news for work in self._jobs.values())
+        for handle in self._crew.finished(0.0 if has_news else timeout):
             self._collect(handle)
         self._feed()
+        now = time.monotonic()
+        since = now - self._told_at
+        self._tell(now + min(MOST_TELL_SECONDS, max(TELL_SECONDS, since)))
         self._crew.check()
         ended = tuple(job for job, work in self._jobs.items() if work.is_done)
         for job in ended:
@@ -98,6 +111,8 @@ class Feeder(Generic[Key]):
                 self._stopped[job] = time.monotonic()
                 self._jobs[job].stop()
                 self._cancel(job, force=False)
+        if jobs is None:
+            self._tell(float("inf"))
 
     @property
     def _in_flight(self) -> int:
@@ -121,13 +136,24 @@ class Feeder(Generic[Key]):
         going = {job: work for job, work in self._jobs.items() if job not in self._stopped}
         wanted = max(LEAST_AHEAD, PREFETCH * self._crew.slots // max(len(going), 1))
         for job in self._shares.order({job: len(work.flying) for job, work in going.items()}):
-            if not self._has_core_for(job):
+            if not self._has_core_for(job) or self._is_behind(going[job]):
                 continue
             if going[job].read_ahead(wanted, deadline):
                 return job
             if going[job].flying and self.is_busy:
                 return None
         return None
+
+    def _tell(self, deadline: float) -> None:
+        """Tell of results, one of each job in turn, until the time is up.
+
+        Before the next ones the workers are asked and fed: a slice of a single run that comes
+        back does not wait until all that a sweep's pack gave is stored.
+        """
+        while sum(work.tell() for work in self._jobs.values()):
+            if time.monotonic() > deadline:
+                break
+        self._told_at = time.monotonic()
 
     def _has_core_for(self, job: Key) -> bool:
         if self._project_cores is None:
@@ -139,6 +165,9 @@ class Feeder(Generic[Key]):
             if self._shares.project_of(mate) == project
         )
         return sum(flying) < self._project_cores
+
+    def _is_behind(self, work: JobWork) -> bool:
+        return work.untold_seconds > MOST_UNTOLD_SECONDS * self._crew.slots
 
     def _idle(self, chosen: Key) -> int:
         """Cores that one run of this job may take besides its own: nobody else's turn suffers."""

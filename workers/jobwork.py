@@ -46,14 +46,25 @@ class JobWork:
         self._ready: deque[ActiveRun] = deque()
         self._active: dict[str, ActiveRun] = {}
         self._shared: dict[str, Any] = {}
+        self._untold: deque[tuple[str, Concluded, float]] = deque()
         self._cost = Cost()
         self._exhausted = False
         self._has_no_more = False  # at present: what follows waits for runs that are not over
 
     @property
     def is_done(self) -> bool:
-        """Whether all runs were read, nothing waits and nothing is with the workers."""
-        return self._exhausted and not self.flying and not self._ready
+        """Whether all runs were read and told of; nothing waits or is with the workers."""
+        return self._exhausted and not (self.flying or self._ready or self._untold)
+
+    @property
+    def has_news(self) -> bool:
+        """Whether there are results that the observer has not been told of."""
+        return bool(self._untold)
+
+    @property
+    def untold_seconds(self) -> float:
+        """Compute time of the results that the observer has not been told of."""
+        return sum(seconds for _, _, seconds in self._untold)
 
     @property
     def is_hungry(self) -> bool:
@@ -109,6 +120,13 @@ class JobWork:
                 self._ready.appendleft(run)
             else:
                 self._take(run, one)
+
+    def tell(self) -> bool:
+        """Tell the observer of the next result, which takes it a while; whether there was one."""
+        if self._untold:
+            self.observer.result(*self._untold.popleft())
+            return True
+        return False
 
     def lose(self, handle: Handle, reason: str) -> None:
         """A worker died: its runs go on from where they were, each alone.
@@ -183,7 +201,7 @@ class JobWork:
             case Concluded() as concluded:
                 self._cost = self._cost.observe(one.seconds)
                 del self._active[run.run]
-                self.observer.result(run.run, concluded, run.seconds)
+                self._untold.append((run.run, concluded, run.seconds))
             case Advanced(state):
                 run.advance(state, one.seconds)
                 self._go_on(run)
