@@ -21,6 +21,10 @@ FIRST_PAUSE_SECONDS = 0.2
 LONGEST_PAUSE_SECONDS = 5.0
 STEADY_SECONDS = 60.0
 """A child that lived so long is restarted after the first pause again."""
+LIVED_SECONDS = 5.0
+"""So is one that was killed, or lost its workers, after so long: it did not fail to start."""
+AGAIN = 75
+"""Exit code of a child that should be started again at once (EX_TEMPFAIL of sysexits)."""
 STOP_SECONDS = 2.0
 LOOK_SECONDS = 1.0
 STOPPED_SECONDS = 12.0
@@ -94,8 +98,11 @@ class Supervisor:
             child.stdin.close()
             if self._stopping.is_set():
                 return
-            steady = time.monotonic() - begun > STEADY_SECONDS
-            pause = FIRST_PAUSE_SECONDS if steady else min(2 * pause, LONGEST_PAUSE_SECONDS)
+            lived = time.monotonic() - begun
+            was_well = lived > STEADY_SECONDS or (
+                lived > LIVED_SECONDS and (code < 0 or code == AGAIN)
+            )
+            pause = FIRST_PAUSE_SECONDS if was_well else min(2 * pause, LONGEST_PAUSE_SECONDS)
             _log.warning("the dispatcher ended with %d; a new one in %.1f s", code, pause)
             self._stopping.wait(pause)
 

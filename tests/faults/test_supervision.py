@@ -15,7 +15,7 @@ from service.settings import Settings
 from service.supervision import Supervisor, environment_of
 from workers.processes import of_session
 
-LIMIT_SECONDS = 15.0
+LIMIT_SECONDS = 40.0
 
 # A child with a child of its own in another process group, as Ray's helpers are.
 CHILD = """
@@ -116,3 +116,17 @@ def test_the_settings_of_the_child_are_those_of_the_parent(
     for name, value in environment_of(settings).items():
         monkeypatch.setenv(name, value)
     assert Settings() == settings
+
+
+def test_a_child_that_was_at_work_is_started_again_without_waiting_longer_each_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervision, "FIRST_PAUSE_SECONDS", 0.02)
+    monkeypatch.setattr(supervision, "LONGEST_PAUSE_SECONDS", 600.0)
+    monkeypatch.setattr(supervision, "LIVED_SECONDS", 0.0)
+    file = tmp_path / "pids"
+    code = f"import os, sys; open(sys.argv[1], 'a').write('1\\n'); os._exit({supervision.AGAIN})"
+    supervisor = Supervisor([sys.executable, "-S", "-c", code, str(file)], {})
+    supervisor.start()
+    until(lambda: len(pids(file)) >= 12, "the twelfth start")
+    supervisor.stop()
