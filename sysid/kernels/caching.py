@@ -106,9 +106,13 @@ def _rebuilt(content: bytes, target_context: Any) -> Any:
 
     Numba's own cache first registers all that could be compiled, a quarter of a second; what is
     loaded needs the memory management alone. The compiler registers it where it runs.
+
+    Numba unpickles what it has pickled: as with the machine code itself, this is safe because
+    only files that this user alone can have written get here (`sysid.kernels.keeping`).
     """
     from numba.core.compiler import CompileResult
     from numba.core.runtime.nrt import rtsys
+    from numba.core.serialize import loads
 
     inside: Any = CompileResult
     initialize = getattr(rtsys, "initialize", None)
@@ -116,7 +120,7 @@ def _rebuilt(content: bytes, target_context: Any) -> Any:
         target_context.refresh()
     else:
         initialize(target_context)
-    return inside._rebuild(target_context, *pickle.loads(content))
+    return inside._rebuild(target_context, *loads(content))
 
 
 def compiled(function: _Function) -> _Function:
