@@ -249,7 +249,7 @@ def _metrics(
         overshoot_percent=known(found.overshoot_percent),
         settling_time=known(found.settling_time), band=found.band,
         steady_error=known(found.steady_error), final_value=known(found.final_value),
-        runs_away=found.runs_away,
+        runs_away=found.runs_away, is_settled=found.is_settled,
     )  # fmt: skip
 
 

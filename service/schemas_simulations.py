@@ -85,8 +85,9 @@ class StepMetricsOut(Answer):
     """What the response to a step of the reference is judged by; null where it never happens.
 
     `settling_time` is when the output last enters `band` (2 % of the step) around its mean over
-    the last tenth of the record; `steady_error` is the reference minus that mean. Of a loop that
-    `runs_away`, which leaves the reference farther and farther behind, none of these is told.
+    the last tenth of the record, and null where `is_settled` is false: it leaves the band in that
+    tenth still. `steady_error` is the reference minus that mean. Of a loop that `runs_away`, which
+    leaves the reference farther and farther behind, none of these is told.
     """
 
     output: str
@@ -98,6 +99,7 @@ class StepMetricsOut(Answer):
     steady_error: float | None
     final_value: float | None
     runs_away: bool = False
+    is_settled: bool = True
 
 
 class RunSimulationOut(Answer):

@@ -1,7 +1,7 @@
 """What a step response is judged by: rise time, overshoot, settling time, steady error."""
 
 from dataclasses import dataclass
-from math import nan
+from math import isfinite, nan
 
 import numpy as np
 
@@ -11,7 +11,11 @@ from sysid.types import FloatArray
 _RISE = (0.1, 0.9)
 _BAND = 0.02
 _TAIL = 0.1
-_END, _GROWTH = 0.25, 1.03  # a limit cycle's peaks differ by less, by where the samples lie
+_WINDOWS = 3  # the last quarters of the record: what comes first, the step itself makes
+_GROWTH = 1.03  # a limit cycle's peaks differ by less, by where the samples lie
+_SWING_GROWTH = 1.01  # the same of swings between turning points that are interpolated
+_STEADY = 0.99  # of the last increment: from there on, growth does not slow down
+_BEYOND = 1e100  # steps away from the reference: not to be squared
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +29,8 @@ class StepMetrics:
     overshoot_percent : float
         Farthest way beyond the reference, in per cent of the step; 0 if it is not passed.
     settling_time : float
-        From when on the output stays within `band` of its mean over the last tenth of the record.
+        From when on the output stays within `band` of its mean over the last tenth of the record;
+        ``nan`` if it leaves it in that tenth still.
     band : float
         2 % of the step, in the unit of the output.
     steady_error : float
@@ -33,9 +38,12 @@ class StepMetrics:
     final_value : float
         That mean.
     runs_away : bool
-        The output is not finite, or farther from the reference in the last quarter of the record
-        than ever before: the loop is unstable, and there is no overshoot, settling time or final
-        value; they are ``nan``.
+        The output is not finite, or its deviation from the reference, or its swing, grows from
+        each quarter of the record to the next without slowing down: the loop is unstable, and
+        there is no overshoot, settling time or final value; they are ``nan``.
+    is_settled : bool
+        There is a settling time. A response that neither runs away nor has settled still moves at
+        the end of the record: its final value and overshoot are those of the record.
     """
 
     rise_time: float
@@ -45,6 +53,7 @@ class StepMetrics:
     steady_error: float
     final_value: float
     runs_away: bool = False
+    is_settled: bool = True
 
 
 def step_metrics(
@@ -76,29 +85,65 @@ def step_metrics(
     way = (y - before) / height
     low, high = (_first_passing(t, way, level) for level in _RISE)
     band = _BAND * abs(height)
-    if _runs_away(t, np.abs(y - after), abs(height)):
-        return StepMetrics(high - low, nan, nan, band, nan, nan, runs_away=True)
+    if _runs_away(t, y - after, abs(height)):
+        return StepMetrics(high - low, nan, nan, band, nan, nan, runs_away=True, is_settled=False)
     tail = t >= t[-1] - _TAIL * (t[-1] - t[0])
     final = float(np.mean(y[tail]))
+    settling = _settled(t, np.abs(y - final), band, float(t[tail][0]))
     return StepMetrics(
         rise_time=high - low,
         overshoot_percent=100.0 * max(float(np.max(way)) - 1.0, 0.0),
-        settling_time=_settled(t, np.abs(y - final), band),
+        settling_time=settling,
         band=band,
         steady_error=after - final,
         final_value=final,
+        is_settled=isfinite(settling),
     )
 
 
-def _runs_away(t: FloatArray, away: FloatArray, height: float) -> bool:
-    """Whether the output is not finite, or leaves the reference farther and farther behind."""
-    if not np.all(np.isfinite(away)):
+def _runs_away(t: FloatArray, deviation: FloatArray, height: float) -> bool:
+    """Whether the output is not finite, or goes or swings farther and farther from the reference.
+
+    A response that is only late, slow, or far off in the end slows down or turns towards its end.
+    """
+    with np.errstate(over="ignore"):
+        away = np.abs(deviation)
+    if not np.all(away < _BEYOND * height):
         return True
-    late = t > t[-1] - _END * (t[-1] - t[0])
-    if late.all():
+    edges = t[0] + (t[-1] - t[0]) * np.arange(1, _WINDOWS + 2) / (_WINDOWS + 1)
+    farthest = _greatest(t, away, edges)
+    before = max(float(np.max(away[t <= edges[-2]])), height)
+    if float(farthest[-1]) > _GROWTH * before and _grows(farthest, 1.0):
+        return True
+    swings = _greatest(*_swings(t, deviation), edges)
+    return float(swings[-1]) > _BAND * height and _grows(swings, _SWING_GROWTH)
+
+
+def _greatest(t: FloatArray, values: FloatArray, edges: FloatArray) -> FloatArray:
+    """The greatest value in each window (_WINDOWS,); 0 where there is none."""
+    which = np.searchsorted(edges, t, side="left")  # 0: before the first window
+    return np.array([np.max(values[which == i], initial=0.0) for i in range(1, _WINDOWS + 1)])
+
+
+def _grows(sizes: FloatArray, least: float) -> bool:
+    """Whether each of the sizes is `least` times the one before, and growth does not slow down."""
+    if not np.all(sizes[:-1] > 0.0) or not np.all(sizes[1:] > least * sizes[:-1]):
         return False
-    before = max(float(np.max(away[~late])), height)
-    return float(np.max(away[late])) > _GROWTH * before
+    more = np.diff(sizes)
+    return bool(np.all(more[1:] >= _STEADY * more[:-1]))
+
+
+def _swings(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """When each way from a turning point to the next ends, and how long it is.
+
+    The values there are those of parabolas through three samples: of the samples alone, those of
+    a limit cycle would seem to grow.
+    """
+    slope = np.diff(y)
+    at = np.flatnonzero(slope[:-1] * slope[1:] < 0.0) + 1
+    bend = slope[at] - slope[at - 1]
+    peaks = y[at] - (slope[at] + slope[at - 1]) ** 2 / (8.0 * bend)
+    return t[at[1:]], np.abs(np.diff(peaks))
 
 
 def _first_passing(t: FloatArray, way: FloatArray, level: float) -> float:
@@ -113,10 +158,10 @@ def _first_passing(t: FloatArray, way: FloatArray, level: float) -> float:
     return float(t[i - 1] + part * (t[i] - t[i - 1]))
 
 
-def _settled(t: FloatArray, away: FloatArray, band: float) -> float:
-    """From when on it stays inside the band; ``nan`` if the last sample is outside."""
+def _settled(t: FloatArray, away: FloatArray, band: float, latest: float) -> float:
+    """From when on it stays inside the band; ``nan`` if that is later than `latest`."""
     outside = np.flatnonzero(away > band)
     if outside.size == 0:
         return 0.0
     last = int(outside[-1])
-    return nan if last + 1 >= t.size else float(t[last + 1])
+    return nan if last + 1 >= t.size or t[last + 1] > latest else float(t[last + 1])

@@ -144,8 +144,8 @@ def _print_step(metrics: dict[str, Any] | None) -> None:
         return
     if metrics["runs_away"]:
         out.print(
-            f"the loop runs away: at the end {metrics['output']} is farther from the "
-            "reference than ever before; choose a smaller gain",
+            f"the loop runs away: at the end {metrics['output']} goes or swings farther "
+            "and farther from the reference; choose a smaller gain",
             markup=False,
         )
         return
@@ -156,7 +156,8 @@ def _print_step(metrics: dict[str, Any] | None) -> None:
         ("steady error", metrics["steady_error"], metrics["unit"]),
     )
     for name, value, unit in told:
-        shown = "never" if value is None else f"{value:.4g} {unit}"
+        missing = "not in this record: it has not settled" if "settling" in name else "never"
+        shown = missing if value is None else f"{value:.4g} {unit}"
         out.print(f"{name}: {shown}", markup=False)
 
 

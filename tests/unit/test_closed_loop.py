@@ -233,6 +233,39 @@ def test_a_swing_that_stays_or_decays_does_not_run_away(rate: float) -> None:
     assert found.overshoot_percent > 100
 
 
+LONG = np.arange(0, 20, 0.05)
+SINCE = np.maximum(LONG - 1.0, 0.0)
+
+
+@pytest.mark.parametrize("rate", [0.005, 0.01, 0.1])
+def test_a_swing_that_grows_slowly_runs_away(rate: float) -> None:
+    values = 1 - np.exp(rate * SINCE) * np.cos(3 * SINCE)
+    assert step_metrics(LONG, values, at=1.0, before=0.0, after=1.0).runs_away
+
+
+@pytest.mark.parametrize(
+    ("values", "is_settled"),
+    [
+        (2.5 * (1 - np.exp(-SINCE / 6)), False),
+        (3.0 * (1 - np.exp(-SINCE)), True),
+        (np.where(SINCE < 14, 0.0, -0.05), True),
+        (np.where(SINCE < 13.5, 0.0, 1.5 * (1 - np.exp(13.5 - SINCE)) - 0.1), False),
+        (-(1 - np.exp(-SINCE / 6)), True),
+        (1 - np.cos(3 * SINCE), False),
+        (1 - np.exp(-SINCE) * np.cos(3 * SINCE) + 1e-15 * np.cos(40 * SINCE) * np.exp(SINCE / 9),
+         True),
+    ],
+)  # fmt: skip
+def test_a_response_that_is_far_off_late_or_slow_does_not_run_away(
+    values: FloatArray, is_settled: bool
+) -> None:
+    found = step_metrics(LONG, values, at=1.0, before=0.0, after=1.0)
+    assert not found.runs_away
+    assert found.is_settled is is_settled
+    assert np.isfinite(found.settling_time) == is_settled
+    assert np.isfinite([found.overshoot_percent, found.final_value, found.steady_error]).all()
+
+
 def test_metrics_need_a_step_that_was_recorded() -> None:
     with pytest.raises(InvalidRecord, match="no two samples after"):
         step_metrics(TIMES, TIMES, at=6.0, before=0.0, after=1.0)
