@@ -1,6 +1,6 @@
 """What can be known of a job before it runs: every fault is found here, and found now."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from pydantic import ValidationError
@@ -42,10 +42,11 @@ class JobChecker:
     datasets as identifiers and an own model as its document.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, unstored: Iterable[Dataset] = ()) -> None:
+        """`unstored`: datasets that are known by their identifiers before they are stored."""
         self._session = session
         self._models: dict[str, tuple[Model, Any] | list[FieldError]] = {}
-        self._datasets: dict[str, Dataset | str] = {}
+        self._datasets: dict[str, Dataset | str] = {one.id: one for one in unstored}
 
     def errors(self, body: Body) -> list[FieldError]:
         """Every fault of a body in its normal form."""

@@ -103,19 +103,26 @@ def add_recording(
     """Store a recording: its object first, then the row that names it."""
     metadata = {"source": key, "parents": " ".join(parents), "name": name}
     content = _written(store, recording, metadata)
-    sampling = recording.sampling
-    new = NewDataset(
+    new = described(recording, name=name, kind=kind, key=key, details=details, content=content)
+    with database.write() as session:
+        return DatasetRepository(session).add(new, parents=parents, relation=relation)
+
+
+def described(
+    recording: Recording, *, name: str, kind: Kind, key: str, details: Mapping[str, Any],
+    content: StoredObject,
+) -> NewDataset:  # fmt: skip
+    """What the row of a recording says."""
+    return NewDataset(
         name=name, kind=kind, sha256=content.sha256, source_key=key, size_bytes=content.size,
         n_samples=recording.samples, duration=recording.duration,
-        sample_time=_common_period(recording) if sampling.is_regular else None,
+        sample_time=_common_period(recording) if recording.sampling.is_regular else None,
         channels=[_summary(channel) for channel in recording.channels],
         details={**details, "segments": [
             {"start": s.start, "stop": s.stop, "origin": s.origin, "labels": dict(s.labels)}
             for s in recording.segments
         ]},
     )  # fmt: skip
-    with database.write() as session:
-        return DatasetRepository(session).add(new, parents=parents, relation=relation)
 
 
 def told(row: Dataset) -> DatasetOut:

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -20,7 +20,7 @@ from service.storage.jobs import JobRepository, NewJob, Submission
 from service.storage.ledger import Cell, add_runs
 from service.storage.lineage import LineageRepository
 from service.storage.sessions import Database
-from service.storage.tables import Job, State
+from service.storage.tables import Dataset, Job, State
 from service.sweep_checks import check_sweep, check_trend
 from service.sweeps import count, groups_of, steps_of
 
@@ -65,8 +65,12 @@ def submit(session: Session, body: JobIn, settings: Settings, key: str | None = 
     return store(session, check(session, body, settings), settings, key)
 
 
-def check(session: Session, body: JobIn, settings: Settings) -> Checked:
+def check(
+    session: Session, body: JobIn, settings: Settings, unstored: Iterable[Dataset] = ()
+) -> Checked:
     """The job as it will be stored: with identifiers for names, also in its axes.
+
+    `unstored` are datasets that it may name before they are stored.
 
     Raises
     ------
@@ -83,7 +87,7 @@ def check(session: Session, body: JobIn, settings: Settings) -> Checked:
             f"the sweep has {n_runs} runs; at most {settings.max_runs_per_job} a job",
         )
     groups = steps_of(body.sweep.axes, axes)
-    checker = JobChecker(session)
+    checker = JobChecker(session, unstored)
     check_sweep(checker, document, groups)
     check_trend(session, checker, body)
     spec = checker.resolved(document)

@@ -1,26 +1,54 @@
 """Use case: a dataset simulated from a model or a plant, with inputs and noise."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from sqlalchemy.orm import Session
 
 from service import models
-from service.datasets import add_recording, key_of
+from service.datasets import add_recording, described, key_of
 from service.errors import FieldError, InvalidRequest
 from service.inputs import Signals
 from service.plants import simulate_plant
 from service.schemas_datasets import InputIn, SimulateIn
-from service.storage.datasets import DatasetRepository, Stored
-from service.storage.objects import ObjectStore
+from service.storage.datasets import DatasetRepository, Stored, row_of
+from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
+from service.storage.tables import Dataset
 from sysid.errors import InvalidSettings, nearest
 from sysid.models.lags import check_lags
 from sysid.models.model import FixedInitial, Model
 from sysid.records import Channel, Recording
 from sysid.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """A recording that was simulated and is not stored, with what its dataset will say."""
+
+    recording: Recording
+    name: str
+    key: str
+    details: Mapping[str, Any]
+    parents: tuple[str, ...]
+
+    def row(self, dataset_id: str) -> Dataset:
+        """The dataset as it will be, to be looked at before it is stored."""
+        nothing = StoredObject(sha256="", size=0)
+        return row_of(
+            described(self.recording, name=self.name, kind="simulate", key=self.key,
+                      details=self.details, content=nothing),
+            dataset_id,
+        )  # fmt: skip
+
+    def keep(self, database: Database, store: ObjectStore) -> Stored:
+        """Store it as a dataset."""
+        return add_recording(
+            database, store, self.recording, name=self.name, kind="simulate", key=self.key,
+            details=self.details, parents=self.parents, relation="simulated",
+        )  # fmt: skip
 
 
 def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored:
@@ -33,6 +61,18 @@ def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored
     """
     if body.plant is not None:
         return simulate_plant(database, store, body)
+    found = simulated(database, store, body)
+    return found if isinstance(found, Stored) else found.keep(database, store)
+
+
+def simulated(database: Database, store: ObjectStore, body: SimulateIn) -> Stored | Simulated:
+    """A model's signals, or the dataset that the same body made before; nothing is stored.
+
+    Raises
+    ------
+    InvalidRequest
+        As `simulate`.
+    """
     with database.read() as session:
         model, document = _model(session, body.model)
         request = body.model_dump(mode="json", exclude={"name", "plant"})
@@ -53,15 +93,14 @@ def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored
             signals.on_samples(f"/inputs/{one.name}", one.name, one.unit, body.inputs[one.name])
             for one in model.inputs
         ]
-    recording = _simulated(model, inputs, body, times)
     details = {
         "simulation": {**request, "name": body.name, "model": document},
         "true_parameters": body.parameters,
         "warnings": [],
     }
-    return add_recording(
-        database, store, recording, name=body.name or f"{model.name}, simulated",
-        kind="simulate", key=key, details=details, parents=signals.parents, relation="simulated",
+    return Simulated(
+        _simulated(model, inputs, body, times), body.name or f"{model.name}, simulated", key,
+        details, tuple(signals.parents),
     )  # fmt: skip
 
 
@@ -75,7 +114,7 @@ def _simulated(
     model: Model, inputs: list[Channel], body: SimulateIn, times: FloatArray
 ) -> Recording:
     # The compiler comes with this import, and most requests never need it.
-    from sysid.simulation import simulate as simulated
+    from sysid.simulation import simulate as outputs_of
 
     rest = {
         f"{state.name}(0)": 0.0
@@ -84,7 +123,7 @@ def _simulated(
     }
     known = {p.name: p.fixed for p in model.parameters if p.fixed is not None}
     values = {**rest, **known, **body.parameters}
-    outputs = simulated(model, inputs, values, times=times).channels
+    outputs = outputs_of(model, inputs, values, times=times).channels
     check_finite(outputs, times)
     recording = Recording((*inputs, *outputs))
     if body.noise.sigma == 0:

@@ -5,26 +5,50 @@ grid of σ or the number of replicates grows, and is taken over then (`service.s
 """
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
 from sqlalchemy.orm import Session
 
 from service import jobs
 from service.checks import JobChecker
 from service.conversion import faults_of
 from service.errors import FieldError, InvalidRequest
-from service.recordings import recording_of
+from service.recipes.spread import check_relative, spread
 from service.schemas_datasets import SimulateIn
 from service.schemas_jobs import JobIn, JobOut
 from service.schemas_noise import MOST_REPLICATES, NoiseSweepIn
 from service.settings import Settings
-from service.simulations import simulate
+from service.simulations import Simulated, simulated
+from service.storage.errors import KeyReused
+from service.storage.jobs import JobRepository
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from service.truth import truth_of
 from sysid.errors import SysidError
+
+UNSTORED = "the simulated record"
+"""Stands for its identifier until it has one."""
+
+
+class _Source(NamedTuple):
+    """Where the record comes from: stored datasets, or a simulation that is not stored yet."""
+
+    datasets: list[str]
+    made: Simulated | None = None
+
+    @property
+    def unstored(self) -> list[Dataset]:
+        return [] if self.made is None else [self.made.row(UNSTORED)]
+
+
+class _Plain(NamedTuple):
+    """The job without its axes, the values of σ as they were given, and the output they are of."""
+
+    job: dict[str, Any]
+    values: list[float]
+    rows: list[Dataset]
+    channel: str
 
 
 def submit(
@@ -32,6 +56,8 @@ def submit(
     key: str | None = None,
 ) -> JobOut:  # fmt: skip
     """Queue the sweep as an ordinary job, after simulating its record if need be.
+
+    All is checked before the record is stored: a body that is refused leaves nothing behind.
 
     Raises
     ------
@@ -41,10 +67,18 @@ def submit(
         If the idempotency key was used with another body.
     """
     _check(body, settings)
-    datasets = body.datasets or [_simulated(database, store, body)]
+    source = _source(database, store, body)
     try:
         with database.read() as session:
-            job = _job(session, store, body, datasets)
+            plain = _plain(session, body, source)
+        job = _job(store, body, plain, source)
+        if source.made is not None:
+            with database.read() as session:
+                jobs.check(session, job, settings, source.unstored)
+                if key is not None and JobRepository(session).is_used(key):
+                    raise KeyReused(key)  # with the same body the record would be stored
+            stored = source.made.keep(database, store).dataset.id
+            job = job.model_copy(update={"datasets": [stored]})
         return jobs.submit_to(database, job, settings, key)
     except InvalidRequest as error:
         raise InvalidRequest(_at_home(one, body) for one in error.errors) from None
@@ -62,11 +96,12 @@ def _check(body: NoiseSweepIn, settings: Settings) -> None:
         )
 
 
-def _simulated(database: Database, store: ObjectStore, body: NoiseSweepIn) -> str:
-    assert body.truth is not None
+def _source(database: Database, store: ObjectStore, body: NoiseSweepIn) -> _Source:
+    if body.truth is None:
+        return _Source(list(body.datasets or ()))
     document = {"model": body.model, **body.truth.model_dump()}
     try:
-        return simulate(database, store, SimulateIn.model_validate(document)).dataset.id
+        found = simulated(database, store, SimulateIn.model_validate(document))
     except (InvalidRequest, SysidError) as error:
         faults = error.errors if isinstance(error, InvalidRequest) else faults_of(error)
         raise InvalidRequest(
@@ -76,69 +111,52 @@ def _simulated(database: Database, store: ObjectStore, body: NoiseSweepIn) -> st
             )
             for one in faults
         ) from None  # fmt: skip
+    if isinstance(found, Simulated):
+        return _Source([UNSTORED], found)
+    return _Source([found.dataset.id])
 
 
-def _job(session: Session, store: ObjectStore, body: NoiseSweepIn, datasets: list[str]) -> JobIn:
-    together = {
-        "range": [body.seed * MOST_REPLICATES, body.seed * MOST_REPLICATES + body.replicates],
-        "zip": "replicate",
-    }
-    job = {"name": "noise sweep", **body.shared, "datasets": datasets}
-    sigma = {"path": "/noise/sigma", **_sigmas(session, store, body, JobIn.model_validate(job))}
-    axes = [
-        sigma, {"path": "/noise/seed", **together}, {"path": "/seed", **together},
-        {"path": "/algorithm/method", "values": body.methods},
-    ]  # fmt: skip
-    return JobIn.model_validate({**job, "sweep": {"axes": axes}})
+def _plain(session: Session, body: NoiseSweepIn, source: _Source) -> _Plain:
+    """What is known without the samples.
 
-
-def _sigmas(session: Session, store: ObjectStore, body: NoiseSweepIn, job: JobIn) -> dict[str, Any]:
-    """Values of σ in the output's unit, with the relative ones as labels.
-
-    Where the truth is not known σ = 0 is among them: its best run is what errors are told against.
+    Where the truth is not known σ = 0 is among the values: its best run is what errors are told
+    against.
     """
-    checker, document = JobChecker(session), job.normal_form()
-    faults = checker.errors(document)
+    fields = {"name": "noise sweep", **body.shared, "datasets": source.datasets}
+    job = JobIn.model_validate(fields)
+    checker = JobChecker(session, source.unstored)
+    faults = checker.errors(job.normal_form())
     if faults:
         raise InvalidRequest(faults)
     rows = [one for name in job.datasets if isinstance(one := checker.dataset(name), Dataset)]
     values = list(body.sigma)
     if 0 not in values and truth_of(session, job.model, rows) is None:
         values.insert(0, 0.0)
-    if not body.relative:
-        return {"values": values}
-    unit = _spread(checker, store, document, rows)
-    return {
-        "values": [unit * one for one in values], "labels": [{"relative": one} for one in values],
-    }  # fmt: skip
+    found = checker.model(job.model)
+    assert isinstance(found, tuple)  # it has no faults
+    if body.relative:
+        check_relative(found[0], rows)
+    output = found[0].outputs[0].name
+    return _Plain(fields, values, rows, job.channels.get(output, output))
 
 
-def _spread(
-    checker: JobChecker, store: ObjectStore, document: dict[str, Any], rows: list[Dataset]
-) -> float:
-    """Standard deviation of the output about its mean in each dataset, over all of them."""
-    found = checker.model(document["model"])
-    assert isinstance(found, tuple)
-    names = [one.name for one in found[0].outputs]
-    if len(names) > 1:
-        raise InvalidRequest.at(
-            "/relative",
-            f"the model has the outputs {', '.join(names)}, and σ is one number for all; "
-            "give σ in their unit, with relative: false",
-        )
-    channel = document["channels"].get(names[0], names[0])
-    values = [recording_of(store, row.sha256).channel(channel).values for row in rows]
-    known = [one[np.isfinite(one)] for one in values]
-    centred = np.concatenate([one - np.mean(one) for one in known if one.size])
-    spread = float(np.sqrt(np.mean(np.square(centred)))) if centred.size else 0.0
-    largest = max(float(np.max(np.abs(one))) for one in known if one.size) if centred.size else 0.0
-    if not spread > 1e-12 * largest:
-        raise InvalidRequest.at(
-            "/relative",
-            f"the output {channel!r} does not vary (its standard deviation is {spread:g}), so "
-            "that there is nothing σ could be relative to; give σ in its unit",
-        )
-    return spread
+def _job(store: ObjectStore, body: NoiseSweepIn, plain: _Plain, source: _Source) -> JobIn:
+    """The whole job; where σ is relative, with the values in the output's unit and labels."""
+    sigma: dict[str, Any] = {"path": "/noise/sigma", "values": plain.values}
+    if body.relative:
+        made = None if source.made is None else source.made.recording
+        unit = spread(store, plain.rows, plain.channel, made)
+        sigma["values"] = [unit * one for one in plain.values]
+        sigma["labels"] = [{"relative": one} for one in plain.values]
+    together = {
+        "range": [body.seed * MOST_REPLICATES, body.seed * MOST_REPLICATES + body.replicates],
+        "zip": "replicate",
+    }
+    axes = [
+        sigma, {"path": "/noise/seed", **together}, {"path": "/seed", **together},
+        {"path": "/algorithm/method", "values": body.methods},
+    ]  # fmt: skip
+    return JobIn.model_validate({**plain.job, "sweep": {"axes": axes}})
 
 
 def _at_home(error: FieldError, body: NoiseSweepIn) -> FieldError:

@@ -113,10 +113,13 @@ class DatasetRepository:
         return Dataset.project_id == self._project_id, Dataset.deleted_at.is_(None)
 
     def _insert(self, new: NewDataset) -> Dataset:
-        values = {name: getattr(new, name) for name in NewDataset.__slots__}
-        dataset = Dataset(
-            id=new_id("ds"), project_id=self._project_id, n_channels=len(new.channels), **values
-        )
+        dataset = row_of(new, new_id("ds"), self._project_id)
         self._session.add(dataset)
         self._session.flush()
         return dataset
+
+
+def row_of(new: NewDataset, dataset_id: str, project_id: str = DEFAULT_PROJECT) -> Dataset:
+    """The row of a recording, of no session: stored, or to be looked at before it is."""
+    values = {name: getattr(new, name) for name in NewDataset.__slots__}
+    return Dataset(id=dataset_id, project_id=project_id, n_channels=len(new.channels), **values)

@@ -74,6 +74,13 @@ class JobRepository:
             return Submission(known, False)
         return Submission(job, True)
 
+    def is_used(self, key: str) -> bool:
+        """Whether a job was submitted under this key."""
+        found = select(IdempotencyKey.key).where(
+            IdempotencyKey.project_id == self._project_id, IdempotencyKey.key == key
+        )
+        return self._session.scalar(found) is not None
+
     def get(self, job_id: str) -> Job:
         """A job of this project that was not deleted; `NotFound` otherwise."""
         job = self._session.get(Job, job_id, populate_existing=True)

@@ -9,6 +9,7 @@ from starlette.testclient import TestClient
 
 from service.api.deps import Parts
 from service.app import create_app
+from service.recordings import recording_of
 from tests.identified import carried_out
 from tests.rest import CSV, recording, refused, settings_of
 
@@ -85,6 +86,64 @@ def test_the_same_key_gives_the_same_job(server: TestClient) -> None:
     assert first["id"] == again["id"]
     other = server.post(URL, json={**BODY, "replicates": 9}, headers=key)
     refused(other, 422, "invalid")
+
+
+def datasets_of(server: TestClient) -> list[str]:
+    return [one["id"] for one in server.get("/v1/datasets").json()["items"]]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"parameters": {"Q": {"fixed": 1}}}, {"skip": 1000}, {"algorithm": {"method": "simple"}},
+        {"relative": True, "truth": {**TRUTH, "parameters": {**TRUE, "K": 0.0}}},
+        {"weights": {"nobody": 1.0}},
+    ],
+)  # fmt: skip
+def test_a_body_that_is_refused_leaves_no_dataset_behind(
+    own: TestClient, fields: dict[str, Any]
+) -> None:
+    refused(own.post(URL, json={**BODY, **fields}), 422, "invalid")
+    assert datasets_of(own) == []
+
+
+def test_a_key_that_was_used_with_another_body_leaves_no_dataset_behind(own: TestClient) -> None:
+    key = {"Idempotency-Key": "once"}
+    body = {**BODY, "relative": True}
+    first = own.post(URL, json=body, headers=key).json()["id"]
+    (dataset,) = datasets_of(own)
+    other = own.post(URL, json={**body, "truth": {**TRUTH, "samples": 151}}, headers=key)
+    refused(other, 422, "invalid")
+    assert datasets_of(own) == [dataset]
+    # The second time σ comes from the stored record, the first time from the one in memory.
+    assert own.post(URL, json=body, headers=key).json()["id"] == first
+
+
+def test_a_relative_deviation_reads_no_more_than_a_request_may(
+    server: TestClient, dataset: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    body = {**BODY, "truth": None, "datasets": [dataset], "relative": True}
+    assert server.post(URL, json=body).status_code == 202
+    monkeypatch.setattr("service.recipes.spread.MOST_VALUES", 599)  # 300 samples of two channels
+    monkeypatch.setattr("service.recipes.spread.recording_of", None)
+    (fault,) = refused(server.post(URL, json=body), 422, "invalid")
+    assert fault["pointer"] == "/relative"
+    assert "600 values in all" in fault["detail"]
+
+
+def test_recordings_are_read_while_no_session_is_open(
+    server: TestClient, dataset: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts, seen = parts_of(server), []
+
+    def noted(*given: Any) -> Any:
+        seen.append(parts.database.engine.pool.checkedout())
+        return recording_of(*given)
+
+    monkeypatch.setattr("service.recipes.spread.recording_of", noted)
+    body = {**BODY, "truth": None, "datasets": [dataset], "relative": True}
+    assert server.post(URL, json=body).status_code == 202
+    assert seen == [0]
 
 
 def test_the_same_sweep_twice_gives_the_same_numbers(own: TestClient) -> None:
