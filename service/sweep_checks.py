@@ -49,8 +49,31 @@ def check_trend(session: Session, checker: JobChecker, body: JobIn) -> None:
     """
     model = checker.model(body.model)
     errors = list(trend_faults(session, body, None if isinstance(model, list) else model[0]))
+    errors += _repeated_recordings(checker, body)
     if errors:
         raise InvalidRequest(errors)
+
+
+def _repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldError]:
+    """Recordings that a trend would take for measured at two places, or twice at one."""
+    if body.trend is None:
+        return
+    for number, axis in enumerate(body.sweep.axes):
+        if axis.path != "/datasets" or not axis.values or not axis.labels:
+            continue
+        first: dict[str, tuple[int, tuple[Any, str]]] = {}
+        for position, (given, labels) in enumerate(zip(axis.values, axis.labels, strict=True)):
+            x = labels.get(body.trend.x)
+            for name in [given] if isinstance(given, str) else given:
+                dataset = checker.dataset(name)
+                key = dataset if isinstance(dataset, str) else dataset.sha256
+                at, before = first.setdefault(key, (position, (x, name)))
+                if at != position:
+                    yield FieldError(
+                        f"/sweep/axes/{number}/values/{position}",
+                        f"{name!r} at {body.trend.x} = {x} is the same recording as {before[1]!r} "
+                        f"at {body.trend.x} = {before[0]}: one of them is another file",
+                    )
 
 
 def _sweep_faults(

@@ -62,7 +62,7 @@ Accept = Annotated[
     str | None, typer.Option(metavar="NAME", help="Accept a run as this reference at the end.")
 ]
 AcceptRun = Annotated[
-    str | None, typer.Option(metavar="RUN|X", help="Which: a run, or a value of the label.")
+    str | None, typer.Option(metavar="X", help="Which: that of this value of the label.")
 ]
 JsonFile = Annotated[
     str | None, typer.Option("--json", metavar="FILE", help="Write the trend; - for stdout.")
@@ -92,8 +92,7 @@ def reidentify(
     Each run begins at the reference, or at the result of its neighbour.
     """
     batch = [_experiments(text) for text in experiments]
-    if accept is not None and accept_run is None and len({x for x, _ in batch}) > 1:
-        usage("--accept needs --accept-run: a run, or a value of the label that has one run")
+    chosen = _chosen([x for x, _ in batch], label, accept, accept_run)
     body: dict[str, Any] = {
         "model": _model(model), "label": label, "look_at": _names(parameters),
         "predict": [_number("--predict", one) for one in _names(predict)],
@@ -112,7 +111,7 @@ def reidentify(
         ended = follow(client, job["id"], quiet=json_file == "-")
         _tell(client, ended, json_file)
         if accept is not None:
-            _accept(client, ended, accept, label, accept_run or f"{batch[0][0]:g}")
+            _accept(client, ended, accept, label, chosen)
 
 
 def _tell(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
@@ -132,16 +131,32 @@ def _tell(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
         raise typer.Exit(1)
 
 
-def _accept(client: "Client", job: dict[str, Any], name: str, label: str, chosen: str) -> None:
+def _chosen(given: list[float], label: str, accept: str | None, accept_run: str | None) -> float:
+    """The value of the label whose run is to be accepted: known before anything is computed."""
+    there = f"there are {', '.join(f'{x:g}' for x in sorted(set(given)))}"
+    if accept is None:
+        if accept_run is not None:
+            usage("--accept-run needs --accept NAME, the reference that the run is to be")
+        return given[0]
+    if accept_run is None and len(set(given)) > 1:
+        usage(f"--accept needs --accept-run, a value of {label}; {there}")
+    if accept_run is not None and accept_run.startswith("run_"):
+        usage(
+            f"--accept-run {accept_run}: need a value of {label}, since only a run of this batch "
+            f"can be meant; {there}. Another run: lagid references accept {accept} {accept_run}"
+        )
+    x = given[0] if accept_run is None else _number("--accept-run", accept_run)
+    if given.count(x) != 1:
+        found = f"{given.count(x)} experiments have {label} = {x:g}; {there}"
+        several = f". Accept one of their runs at the end: lagid references accept {accept} RUN"
+        usage(f"--accept-run {x:g}: {found}{several if x in given else ''}")
+    return x
+
+
+def _accept(client: "Client", job: dict[str, Any], name: str, label: str, x: float) -> None:
     """Make a run of the batch the reference of a name."""
-    if not chosen.startswith("run_"):
-        x = _number("--accept-run", chosen)
-        found = [run["id"] for run in client.runs(job["id"], label=f"{label}={json.dumps(x)}")]
-        if len(found) != 1:
-            there = f" {', '.join(found)}" if found else ""
-            fail(f"--accept-run {chosen}: {len(found)} runs have {label} = {x:g}{there}; name one")
-        chosen = found[0]
-    told = client.accept_reference(name, chosen)
+    (run,) = client.runs(job["id"], label=f"{label}={json.dumps(x)}")
+    told = client.accept_reference(name, run["id"])
     before = f" (before: {told['history'][0]['run']})" if told["history"] else ""
     out.print(f"{told['name']}: {told['run']}{before}", markup=False)
 

@@ -5,8 +5,10 @@ from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
+from typer.testing import CliRunner
 
 from service.app import create_app
+from service.cli.main import app as lagid
 from tests.integration.rest.test_rest_reidentify import (
     BODY,
     LENGTHS,
@@ -143,3 +145,38 @@ def test_the_same_equations_under_another_name_with_other_bounds_are_the_same_mo
               "batch": [{"x": 8.0, "datasets": served.datasets[8.0][:1]}]},
     )  # fmt: skip
     assert answer.status_code == 202, answer.text
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["5=ds_a", "6=ds_b", "--accept", "x", "--accept-run", "41"],
+         "0 experiments have length_m = 41; there are 5, 6"),
+        (["5=ds_a", "6=ds_b", "--accept", "x"], "a value of length_m; there are 5, 6"),
+        (["5=ds_a", "5=ds_b", "--accept", "x"], "2 experiments have length_m = 5"),
+        (["5=ds_a", "--accept", "x", "--accept-run", "run_1"],
+         "only a run of this batch can be meant"),
+        (["5=ds_a", "--accept-run", "5"], "--accept-run needs --accept NAME"),
+    ],
+)  # fmt: skip
+def test_a_run_that_cannot_be_accepted_is_told_before_anything_is_sent(
+    monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
+) -> None:
+    def connected(*_: object) -> None:
+        raise AssertionError("sent before it was checked")
+
+    monkeypatch.setattr("service.cli.reidentifying.connected", connected)
+    told = CliRunner().invoke(
+        lagid, ["reidentify", "--model", "tube", "--label", "length_m", *words]
+    )  # fmt: skip
+    assert told.exit_code == 2
+    assert said in " ".join(told.output.split())
+
+
+def test_one_recording_under_two_labels_is_refused(served: Served) -> None:
+    batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS]
+    batch[0]["datasets"] = ["tube-16-1-0"]  # by its name what the last entry gives by its id
+    answer = served.server.post("/v1/recipes/reidentify", json={**BODY, "batch": batch})
+    (fault,) = refused(answer, 422, "invalid")
+    assert fault["pointer"] == "/batch/3/datasets"
+    assert "is the same recording as 'tube-16-1-0' at length_m = 2.0" in fault["detail"]

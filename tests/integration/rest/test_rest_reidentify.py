@@ -278,7 +278,8 @@ def test_a_trend_of_too_few_lengths_says_how_many_it_needs(served: Served) -> No
 
 def test_lengths_that_no_law_can_hold_are_told_and_the_page_is_shown(served: Served) -> None:
     sizes = (-1e99, 1.0, 2.0, 1e99)
-    batch = [{"x": x, "datasets": served.datasets[2.0][:1]} for x in sizes]
+    recordings = [served.datasets[x][:1] for x in LENGTHS]
+    batch = [{"x": x, "datasets": one} for x, one in zip(sizes, recordings, strict=True)]
     job = batch_of(served.server, served.parts, batch=batch)
     assert [one["x"] for one in trend(served, job)["places"]] == list(sizes)
     assert served.server.get(f"/jobs/{job}").status_code == 200
