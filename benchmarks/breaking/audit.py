@@ -25,12 +25,15 @@ class Finding:
         Of its runs, in the order of the sweep.
     doubled : int
         Runs, ends or counts that are there more than once.
+    given_up : bool
+        Whether the job failed because its dispatchers ended or fell silent too often.
     figures : str
         Summary, evaluations and history, without clock fields, as text: equal for equal bits.
     """
 
     states: tuple[str, ...]
     doubled: int
+    given_up: bool
     figures: str
 
     def lost_beside(self, undisturbed: "Finding") -> int:
@@ -55,9 +58,9 @@ def audit(stand: Stand, job_id: str) -> Finding:
     summary = without_clock(stand.client.summary(job_id))
     total = sum(run.evaluations for run in runs)
     figures = [summary, job.evaluations, total, n_points, [run.estimates for run in runs]]
-    return Finding(
-        tuple(run.state.value for run in runs), doubled, json.dumps(figures, sort_keys=True)
-    )
+    given_up = job.state is State.FAILED and job.lost_leases >= job.max_attempts
+    states = tuple(run.state.value for run in runs)
+    return Finding(states, doubled, given_up, json.dumps(figures, sort_keys=True))
 
 
 def without_clock(document: Any) -> Any:

@@ -119,6 +119,7 @@ class Stream:
         self.counts["runs"] += len(found.states)
         self.counts["lost"] += found.lost_beside(wanted)
         self.counts["doubled"] += found.doubled
+        self.counts["given up"] += found.given_up
         if found.figures != wanted.figures:
             self.different.append(job)
         del self.open[kind]

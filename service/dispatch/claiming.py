@@ -127,16 +127,21 @@ class Leases:
         """
         with self._lock:
             held = tuple(self._held)
+        worked = lost and patiently(self._worked)
         for lease in held:
             try:
-                patiently(partial(self._release, lease, lost=lost))
+                patiently(partial(self._release, lease, lost=lost, beside_others=worked))
             except LeaseLost:
                 _log.info("%s was no longer ours", lease.job_id)
             self.forget(lease)
 
-    def _release(self, lease: Lease, *, lost: bool) -> None:
+    def _release(self, lease: Lease, *, lost: bool, beside_others: bool) -> None:
         with self._database.write() as session:
-            Queue(session, self._clock).release(lease, lost=lost)
+            Queue(session, self._clock).release(lease, lost=lost, beside_others=beside_others)
+
+    def _worked(self) -> bool:
+        with self._database.read() as session:
+            return Queue(session, self._clock).worked(self.owner)
 
     def stop(self) -> None:
         """Stop beating and take leave."""

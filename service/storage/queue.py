@@ -44,6 +44,9 @@ LONGEST = 2
 HUNG = timedelta(seconds=60)
 """A dispatcher whose process lives keeps its jobs so long after its lease has ended: it waits for
 the database, and lost nothing. Then it counts as hung."""
+BESIDE_OTHERS = 4
+"""So many times as many losses without progress a job may have while others of the same dispatcher
+come further: then it is hardly this one over which the dispatchers die."""
 _NO_SPEC = defer(Job.spec)
 """A specification of many cells has megabytes; it is read where it is wanted."""
 Outcome = Literal[State.SUCCEEDED, State.FAILED, State.CANCELLED]
@@ -242,11 +245,22 @@ class Queue:
         self._events.append_state(job)
         return job
 
-    def release(self, lease: Lease, *, lost: bool = False) -> None:
-        """Give a job back, because the dispatcher is shutting down, or has `lost` its workers."""
+    def worked(self, owner: str) -> bool:
+        """Whether a job that this owner holds has come further under its lease."""
+        found = select(Job.id).where(Job.lease_owner == owner, Job.state == State.RUNNING)
+        return bool(self._session.scalar(select(found.where(_came_further()).exists())))
+
+    def release(self, lease: Lease, *, lost: bool = False, beside_others: bool = False) -> None:
+        """Give a job back, because the dispatcher is shutting down, or has `lost` its workers.
+
+        Parameters
+        ----------
+        beside_others : bool
+            Whether a job of the same owner came further meanwhile.
+        """
         job = self.hold(lease)
         if lost:
-            self._bury(job)
+            self._bury(job, beside_others=beside_others)
         elif job.cancel_requested:
             self._end(job, State.CANCELLED, None)
         else:
@@ -263,8 +277,9 @@ class Queue:
         """Give back the jobs whose leases have expired, or end them.
 
         A job that was to be cancelled is cancelled; one that was lost `max_attempts` times while
-        no run of it went on or ended fails with that reason; any other is queued and goes on
-        from its checkpoints. The leases of owners that are gone are not waited for, those of
+        no run of it went on or ended fails with that reason, or `BESIDE_OTHERS` times as often
+        where others of its owner did; any other is queued and goes on from its checkpoints. The
+        leases of owners that are gone are not waited for, those of
         living ones `HUNG` longer. A lease that ends more than `LONGEST` lengths from now was
         written by a clock that was stepped back since: it is shortened to one, from now.
         """
@@ -279,15 +294,16 @@ class Queue:
             .with_for_update(skip_locked=True, key_share=True)
             .options(_NO_SPEC)
         )
+        lost = self._session.scalars(expired, execution_options={"populate_existing": True}).all()
+        whose = frozenset(str(job.lease_owner) for job in lost)
+        busy = {owner for owner in whose if self.worked(owner)}
         fates: dict[State, list[str]] = {state: [] for state in State}
-        whose: set[str] = set()
-        for job in self._session.scalars(expired, execution_options={"populate_existing": True}):
-            whose.add(str(job.lease_owner))
-            fates[self._bury(job)].append(job.id)
+        for job in lost:
+            fates[self._bury(job, beside_others=job.lease_owner in busy)].append(job.id)
         queued, failed, cancelled = (
             tuple(fates[one]) for one in (State.QUEUED, State.FAILED, State.CANCELLED)
         )
-        return Reaped(queued, failed, cancelled, frozenset(whose))
+        return Reaped(queued, failed, cancelled, whose)
 
     def _change(self, lease: Lease, values: dict[str, Any]) -> Job:
         changed = update(Job).where(*lease.fence()).values(values).returning(Job.id)
@@ -309,11 +325,14 @@ class Queue:
         if n_left:
             raise Conflict(f"{job.id} cannot succeed: {n_left} of its runs did not finish")
 
-    def _bury(self, job: Job) -> State:
-        job.lost_leases = 1 if self._went_on(job) else job.lost_leases + 1
+    def _bury(self, job: Job, *, beside_others: bool) -> State:
+        went_on = self._session.scalar(select(Job.id).where(Job.id == job.id, _came_further()))
+        job.lost_leases = job.lost_leases + 1 if went_on is None else 1
+        is_spared = beside_others and went_on is None
+        most = job.max_attempts * (BESIDE_OTHERS if is_spared else 1)
         if job.cancel_requested:
             self._end(job, State.CANCELLED, None)
-        elif job.lost_leases >= job.max_attempts:
+        elif job.lost_leases >= most:
             self._end(
                 job, State.FAILED,
                 f"the dispatcher ended or fell silent {job.lost_leases} times, or lost its "
@@ -323,14 +342,6 @@ class Queue:
         else:
             self._requeue(job)
         return job.state
-
-    def _went_on(self, job: Job) -> bool:
-        """Whether a run ended or came further in this attempt: only then has it a checkpoint."""
-        ended = exists().where(
-            Run.job_id == job.id, Run.attempt == job.attempt, Run.state.not_in(OPEN)
-        )
-        further = exists().where(Checkpoint.job_id == job.id, Checkpoint.attempt == job.attempt)
-        return bool(self._session.scalar(select(or_(ended, further))))
 
     def _end(self, job: Job, state: State, error: str | None) -> None:
         job.state, job.error, job.finished_at = state, error, self._clock()
@@ -344,6 +355,13 @@ class Queue:
         self._session.execute(running.values(state=State.QUEUED), execution_options=IN_PLACE)
         self._events.append_state(job)
         notify_queue(self._session)
+
+
+def _came_further() -> ColumnElement[bool]:
+    """Condition that a run of a job ended in its attempt, or came further: it has a checkpoint."""
+    ended = exists().where(Run.job_id == Job.id, Run.attempt == Job.attempt, Run.state.not_in(OPEN))
+    kept = exists().where(Checkpoint.job_id == Job.id, Checkpoint.attempt == Job.attempt)
+    return or_(ended, kept)
 
 
 def _silent(now: datetime, owners: Owners) -> ColumnElement[bool]:

@@ -11,12 +11,13 @@ from datetime import timedelta
 
 import pytest
 
+from service.dispatch.claiming import Leases
 from service.reaping import Reaper, identity, is_awake, is_gone, reap
 from service.storage.clocks import clock_of
 from service.storage.columns import utc_now
 from service.storage.dispatchers import LEASE_SECONDS, DispatcherRepository
 from service.storage.ledger import Cell, RunLedger, RunOutcome
-from service.storage.queue import HUNG, Queue
+from service.storage.queue import BESIDE_OTHERS, HUNG, Queue
 from service.storage.tables import State
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
 from workers.processes import standing
@@ -265,3 +266,36 @@ def test_leases_follow_the_clock_of_the_server_not_those_of_its_clients(
     monkeypatch.undo()
     assert reap(postgres_database, LEASE).requeued == ()
     assert state_of(postgres_database, job) is State.RUNNING
+
+
+def save_one(database, got) -> None:
+    """Write a checkpoint of a run of the job."""
+    with database.write() as session:
+        ledger = RunLedger(session, got.lease)
+        ledger.create([Cell(number=0)])
+        ledger.save([(ledger.pending()[0].id, 100, b"state")])
+
+
+@pytest.mark.parametrize("is_told", [False, True], ids=["reaped", "given back"])
+def test_a_job_that_waits_beside_others_that_come_further_is_not_soon_given_up(
+    database, clock: Clock, is_told: bool
+) -> None:
+    busy, waits = submit(database, max_attempts=2), submit(database, max_attempts=2)
+    leases = Leases(database, 10, clock=clock, stopwatch=lambda: clock.now.timestamp())
+    for loss in range(1, 2 * BESIDE_OTHERS):
+        got = [leases.claim(), leases.claim()]
+        save_one(database, next(one for one in got if one.job.id == busy))
+        if is_told:
+            leases.release_all(lost=True)
+        else:
+            clock.advance(11)
+            reap(database, LEASE, clock)
+            for one in got:
+                leases.forget(one.lease)
+        assert state_of(database, waits) is State.QUEUED
+        assert job_of(database, waits).lost_leases == loss
+        assert job_of(database, busy).lost_leases == 1
+    leases.claim(), leases.claim()
+    leases.release_all(lost=True)  # and now nothing came further
+    assert state_of(database, waits) is State.FAILED
+    assert state_of(database, busy) is State.FAILED
