@@ -239,7 +239,13 @@ class Recorder:
             + sum(self._waiting.values())
             + sum(one.evaluations for one in self._taken)
             + sum(state.evaluations for state in states),
-            generation=max([self._generation, *(state.generation for state in states)]),
+            generation=max(
+                [
+                    self._generation,
+                    *(one.generations for one in self._taken),
+                    *(state.generation for state in states),
+                ]
+            ),
             best_rms=best if math.isfinite(best) else None,
             seconds_left=self._seconds_left(),
         )
@@ -291,6 +297,7 @@ class Recorder:
     def _written(self, now: float, *, tell: bool, keep: bool) -> None:
         self._pending, self._wrote = _Pending(), now
         self._evaluations += sum(one.evaluations for one in self._taken)
+        self._generation = max([self._generation, *(one.generations for one in self._taken)])
         self._best = min([self._best, *_rms_of(self._taken)])
         self._taken = []
         if tell:

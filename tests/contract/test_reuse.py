@@ -76,6 +76,15 @@ def test_more_replicates_of_a_sweep_compute_only_the_new_ones(place):
     assert place.job(job).n_done == 5
 
 
+def test_the_same_sweep_twice_reports_the_same_figures(place):
+    jobs = [place.job(carried_out(place, **sweep(3))[0]) for _ in range(2)]
+    names = ("state", "n_runs", "n_done", "n_failed", "evaluations", "generation", "best_rms")
+    first, again = ([getattr(job, name) for name in names] for job in jobs)
+    assert first == again
+    assert jobs[0].generation > 0
+    assert [job.n_reused for job in jobs] == [0, 3]
+
+
 def test_a_run_taken_over_twice_names_the_one_that_was_computed(place):
     _, (first,), _ = carried_out(place, **sweep(1))
     carried_out(place, **sweep(1))
