@@ -1,6 +1,6 @@
 """Faults of a job with axes: of the job itself, of every value that an axis gives, of its trend."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
@@ -32,8 +32,7 @@ def check_sweep(
         With every fault that can be known before the job runs.
     """
     errors = checker.errors(body_of(document, {}))
-    if not errors:
-        errors = list(_sweep_faults(checker, document, groups))
+    errors += _sweep_faults(checker, document, groups, frozenset(errors))
     if errors:
         unique = dict.fromkeys(errors)
         raise InvalidRequest(unique)
@@ -77,14 +76,20 @@ def _repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldErro
 
 
 def _sweep_faults(
-    checker: JobChecker, document: dict[str, Any], groups: Sequence[Sequence[Step]]
+    checker: JobChecker,
+    document: dict[str, Any],
+    groups: Sequence[Sequence[Step]],
+    known: Set[FieldError],
 ) -> Iterator[FieldError]:
-    """Faults of the values; of a range or a logarithmic axis, those of its first bad value."""
+    """Faults of the values; of a range or a logarithmic axis, those of its first bad value.
+
+    What the job has without its axes is `known`, and not told of every value again.
+    """
     told: set[str] = set()
     for step in (step for group in groups for step in group):
         if step.pointer in told or _is_good_alone(step.cell):
             continue
-        found = list(_step_faults(checker, document, step))
+        found = list(_step_faults(checker, document, step, known))
         if found:
             told.add(step.pointer)
         yield from found
@@ -112,7 +117,9 @@ def _fits(kind: TypeAdapter[Any], value: Any) -> bool:
     return True
 
 
-def _step_faults(checker: JobChecker, document: dict[str, Any], step: Step) -> Iterator[FieldError]:
+def _step_faults(
+    checker: JobChecker, document: dict[str, Any], step: Step, known: Set[FieldError]
+) -> Iterator[FieldError]:
     body = body_of(document, step.cell.values)
     wrong = value_faults(step.pointer, body)
     yield from wrong
@@ -121,4 +128,5 @@ def _step_faults(checker: JobChecker, document: dict[str, Any], step: Step) -> I
     whole = JobIn.model_validate(body).normal_form()
     yield from _of_another_type(step, whole)
     for fault in checker.errors(whole):
-        yield FieldError(step.pointer, str(fault), fault.column)
+        if fault not in known:
+            yield FieldError(step.pointer, str(fault), fault.column)

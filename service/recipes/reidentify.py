@@ -69,7 +69,7 @@ def _warm_start(body: ReidentifyIn, reference: str | None) -> str | None:
     wanted = body.warm_start or ("previous" if reference is None else "reference")
     if wanted == "reference":
         return reference
-    return PREVIOUS if wanted == "previous" and len(body.batch) > 1 else None
+    return PREVIOUS if wanted == "previous" else None
 
 
 def _at_home(error: FieldError, order: list[int]) -> FieldError:

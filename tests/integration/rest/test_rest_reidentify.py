@@ -197,6 +197,26 @@ def test_references_keep_their_history_and_say_what_is_wrong(served: Served) -> 
     assert "did you mean 'kept'" in missing.json()["detail"]
 
 
+def test_every_unknown_dataset_of_a_batch_is_told_at_its_entry(served: Served) -> None:
+    batch = [{"x": 3, "datasets": ["ds_c"]}, {"x": 1, "datasets": ["ds_a"]},
+             {"x": 2, "datasets": served.datasets[2.0][:1]},
+             {"x": 4, "datasets": ["ds_d"]}]  # fmt: skip
+    answer = served.server.post("/v1/recipes/reidentify", json={**BODY, "batch": batch})
+    faults = refused(answer, 422, "invalid")
+    assert {(one["pointer"][:17], named) for one in faults for named in ("ds_a", "ds_c", "ds_d")
+            if named in one["detail"]} == {
+        ("/batch/0/datasets", "ds_c"), ("/batch/1/datasets", "ds_a"), ("/batch/3/datasets", "ds_d"),
+    }  # fmt: skip
+    assert len(faults) == 3
+
+
+def test_a_warm_start_that_was_asked_for_is_told_also_for_a_batch_of_one(served: Served) -> None:
+    batch = [{"x": 2.0, "datasets": served.datasets[2.0][:1]}]
+    job = batch_of(served.server, served.parts, batch=batch, warm_start="previous")
+    told = served.server.get(f"/v1/jobs/{job}").json()
+    assert (told["state"], told["request"]["warm_start"]) == ("succeeded", "previous")
+
+
 @pytest.mark.parametrize("name", ["run_mine", "reference:x", "a/b", "..", " blank", "n" * 101])
 def test_a_name_that_means_something_else_is_refused_at_the_path(served: Served, name: str) -> None:
     run = run_at(served, served.job, 2.0)
