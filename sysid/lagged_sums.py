@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.fft import irfft, rfft
 
-from sysid.distributions import median
 from sysid.records import Channel, sampling_of
 from sysid.types import BoolArray, FloatArray
 
@@ -38,7 +37,7 @@ class Laid(NamedTuple):
 def laid_out(times: FloatArray, values: FloatArray) -> Laid:
     """Residuals (N,) in places a period apart, those between missing; irregular ones in order."""
     steps = np.diff(times)
-    period = median(steps) if steps.size else 0.0
+    period = float(np.median(steps)) if steps.size else 0.0
     if period > 0:
         rounded = np.cumsum(np.maximum(np.rint(steps / period), 0.0))
         period = float((times[-1] - times[0]) / rounded[-1])  # not off by the rounding of one step

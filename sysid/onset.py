@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.distributions import median
 from sysid.models.model import Model
 from sysid.records import Channel, Record
 from sysid.types import BoolArray, FloatArray
@@ -120,7 +119,7 @@ def _pair(number: int, first: Channel, then: Channel, others: Sequence[Channel])
     spread = float(np.std(delays, ddof=1)) if delays.size > 1 else None
     share = max(share for _, share in found)
     return OnsetDelay(
-        number, first.name, then.name, median(delays), spread, len(found), share
+        number, first.name, then.name, float(np.median(delays)), spread, len(found), share
     )
 
 
@@ -241,4 +240,4 @@ def _noise(values: FloatArray) -> float:
     if values.size < _REST:
         return 0.0
     bend = np.diff(values, 2)
-    return 1.4826 * median(np.abs(bend)) / sqrt(6.0)
+    return 1.4826 * float(np.median(np.abs(bend))) / sqrt(6.0)

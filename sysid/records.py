@@ -6,7 +6,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sysid.distributions import median
 from sysid.errors import InvalidRecord, InvalidSettings, nearest
 from sysid.types import FloatArray
 
@@ -42,7 +41,7 @@ def sampling_of(times: FloatArray) -> Sampling:
     grid = times[0] + period * np.arange(times.size)
     if period > 0 and float(np.max(np.abs(times - grid))) <= REGULAR_WITHIN * period:
         return Sampling(times.size, period, is_regular=True)
-    return Sampling(times.size, median(np.diff(times)), is_regular=False)
+    return Sampling(times.size, float(np.median(np.diff(times))), is_regular=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,8 +27,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
+from scipy.special import chdtrc
 
-from sysid.distributions import chi_squared_tail
 from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, lagged_sums, laid_out, whiteness
 from sysid.past_outputs import coefficients_on_past_outputs
 from sysid.records import Channel
@@ -281,7 +281,7 @@ def _test(
     one: Series, kind: Kind, channel: str | None, scaled: FloatArray, statistic: float,
     degrees: float, level: float,
 ) -> ResidualTest:  # fmt: skip
-    p = chi_squared_tail(degrees, statistic)
+    p = float(chdtrc(degrees, statistic))
     size = np.abs(scaled)
     return ResidualTest(
         one.experiment, one.output, kind, channel, "passed" if p >= level else "failed",

@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.fft import rfft
+from scipy.special import chdtrc, stdtrit
 
-from sysid.distributions import chi_squared_tail, student_95
 from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, laid_out, whiteness
 from sysid.problem import Problem
 from sysid.types import FloatArray
@@ -62,7 +62,7 @@ class Coloured(NamedTuple):
             Mean square of the residuals; sum of squares of that combination.
         """
         told = float(direction @ self.middle @ direction) / (power * norm)
-        reach = student_95(self.degrees) ** 2 / QUANTILE
+        reach = float(stdtrit(self.degrees, 0.975)) ** 2 / QUANTILE
         return float(told * reach * self.samples / self.degrees)
 
 
@@ -131,7 +131,7 @@ def _is_coloured(laid: Laid, size: float) -> bool:
     n = np.count_nonzero(laid.present)
     if n < FEWEST or float(np.sqrt(laid.values @ laid.values / n)) <= ROUNDING * size:
         return False
-    return chi_squared_tail(laid.lags, whiteness(laid).statistic) < _CHANCE
+    return float(chdtrc(laid.lags, whiteness(laid).statistic)) < _CHANCE
 
 
 def _with_colour(laid: Laid, columns: FloatArray) -> Coloured:

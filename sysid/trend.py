@@ -12,8 +12,8 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtrc, stdtr, stdtrit
 
-from sysid.distributions import chi_squared_tail, student_95, student_tail
 from sysid.trend_laws import Law, fit_line, fit_power, rounding
 from sysid.types import FloatArray
 
@@ -136,7 +136,7 @@ def half_width(law: Law) -> float:
     That of the normal distribution where the stated errors hold; that of Student's t where the
     size of the errors is taken from the scatter of few points.
     """
-    return _NORMAL_95 if law.birge <= 1.0 else student_95(law.degrees)
+    return _NORMAL_95 if law.birge <= 1.0 else float(stdtrit(law.degrees, 0.975))
 
 
 def _band(law: Law, x: FloatArray) -> tuple[Place, ...]:
@@ -216,7 +216,7 @@ def _influence(law: Law, residual: float, leverage: float, n: int, floor: float)
         t = float(np.copysign(inf, residual)) if square > 2.0 * floor else 0.0
     else:
         t = residual / sqrt(others * (1.0 - leverage))
-    p_value = min(1.0, n * student_tail(degrees, t))
+    p_value = min(1.0, n * 2.0 * float(stdtr(degrees, -abs(t))))
     is_explained = sqrt(square) <= -NormalDist().inv_cdf(_OUTLIER / (2.0 * n))
     return Influence(residual, t, p_value, p_value < _OUTLIER and not is_explained)
 
@@ -274,9 +274,9 @@ def drift_limit(law: Law | None = None, comparisons: int = 1) -> float:
     batches that happen to scatter little, and these have their stated errors.
     """
     limit = -NormalDist().inv_cdf(_DRIFT / (2.0 * comparisons))
-    if law is None or chi_squared_tail(law.degrees, law.chi_squared) >= _CHANCE:
+    if law is None or chdtrc(law.degrees, law.chi_squared) >= _CHANCE:
         return limit
-    return limit * student_95(law.degrees) / _NORMAL_95
+    return limit * float(stdtrit(law.degrees, 0.975)) / _NORMAL_95
 
 
 def drift(new: Estimate, old: Estimate, comparisons: int = 1) -> Drift:

@@ -21,8 +21,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import stdtrit
 
-from sysid.distributions import median, student_95
 from sysid.estimates import Known, estimates_of
 from sysid.ga.chromosome import placed
 from sysid.groups import Block, blocks, written
@@ -157,7 +157,7 @@ def _analysed(
     )
     statuses = _statuses(place, found, [p.name for p in pulled], problem)
     told = Known(
-        theta, statuses, physical, student_95(_degrees(n, d, colour)), member,
+        theta, statuses, physical, float(stdtrit(_degrees(n, d, colour), 0.975)), member,
         uncertainty.groups, rows[~kept], scale,
     )  # fmt: skip
     estimates = estimates_of(problem, told)
@@ -262,7 +262,7 @@ def _covariance(
     share = 1.0 / np.sqrt(1.0 + (error / scale) ** 2)
     bread = np.linalg.pinv((columns.T * share**3) @ columns, rcond=RANK**2, hermitian=True)
     filling = (columns.T * influence**2) @ columns if colour is None else colour.middle
-    noise = 1.4826 * median(np.abs(error))  # of the bulk, not of the outliers
+    noise = 1.4826 * float(np.median(np.abs(error)))  # of the bulk, not of the outliers
     return widening * bread @ filling @ bread, noise
 
 

@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.distributions import median
 from sysid.errors import InvalidRecord
 from sysid.records import Channel
 from sysid.types import FloatArray
@@ -106,7 +105,7 @@ def sampling_period(channel: Channel) -> float | None:
     """Median distance of neighbouring samples in s; None if no two have different times."""
     steps = np.diff(channel.times)
     steps = steps[steps > 0]
-    return median(steps) if steps.size else None
+    return float(np.median(steps)) if steps.size else None
 
 
 def between_samples(channel: Channel, times: FloatArray) -> FloatArray:

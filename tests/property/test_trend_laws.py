@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sysid.distributions import student_tail
 from sysid.trend import (
     Estimate,
     drift,
@@ -268,13 +267,6 @@ def test_the_limit_is_three_and_moderately_more_for_many_comparisons_and_few_poi
     assert drift_limit(wrong, 15) < 6.2
     told = drift_from_law(Estimate(1.0, 0.1), wrong, X, np.full(5, 0.2), 20.0, 15)
     assert told.limit == drift_limit(wrong, 15)
-
-
-@pytest.mark.parametrize("degrees", [1, 2, 3.5, 12, 400])
-@pytest.mark.parametrize("t", [-4.0, 0.0, 0.3, 2.0, 30.0, inf])
-def test_the_tail_of_student_is_scipys(degrees: float, t: float) -> None:
-    expected = 2 * stats.t.sf(abs(t), degrees)
-    assert student_tail(degrees, t) == pytest.approx(expected, rel=1e-9, abs=1e-300)
 
 
 def test_aic_prefers_the_law_that_made_the_data() -> None:

@@ -272,7 +272,7 @@ WARM = """
 import sys
 from sysid.warming import warm_up
 warm_up()
-loaded = ("numba.np.arraymath", "numba.np.npyimpl", "scipy.special", "scipy.linalg")
+loaded = ("numba.np.arraymath", "numba.np.npyimpl", "scipy.linalg")
 print([name for name in loaded if name in sys.modules])
 """
 
