@@ -7,6 +7,7 @@ from benchmarks.real_data import (
     dryer2,
     emps,
     pneuact_tube,
+    reidentify,
     silverbox,
     silverbox_narx,
     tube_reference,
@@ -22,6 +23,7 @@ PROGRAMS = {
     "dryer2": dryer2.measure,
     "pneuact": pneuact_tube.measure,
     "tube reference": tube_reference.measure,
+    "tubes re-identified": reidentify.measure,
 }
 
 

@@ -40,7 +40,7 @@ class Carried:
         return sum(run["evaluations"] for _, run in self.runs)
 
 
-def measure(client: Client, folder: Path, *, quick: bool) -> list[Row]:
+def measure(client: Client, folder: Path, *, quick: bool = False) -> list[Row]:
     """Both sets of tubes; `quick`: the reference tubes only."""
     rows = _reference_tubes(client, folder / "tube_reference")
     return rows if quick else rows + _measured_tubes(client, folder / "pneuact_tube")

@@ -2,10 +2,13 @@
 
 import json
 import sys
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 
-from benchmarks import collect
+from benchmarks import collect, real_data
+from benchmarks.real_data import all as every
 from benchmarks.table import Row, Skipped, parser, report
 
 HOLDS, MISSES = Row("quick", 1.0, "s", 2.0), Row("slow", 3.0, "s", 2.0)
@@ -48,3 +51,10 @@ def test_the_table_of_all_names_each_program_and_those_that_wrote_nothing(tmp_pa
     assert "| one: quick | 1 | s | <= 2 | yes |" in text
     assert "| two | did not finish |" in text
     assert json.loads((tmp_path / "bench.json").read_text())[0]["name"] == "one: quick"
+
+
+def test_every_program_on_measured_records_is_part_of_all_of_them() -> None:
+    folder = Path(real_data.__path__[0])
+    programs = [import_module(f"{real_data.__name__}.{one.stem}") for one in folder.glob("*.py")]
+    own = {one.measure for one in programs if hasattr(one, "measure")} - {every.measure}
+    assert own == set(every.PROGRAMS.values())
