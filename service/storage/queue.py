@@ -147,7 +147,7 @@ class Queue:
             # Rivals take the next one; SQLite has no rivals.
             .with_for_update(skip_locked=True, of=waiting)
         )
-        now = self._clock()
+        now = self._now()
         taken = update(Job).where(Job.id == first.scalar_subquery()).values(
             state=State.RUNNING, attempt=Job.attempt + 1, lease_owner=owner,
             lease_until=now + lease, started_at=func.coalesce(Job.started_at, now),
@@ -179,7 +179,7 @@ class Queue:
         renewed = (
             update(Job)
             .where(or_(false(), *(and_(*one.fence()) for one in held)))
-            .values(lease_until=self._clock() + lease)
+            .values(lease_until=self._now() + lease)
             .returning(Job.id, Job.attempt, Job.cancel_requested)
         )
         rows = self._session.execute(renewed, execution_options=IN_PLACE)
@@ -234,7 +234,7 @@ class Queue:
         """
         job = self._change(
             lease,
-            {"state": state, "error": error, "finished_at": self._clock(), "lease_until": None,
+            {"state": state, "error": error, "finished_at": self._now(), "lease_until": None,
              "lease_owner": None, "seconds_left": None},
         )  # fmt: skip
         self._settle_best(job)
@@ -268,7 +268,7 @@ class Queue:
 
     def has_silent(self, owners: Owners) -> bool:
         """Whether a lease is to be reaped, or seems to end later than any that is given."""
-        now = self._clock()
+        now = self._now()
         wrong = or_(_silent(now, owners), _ahead(now, owners))
         found = select(exists().where(Job.state == State.RUNNING, wrong))
         return bool(self._session.scalar(found))
@@ -283,7 +283,7 @@ class Queue:
         living ones `HUNG` longer. A lease that ends more than `LONGEST` lengths from now was
         written by a clock that was stepped back since: it is shortened to one, from now.
         """
-        now, known = self._clock(), owners or Owners()
+        now, known = self._now(), owners or Owners()
         ahead = update(Job).where(Job.state == State.RUNNING, _ahead(now, known))
         ends = _by_owner({one: now + length for one, length in known.lengths.items()},
                          now + known.usual)  # fmt: skip
@@ -304,6 +304,10 @@ class Queue:
             tuple(fates[one]) for one in (State.QUEUED, State.FAILED, State.CANCELLED)
         )
         return Reaped(queued, failed, cancelled, whose)
+
+    def _now(self) -> datetime:
+        self._session.connection()  # SQLite may wait here for its turn, and the time goes on
+        return self._clock()
 
     def _change(self, lease: Lease, values: dict[str, Any]) -> Job:
         changed = update(Job).where(*lease.fence()).values(values).returning(Job.id)
@@ -344,7 +348,7 @@ class Queue:
         return job.state
 
     def _end(self, job: Job, state: State, error: str | None) -> None:
-        job.state, job.error, job.finished_at = state, error, self._clock()
+        job.state, job.error, job.finished_at = state, error, self._now()
         job.lease_owner = job.lease_until = job.seconds_left = None
         close_runs(self._session, job.id, state, error)
         self._events.append_state(job)

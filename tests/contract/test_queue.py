@@ -4,6 +4,7 @@ import threading
 from datetime import timedelta
 
 import pytest
+from sqlalchemy import text
 
 from service.storage.errors import Conflict, LeaseLost
 from service.storage.events import EventRepository
@@ -113,6 +114,33 @@ def test_one_heartbeat_renews_the_leases_given_and_no_others(database, clock):
     assert {one.lease for one in held} == mine
     clock.advance(4)
     assert set(reap(database, clock).requeued) == others
+
+
+def test_a_lease_begins_when_the_database_was_got_not_when_it_was_asked_for(database):
+    if not database.is_sqlite:
+        pytest.skip("only SQLite lets one writer in at a time")
+    submit(database)
+    is_held, may_end = threading.Event(), threading.Event()
+    asked: list[bool] = []  # for the time, and whether the other writer had come to its end
+
+    def hold():
+        with database.write() as session:
+            session.execute(text("UPDATE jobs SET name = 'held'"))
+            is_held.set()
+            threading.Event().wait(0.2)  # so that the claim waits for it
+            may_end.set()
+
+    def clock():
+        asked.append(may_end.is_set())
+        return Clock().now
+
+    holder = threading.Thread(target=hold)
+    holder.start()
+    is_held.wait(20)
+    got = claim(database, "d1", clock)
+    holder.join()
+    assert got.job.lease_until == Clock().now + LEASE
+    assert set(asked) == {True}
 
 
 def test_a_heartbeat_tells_of_a_wish_to_cancel(database):

@@ -2,10 +2,15 @@
 
 import os
 import signal
+import sqlite3
+from contextlib import closing
+from datetime import timedelta
 from pathlib import Path
 
 import pytest
 
+from service.reaping import reap
+from service.storage.columns import utc_now
 from service.storage.tables import Checkpoint, State
 from tests.dispatching import Place, until
 
@@ -58,3 +63,34 @@ def test_cancelling_ends_a_job_and_stopping_gives_it_back_with_its_checkpoint(
     assert [run.state for run in place.runs(cancelled)] == [State.CANCELLED]
     assert (place.job(stopped).state, place.job(stopped).lost_leases) == (State.QUEUED, 0)
     assert has_checkpoint(place)
+
+
+def test_a_database_that_is_busy_for_longer_than_a_lease_costs_nobody_a_job(
+    tmp_path: Path,
+) -> None:
+    place = Place(tmp_path / "data")
+    place.settings = place.settings.model_copy(update={"lease_seconds": 1.0})
+    lease = timedelta(seconds=1)
+
+    def is_overdue() -> bool:
+        until_when = place.job(job).lease_until
+        return until_when is not None and until_when < utc_now() - lease
+
+    with place.dispatcher(), closing(sqlite3.connect(place.settings.data_dir / "lagid.db")) as busy:
+        busy.isolation_level = None
+        busy.execute("PRAGMA busy_timeout = 30000")
+        job = place.submit(algorithm=ENDLESS)
+        until(lambda: place.job(job).evaluations > 0, "progress")
+        for _ in range(3):
+            busy.execute("BEGIN IMMEDIATE")
+            until(is_overdue, "the lease was overdue")
+            busy.execute("ROLLBACK")
+            assert reap(place.database, lease).owners == frozenset()
+            before = place.job(job).evaluations
+            until(lambda before=before: place.job(job).evaluations > before, "more progress")
+        row = place.job(job)
+        assert (row.state, row.attempt, row.lost_leases) == (State.RUNNING, 1, 0)
+        place.cancel(job)
+        place.until(job, State.CANCELLED)
+    log = (place.settings.data_dir / "dispatcher.log").read_text()
+    assert "no longer holds the lease" not in log
