@@ -160,11 +160,7 @@ def _analysed(
         theta, statuses, physical, float(stdtrit(_degrees(n, d, colour), 0.975)), member,
         uncertainty.groups, rows[~kept], scale,
     )  # fmt: skip
-    estimates = estimates_of(problem, told)
-    jumps = {p.name for p, one in zip(problem.space, one_sided, strict=True) if one}
-    estimates = tuple(_on_one_side(e) if e.name in jumps else e for e in estimates)
-    moved = {p.name: by for p, by in zip(problem.space, aside * scale, strict=True) if by}
-    estimates = tuple(_centred(e, moved[e.name]) if e.name in moved else e for e in estimates)
+    estimates = _beside_jumps(problem, estimates_of(problem, told), one_sided, aside * scale)
     linear = None
     if loss_scale(problem) == 0.0:
         stated = np.diag(covariance)
@@ -206,6 +202,17 @@ def _blocks(directions: _Directions) -> tuple[Block, ...]:
     weak = directions.rows[directions.weak]
     member = np.any(weak**2 > _WEAK_MEMBER, axis=0) & ~directions.member
     return found + tuple(one for one in blocks(weak, member) if one.basis.size)
+
+
+def _beside_jumps(
+    problem: Problem, estimates: tuple[Estimate, ...], one_sided: BoolArray, aside: FloatArray
+) -> tuple[Estimate, ...]:
+    """Estimates of parameters whose output changes in jumps only."""
+    names = [p.name for p in problem.space]
+    blind = {name for name, one in zip(names, one_sided, strict=True) if one}
+    moved = {name: float(by) for name, by in zip(names, aside, strict=True) if by}
+    seen = (_on_one_side(one) if one.name in blind else one for one in estimates)
+    return tuple(_centred(one, moved[one.name]) if one.name in moved else one for one in seen)
 
 
 def _on_one_side(estimate: Estimate) -> Estimate:
