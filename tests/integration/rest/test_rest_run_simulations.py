@@ -108,8 +108,12 @@ def test_an_open_loop_follows_given_samples_a_dataset_or_a_formula(served: Serve
     times = np.array(found["outputs"][0]["times"])
     p = found["parameters"]
     late = np.maximum(times - 1.0 - p["L"], 0.0)
-    np.testing.assert_allclose(values, p["y0"] + p["K"] * (1 - np.exp(-late / p["T"])),
-                               rtol=1e-3)  # fmt: skip
+    expected = p["y0"] + p["K"] * (1 - np.exp(-late / p["T"]))
+    # At the sample just behind the jump a held input is off by K h/(8 T s) at most (decision 13).
+    first = int(np.argmax(late > 0))
+    assert abs(values[first] - expected[first]) <= p["K"] * 0.05 / (8 * p["T"] * 2) + 1e-3
+    others = np.arange(values.size) != first
+    np.testing.assert_allclose(values[others], expected[others], rtol=1e-3)
     assert found["metrics"] is found["reference"] is None
     inputs = (
         {"kind": "series", "times": [0.0, 1.0], "values": [0.0, 1.0], "hold": "zero"},
