@@ -44,13 +44,16 @@ def begin(
 ) -> RunState:
     """A run before its first generation; `warm`: parameter values that seed a quarter of it.
 
-    The improved search of a polynomial is seeded by least squares one step ahead, too. A warm
-    start settles sooner.
+    The improved search of a polynomial is seeded by least squares one step ahead, too. Values of
+    all free parameters are taken for an earlier result, behind which a run settles sooner; those
+    of some of them seed the search, and no more.
     """
     given = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
+    given = tuple(one for one in given if one)
+    is_warm = any(all(p.name in one for p in problem.space) for one in given)
     starts = equation_error_starts(problem, algorithm)
     islands = found(problem, algorithm, seed, given, starts.values, starts.evaluations)
-    return RunState(seed, islands, is_warm=bool(given))
+    return RunState(seed, islands, is_warm=is_warm)
 
 
 def border(algorithm: GeneticAlgorithm, state: RunState) -> int:
@@ -110,13 +113,14 @@ def _is_settled(settled: int, state: RunState) -> bool:
     Nearly all searches that began beside it have to lead back to it: where the fitness is rough
     others nearby may be better.
     Behind a warm start stands an earlier result. So a third of them is enough, and so it is that
-    as many, from random places or from beside it, and the second half of the generations have
-    found nothing better.
+    as many from random places, one from beside it and the second half of the generations have
+    found nothing better. Those from beside it alone would not do: around a false optimum they
+    find nothing better.
     """
     hops, returned = state.hops
     if state.is_warm:
-        tried = state.independent + hops
-        if tried >= settled and state.is_the_best_since(state.generation // 2):
+        tried = state.independent >= settled and hops > 0
+        if tried and state.is_the_best_since(state.generation // 2):
             return True
         settled = -(-settled // _WARM_SETTLED)
     if returned < max(settled, _RETURN * hops):

@@ -1,12 +1,20 @@
 """A warm start: the same result for at most half of the simulations, wherever it begins."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 
 import pytest
 
 from sysid import Identification, identify, load_model
+from sysid.ga.state import CONFIRMED, GENERATION, HOPS, RETURNED, TRIED
 from sysid.records import Record
+from sysid.run import advance, begin, border, exchange
+from sysid.settings import GeneticAlgorithm
 from tests.runs import step_record
+from tests.searching import DUFFING, bits, example, noisy, record
+
+Given = Mapping[str, float] | Sequence[Mapping[str, float]]
 
 BOUNDS = {"T": {"upper": 10.0}, "L": {"upper": 2.0}}
 
@@ -51,3 +59,42 @@ def test_a_warm_start_repeats_bit_for_bit() -> None:
     before, after = records()
     start = values(found(before))
     assert values(found(after, start)) == values(found(after, start))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 25, 34])
+def test_beside_a_false_start_of_a_rough_loss_the_result_is_the_same(seed: int) -> None:
+    seen = record(noisy("coulomb-eq16", seed=100 + seed))
+    false = {"c": 0.192, "L": 0.895, "b": 5.0, "mu": 0.1}
+    model = load_model("coulomb-eq16")
+    cold, warm = identify(model, seen, seed=seed), identify(model, seen, seed=seed, warm=false)
+    assert warm.rms <= cold.rms * (1.0 + 2e-5)
+
+
+@pytest.mark.parametrize("given", [{}, [{}], {"c": 0.2}, [{}, {"c": 0.2, "L": 0.5}]])
+def test_less_than_all_free_parameters_is_no_earlier_result(given: Given) -> None:
+    assert not begin(example(), GeneticAlgorithm(), 1, given).is_warm
+    full = [given] if isinstance(given, Mapping) else list(given)
+    assert begin(example(), GeneticAlgorithm(), 1, [*full, DUFFING]).is_warm
+
+
+def test_an_empty_warm_start_is_a_cold_one() -> None:
+    cold = begin(example(), GeneticAlgorithm(), 1)
+    assert bits(begin(example(), GeneticAlgorithm(), 1, {})) == bits(cold)
+
+
+@pytest.mark.parametrize(
+    ("random", "beside", "ends"), [(6, 1, True), (5, 9, False), (0, 30, False), (6, 0, False)]
+)
+def test_searches_from_beside_a_warm_start_alone_do_not_end_it(
+    random: int, beside: int, ends: bool
+) -> None:
+    algorithm = GeneticAlgorithm(islands=1)
+    state = advance(example(), replace(algorithm, generations=5), begin(example(), algorithm, 1))
+    (island,) = state.islands
+    counters, first = island.counters.copy(), island.history[-1]._replace(generation=1)
+    counters[[TRIED, CONFIRMED, HOPS, RETURNED]] = random, 0, beside, beside
+    counters[GENERATION] = border(algorithm, state)
+    there = replace(island, counters=counters, history=(first,))
+    state = replace(state, islands=(there,), is_warm=True, ended=False)
+    assert exchange(algorithm, state, state.islands).ended is ends
