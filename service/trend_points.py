@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from typing import Any, Literal
 
 from service.schemas_trends import BatchPlaceOut, SpanOut
@@ -29,13 +30,17 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A parameter or an onset delay over the labels; `between` as of `sysid.trend.pooled`."""
+    """A parameter or an onset delay over the labels; `between` as of `sysid.trend.pooled`.
+
+    `bounds` are the widest of its runs.
+    """
 
     name: str
     unit: str
     kind: Kind
     points: tuple[Point, ...]
     between: float | None
+    bounds: tuple[float, float] = (-inf, inf)
 
 
 @dataclass(slots=True)
@@ -48,11 +53,18 @@ class _Entry:
 
 @dataclass(slots=True)
 class _Column:
-    """Entries of one quantity by label."""
+    """Entries of one quantity by label; its bounds are the widest of its runs."""
 
     unit: str
     kind: Kind
+    lower: float = inf
+    upper: float = -inf
     entries: dict[float, list[_Entry]] = field(default_factory=dict)
+
+    def widen(self, lower: float | None, upper: float | None) -> None:
+        """Take in the bounds of a run; None: there is none."""
+        self.lower = min(self.lower, -inf if lower is None else lower)
+        self.upper = max(self.upper, inf if upper is None else upper)
 
 
 def by_label(rows: Sequence[TrendRow], x: str) -> dict[float, list[TrendRow]]:
@@ -79,9 +91,10 @@ def quantities(places: Mapping[float, Sequence[TrendRow]], names: Sequence[str])
             for one in row.parameters:
                 if one["name"] in names or (not names and one["status"] not in ("fixed", "tied")):
                     entry = _Entry(row.id, one["value"], one["stderr"], one["status"])
-                    _add(columns, one["name"], one["unit"], "parameter", x, entry)
+                    column = _add(columns, one["name"], one["unit"], "parameter", x, entry)
+                    column.widen(one.get("lower"), one.get("upper"))
             for name, unit, entry in _onsets(row.id, row.onset_delays):
-                _add(columns, name, unit, "onset delay", x, entry)
+                _add(columns, name, unit, "onset delay", x, entry).widen(0.0, None)
     order = {name: number for number, name in enumerate(names)}
     named = sorted(columns.items(), key=lambda one: order.get(one[0], len(order)))
     return [_quantity(name, column) for name, column in named]
@@ -89,9 +102,10 @@ def quantities(places: Mapping[float, Sequence[TrendRow]], names: Sequence[str])
 
 def _add(
     columns: dict[str, _Column], name: str, unit: str, kind: Kind, x: float, entry: _Entry
-) -> None:  # fmt: skip
+) -> _Column:  # fmt: skip
     column = columns.setdefault(name, _Column(unit, kind))
     column.entries.setdefault(x, []).append(entry)
+    return column
 
 
 def onset_estimates(told: Sequence[Mapping[str, Any]]) -> dict[str, Estimate]:
@@ -136,7 +150,8 @@ def _quantity(name: str, column: _Column) -> Quantity:
     estimates = dict(zip(used, means, strict=True))
     several = any(len(known[x]) > 1 for x in used)
     points = tuple(_point(x, column.entries[x], estimates.get(x)) for x in sorted(column.entries))
-    return Quantity(name, column.unit, column.kind, points, ratio if several else None)
+    bounds = column.lower, column.upper
+    return Quantity(name, column.unit, column.kind, points, ratio if several else None, bounds)
 
 
 def _estimate(one: _Entry) -> Estimate | None:

@@ -23,12 +23,12 @@ from service.storage.runs import RunRepository
 from service.storage.tables import Job
 from service.storage.trends import TrendRow, count_succeeded, trend_rows
 from service.sweeps import body_of
+from service.trend_notes import quantity_notes
 from service.trend_points import Point, Quantity, by_label, place, quantities
 from sysid.trend import Influence, Place, Trend, fit_trend
 from sysid.trend_laws import FORMULAS, Law
 
 MOST_RUNS = 5_000
-REAL_SCATTER = 1.5  # Birge ratios below that happen by chance in small batches
 
 
 def has_trend(job: Job) -> bool:
@@ -144,7 +144,7 @@ def _told(
         laws=[_law(law, law is fitted.chosen) for law in fitted.laws], reason=fitted.reason,
         band=[_place(at) for at in fitted.band],
         predictions=[_place(at) for at in fitted.predictions],
-        notes=_quantity_notes(one, fitted),
+        notes=quantity_notes(one, fitted),
     )  # fmt: skip
 
 
@@ -182,24 +182,3 @@ def _place(at: Place) -> PlaceOut:
 
 def _finite(value: float | None) -> float | None:
     return None if value is None or not isfinite(value) else value
-
-
-def _quantity_notes(one: Quantity, fitted: Trend) -> list[str]:
-    notes = []
-    without = [f"{point.x:g}" for point in one.points if point.estimate is None]
-    if without:
-        notes.append(f"no standard error at {', '.join(without)}: the laws leave this out")
-    if one.between is not None and one.between > 1:
-        notes.append(
-            f"runs of one label differ by {one.between:.2g} times what their standard errors say; "
-            "the errors shown hold that"
-        )
-    if fitted.chosen is not None and fitted.chosen.birge > REAL_SCATTER:
-        notes.append(
-            f"the points scatter about the law by {fitted.chosen.birge:.2g} times their errors "
-            "(Birge ratio); band and intervals are wider by that"
-        )
-    outside = [f"{at.x:g}" for at in fitted.predictions if at.is_outside]
-    if outside:
-        notes.append(f"{', '.join(outside)} is outside the measured range: an extrapolation")
-    return notes
