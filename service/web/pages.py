@@ -16,18 +16,18 @@ from service import models
 from service.comparison import compare
 from service.runs import wanted
 from service.storage.datasets import DatasetRepository
-from service.storage.errors import NotFound
 from service.storage.events import EventRepository
 from service.storage.jobs import JobRepository
 from service.storage.lineage import LineageRepository
 from service.storage.runs import RunRepository
-from service.storage.tables import Dataset, Job, Run, State
+from service.storage.tables import Job, Run, State
 from service.web import assets, figures_signals, formats
 from service.web.cells import grid_of
 from service.web.figures import WATERFALL_HEIGHT, convergence_height, correlation_height
 from service.web.figures_noise import noise_height, noise_keys
 from service.web.figures_residuals import residuals_height
 from service.web.findings import findings_of
+from service.web.links import dataset_links, unnamed
 from service.web.reading import model_of, run_body, sought_parameters, unit_of
 from service.web.reference import operations
 from service.web.trend_view import TrendView, trend_of, trend_view
@@ -106,7 +106,8 @@ def job_page(
         cell_title=cell_text(chosen_cell, {}),
         noise_height=_noise_height(job, chosen), trend=_trend(session, job),
         comparable=_comparable(page.items),
-        datasets=dataset_links(session, job), commands=_commands(view, base_url),
+        datasets=dataset_links(session, job), more_datasets=unnamed(job),
+        commands=_commands(view, base_url),
         events=[event_view(one) for one in _events(session, job)],
     )  # fmt: skip
 
@@ -233,27 +234,6 @@ def _best(runs: RunRepository, job: Job) -> Run | None:
 def _events(session: Session, job: Job) -> list[Any]:
     # Progress is on the page already; what remains are the few lines that tell a story.
     return EventRepository(session).latest(job.id, EVENTS_SHOWN, kinds=("state", "log", "end"))
-
-
-def dataset_links(session: Session, job: Job) -> list[dict[str, Any]]:
-    """Datasets of a job, each with its role, name and parents."""
-    kept = job.spec.get("validation") or {}
-    roles = [("estimation", one) for one in job.spec.get("datasets", [])]
-    roles += [("validation", one) for one in kept.get("datasets") or []]
-    lineage = LineageRepository(session)
-    return [
-        {"role": role, "id": one, "name": _dataset_name(session, one),
-         "parents": [e.parent for e in lineage.ancestors(one) if e.child == one]}
-        for role, one in roles
-    ]  # fmt: skip
-
-
-def _dataset_name(session: Session, dataset_id: str) -> str:
-    try:
-        found: Dataset = DatasetRepository(session).get(dataset_id)
-    except NotFound:
-        return "deleted"
-    return found.name
 
 
 def _commands(job: JobView, base_url: str) -> list[tuple[str, str, str]]:

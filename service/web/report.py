@@ -19,7 +19,8 @@ from service.web import assets, figures, figures_signals
 from service.web.figures import Figure
 from service.web.figures_trend import trend_figure
 from service.web.findings import residual_figure
-from service.web.pages import dataset_links, render, run_in_full, run_summary
+from service.web.links import dataset_links, unnamed
+from service.web.pages import render, run_in_full, run_summary
 from service.web.reading import evidence_of, unit_of
 from service.web.results import FigureChoice, job_figure
 from service.web.signals import experiments_of
@@ -33,21 +34,24 @@ EXPERIMENTS_SHOWN = 4
 
 
 def job_report(session: Session, store: ObjectStore, job_id: str) -> str:
-    """The report of a job: every run in a table, the few best of them in full."""
+    """The report of a job: every run in a table, the few best (of a batch first) in full."""
     job = JobRepository(session).get(job_id)
-    runs = RunRepository(session).page(job.id, limit=RUNS_IN_TABLE).items
-    order: RunOrder = "number" if len(runs) <= RUNS_IN_FULL else "best_rms"
-    chosen = RunRepository(session).page(job.id, limit=RUNS_IN_FULL, order=order).items
     made, batch = datetime.now(UTC), trend_of(session, job)
+    view = job_view(job, unit_of(session, job.spec), made)
+    runs = RunRepository(session).page(job.id, limit=RUNS_IN_TABLE).items
+    is_in_order = view.is_batch or len(runs) <= RUNS_IN_FULL
+    order: RunOrder = "number" if is_in_order else "best_rms"
+    chosen = RunRepository(session).page(job.id, limit=RUNS_IN_FULL, order=order).items
     return render(
-        "report.html", job=job_view(job, unit_of(session, job.spec), made), made=made,
+        "report.html", job=view, made=made,
         runs=[run_summary(session, job, run) for run in runs], overview=_overview(session, job),
         trend=None if batch is None else trend_view(batch),
         trend_figure=None if batch is None else as_json(bare(trend_figure(batch))),
         sections=[
             (run_in_full(session, job, run), _figures(session, store, job, run)) for run in chosen
         ],
-        datasets=dataset_links(session, job), policy=policy(), style=style(),
+        datasets=dataset_links(session, job), more_datasets=unnamed(job),
+        policy=policy(), style=style(),
         plotly_code=plotly(), draw=draw(),
         templates=as_json({"light": template("light"), "dark": template("dark")}),
     )  # fmt: skip

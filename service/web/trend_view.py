@@ -29,7 +29,11 @@ class RowView:
 
 @dataclass(frozen=True, slots=True)
 class TrendView:
-    """A trend; `laws` are (text, AIC, Birge ratio, whether chosen)."""
+    """A trend; `laws` are (text, AIC, Birge ratio, whether chosen).
+
+    Offered to be accepted is the run at the reference's label under its name; of a batch without
+    one the run in the middle, which is the nearest to all others.
+    """
 
     x: str
     headings: Sequence[str]
@@ -40,6 +44,8 @@ class TrendView:
     notes: Sequence[str]
     reference: str | None
     reference_text: str
+    offered: str
+    offered_name: str
     height: int
 
 
@@ -71,8 +77,16 @@ def trend_view(found: TrendOut) -> TrendView:
         predictions=[_prediction(one, at) for one in shown for at in one["predictions"]],
         reasons=[f"{one['name']}: {one['reason']}" for one in shown if one["reason"]],
         notes=notes(document), reference=found.reference, reference_text=reference_text(document),
+        offered=_offered(found), offered_name=next(iter(found.reference_names), ""),
         height=trend_height(max(len(shown), 1)),
     )  # fmt: skip
+
+
+def _offered(found: TrendOut) -> str:
+    runs = {place.x: place.runs[0] for place in found.places if place.runs}
+    middle = list(runs.values())[len(runs) // 2 : len(runs) // 2 + 1]
+    known = None if found.reference_x is None else runs.get(found.reference_x)
+    return known or next(iter(middle), "")
 
 
 def _row(place: dict[str, Any], quantities: Sequence[Quantity]) -> RowView:

@@ -27,6 +27,9 @@ class EstimateView:
     reason: str
 
 
+DATASETS = "/datasets"
+
+
 @dataclass(frozen=True, slots=True)
 class RunView:
     """One run: what it gave, or how far it is."""
@@ -55,7 +58,10 @@ class RunView:
 
 @dataclass(frozen=True, slots=True)
 class JobView:
-    """One job: its state, how far it is, and its request."""
+    """One job: its state, how far it is, and its request.
+
+    The RMS of a batch, whose runs see different recordings, do not compare: it has no best one.
+    """
 
     id: str
     name: str
@@ -74,6 +80,7 @@ class JobView:
     progress: float
     progress_text: str
     best_rms: float | None
+    is_batch: bool
     evaluations: int
     rate: float | None
     seconds_left: float | None
@@ -102,6 +109,7 @@ def job_view(job: Job, unit: str, now: datetime) -> JobView:
     took = None if job.started_at is None else ((job.finished_at or now) - job.started_at)
     seconds = None if took is None else max(took.total_seconds(), 0.0)
     share = progress(job)
+    is_batch = any(axis["path"].startswith(DATASETS) for axis in axes_of(job.spec))
     return JobView(
         id=job.id, name=job.name, state=job.state.value, is_open=not job.state.is_terminal,
         can_resume=job.state in (State.FAILED, State.CANCELLED),
@@ -109,7 +117,7 @@ def job_view(job: Job, unit: str, now: datetime) -> JobView:
         attempt=job.attempt, max_attempts=job.max_attempts, n_runs=job.n_runs, n_done=job.n_done,
         n_failed=job.n_failed, n_reused=job.n_reused,
         progress=share, progress_text=_progress_text(job, share),
-        best_rms=job.best_rms, evaluations=job.evaluations,
+        best_rms=None if is_batch else job.best_rms, is_batch=is_batch, evaluations=job.evaluations,
         rate=job.evaluations / seconds if seconds and job.evaluations else None,
         seconds_left=job.seconds_left, took=seconds, created_at=job.created_at,
         error=job.error, request=job.spec,
@@ -179,9 +187,14 @@ def progress(job: Job) -> float:
     return min(max(parts), 1.0)
 
 
+def axes_of(spec: Document) -> list[Document]:
+    """The axes of a job's sweep."""
+    return list((spec.get("sweep") or {}).get("axes") or [])
+
+
 def cell_text(cell: Document, labels: Document) -> str:
     """What distinguishes a run from the others of its job; labels tell data better than ids."""
-    told = {path: value for path, value in cell.items() if not (labels and path == "/datasets")}
+    told = {path: value for path, value in cell.items() if not (labels and path == DATASETS)}
     pairs = [(path.rsplit("/", 1)[-1], value) for path, value in told.items()]
     return ", ".join(f"{name} {_plain(value)}" for name, value in [*labels.items(), *pairs])
 

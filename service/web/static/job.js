@@ -63,7 +63,9 @@ document.addEventListener('submit', async (event) => {
   const told = event.target.querySelector('[data-accepted]');
   try {
     const found = await put(`/v1/references/${encodeURIComponent(name.value)}`, { run: run.value });
-    told.textContent = `${found.name} is ${found.run}; ${found.history.length} before it`;
+    const before = found.history[0];
+    told.textContent = `The reference ${found.name} is ${found.run} now, `
+      + (before ? `${before.run} was before it.` : 'the first of this name.');
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     told.textContent = error.message;

@@ -180,3 +180,38 @@ def test_one_recording_under_two_labels_is_refused(served: Served) -> None:
     (fault,) = refused(answer, 422, "invalid")
     assert fault["pointer"] == "/batch/3/datasets"
     assert "is the same recording as 'tube-16-1-0' at length_m = 2.0" in fault["detail"]
+
+
+def test_report_and_page_of_a_batch_name_every_dataset_and_no_best_rms(served: Served) -> None:
+    report = served.server.get(f"/v1/jobs/{served.job}/report").text
+    page = served.server.get(f"/jobs/{served.job}").text
+    for x in LENGTHS:
+        (dataset,) = served.datasets[x][:1]
+        assert f"length_m = {x:g}: tube-{x:g}-1-0 (estimation, " in report
+        assert f'length_m = {x:g}: <a href="/datasets/{dataset}">' in page
+    assert "Best RMS" not in report + page
+
+
+def test_the_run_at_the_reference_is_offered_under_its_name_else_the_one_in_the_middle(
+    served: Served,
+) -> None:
+    for job, x, name in ((against(served)["job"], 8.0, "tube"), (served.job, 8.0, "")):
+        page = served.server.get(f"/jobs/{job}").text
+        assert f'<option value="{run_at(served, job, x)}" selected>' in page
+        assert f'name="name" required maxlength="100" placeholder="name" value="{name}"' in page
+
+
+def test_a_reference_batch_that_is_too_large_for_a_trend_is_a_note(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS[:3]]
+    reference = run_at(served, served.job, 2.0)
+    job = batch_of(served.server, served.parts, batch=batch, reference=reference)
+    monkeypatch.setattr("service.trends.MOST_RUNS", 3)
+    found = trend(served, job)
+    (note,) = found["notes"]
+    assert "has 4 runs" in note
+    assert "at most 3" in note
+    kinds = {drift["kind"] for one in found["quantities"] for point in one["points"]
+             for drift in point["drifts"]}  # fmt: skip
+    assert kinds == {"run"}

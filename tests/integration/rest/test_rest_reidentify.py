@@ -305,22 +305,6 @@ def test_lengths_that_no_law_can_hold_are_told_and_the_page_is_shown(served: Ser
     assert served.server.get(f"/jobs/{job}").status_code == 200
 
 
-def test_a_reference_batch_that_is_too_large_for_a_trend_is_a_note(
-    served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS[:3]]
-    reference = run_at(served, served.job, 2.0)
-    job = batch_of(served.server, served.parts, batch=batch, reference=reference)
-    monkeypatch.setattr("service.trends.MOST_RUNS", 3)
-    found = trend(served, job)
-    (note,) = found["notes"]
-    assert "has 4 runs" in note
-    assert "at most 3" in note
-    kinds = {drift["kind"] for one in found["quantities"] for point in one["points"]
-             for drift in point["drifts"]}  # fmt: skip
-    assert kinds == {"run"}
-
-
 def test_a_job_without_a_trend_says_so(served: Served) -> None:
     body = {"model": "tube", "datasets": served.datasets[2.0]}
     job = served.server.post("/v1/jobs", json=body).json()["id"]
