@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import time
+from contextlib import suppress
 from pathlib import Path
 
 from workers.processes import has_ended, standing, tag
@@ -25,8 +26,9 @@ def prefix() -> str:
 def clear(folder: Path, pattern: str = "lagid-tmp-*") -> None:
     """Remove files and folders of processes of this machine that are gone, and stale ones."""
     for path in folder.glob(pattern):
-        if _is_of_the_dead(path.name) or _is_stale(path):
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # its owner, or another that clears, was faster
+            if _is_of_the_dead(path.name) or _is_stale(path):
+                shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def _is_of_the_dead(name: str) -> bool:

@@ -38,6 +38,14 @@ def test_what_a_dead_process_left_goes_and_what_a_living_one_has_stays(tmp_path:
     assert list(tmp_path.iterdir()) == [mine]
 
 
+def test_a_file_that_goes_while_it_is_looked_at_is_no_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = tmp_path / "lagid-tmp-another-host-1-file"
+    monkeypatch.setattr(Path, "glob", lambda *_: [gone])
+    temporary.clear(tmp_path)
+
+
 def test_a_living_process_of_another_pid_namespace_keeps_its_files_and_rays_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ended: int
 ) -> None:
