@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.errors import InvalidSettings
+from sysid.linear import RANK
 from sysid.problem import Problem
 from sysid.sensitivities import sensitivities
 from sysid.symmetries import scalings
 from sysid.translations import translations
 from sysid.types import FloatArray
-from sysid.uncertainty import NULL_MEMBER, RANK, physical_scale, without_symmetries
+from sysid.uncertainty import NULL_MEMBER, physical_scale, without_symmetries
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,6 +7,8 @@ import numpy as np
 from sysid.pulls import AT_BOUND
 from sysid.types import BoolArray, FloatArray
 
+RANK = 1e-7  # of the largest singular value: below, the differences are rounding
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
@@ -44,7 +46,7 @@ class Linear:
 
 def linear_model(
     error: FloatArray, columns: FloatArray, held: BoolArray, place: FloatArray,
-    stated: FloatArray, scale: FloatArray, rank: float,
+    stated: FloatArray, scale: FloatArray, inverse: FloatArray, root: FloatArray,
 ) -> Linear:  # fmt: skip
     """The linear model in the parameters' units.
 
@@ -61,17 +63,19 @@ def linear_model(
         Variances of the places, without the width of a plateau.
     scale : FloatArray, shape (D,)
         ∂θ/∂p.
-    rank : float
-        Of the largest singular value: below, slopes are rounding.
+    inverse : FloatArray, shape (D, D)
+        (SᵀS)⁻¹ over what moves the output.
+    root : FloatArray, shape (k, D)
+        R of SᵀS = RᵀR.
     """
     n, d = columns.shape
     total = float(error @ error)
     variance = total / (n - d)
     told = (stated > 0) & ~held
-    white = variance * np.diag(_inverse(columns, rank)[0])
-    sloping = np.where(held, 0.0, columns)
-    inverse, root = _inverse(sloping, rank)
-    slope = sloping.T @ error
+    white = variance * np.diag(inverse)
+    slope = np.where(held, 0.0, columns.T @ error)
+    if held.any():
+        inverse, root = _without(root, held)
     leads_out = ((place < AT_BOUND) & (slope > 0)) | ((place > 1.0 - AT_BOUND) & (slope < 0))
     unit = np.where(scale > 0, scale, 1.0)
     return Linear(
@@ -83,8 +87,9 @@ def linear_model(
     )
 
 
-def _inverse(columns: FloatArray, rank: float) -> tuple[FloatArray, FloatArray]:
-    """(SᵀS)⁻¹ over what moves the output, and R (D, D) of SᵀS = RᵀR."""
-    singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
-    kept = singular > rank * max(singular[0], np.finfo(float).tiny)
-    return (rows[kept].T / singular[kept] ** 2) @ rows[kept], singular[:, None] * rows
+def _without(root: FloatArray, held: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """The same without the parameters held."""
+    root = np.where(held, 0.0, root)
+    singular, rows = np.linalg.svd(root, full_matrices=False)[1:]
+    kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
+    return (rows[kept].T / singular[kept] ** 2) @ rows[kept], root

@@ -52,11 +52,14 @@ class Sensitivities(NamedTuple):
 
 
 class BudgetSpentError(Exception):
-    """The simulations that were left do not suffice; `evaluations` of them were run."""
+    """The simulations that were left do not suffice; `evaluations` of them were run.
 
-    def __init__(self, evaluations: int) -> None:
+    `error` are the weighted residuals (n,) at the estimate, None where not even one was left.
+    """
+
+    def __init__(self, evaluations: int, error: FloatArray | None) -> None:
         super().__init__(f"{evaluations} simulations were not enough")
-        self.evaluations = evaluations
+        self.evaluations, self.error = evaluations, error
 
 
 def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) -> Sensitivities:
@@ -94,7 +97,7 @@ def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) 
             steps = np.where(both, 2.0 * width, np.inf)
             columns[:, jumping] = np.where(both, (above - below) / steps, 0.0)
         columns = probe.weight[:, None] * np.where(np.isfinite(columns), columns, 0.0)
-        error = probe.weight * (probe.predicted - probe.measured)
+        error = probe.error
     return Sensitivities(error, columns, plateau, one_sided, middle, probe.evaluations)
 
 
@@ -139,6 +142,8 @@ class _Probe:
     """The scored output beside an estimate, one parameter moved at a time."""
 
     def __init__(self, problem: Problem, theta: FloatArray, most: int | None) -> None:
+        if most is not None and most < 1:
+            raise BudgetSpentError(0, None)
         self._problem, self._most = problem, most
         self._scored = problem.evaluator.weight > 0
         self.weight = problem.evaluator.weight[self._scored]
@@ -147,10 +152,15 @@ class _Probe:
         self.predicted = problem.predictions(theta[None])[0][self._scored]
         self.evaluations = 1
 
+    @property
+    def error(self) -> FloatArray:
+        """Weighted residuals (n,) at the estimate."""
+        return np.asarray(self.weight * (self.predicted - self.measured))
+
     def at(self, which: IntArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Steps taken, cut off at the bounds, and the outputs there: (n, number of `which`)."""
         if self._most is not None and self.evaluations + which.size > self._most:
-            raise BudgetSpentError(min(self.evaluations, self._most))
+            raise BudgetSpentError(self.evaluations, self.error)
         moved = np.clip(self.place[which] + steps, 0.0, 1.0)
         around = np.repeat(self.place[None], which.size, axis=0)
         around[np.arange(which.size), which] = moved

@@ -27,7 +27,7 @@ from sysid.estimates import Known, estimates_of
 from sysid.ga.chromosome import placed
 from sysid.groups import Block, blocks, written
 from sysid.islands.archipelago import loss_scale
-from sysid.linear import Linear, linear_model
+from sysid.linear import RANK, Linear, linear_model
 from sysid.problem import Problem
 from sysid.pulls import AT_BOUND, Pull, pulls
 from sysid.result import Criteria, Estimate, EstimateStatus, NoiseColour, Uncertainty
@@ -37,7 +37,6 @@ from sysid.symmetries import scalings
 from sysid.translations import translations
 from sysid.types import BoolArray, FloatArray
 
-RANK = 1e-7  # of the largest singular value: below, the differences are rounding
 _SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
 # Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
 # about, and of one that has no effect at all, which is known to many digits.
@@ -95,18 +94,24 @@ def analyse(problem: Problem, theta: FloatArray, most: int | None = None) -> Ana
     """
     try:
         sensitive = sensitivities(problem, theta, most)
-    except BudgetSpentError as error:
-        return _unexplored(problem, theta, error.evaluations)
+    except BudgetSpentError as spent:
+        return _unexplored(problem, theta, spent)
     return _analysed(problem, theta, sensitive, most)
 
 
-def _unexplored(problem: Problem, theta: FloatArray, evaluations: int) -> Analysis:
-    """What is known without a look at the neighbours of the estimate."""
-    weight = problem.evaluator.weight
-    error = weight * (problem.predictions(theta[None])[0] - problem.evaluator.measured)
-    criteria = criteria_of(error[weight > 0], theta.size)
+def _unexplored(problem: Problem, theta: FloatArray, spent: BudgetSpentError) -> Analysis:
+    """What is known without a look at the neighbours of the estimate.
+
+    With nothing left it is that of the simulation that a result shows: no budget counts it.
+    """
+    error = spent.error
+    if error is None:
+        weight = problem.evaluator.weight
+        errors = weight * (problem.predictions(theta[None])[0] - problem.evaluator.measured)
+        error = errors[weight > 0]
+    criteria = criteria_of(error, theta.size)
     reason = "the budget of simulations left too few for standard errors"
-    return Analysis(_without(problem, theta, reason), None, 0.0, evaluations, criteria)
+    return Analysis(_without(problem, theta, reason), None, 0.0, spent.evaluations, criteria)
 
 
 def _analysed(
@@ -164,7 +169,8 @@ def _analysed(
     linear = None
     if loss_scale(problem) == 0.0:
         stated = np.diag(covariance)
-        linear = linear_model(error, columns, plateau > 0, place, stated, scale, RANK)
+        root = singular[:, None] * rows
+        linear = linear_model(error, columns, plateau > 0, place, stated, scale, inverse, root)
     return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, pulled, linear)
 
 

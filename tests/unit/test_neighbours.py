@@ -75,7 +75,9 @@ def test_few_samples_do_not_make_a_linear_regression_rough(n: int, d: int) -> No
         columns, measured = random.standard_normal((n, d)), random.standard_normal(n)
         theta = np.linalg.lstsq(columns, measured, rcond=None)[0]
         error, one = columns @ theta - measured, np.ones(d)
-        linear = linear_model(error, columns, one < 0, 0.5 * one, one, one, 1e-7)
+        inverse = np.asarray(np.linalg.inv(columns.T @ columns), dtype=np.float64)
+        root = np.linalg.qr(columns)[1]
+        linear = linear_model(error, columns, one < 0, 0.5 * one, one, one, inverse, root)
         rms = float(np.sqrt(np.mean(error**2)))
         found = neighbourhood(Regression(), theta, rms, linear, seed)  # type: ignore[arg-type]
         assert found.evaluations == 24

@@ -213,3 +213,23 @@ def test_a_rounded_lag_at_its_bound_has_no_standard_error_and_says_why() -> None
     assert found.stderr is None
     assert found.interval95 is None
     assert "jumps" in found.reason
+
+
+@pytest.mark.parametrize("most", [0, 1, 5, 8])
+def test_of_a_budget_that_does_not_suffice_is_told_what_was_simulated(
+    monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    theta, simulated = np.array([0.2, 0.5, 5.0, 1.0]), []
+    problem, inner = example(), Problem.predictions
+
+    def counted(self: Problem, places: FloatArray) -> FloatArray:
+        simulated.append(len(places))
+        return inner(self, places)
+
+    monkeypatch.setattr(Problem, "predictions", counted)
+    short = analyse(problem, theta, most)
+    assert short.uncertainty is None
+    assert short.evaluations <= most
+    shown = 1 if most == 0 else 0  # what every result shows, which no budget counts
+    assert sum(simulated) - shown == short.evaluations
+    assert short.criteria == analyse(problem, theta).criteria
