@@ -1,16 +1,13 @@
 """The web application: parts opened and closed, routes joined, errors made problem documents."""
 
-import tempfile
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from datetime import timedelta
 from importlib.metadata import version
-from pathlib import Path
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
-from service import temporary
 from service.api import (
     comparison,
     datasets,
@@ -27,11 +24,9 @@ from service.api import (
 )
 from service.api.body_limit import BodyLimit
 from service.api.deps import Parts
+from service.opening import open_storage
 from service.reaping import Reaper
 from service.settings import Settings
-from service.storage import migrate
-from service.storage.objects import open_store
-from service.storage.sessions import Database
 
 DESCRIPTION = (
     "Identification of nonlinear time-lag systems. Send a recording, name a model or write its "
@@ -75,11 +70,7 @@ def open_parts(settings: Settings) -> Parts:
     Misconfigured
         If the data folder is not writable.
     """
-    settings.prepare_folder()
-    temporary.clear(Path(tempfile.gettempdir()))
-    database = Database(settings.database)
-    migrate.upgrade(database)
-    return Parts(settings, database, open_store(settings.store))
+    return Parts(settings, *open_storage(settings))
 
 
 def _lifespan(settings: Settings):  # type: ignore[no-untyped-def]

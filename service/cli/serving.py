@@ -43,15 +43,18 @@ def serve(
     settings.check_exposure()
     settings.prepare_folder()
     with listening(settings.host, settings.port) as listener:
-        from service.app import create_app, open_parts
+        from service.opening import open_storage
         from service.supervision import supervised_dispatcher
 
-        open_parts(settings).database.dispose()  # what cannot be opened is told now, in one line
+        database, _ = open_storage(settings)  # what cannot be opened is told now, in one line
+        database.dispose()
         _end_on_signals()
         child: AbstractContextManager[Supervisor | None] = nullcontext()
         if with_dispatcher:
             child = supervised_dispatcher(settings)
         with child as supervisor:
+            from service.app import create_app  # the dispatcher starts beside this import
+
             bound = listener.getsockname()[1]
             folder = settings.data_dir.absolute()
             out.print(f"lagid serves http://{settings.host}:{bound}/ (data in {folder}); "
