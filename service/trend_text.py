@@ -39,7 +39,7 @@ def limit_text(quantities: list[Quantity]) -> str:
     found: dict[str, dict[str, None]] = {}
     for one in quantities:
         for drift in (drift for point in one["points"] for drift in point["drifts"]):
-            against = "its trend" if drift["kind"] == "trend" else "the reference run"
+            against = "the reference's trend" if drift["kind"] == "trend" else "the reference run"
             found.setdefault(f"{drift['limit']:.1f} against {against}", {})[one["name"]] = None
     told = "; ".join(f"{limit} ({', '.join(names)})" for limit, names in found.items())
     return f"drift is flagged where z, in standard errors, is beyond {told}" if told else ""
