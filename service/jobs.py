@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 from service.cells import AT_ONCE, resolved_axes, stored_cells, stored_groups
 from service.checks import JobChecker
 from service.errors import InvalidRequest, TooMuchUnfinished
+from service.rms_units import unit_of
 from service.schemas import Page
 from service.schemas_jobs import JobIn, JobOut, Progress
 from service.settings import Settings
@@ -170,7 +171,7 @@ def clone(database: Database, job_id: str, settings: Settings) -> JobOut:
     return submit_to(database, body, settings)
 
 
-def told(job: Job, *, with_request: bool = False) -> JobOut:
+def told(job: Job, *, with_request: bool = False, rms_unit: str | None = None) -> JobOut:
     """A job as it is told."""
     model = job.spec["model"]
     return JobOut(
@@ -183,14 +184,15 @@ def told(job: Job, *, with_request: bool = False) -> JobOut:
             best_rms=job.best_rms, evaluations=job.evaluations, generation=job.generation,
             seconds_left=job.seconds_left,
         ),
-        request=job.spec if with_request else None,
+        request=job.spec if with_request else None, rms_unit=rms_unit,
     )  # fmt: skip
 
 
 def page(session: Session, cursor: str | None, limit: int, states: list[State]) -> Page[JobOut]:
     """Jobs, latest first."""
     found = JobRepository(session).page(cursor=cursor, limit=limit, states=states)
-    return Page(items=[told(job) for job in found.items], next=found.next)
+    items = [told(job, rms_unit=unit_of(session, job.spec)) for job in found.items]
+    return Page(items=items, next=found.next)
 
 
 def _name(checker: JobChecker, spec: Mapping[str, Any]) -> str:

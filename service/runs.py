@@ -9,6 +9,7 @@ from sqlalchemy.orm import Session
 
 from service.errors import InvalidRequest
 from service.models import model_of_run
+from service.rms_units import unit_of
 from service.schemas import Page
 from service.schemas_runs import (
     HistoryOut,
@@ -59,7 +60,8 @@ def one(session: Session, run_id: str) -> RunOut:
     run = RunRepository(session).get(run_id)
     job = JobRepository(session).get(run.job_id)
     known = reached(session, [run.id]) if run.result is None else {}
-    answer = told(run, job, known.get(run.id))
+    unit = unit_of(session, body_of_run(run, job))
+    answer = told(run, job, known.get(run.id)).model_copy(update={"rms_unit": unit})
     if run.result is not None or not run.state.is_terminal:
         return answer
     return answer.model_copy(update={"parameters": _best_so_far(session, run, job)})

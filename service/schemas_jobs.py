@@ -276,4 +276,7 @@ class JobOut(Answer):
     model: str
     priority: int
     progress: Progress
+    rms_unit: str | None = Field(
+        default=None, description="of the best RMS; σ: of several outputs together"
+    )
     request: dict[str, Any] | None = None

@@ -28,6 +28,9 @@ class RunOut(Answer):
     state: RunState
     valid: bool | None = None
     rms: float | None = None
+    rms_unit: str | None = Field(
+        default=None, description="told of a single run; σ: of several outputs together"
+    )
     evaluations: int = 0
     generations: int = 0
     seconds: float | None = None

@@ -76,5 +76,8 @@ class SummaryOut(Answer):
     groups: list[GroupOut]
     runs: int = 0
     reused: int = Field(default=0, description="runs taken over from ones computed before")
+    rms_unit: str | None = Field(
+        default=None, description="of each RMS; σ: of several outputs together"
+    )
     references: list[ReferenceOut] = Field(default=[])
     notes: list[str] = Field(default=[], description="what the numbers mean")

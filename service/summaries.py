@@ -7,6 +7,7 @@ from sqlalchemy.orm import Session
 
 from service.errors import InvalidRequest
 from service.floors import Floors, at_sigma
+from service.rms_units import unit_of
 from service.schemas_summaries import GroupOut, ParameterSummaryOut, ReferenceOut, SummaryOut
 from service.storage.jobs import JobRepository
 from service.storage.runs import RunRepository
@@ -67,6 +68,7 @@ def summary(
         groups=[_told(group, keys, units, floors) for group in found],
         runs=job.n_runs,
         reused=job.n_reused,
+        rms_unit=unit_of(session, job.spec),
         references=[_reference(one) for one in floors.problems],
         notes=list(_notes(job, floors)),
     )

@@ -6,6 +6,7 @@ from fastapi import APIRouter, Header, Query, Response, status
 
 from service import jobs, runs, summaries, trends
 from service.api.deps import Cursor, Limit, PartsDep, ReadSession, WriteSession
+from service.rms_units import unit_of
 from service.schemas import Page
 from service.schemas_jobs import JobIn, JobOut
 from service.schemas_runs import RunOut
@@ -52,7 +53,8 @@ def page(
 @router.get("/{job_id}")
 def read(job_id: str, session: ReadSession) -> JobOut:
     """One job: state, progress, and the exact request."""
-    return jobs.told(JobRepository(session).get(job_id), with_request=True)
+    job = JobRepository(session).get(job_id)
+    return jobs.told(job, with_request=True, rms_unit=unit_of(session, job.spec))
 
 
 @router.post("/{job_id}:cancel")

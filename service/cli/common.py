@@ -88,7 +88,8 @@ def print_table(
     table = Table(title=title or None, box=None, pad_edge=False, title_justify="left")
     for number, heading in enumerate(headings):
         table.add_column(
-            heading.removeprefix(">"), justify="right" if heading.startswith(">") else "left",
+            shown(heading.removeprefix(">")),
+            justify="right" if heading.startswith(">") else "left",
             overflow="fold", no_wrap=number == 0,
         )  # fmt: skip
     for row in rows:
@@ -119,6 +120,11 @@ def shown(value: object) -> str:
     return str(value).replace("[", "\\[")
 
 
+def with_unit(name: str, unit: str | None) -> str:
+    """A heading with its unit, ``T [s]``; σ as a unit is that of several outputs together."""
+    return name if unit in (None, "", "1") else f"{name} [{unit}]"
+
+
 def estimate(one: dict[str, Any]) -> str:
     """``0.1193 ± 0.0004``, cut at the standard error's second digit."""
     value, stderr = one["value"], one["stderr"]
@@ -128,6 +134,11 @@ def estimate(one: dict[str, Any]) -> str:
     if _exponent(stderr) > 5 or digits > 9:
         return f"{value:.6g} ± {stderr:.2g}"
     return f"{value:.{digits}f} ± {stderr:.{digits}f}"
+
+
+def status_of(one: dict[str, Any]) -> str:
+    """The status of an estimate, with its reason where there is one."""
+    return f"{one['status']} ({one['reason']})" if one["reason"] else str(one["status"])
 
 
 def _exponent(number: float) -> int:

@@ -19,6 +19,7 @@ from service.cli.common import (
     print_table,
     put,
     read_file,
+    status_of,
     usage,
 )
 
@@ -149,7 +150,10 @@ def tell(model: "Model", found: "Identification", seconds: float, json_file: str
             fail(f"{json_file} cannot be written: {error.strerror}")
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "status"),
-        ((one["name"], estimate(one), one["unit"], _status(one)) for one in document["parameters"]),
+        (
+            (one["name"], estimate(one), one["unit"], status_of(one))
+            for one in document["parameters"]
+        ),
         empty="no parameters",
     )
     unit = model.outputs[0].unit if len(model.outputs) == 1 else "standard deviations"
@@ -160,10 +164,6 @@ def tell(model: "Model", found: "Identification", seconds: float, json_file: str
     out.print(f"; {found.evaluations} simulations in {seconds:.2f} s", markup=False)
     for warning in found.warnings:
         err.print(f"note: {warning}", markup=False)
-
-
-def _status(one: dict[str, Any]) -> str:
-    return f"{one['status']} ({one['reason']})" if one["reason"] else str(one["status"])
 
 
 def _identified(

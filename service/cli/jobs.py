@@ -19,7 +19,9 @@ from service.cli.common import (
     print_listing,
     print_table,
     read_file,
+    with_unit,
 )
+from service.cli.one_run import place_of, show_run
 from service.cli.watching import follow
 from service.documents import read_yaml
 
@@ -67,29 +69,38 @@ def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) ->
     print_listing(
         found,
         as_json,
-        ("id", "name", "state", "model", ">runs", ">best RMS", "submitted"),
+        ("id", "name", "state", "model", ">runs", ">best RMS", "unit",
+         "submitted"),
         lambda one: (one["id"], one["name"], one["state"], one["model"],
                      f"{one['progress']['finished']}/{one['progress']['runs']}",
-                     one["progress"]["best_rms"], one["created_at"][:19].replace("T", " ")),
+                     one["progress"]["best_rms"], _unit(one),
+                     one["created_at"][:19].replace("T", " ")),
         empty="no jobs; submit one: lagid submit job.yaml",
     )  # fmt: skip
 
 
 def runs(
     job: Annotated[
-        str | None, typer.Argument(metavar="[JOB]", help="Id of a job; by default the latest.")
+        str | None,
+        typer.Argument(
+            metavar="[JOB|RUN]", help="Id of a job, by default the latest, or of one run."
+        ),
     ] = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the runs of a job with their estimates."""
+    """List the runs of a job with their estimates, or show one run."""
     with connected(url, key) as client:
-        found = client.runs(job or _latest(client))
+        if job is not None and job.startswith("run_"):
+            show_run(client.run(job), as_json)
+            return
+        about = client.job(job or _latest(client))
+        found = client.runs(about["id"])
     if as_json:
         print_json(found)
     else:
-        print_runs(found)
+        print_runs(found, about["rms_unit"])
 
 
 def cancel(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
@@ -138,22 +149,22 @@ def job_of(file: Path) -> dict[str, Any]:
     return body
 
 
-def print_runs(runs: list[dict[str, Any]]) -> None:
-    """Print runs with their cells, fits and estimates."""
-    paths = list(dict.fromkeys(path for run in runs for path in run["cell"]))
-    names = list(dict.fromkeys(one["name"] for run in runs for one in run["parameters"]))
+def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
+    """Print runs with their cells, fits and estimates; labels stand for the data they tell of."""
+    places = [place_of(run) for run in runs]
+    paths = list(dict.fromkeys(path for place in places for path in place))
+    units = {one["name"]: one["unit"] for run in runs for one in run["parameters"]}
     rows = []
-    for run in runs:
+    for run, place in zip(runs, places, strict=True):
         found = {one["name"]: estimate(one) for one in run["parameters"]}
         fit = run.get("fit_percent") or {}
         rows.append([
-            run["id"], run["state"], *(_brief(run["cell"].get(path)) for path in paths),
+            run["id"], run["state"], *(place.get(path) for path in paths),
             run["rms"], _percent(fit.get("estimation")), _percent(fit.get("validation")),
-            *(found.get(name) for name in names),
+            *(found.get(name) for name in units),
         ])  # fmt: skip
-    axes = [path.removeprefix("/").replace("/", ".") for path in paths]
-    headings = ("run", "state", *axes, ">RMS", ">fit %", ">validation %",
-                *(f">{name}" for name in names))  # fmt: skip
+    headings = ("run", "state", *paths, f">{with_unit('RMS', rms_unit)}", ">fit %",
+                ">validation %", *(f">{with_unit(*one)}" for one in units.items()))  # fmt: skip
     print_table(headings, rows, empty="no runs")
 
 
@@ -162,7 +173,7 @@ def _finish(client: "Client", job: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print_json({**job, "runs": found})
     else:
-        print_runs(found[:50])
+        print_runs(found[:50], job["rms_unit"])
         if len(found) > 50:
             out.print(f"… and {len(found) - 50} more: lagid runs {job['id']}", markup=False)
         for warning in dict.fromkeys(w for run in found for w in run.get("warnings", [])):
@@ -180,8 +191,9 @@ def _latest(client: "Client") -> str:
     return str(found[0]["id"])
 
 
-def _brief(value: object) -> object:
-    return value.get("name", "…") if isinstance(value, dict) else value
+def _unit(job: dict[str, Any]) -> str | None:
+    """Unit of a best RMS; none beside a dash."""
+    return job["rms_unit"] if job["progress"]["best_rms"] is not None else None
 
 
 def _percent(value: float | None) -> str | None:

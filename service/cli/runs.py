@@ -38,7 +38,8 @@ class _Listing(TyperGroup):
 
 app = typer.Typer(
     cls=_Listing, add_completion=False,
-    help="List the runs of a job with their estimates: lagid runs [JOB]; or ask about one run.",
+    help="List the runs of a job with their estimates: lagid runs [JOB]; show one: "
+    "lagid runs RUN; or ask about it.",
 )  # fmt: skip
 app.command(LISTING)(listing)
 

@@ -19,6 +19,7 @@ from service.cli.common import (
     put,
     read_file,
     usage,
+    with_unit,
 )
 from service.cli.watching import follow
 from service.documents import read_yaml
@@ -139,9 +140,12 @@ def tables_of(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]
     units = {one["name"]: one["unit"] for group in groups for one in group["parameters"]}
     others = [key for key in summary["by"] if key != "/noise/sigma"]
     cells = [[_short(one["sigma"], 4), *(str(one["key"][key]) for key in others)] for one in groups]
-    keys = [">σ", *(key.rsplit("/", 1)[-1] for key in others)]
+    unit = summary.get("rms_unit")
+    one_output = None if unit == "σ" else unit
+    keys = [f">{with_unit('σ', one_output)}", *(key.rsplit("/", 1)[-1] for key in others)]
     found = [(
-        [*keys, ">runs", ">success", ">evaluations", "RMS error [5 %, 95 %]", ">floor"],
+        [*keys, ">runs", ">success", ">evaluations",
+         f"RMS error{'' if unit in (None, '1') else f' in {unit}'} [5 %, 95 %]", ">floor"],
         [[*cell, *_whole(one)] for cell, one in zip(cells, groups, strict=True)],
     )]  # fmt: skip
     names = list(units)

@@ -77,6 +77,18 @@ def test_the_tables_have_a_row_for_each_group_and_at_most_four_parameters_each()
     assert found[1][1][0][2:4] == ["+0.05 [-0.15, +0.25]", "0.12"]
 
 
+@pytest.mark.parametrize(
+    ("unit", "sigma", "error"),
+    [("m", ">σ [m]", "RMS error in m [5 %, 95 %]"), ("1", ">σ", "RMS error [5 %, 95 %]"),
+     ("σ", ">σ", "RMS error in σ [5 %, 95 %]")],
+)  # fmt: skip
+def test_the_noise_and_the_error_of_the_response_have_the_unit_of_the_output(unit, sigma, error):
+    told = summary([group(0.5, "simple")]).model_copy(update={"rms_unit": unit})
+    headings, _ = tables_of(told.model_dump())[0]
+    assert headings[0] == sigma
+    assert error in headings
+
+
 def test_what_is_not_known_is_a_dash():
     blank = ParameterSummaryOut(name="L", unit="s", value=[0.0] * 5, stderr=None)
     waiting = group(

@@ -1,0 +1,118 @@
+"""What the commands print of jobs and runs: one run in full, labels of a batch, units."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import pytest
+from starlette.testclient import TestClient
+from typer.testing import CliRunner, Result
+
+from service.app import create_app
+from service.cli.main import app as program
+from service.cli.trends import print_trend
+from service.client import Client
+from tests.identified import identified
+from tests.integration.rest.test_client import Through
+from tests.rest import CSV, recording, settings_of
+
+MODEL: dict[str, Any] = {
+    "name": "lagged", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
+    "parameters": {"K": {"lower": 0, "upper": 5, "unit": "m/V"},
+                   "T": {"lower": 0.1, "upper": 5, "unit": "s"},
+                   "L": {"lower": 0, "upper": 2, "unit": "s"}},
+    "equations": {"x": "(K*u(t - L) - x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
+}  # fmt: skip
+
+
+class Served(NamedTuple):
+    client: Client
+    data: str
+    job: str
+    runs: list[str]
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    app = create_app(settings_of(tmp_path_factory.mktemp("shown")))
+    with TestClient(app) as server:
+        data = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()["id"]
+        axis = {"path": "/datasets", "values": [[data], [data]],
+                "labels": [{"length_m": 5}, {"length_m": 20}]}  # fmt: skip
+        body = {
+            "model": MODEL, "datasets": [data], "sweep": {"axes": [axis]},
+            "algorithm": {"population": 20, "generations": 40, "islands": 1},
+            "hold": {"u": "zero"}, "validation": {"fraction": 0.2},
+        }  # fmt: skip
+        job, runs = identified(app.state.parts, body)
+        yield Served(Client("http://testserver", transport=Through(server)), data, job, runs)
+
+
+@pytest.fixture(autouse=True)
+def connected(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("jobs", "runs", "datasets"):
+        monkeypatch.setattr(f"service.cli.{module}.connected", lambda *_: Again(served.client))
+
+
+class Again:
+    """A client that several commands use, each in a block of its own."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    def __enter__(self) -> Client:
+        return self._client
+
+    def __exit__(self, *_: object) -> None:
+        """The client stays open."""
+
+
+def lagid(*words: str) -> Result:
+    return CliRunner().invoke(program, list(words))
+
+
+def test_one_run_is_shown_with_estimates_units_intervals_and_fit(served: Served) -> None:
+    told = lagid("runs", served.runs[1])
+    assert told.exit_code == 0, told.output
+    run = served.client.run(served.runs[1])
+    assert run["rms_unit"] == "m"
+    assert f"run 2 of {served.job}: succeeded" in told.output
+    assert "length_m = 20" in told.output
+    assert served.data not in told.output
+    for one in run["parameters"]:
+        (line,) = (row for row in told.output.splitlines() if row.startswith(f"{one['name']} "))
+        assert "±" in line
+        assert f" {one['unit']} " in line
+        assert f"{one['interval95'][0]:.6g} to {one['interval95'][1]:.6g}" in line
+        assert one["status"] in line
+    assert f"RMS {run['rms']:.6g} m, fit {run['fit_percent']['estimation']:.2f} %" in told.output
+    for warning in run["warnings"]:
+        assert f"note: {warning}" in told.output
+    as_json = lagid("runs", served.runs[1], "--json")
+    assert f'"id": "{served.runs[1]}"' in as_json.output
+
+
+def test_a_batch_is_listed_by_its_labels_with_units_in_the_headings(served: Served) -> None:
+    told = lagid("runs", served.job)
+    assert told.exit_code == 0, told.output
+    heading, *rows = told.output.splitlines()
+    assert heading.split()[:3] == ["run", "state", "length_m"]
+    for text in ("RMS [m]", "K [m/V]", "T [s]", "L [s]"):
+        assert text in heading
+    assert [row.split()[2] for row in rows[:2]] == ["5", "20"]
+    assert served.data not in told.output
+
+
+def test_a_best_rms_of_the_list_of_jobs_has_its_unit(served: Served) -> None:
+    best = served.client.job(served.job)["progress"]["best_rms"]
+    assert f"{best:.6g}  m " in lagid("jobs").output
+
+
+def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    point = {"x": 5.0, "value": 1.0, "stderr": 0.1, "status": "identified", "is_outlier": False,
+             "drifts": []}  # fmt: skip
+    one = {"name": "T", "unit": "s", "kind": "parameter", "points": [point], "laws": [],
+           "reason": "", "predictions": [], "notes": []}  # fmt: skip
+    place = {"x": 5.0, "runs": [], "evaluations": 1, "spans": [], "warnings": []}
+    print_trend({"x": "length_m", "reference": None, "reference_x": None, "reference_names": [],
+                 "places": [place], "quantities": [one], "missing": 0, "notes": []})  # fmt: skip
+    assert "T [s]" in capsys.readouterr().out
