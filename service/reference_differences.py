@@ -77,7 +77,7 @@ def _facts(session: Session, body: Body, known: Channels) -> Facts:
     except SysidError:
         return {}  # a model that this version cannot read any more
     inputs, outputs = signals_of(model)
-    found = {}
+    found = {"model": model.name}
     for signal in (*inputs, *outputs):
         channel = (body.get("channels") or {}).get(signal, signal)
         stored = [known[one][channel] for one in body["datasets"] if channel in known.get(one, {})]

@@ -139,12 +139,9 @@ def test_the_same_equations_under_another_name_with_other_bounds_are_the_same_mo
     document = served.server.get("/v1/models/tube").json()["document"]
     document = {**document, "name": "my-tube", "description": "mine"}
     document["parameters"]["T"]["upper"] = 1.5
-    answer = served.server.post(
-        "/v1/recipes/reidentify",
-        json={**BODY, "model": document, "reference": "tube",
-              "batch": [{"x": 8.0, "datasets": served.datasets[8.0][:1]}]},
-    )  # fmt: skip
-    assert answer.status_code == 202, answer.text
+    batch = [{"x": 8.0, "datasets": served.datasets[8.0][:1]}]
+    found = against(served, model=document, batch=batch)
+    assert found["notes"] == ["the reference was made with model = tube (here my-tube)"]
 
 
 @pytest.mark.parametrize(
