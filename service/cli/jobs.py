@@ -21,6 +21,7 @@ from service.cli.common import (
     read_file,
     with_unit,
 )
+from service.cli.many_runs import MOST, print_many
 from service.cli.one_run import place_of, show_run
 from service.cli.watching import follow
 from service.documents import read_yaml
@@ -172,10 +173,10 @@ def _finish(client: "Client", job: dict[str, Any], as_json: bool) -> None:
     found = client.runs(job["id"])
     if as_json:
         print_json({**job, "runs": found})
+    elif len(found) > MOST:
+        print_many(client, job, found)
     else:
-        print_runs(found[:50], job["rms_unit"])
-        if len(found) > 50:
-            out.print(f"… and {len(found) - 50} more: lagid runs {job['id']}", markup=False)
+        print_runs(found, job["rms_unit"])
         for warning in dict.fromkeys(w for run in found for w in run.get("warnings", [])):
             out.print(f"note: {warning}", markup=False, soft_wrap=True)
     if job["state"] != "succeeded":
