@@ -179,9 +179,9 @@ class Client:
         """Queue a batch re-identification: a run for each value of a label, with a trend."""
         return self._json(calls.reidentify(body, idempotency_key))
 
-    def jobs(self, limit: int | None = None) -> list[Document]:
-        """Jobs, newest first: all, or at most `limit`."""
-        return self._all("jobs", at_most=limit)
+    def jobs(self, limit: int | None = None, state: Sequence[str] | None = None) -> list[Document]:
+        """Jobs, newest first: all, or at most `limit`, or those in some states."""
+        return self._all("jobs", at_most=limit, state=None if state is None else list(state))
 
     def job(self, name: str) -> Document:
         """One job with its state and progress."""

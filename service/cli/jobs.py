@@ -1,5 +1,6 @@
 """`lagid submit`, `watch`, `jobs`, `runs`, `cancel`, `resume`, `report`."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -28,6 +29,17 @@ from service.documents import read_yaml
 
 if TYPE_CHECKING:
     from service.client import Client
+
+
+class State(StrEnum):
+    """States of a job."""
+
+    queued = "queued"
+    running = "running"
+    succeeded = "succeeded"
+    failed = "failed"
+    cancelled = "cancelled"
+
 
 JobName = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.")]
 FILE_SUFFIXES = (".yaml", ".yml", ".json")
@@ -63,10 +75,17 @@ def watch(job: JobName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson
         _finish(client, follow(client, job, quiet=as_json), as_json)
 
 
-def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
+def listing(
+    state: Annotated[
+        list[State] | None, typer.Option(help="Only jobs in this state; may be repeated.")
+    ] = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
     """List the jobs of the server, latest first."""
     with connected(url, key) as client:
-        found = client.jobs()
+        found = client.jobs(state=state or None)
     print_listing(
         found,
         as_json,
@@ -76,7 +95,8 @@ def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) ->
                      f"{one['progress']['finished']}/{one['progress']['runs']}",
                      one["progress"]["best_rms"], _unit(one),
                      one["created_at"][:19].replace("T", " ")),
-        empty="no jobs; submit one: lagid submit job.yaml",
+        empty=f"no jobs are {' or '.join(state)}" if state
+        else "no jobs; submit one: lagid submit job.yaml",
     )  # fmt: skip
 
 
