@@ -9,6 +9,7 @@ from sqlalchemy.orm import Session
 from service import models, warm_starts
 from service.conversion import algorithm_of, faults_of, loss_of
 from service.errors import FieldError
+from service.named_datasets import dataset_of
 from service.pointers import explained
 from service.record_checks import (
     channel_faults,
@@ -18,11 +19,8 @@ from service.record_checks import (
     unit_faults,
 )
 from service.schemas_jobs import JobIn
-from service.storage.datasets import DatasetRepository
-from service.storage.errors import NotFound
-from service.storage.lookups import dataset_names, datasets_named
 from service.storage.tables import Dataset
-from sysid.errors import SysidError, nearest
+from sysid.errors import SysidError
 from sysid.models.initial import initial_parameters
 from sysid.models.lags import check_lags
 from sysid.models.model import Model
@@ -118,19 +116,7 @@ class JobChecker:
         return self._datasets[reference]
 
     def _find(self, reference: str) -> Dataset | str:
-        try:
-            return DatasetRepository(self._session).get(reference)
-        except NotFound:
-            named = datasets_named(self._session, reference)
-        if len(named) == 1:
-            return named[0]
-        if named:
-            ids = ", ".join(one.id for one in named)
-            return f"{len(named)} datasets are named {reference!r}; give one of the ids {ids}"
-        hint = nearest(reference, set(dataset_names(self._session)))
-        if "/" in reference or reference.endswith((".csv", ".mcap")):
-            hint = "; a path of a file is not read here, add the file first: `lagid dataset add`"
-        return f"there is no dataset {reference!r}{hint}"
+        return dataset_of(self._session, reference)
 
     def _all_parameters(self, body: Body, model: Model) -> tuple[Parameter, ...]:
         """The model's parameters, and the initial states to be estimated in each experiment."""

@@ -11,7 +11,8 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service import temporary
-from service.errors import TooLarge
+from service.errors import NoSuchDataset, TooLarge
+from service.named_datasets import dataset_of
 from service.recordings import recording_of
 from service.schemas import Page
 from service.schemas_datasets import ChannelOut, DatasetOut, DeriveIn, Series, SignalsOut
@@ -69,11 +70,15 @@ def derive(database: Database, store: ObjectStore, parent_id: str, body: DeriveI
 
     Raises
     ------
+    NoSuchDataset
+        If none has that identifier or name, or several have the name.
     InvalidRecord, InvalidSettings
         If a step cannot be done.
     """
     with database.read() as session:
-        parent = DatasetRepository(session).get(parent_id)
+        parent = dataset_of(session, parent_id)
+        if isinstance(parent, str):
+            raise NoSuchDataset(parent)
         known = DatasetRepository(session).by_source(_derivation_key(parent, body))
     if known is not None:
         return Stored(known, is_new=False)
@@ -135,6 +140,15 @@ def told(row: Dataset) -> DatasetOut:
         segments=details.pop("segments", []), warnings=details.pop("warnings", []),
         details=details, created_at=row.created_at,
     )  # fmt: skip
+
+
+def told_again(stored: Stored, name: str | None) -> DatasetOut:
+    """A dataset that was just sent; warned of if it is there already under another name."""
+    answer = told(stored.dataset)
+    if stored.is_new or name in (None, stored.dataset.name):
+        return answer
+    warning = f"the same data were stored before, as {stored.dataset.name!r}; that name stays"
+    return answer.model_copy(update={"warnings": [*answer.warnings, warning]})
 
 
 def page(session: Session, cursor: str | None, limit: int) -> Page[DatasetOut]:

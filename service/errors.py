@@ -78,6 +78,12 @@ class NotFound(ServiceError):
         self.what, self.name = what, name
 
 
+class NoSuchDataset(ServiceError):
+    """No dataset has that identifier or name, or several have the name; the text says which."""
+
+    status, kind, title = 404, "not-found", "There is no such thing"
+
+
 class Conflict(ServiceError):
     """The state of the thing does not allow it."""
 

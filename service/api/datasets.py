@@ -59,19 +59,20 @@ async def add(
             segments=[one.strip() for one in (segments or "").split(",") if one.strip()],
             sample_time=sample_time,
         )  # fmt: skip
-    return _told(stored, response)
+    return _told(stored, response, name)
 
 
 @router.post("/datasets:simulate", status_code=201)
 def simulate(body: SimulateIn, parts: PartsDep, response: Response) -> DatasetOut:
     """Make a dataset from a model, its true parameters, inputs and noise."""
-    return _told(simulations.simulate(parts.database, parts.store, body), response)
+    return _told(simulations.simulate(parts.database, parts.store, body), response, body.name)
 
 
 @router.post("/datasets/{dataset_id}:derive", status_code=201)
 def derive(dataset_id: str, body: DeriveIn, parts: PartsDep, response: Response) -> DatasetOut:
-    """Make a dataset from another: noise, resample, trim, detrend, select, pool and so on."""
-    return _told(datasets.derive(parts.database, parts.store, dataset_id, body), response)
+    """Make a dataset from another, by its id or name: noise, resample, trim, select and so on."""
+    stored = datasets.derive(parts.database, parts.store, dataset_id, body)
+    return _told(stored, response, body.name)
 
 
 @router.get("/datasets")
@@ -123,8 +124,8 @@ def content_csv(dataset_id: str, session: ReadSession, parts: PartsDep) -> Strea
     return StreamingResponse(rows, media_type="text/csv; charset=utf-8", headers=headers)
 
 
-def _told(stored: Stored, response: Response) -> DatasetOut:
+def _told(stored: Stored, response: Response, name: str | None = None) -> DatasetOut:
     response.headers["Location"] = f"/v1/datasets/{stored.dataset.id}"
     if not stored.is_new:
         response.status_code = 200
-    return datasets.told(stored.dataset)
+    return datasets.told_again(stored, name)

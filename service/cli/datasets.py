@@ -56,9 +56,6 @@ def add(
     with connected(url, key) as client:
         stored = client.add_dataset(file, name, segments=segments, sample_time=sample_time)
     _tell(stored, as_json)
-    if name and stored["name"] != name and not as_json:
-        out.print(f"note: these bytes were stored before, as {stored['name']!r}; that name stays",
-                  markup=False, soft_wrap=True)  # fmt: skip
 
 
 @app.command()
@@ -97,7 +94,7 @@ def simulate(
 
 @app.command()
 def derive(
-    dataset: Annotated[str, typer.Argument(help="Id of the parent.")],
+    dataset: Annotated[str, typer.Argument(help="Id or name of the parent.")],
     file: Annotated[Path, typer.Argument(help="YAML or JSON file with the list of steps.")],
     name: Annotated[str | None, typer.Option(help="Name of the new dataset.")] = None,
     url: Url = DEFAULT_URL,

@@ -1,6 +1,8 @@
 """What the commands print of jobs and runs: one run in full, labels of a batch, units."""
 
+import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
@@ -10,7 +12,7 @@ from typer.testing import CliRunner, Result
 from service.app import create_app
 from service.cli.main import app as program
 from service.cli.trends import print_trend
-from service.client import Client
+from service.client import Client, ProblemError
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
 from tests.rest import CSV, recording, settings_of
@@ -116,3 +118,42 @@ def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) ->
     print_trend({"x": "length_m", "reference": None, "reference_x": None, "reference_names": [],
                  "places": [place], "quantities": [one], "missing": 0, "notes": []})  # fmt: skip
     assert "T [s]" in capsys.readouterr().out
+
+
+def test_a_job_that_is_watched_from_a_pipe_tells_its_state(served: Served) -> None:
+    told = lagid("watch", served.job)
+    assert told.exit_code == 0, told.output
+    assert f"{served.job} succeeded, 2/2 runs, best RMS" in told.stderr
+
+
+def test_a_dataset_is_derived_by_its_name(served: Served, tmp_path: Path) -> None:
+    steps = tmp_path / "steps.yaml"
+    steps.write_text("- trim: {start: 1, stop: 20}\n")
+    told = lagid("dataset", "derive", "steps", str(steps), "--json")
+    assert told.exit_code == 0, told.output
+    stored = json.loads(told.stdout)
+    assert served.client.lineage(stored["id"])["edges"][0]["parent"] == served.data
+    with pytest.raises(ProblemError, match=r"no dataset 'step'.*did you mean 'steps'"):
+        served.client.derive("step", [{"detrend": {}}])
+
+
+def test_jobs_are_listed_by_state(served: Served) -> None:
+    assert served.job in lagid("jobs", "--state", "succeeded").stdout
+    assert served.job in lagid("jobs", "--state", "running", "--state", "succeeded").stdout
+    none = lagid("jobs", "--state", "running")
+    assert none.exit_code == 0
+    assert served.job not in none.stdout
+    assert "no jobs are running" in none.stdout
+    wrong = lagid("jobs", "--state", "runing")
+    assert wrong.exit_code == 2
+    assert "running" in wrong.stderr
+
+
+def test_bytes_that_are_stored_under_another_name_are_warned_of(served: Served) -> None:
+    again = served.client.add_dataset(recording(), "other")
+    assert again["id"] == served.data
+    assert again["name"] == "steps"
+    (warning,) = again["warnings"]
+    assert "stored before, as 'steps'" in warning
+    assert served.client.add_dataset(recording(), "steps")["warnings"] == []
+    assert served.client.dataset(served.data)["warnings"] == []
