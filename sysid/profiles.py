@@ -36,6 +36,7 @@ _SPAN = 1.5  # of the half width that the covariance promises: where the outermo
 _BEYOND = 1.3  # growth of a step that does not reach the threshold, and how often
 _MOST, _LEAST = 40, 3
 _EXACT = 1e-9  # of the outputs' size: residuals that are rounding
+_ALONE = 1e-14  # of the square of a slope: below, nothing of it is the parameter's own
 _ROOTS = 6  # halvings of the gap in which the ratio crosses the threshold
 
 
@@ -195,7 +196,10 @@ class _Walk:
             made_up = np.linalg.lstsq(others, columns[:, self._d], rcond=1e-7)[0]
             direction[np.arange(direction.size) != self._d] = -made_up
         own = columns @ direction
+        # What the others make up for but for rounding has no direction of its own.
         norm = float(own @ own)
+        if norm <= _ALONE * float(columns[:, self._d] @ columns[:, self._d]):
+            norm = 0.0
         self._factor = self._scaling(error, columns, direction, norm)
         spread = float(np.linalg.norm(error)) / np.sqrt(max(error.size - columns.shape[1], 1))
         wide = np.sqrt(QUANTILE / (norm * self._factor)) * spread if norm > 0 else 1.0

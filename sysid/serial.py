@@ -33,6 +33,8 @@ QUANTILE = 3.841458820694124
 _STEEPEST = 0.97
 """Of the recursion (Andrews and Monahan 1992): one nearer 1 would follow a single drift."""
 
+_NARROWEST = 1e-3  # of the variance under white residuals: below is rounding
+
 _EVEN = 1e-3  # of a period: steps that differ by less are equal
 
 
@@ -61,7 +63,7 @@ class Coloured(NamedTuple):
         power, norm : float
             Mean square of the residuals; sum of squares of that combination.
         """
-        told = float(direction @ self.middle @ direction) / (power * norm)
+        told = max(float(direction @ self.middle @ direction) / (power * norm), _NARROWEST)
         reach = float(stdtrit(self.degrees, 0.975)) ** 2 / QUANTILE
         return float(told * reach * self.samples / self.degrees)
 
