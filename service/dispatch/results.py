@@ -10,9 +10,7 @@ from sysid.result import Improvement, Migrant
 from workers.ports import Concluded
 
 
-def outcome_of(
-    run: str, concluded: Concluded, seconds: float, signals: str | None
-) -> RunOutcome:
+def outcome_of(run: str, concluded: Concluded, seconds: float, signals: str | None) -> RunOutcome:
     """The row of a run that succeeded."""
     found, without = concluded.identification, finite(concluded.rms_noise_free)
     return RunOutcome(
