@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from service.datasets import add_recording
+from service.dispatch.claiming import Leases
+from service.dispatcher import Dispatcher
 from service.jobs import submit
 from service.schemas_jobs import JobIn
 from service.settings import Settings
@@ -19,10 +22,11 @@ from service.storage.migrate import upgrade
 from service.storage.objects import ObjectStore, open_store
 from service.storage.runs import RunRepository
 from service.storage.sessions import Database
-from service.storage.tables import Job, Run, State
+from service.storage.tables import OPEN, Job, Run, State
 from service.supervision import clear_family, environment_of
 from sysid.records import Recording
 from tests.runs import step_record
+from workers.ports import Crew
 
 LIMIT_SECONDS = 120.0
 
@@ -94,6 +98,21 @@ class Place:
             details={},
         )  # fmt: skip
         return stored.dataset.id
+
+
+def carry_out(place: Place, job: str, crew: Crew) -> None:
+    """Run a dispatcher of this crew until the job has ended."""
+    dispatcher = Dispatcher(place.database, place.store, crew, Leases(place.database, 30))
+
+    def stop_at_the_end() -> None:
+        while place.job(job).state in OPEN:
+            time.sleep(0.01)
+        dispatcher.stopping.set()
+
+    watcher = threading.Thread(target=stop_at_the_end)
+    watcher.start()
+    dispatcher.run()
+    watcher.join()
 
 
 def until(holds: Callable[[], bool], what: str) -> None:

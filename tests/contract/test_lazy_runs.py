@@ -1,16 +1,12 @@
 """Runs of a large sweep are made while it runs: none lost, none doubled, and all as submitted."""
 
-import threading
-import time
 from datetime import timedelta
 
 import pytest
 
 from service import jobs
 from service.dispatch import preparing
-from service.dispatch.claiming import Leases
 from service.dispatch.preparing import JobRuns
-from service.dispatcher import Dispatcher
 from service.runs import Choice, page
 from service.schemas_jobs import JobIn
 from service.storage.errors import Conflict
@@ -19,10 +15,10 @@ from service.storage.ledger import RunLedger
 from service.storage.queue import Owners, Queue
 from service.storage.runs import RunRepository
 from service.storage.summaries import GroupKey, groups
-from service.storage.tables import OPEN, Dataset, State
+from service.storage.tables import Dataset, State
 from service.summaries import summary
 from service.unmade import all_groups
-from tests.dispatching import Place
+from tests.dispatching import Place, carry_out
 from workers.inline import InlineCrew
 
 SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
@@ -67,20 +63,6 @@ def submit_whole(place, monkeypatch, **body):
         return place.submit(**body)
 
 
-def carry_out(place, job):
-    dispatcher = Dispatcher(place.database, place.store, InlineCrew(), Leases(place.database, 30))
-
-    def stop_at_the_end():
-        while place.job(job).state in OPEN:
-            time.sleep(0.01)
-        dispatcher.stopping.set()
-
-    watcher = threading.Thread(target=stop_at_the_end)
-    watcher.start()
-    dispatcher.run()
-    watcher.join()
-
-
 def numbers_found(run):
     return run.state, run.best_rms, run.evaluations, run.estimates, run.spec_hash
 
@@ -90,15 +72,15 @@ def test_a_submission_makes_the_first_runs_and_the_dispatcher_the_others(place, 
     lazily = place.submit(**SWEEP)
     assert len(place.runs(lazily)) == AT_ONCE
     assert place.job(lazily).n_runs == len(place.runs(whole)) == N_RUNS
-    carry_out(place, lazily)
+    carry_out(place, lazily, InlineCrew())
     assert place.job(lazily).state is State.SUCCEEDED
     assert cells(place, lazily) == cells(place, whole)
 
 
 def test_results_are_those_of_a_job_whose_runs_were_all_made_at_submission(place, monkeypatch):
     whole, lazily = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
-    carry_out(place, whole)
-    carry_out(place, lazily)
+    carry_out(place, whole, InlineCrew())
+    carry_out(place, lazily, InlineCrew())
     found = [[numbers_found(run) for run in place.runs(job)] for job in (whole, lazily)]
     assert found[0] == found[1]
     assert all(state is State.SUCCEEDED for state, *_ in found[1])
@@ -107,17 +89,17 @@ def test_results_are_those_of_a_job_whose_runs_were_all_made_at_submission(place
 def test_a_chain_of_warm_starts_goes_on_over_runs_that_are_made_later(place, monkeypatch):
     chained = {**SWEEP, "warm_start": "previous"}
     whole, lazily = submit_whole(place, monkeypatch, **chained), place.submit(**chained)
-    carry_out(place, whole)
-    carry_out(place, lazily)
+    carry_out(place, whole, InlineCrew())
+    carry_out(place, lazily, InlineCrew())
     assert [run.estimates for run in place.runs(lazily)] == [
         run.estimates for run in place.runs(whole)
     ]
 
 
 def test_what_was_computed_before_is_taken_over_also_by_runs_that_are_made_later(place):
-    carry_out(place, place.submit(**SWEEP))
+    carry_out(place, place.submit(**SWEEP), InlineCrew())
     second = place.submit(**SWEEP, reuse=True)
-    carry_out(place, second)
+    carry_out(place, second, InlineCrew())
     assert place.job(second).n_reused == N_RUNS
 
 
@@ -189,7 +171,7 @@ def test_a_cancelled_job_is_resumed_with_the_runs_that_were_never_made(place, mo
     assert group.states[State.CANCELLED] == N_RUNS
     with place.database.write() as session:
         jobs.resume(session, job, place.settings)
-    carry_out(place, job)
+    carry_out(place, job, InlineCrew())
     assert place.job(job).state is State.SUCCEEDED
     assert cells(place, job) == cells(place, whole)
 
@@ -198,7 +180,7 @@ def test_a_clone_has_the_same_cells(place):
     job = place.submit(**SWEEP)
     other = jobs.clone(place.database, job, place.settings).id
     assert place.job(other).n_runs == N_RUNS
-    carry_out(place, job)
+    carry_out(place, job, InlineCrew())
     assert cells(place, other) == cells(place, job)
 
 
@@ -232,7 +214,7 @@ def test_what_a_name_means_is_settled_at_submission(place):
     job = place.submit(algorithm=SMALL, sweep={"axes": axes})
     with place.database.write() as session:
         session.get(Dataset, place.dataset).name = "another name"
-    carry_out(place, job)
+    carry_out(place, job, InlineCrew())
     assert [run.cell for run in place.runs(job)] == [{"/datasets": [place.dataset]}] * 8
     assert place.job(job).state is State.SUCCEEDED
 

@@ -1,15 +1,10 @@
 """Runs that were computed before are taken over, whole, and say so."""
 
-import threading
-import time
-
 import pytest
 
-from service.dispatch.claiming import Leases
-from service.dispatcher import Dispatcher
 from service.storage.events import EventRepository
-from service.storage.tables import OPEN, State
-from tests.dispatching import Place
+from service.storage.tables import State
+from tests.dispatching import Place, carry_out
 from workers.inline import InlineCrew
 from workers.tasks import advance
 
@@ -43,17 +38,7 @@ def sweep(seeds, **changes):
 def carried_out(place, **body):
     """The job's runs once it is over, and those that a worker computed."""
     job, crew = place.submit(**body), CountingCrew()
-    dispatcher = Dispatcher(place.database, place.store, crew, Leases(place.database, 30))
-
-    def stop_at_the_end():
-        while place.job(job).state in OPEN:
-            time.sleep(0.01)
-        dispatcher.stopping.set()
-
-    watcher = threading.Thread(target=stop_at_the_end)
-    watcher.start()
-    dispatcher.run()
-    watcher.join()
+    carry_out(place, job, crew)
     return job, place.runs(job), list(dict.fromkeys(crew.computed))
 
 

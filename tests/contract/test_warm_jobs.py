@@ -1,24 +1,20 @@
 """Jobs that start from earlier results: what each run begins with, and that it repeats."""
 
-import threading
-import time
 from itertools import takewhile
 
 import pytest
 from sqlalchemy import event
 
 from service.conversion import algorithm_of
-from service.dispatch.claiming import Leases
 from service.dispatch.preparing import JobRuns
-from service.dispatcher import Dispatcher
 from service.errors import InvalidRequest
 from service.references import accept
 from service.schemas_references import ReferenceIn
 from service.storage.ledger import RunLedger
 from service.storage.queue import Queue
-from service.storage.tables import OPEN, State
+from service.storage.tables import State
 from sysid.errors import InvalidSettings
-from tests.dispatching import Place
+from tests.dispatching import Place, carry_out
 from workers.inline import InlineCrew
 from workers.ports import NotYet
 
@@ -47,17 +43,7 @@ def place(tmp_path):
 def carried_out(place, slots=1, **body):
     """The job's runs once it is over, and what each began with."""
     job, crew = place.submit(**{"algorithm": QUICK, **body}), KeepingCrew(slots)
-    dispatcher = Dispatcher(place.database, place.store, crew, Leases(place.database, 30))
-
-    def stop_at_the_end():
-        while place.job(job).state in OPEN:
-            time.sleep(0.01)
-        dispatcher.stopping.set()
-
-    watcher = threading.Thread(target=stop_at_the_end)
-    watcher.start()
-    dispatcher.run()
-    watcher.join()
+    carry_out(place, job, crew)
     runs = place.runs(job)
     return runs, [crew.warm.get(run.id) for run in runs]
 
