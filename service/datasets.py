@@ -26,6 +26,7 @@ from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from sysid.records import Channel, Recording
+from sysid.signal_units import unknown_units
 
 Kind = Literal["upload", "simulate", "derive"]
 Format = Literal["csv", "mcap"]
@@ -123,10 +124,14 @@ def described(
         n_samples=recording.samples, duration=recording.duration,
         sample_time=_common_period(recording) if recording.sampling.is_regular else None,
         channels=[_summary(channel) for channel in recording.channels],
-        details={**details, "segments": [
-            {"start": s.start, "stop": s.stop, "origin": s.origin, "labels": dict(s.labels)}
-            for s in recording.segments
-        ]},
+        details={
+            **details,
+            "warnings": [*details.get("warnings", ()), *unknown_units(recording.channels)],
+            "segments": [
+                {"start": s.start, "stop": s.stop, "origin": s.origin, "labels": dict(s.labels)}
+                for s in recording.segments
+            ],
+        },
     )  # fmt: skip
 
 

@@ -2,16 +2,14 @@
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from inspect import get_annotations
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 
 from service.errors import FieldError
-from sysid.errors import nearest
+from service.sentences import NOT_AN_OBJECT, detail_of
 
 Location = Sequence[str | int]
-SHOWN = 80
-NOT_AN_OBJECT = ("model_type", "model_attributes_type", "dict_type")
 
 
 def explained(entries: Iterable[Mapping[str, Any]], body: Any, kind: Any) -> Iterator[FieldError]:
@@ -31,24 +29,8 @@ def explained(entries: Iterable[Mapping[str, Any]], body: Any, kind: Any) -> Ite
         if pointer not in seen:
             seen.add(pointer)
             at = entry["loc"] if entry["type"] in NOT_AN_OBJECT else entry["loc"][:-1]
-            yield FieldError(pointer, detail_of(entry, known_fields(kind, at)))
-
-
-def detail_of(entry: Mapping[str, Any], known: Sequence[str]) -> str:
-    """What was wrong, what was found."""
-    if entry["type"] == "extra_forbidden":
-        return f"unknown field {entry['loc'][-1]!r}{nearest(str(entry['loc'][-1]), known)}"
-    if entry["type"] == "missing":
-        return "this field is required"
-    found = repr(entry.get("input"))
-    found = found if len(found) <= SHOWN else found[:SHOWN] + "…"
-    if entry["type"] in NOT_AN_OBJECT:
-        return f"found {found}; need an object with fields such as {', '.join(known)}"
-    if entry["type"] == "list_type":
-        return f"found {found}; need a list, such as [{entry.get('input')}]"
-    if entry["type"] == "string_pattern_mismatch" and entry["loc"][-1] == "path":
-        return f"found {found}; need a JSON pointer, such as /noise/sigma"
-    return f"{entry['msg']}; found {found}"
+            elsewhere = places_of(kind, entry["loc"][-1]) if entry["loc"] else []
+            yield FieldError(pointer, detail_of(entry, known_fields(kind, at), elsewhere))
 
 
 def pointer_into(body: Any, loc: Location, *, is_missing: bool = False) -> str:
@@ -81,6 +63,18 @@ def known_fields(kind: Any, loc: Location) -> list[str]:
         if fields:
             types = [model for field in fields for model in _models(field.annotation)]
     return sorted({name for model in types for name in model.model_fields})
+
+
+def places_of(kind: Any, name: str | int, above: str = "") -> list[str]:
+    """Pointers of the fields of a name that can be reached by names alone, the shortest first."""
+    found = []
+    for model in _models(kind):
+        for own, field in model.model_fields.items():
+            if own == name:
+                found.append(f"{above}/{own}")
+            if get_origin(field.annotation) not in (dict, list):
+                found += places_of(field.annotation, name, f"{above}/{own}")
+    return sorted(dict.fromkeys(found), key=lambda place: place.count("/"))
 
 
 def escaped(part: str | int) -> str:

@@ -17,7 +17,7 @@ from sysid.pooling import pool, select
 from sysid.records import HOLDS, Channel, Hold, Recording, Segment, time_of_cut
 from sysid.resampling import resample
 from sysid.types import FloatArray
-from sysid.units import difference, factor, is_blank, is_read
+from sysid.units import difference, factor, is_blank, is_read, suggestion
 
 KINDS = ("gaussian", "uniform-sum")
 _HOLDS: Mapping[str, Hold] = {hold: hold for hold in HOLDS}
@@ -171,7 +171,8 @@ def set_unit(recording: Recording, given: Arguments) -> Recording:
         if times is None:
             unread = [f"{one!r}" for one in (channel.unit, unit) if not is_read(one)]
             told = difference(channel.unit, unit) or f"{' and '.join(unread)} cannot be read"
-            given.fail(name, f"{told}; need a unit of the same quantity as {channel.unit}")
+            need = f"need a unit of the same quantity as {channel.unit}"
+            given.fail(name, f"{told}; {need}{suggestion(unit)}")
         values = channel.values if times == 1.0 else channel.values * times
         changed[name] = replace(channel, unit=unit.strip() or "1", values=values)
     channels = tuple(changed.get(one.name, one) for one in recording.channels)

@@ -1,11 +1,14 @@
 """Whether the channels of all records are in the units of the model, and of one another."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import combinations
 
 from sysid.errors import InvalidRecord
 from sysid.models.model import Model
-from sysid.records import Record
-from sysid.units import difference, factor, is_blank, is_read
+from sysid.records import Channel, Record
+from sysid.units import difference, factor, is_blank, is_known, is_read, suggestion
+
+_SHOWN = 40  # characters of a unit in a message
 
 
 class SignalUnits:
@@ -64,6 +67,16 @@ def check_units(model: Model, records: Sequence[Record]) -> None:
                 raise InvalidRecord(fault)
 
 
+def unknown_units(channels: Iterable[Channel]) -> list[str]:
+    """What to say of channels whose units nobody knows, such as ``bat`` for ``bar``."""
+    return [
+        f"channel {one.name!r}: {_quoted(one.unit)} is no known unit, so it is kept as it is "
+        f"written and compared with no other{suggestion(one.unit)}"
+        for one in channels
+        if not (is_blank(one.unit) or is_known(one.unit))
+    ]
+
+
 def unread_units(model: Model, records: Sequence[Record]) -> list[str]:
     """Channels of which nobody can tell whether they are in the unit of the model."""
     found = {}
@@ -79,3 +92,28 @@ def unread_units(model: Model, records: Sequence[Record]) -> list[str]:
                     f"{' and '.join(unread)} could not be read as a unit, so they were not compared"
                 )
     return list(found.values())
+
+
+def mixed_units(model: Model, records: Sequence[Record]) -> list[str]:
+    """Channels of one quantity in two units, where the model does not give the units of both.
+
+    What is found then holds for these units: a gain of 1 between kPa and Pa is one of 1000.
+    """
+    free = {one.name for one in (*model.inputs, *model.outputs) if is_blank(one.unit)}
+    units: dict[str, str] = {}
+    for record in records:  # those of the first stand for all: `check_units` has compared them
+        for channel in (*record.inputs, *record.outputs):
+            if not is_blank(channel.unit):
+                units.setdefault(channel.name, channel.unit)
+    return [
+        f"{a!r} is in {units[a]} and {b!r} in {units[b]}, and model {model.name!r} does not say in "
+        "which units both are: the numbers were taken as they are, so a gain between the two is in "
+        f"these units, whatever stands beside it ({difference(units[a], units[b])}); to have both "
+        f'in one unit, convert the data, by the derivation {{"unit": {{"{a}": "{units[b]}"}}}}'
+        for a, b in combinations(units, 2)
+        if free & {a, b} and factor(units[a], units[b]) not in (None, 1.0)
+    ]
+
+
+def _quoted(unit: str) -> str:
+    return repr(unit if len(unit) <= _SHOWN else f"{unit[:_SHOWN]}…")

@@ -11,6 +11,7 @@ and ``rad/s`` there is no number.
 """
 
 import re
+from difflib import SequenceMatcher
 from fractions import Fraction
 from functools import lru_cache
 from math import pi
@@ -103,6 +104,15 @@ _ALONE = {
     "kgf": _Unit((1, 1, -2, 0, 0, 0, 0), Fraction(980_665, 100_000)),
     "atm": _Unit((-1, 1, -2, 0, 0, 0, 0), Fraction(101_325)),
     "psi": _Unit((-1, 1, -2, 0, 0, 0, 0), Fraction(8_896_443_230_521, 1_290_320_000)),
+    "mmHg": _Unit((-1, 1, -2, 0, 0, 0, 0), Fraction(133_322_387_415, 10**9)),
+    "Torr": _Unit((-1, 1, -2, 0, 0, 0, 0), Fraction(101_325, 760)),
+    "lbf": _Unit((1, 1, -2, 0, 0, 0, 0), Fraction(44_482_216_152_605, 10**13)),
+    "lb": _Unit((0, 1, 0, 0, 0, 0, 0), Fraction(45_359_237, 10**8)),
+    "mph": _Unit((1, 0, -1, 0, 0, 0, 0), Fraction(44_704, 10**5)),
+    "d": _Unit((0, 0, 1, 0, 0, 0, 0), Fraction(86_400)),
+    "day": _Unit((0, 0, 1, 0, 0, 0, 0), Fraction(86_400)),
+    "ppm": _Unit(_NONE, Fraction(1, 10**6)),
+    "ppb": _Unit(_NONE, Fraction(1, 10**9)),
 }
 _PREFIXES = {"p": -12, "n": -9, "µ": -6, "u": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3,
              "M": 6, "G": 9, "T": 12}  # fmt: skip
@@ -111,6 +121,19 @@ _SCALES = {
     "°C": "°C", "℃": "°C", "degC": "°C", "Celsius": "°C", "celsius": "°C",
     "°F": "°F", "℉": "°F", "degF": "°F", "Fahrenheit": "°F", "fahrenheit": "°F",
 }  # fmt: skip
+
+_OPEN = ("dB", "dBm", "pH", "count", "counts", "px")
+"""Units that many have and no factor leads to: known, and compared with nothing."""
+
+_SPELLED = {
+    "second": "s", "minute": "min", "hour": "h", "metre": "m", "meter": "m", "gram": "g",
+    "ampere": "A", "amp": "A", "volt": "V", "watt": "W", "joule": "J", "newton": "N",
+    "pascal": "Pa", "bars": "bar", "hertz": "Hz", "kelvin": "K", "liter": "L", "litre": "L",
+    "degree": "deg", "radian": "rad", "percent": "%", "foot": "ft", "feet": "ft", "mol": "mol",
+    "mole": "mol", "none": "1", "unitless": "1", "dimensionless": "1",
+}  # fmt: skip
+_COMMON = "µmckMh"  # prefixes of what is suggested
+_CLOSE = 0.6  # of the letters of a name, for which another is suggested
 
 _RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _TOKEN = re.compile(
@@ -129,6 +152,11 @@ def is_blank(unit: str | None) -> bool:
 def is_read(unit: str) -> bool:
     """Whether it is known what a unit means."""
     return _read(unit) is not None
+
+
+def is_known(unit: str) -> bool:
+    """Whether a unit can be read, or is one of those that no factor leads to, such as ``dB``."""
+    return unit.strip() in _OPEN or is_read(unit)
 
 
 def factor(unit: str, other: str) -> float | None:
@@ -169,6 +197,36 @@ def difference(unit: str | None, other: str | None) -> str:
     if _are_of_a_kind(a, b) and _radians_of_revolutions(a, b) is None:
         return f"between {unit} and {other} it is open whether cycles or radians are meant"
     return f"{unit} is not {other}, and no number makes one of the other"
+
+
+def suggestion(unit: str) -> str:
+    """What may be meant by a text that is no known unit, to be added to a message about it.
+
+    Empty of a known unit, and where none is written alike.
+    """
+    if is_known(unit):
+        return ""
+    parts = re.split(r"([A-Za-zµΩ]+)", unit[:_LONGEST].strip())
+    names = [part if at % 2 == 0 or _named(part) else _nearest(part)
+             for at, part in enumerate(parts)]  # fmt: skip
+    meant = "".join(names)
+    return f"; did you mean {meant!r}?" if meant and is_read(meant) else ""
+
+
+def _nearest(name: str) -> str:
+    """The known unit whose symbol is written most alike; empty if none is."""
+    spelled = name.lower()
+    if found := _SPELLED.get(spelled) or _SPELLED.get(spelled.removesuffix("s")):
+        return found
+    known = [*_PREFIXED, *_ALONE, *(a + b for b in _PREFIXED for a in _COMMON if len(b) < 4)]
+    best = max(known, key=lambda one: _likeness(name, one))
+    return best if _likeness(name, best)[0] >= _CLOSE else ""
+
+
+def _likeness(name: str, known: str) -> tuple[float, float]:
+    """How many letters two names share, whatever their case, and how many in the same case."""
+    alike = SequenceMatcher(None, name.lower(), known.lower(), autojunk=False).ratio()
+    return alike, SequenceMatcher(None, name, known, autojunk=False).ratio()
 
 
 def _are_of_a_kind(a: _Unit, b: _Unit) -> bool:

@@ -10,7 +10,7 @@ from sysid.problem import Problem
 from sysid.residuals import ResidualTests
 from sysid.result import Estimate, Group, NoiseColour, Uncertainty
 from sysid.settings import GeneticAlgorithm
-from sysid.signal_units import unread_units
+from sysid.signal_units import mixed_units, unread_units
 from sysid.ties import names_in
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis
@@ -44,6 +44,7 @@ def warnings_of(
     limit = algorithm.safe_limit
     if limit is not None and rms > limit:
         found.append(f"the RMS error {rms:.4g} is above the safe limit {limit:g}: not valid")
+    found += mixed_units(problem.model, problem.records)
     found += _held_back(analysis)
     found += _worse_than_a_line(problem, simulated)
     found += _without_excitation(problem, analysis.estimates)

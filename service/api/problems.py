@@ -22,7 +22,8 @@ from service.errors import (
     Unavailable,
     UnsupportedMediaType,
 )
-from service.pointers import body_type, detail_of, explained
+from service.pointers import body_type, explained
+from service.sentences import detail_of
 from service.storage.errors import StorageError
 from service.storage.patience import PASSING, is_passing
 from sysid.errors import SysidError

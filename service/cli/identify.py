@@ -119,6 +119,7 @@ def read(path: Path, reading: Reading) -> "Recording":
     from service.signals.csv_reader import read_csv
     from service.signals.limits import DEFAULT_LIMITS
     from service.signals.reader import read_mcap
+    from sysid.signal_units import unknown_units
 
     if not path.is_file():
         fail(f"there is no file {path}")
@@ -128,7 +129,7 @@ def read(path: Path, reading: Reading) -> "Recording":
         recording, notes = read_csv(
             path, sample_time=reading.sample_time, segments=reading.segments
         )
-    for note in notes:
+    for note in (*notes, *unknown_units(recording.channels)):
         err.print(f"note: {note}", markup=False)
     return recording
 

@@ -81,6 +81,7 @@ def settings_of(**given: Any) -> "Settings":
     """
     from pydantic import ValidationError
 
+    from service.sentences import detail_of
     from service.settings import Settings
 
     try:
@@ -88,7 +89,7 @@ def settings_of(**given: Any) -> "Settings":
     except ValidationError as error:
         first = error.errors()[0]
         name = "_".join(str(part) for part in first["loc"]).upper()
-        raise Misconfigured(f"LAGID_{name}={first['input']!r}: {first['msg']}") from None
+        raise Misconfigured(f"LAGID_{name}: {detail_of(first, ())}") from None
 
 
 def listening(host: str, port: int) -> socket.socket:

@@ -12,7 +12,8 @@ from sysid.models.model import Model
 from sysid.models.spec import parse_model
 from sysid.records import Channel, Record, Recording
 from sysid.settings import GeneticAlgorithm
-from sysid.units import difference, factor
+from sysid.signal_units import mixed_units, unknown_units
+from sysid.units import difference, factor, is_read, suggestion
 
 TINY = GeneticAlgorithm(population=8, generations=2, islands=1)
 
@@ -150,3 +151,52 @@ def test_a_derivation_converts_exactly_and_writes_down_a_unit_that_is_missing() 
         derive(spinning, [{"unit": {"c": "V"}}])
     with pytest.raises(InvalidSettings, match="no channel 'z'"):
         derive(made, [{"unit": {"z": "V"}}])
+
+
+@pytest.mark.parametrize(
+    ("unit", "meant"),
+    [("bat", "bar"), ("m/sx", "m/s"), ("Kpa", "kPa"), ("Mpa", "MPa"), ("PA", "Pa"),
+     ("seconds", "s"), ("volt", "V"), ("N*meters", "N*m"), ("Hertz", "Hz"), ("mbat", "mbar")],
+)  # fmt: skip
+def test_for_a_unit_that_nobody_knows_the_one_written_most_alike_is_suggested(
+    unit: str, meant: str
+) -> None:
+    assert suggestion(unit) == f"; did you mean {meant!r}?"
+    assert not suggestion(meant)
+
+
+@given(st.text(max_size=90))
+def test_what_is_suggested_can_be_read_and_nothing_is_for_what_can_be(unit: str) -> None:
+    told = suggestion(unit)
+    if told:
+        assert not is_read(unit)
+        assert is_read(told.removeprefix("; did you mean '").removesuffix("'?"))
+
+
+def test_channels_in_units_that_nobody_knows_are_told_and_others_are_not() -> None:
+    times = np.arange(3.0)
+    known = [Channel("k", times, times, unit) for unit in ("kPa", "1", "", "dB", "m/s²", "°C")]
+    assert unknown_units(known) == []
+    (told,) = unknown_units([*known, Channel("p", times, times, "bat")])
+    assert told.startswith("channel 'p': 'bat' is no known unit")
+    assert told.endswith("did you mean 'bar'?")
+    (long,) = unknown_units([Channel("p", times, times, "x" * 1000)])
+    assert len(long) < 200
+
+
+def test_two_units_of_one_quantity_are_told_where_the_model_does_not_give_both() -> None:
+    assert mixed_units(model("Pa", "1"), [record("Pa", "kPa")])
+    (told,) = mixed_units(model("1", "1"), [record("kPa", "Pa")])
+    assert "'u' is in kPa and 'y' in Pa" in told
+    assert "1 kPa is 1000 Pa" in told
+    assert '{"unit": {"u": "Pa"}}' in told
+    assert told in identify(model("1", "1"), record("kPa", "Pa"), TINY).warnings
+
+
+@pytest.mark.parametrize(("u", "y"), [("Pa", "Pa"), ("Pa", "m"), ("1", "Pa"), ("bat", "Pa")])
+def test_of_one_unit_two_quantities_or_a_plain_number_nothing_is_told(u: str, y: str) -> None:
+    assert mixed_units(model("1", "1"), [record(u, y)]) == []
+
+
+def test_units_that_the_model_gives_are_not_told_of_its_channels() -> None:
+    assert mixed_units(model("kPa", "Pa"), [record("kPa", "Pa")]) == []

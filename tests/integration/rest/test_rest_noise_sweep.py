@@ -285,8 +285,8 @@ def test_the_figure_of_a_sweep_without_noise_is_empty(server: TestClient) -> Non
 @pytest.mark.parametrize(
     ("changes", "pointer", "detail"),
     [
-        ({"replicates": 0}, "/replicates", "greater than or equal to 1"),
-        ({"sigma": [0.1, -0.5]}, "/sigma/1", "greater than or equal to 0"),
+        ({"replicates": 0}, "/replicates", "need 1 or more"),
+        ({"sigma": [0.1, -0.5]}, "/sigma/1", "need 0 or more"),
         ({"sigma": []}, "/sigma", "at least 1"),
         ({"sigma": [0.1, 0.2, 0.1]}, "/sigma", "twice"),
         ({"methods": ["simple", "best"]}, "/methods/1", "'improved'"),

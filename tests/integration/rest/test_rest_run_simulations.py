@@ -157,7 +157,7 @@ def test_a_stored_simulation_is_a_dataset_that_knows_its_run_and_is_made_once(
         ({"control": {**CONTROL, "reference": {"kind": "expression", "expression": "q*t"}}},
          "/control/reference/expression", "known are h, k, pi, t"),
         ({"control": {**CONTROL, "output": "theta_"}}, "/control/output", "did you mean 'theta'"),
-        ({"control": {**CONTROL, "limit": 0}}, "/control/limit", "greater than 0"),
+        ({"control": {**CONTROL, "limit": 0}}, "/control/limit", "need a number above 0"),
         ({"control": {**CONTROL, "transport": {"delay": -1}}}, "/control/transport/delay", "0"),
         ({"control": {**CONTROL, "reference": {**STEP, "time": 9}}}, "/control/reference/time",
          "outside the simulation, from 0 to 6 s"),
