@@ -99,7 +99,8 @@ def mixed_units(model: Model, records: Sequence[Record]) -> list[str]:
 
     What is found then holds for these units: a gain of 1 between kPa and Pa is one of 1000.
     """
-    free = {one.name for one in (*model.inputs, *model.outputs) if is_blank(one.unit)}
+    free = {one.name for one in model.inputs if is_blank(one.unit)}
+    free |= {one.name for one in model.outputs if is_blank(one.unit)}
     units: dict[str, str] = {}
     for record in records:  # those of the first stand for all: `check_units` has compared them
         for channel in (*record.inputs, *record.outputs):
