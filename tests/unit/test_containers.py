@@ -85,6 +85,65 @@ def test_every_setting_named_in_the_compose_file_exists() -> None:
     assert named <= known | {"LAGID_DB_PASSWORD"}
 
 
+def _kubernetes() -> dict[str, dict[str, Any]]:
+    found = yaml.safe_load_all((DOCKER / "kuberay.yaml").read_text())
+    return {one["kind"]: one for one in found}
+
+
+def _pods() -> list[dict[str, Any]]:
+    cluster = _kubernetes()["RayCluster"]["spec"]
+    groups = [cluster["headGroupSpec"], *cluster["workerGroupSpecs"]]
+    templates = [
+        *(one["template"] for one in groups),
+        _kubernetes()["Deployment"]["spec"]["template"],
+    ]
+    return [one["spec"] for one in templates]
+
+
+def _containers() -> list[dict[str, Any]]:
+    return [container for pod in _pods() for container in pod["containers"]]
+
+
+def test_all_of_kubernetes_runs_the_image_of_the_compose_file() -> None:
+    assert {one["image"] for one in _containers()} == {_compose()["services"]["web"]["image"]}
+
+
+def test_kubernetes_starts_the_commands_that_compose_starts() -> None:
+    ours = [one["command"][:2] for one in _containers() if "command" in one]
+    services = _compose()["services"]
+    assert ours == [services[name]["command"][:2] for name in ("dispatcher", "web")]
+
+
+def test_every_setting_and_secret_of_kubernetes_is_one_that_is_told() -> None:
+    text = (DOCKER / "kuberay.yaml").read_text()
+    known = {f"LAGID_{name.upper()}" for name in Settings.model_fields}
+    assert set(re.findall(r"LAGID_[A-Z_]+", text)) <= known
+    made = set(re.findall(r"--from-literal=([a-z-]+)=", text))
+    assert made == set(re.findall(r"secretKeyRef: \{name: lagid, key: ([a-z-]+)\}", text))
+
+
+def test_whoever_talks_to_ray_has_its_token_and_its_sockets() -> None:
+    rays = [one for pod in _pods() if pod.get("shareProcessNamespace") for one in pod["containers"]]
+    assert [one["name"] for one in rays] == ["ray", "dispatcher", "ray"]
+    for one in rays:
+        assert {"RAY_AUTH_MODE", "RAY_AUTH_TOKEN"} <= {each["name"] for each in one["env"]}
+        assert {"/tmp/ray", "/dev/shm"} <= {each["mountPath"] for each in one["volumeMounts"]}
+
+
+def test_whatever_a_pod_mounts_is_declared_and_runs_as_the_user_of_the_image() -> None:
+    user = int(re.findall(r"--uid (\d+)", (DOCKER / "Dockerfile").read_text())[0])
+    for pod in _pods():
+        declared = {one["name"] for one in pod.get("volumes", [])}
+        mounted = {m["name"] for one in pod["containers"] for m in one.get("volumeMounts", [])}
+        assert mounted == declared
+        assert pod["securityContext"]["runAsUser"] == user
+
+
+def test_kubernetes_is_told_the_version_of_ray_that_is_locked() -> None:
+    locked = re.findall(r"^ray==([\d.]+)", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
+    assert [_kubernetes()["RayCluster"]["spec"]["rayVersion"]] == locked
+
+
 def test_the_image_copies_what_exists_and_installs_from_the_lock() -> None:
     text = (DOCKER / "Dockerfile").read_text()
     for line in re.findall(r"^COPY (.+)$", text, re.MULTILINE):
