@@ -11,6 +11,7 @@ from service.errors import NotFound
 from service.storage.tables import State
 from service.web import assets, figures, pages, report, results
 from service.web.results import FigureChoice, FigureName
+from service.web.simulate_page import simulate_page as simulate
 
 router = APIRouter()
 
@@ -32,8 +33,8 @@ FOREVER = "public, max-age=31536000, immutable"
 class _Page(HTMLResponse):
     """A page, with what a browser may load for it."""
 
-    def __init__(self, content: str) -> None:
-        super().__init__(content, headers=PAGE_HEADERS)
+    def __init__(self, content: str, status: int = 200) -> None:
+        super().__init__(content, status, headers=PAGE_HEADERS)
 
 
 Hidden: dict[str, Any] = {"include_in_schema": False, "response_class": HTMLResponse}
@@ -68,6 +69,16 @@ def job_page(
 def run_page(run_id: str, request: Request, session: ReadSession) -> Response:
     """The job of one run, with this run in full."""
     return _Page(pages.run_page(session, run_id, str(request.base_url)))
+
+
+@router.get("/runs/{run_id}/simulate", **Hidden)
+def simulate_page(run_id: str, request: Request, parts: PartsDep) -> Response:
+    """The model of a run in a closed loop, over a recording, or on a signal; or its form."""
+    query = dict(request.query_params)
+    found = simulate(parts.database, parts.store, run_id, query, str(request.base_url))
+    if found.is_csv:
+        return _as_csv(found.text, "simulation")
+    return _Page(found.text, found.status)
 
 
 @router.get("/compare", **Hidden)
@@ -148,9 +159,13 @@ def job_report(job_id: str, parts: PartsDep, session: ReadSession) -> Response:
 
 def _figure(figure: figures.Figure, name: str, choice: FigureChoice) -> Response:
     if choice.format == "csv":
-        disposition = {"Content-Disposition": f'attachment; filename="{name}.csv"'}
-        return Response(figures.as_csv(figure), media_type="text/csv", headers=disposition)
+        return _as_csv(figures.as_csv(figure), name)
     return JSONResponse(figures.in_theme(figure, choice.theme))
+
+
+def _as_csv(text: str, name: str) -> Response:
+    disposition = {"Content-Disposition": f'attachment; filename="{name}.csv"'}
+    return Response(text, media_type="text/csv", headers=disposition)
 
 
 def _plotly(request: Request) -> Response:

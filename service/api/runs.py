@@ -4,10 +4,11 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from service import exports, profiles, residuals, responses, run_simulations, runs
+from service import exports, free_runs, profiles, residuals, responses, run_simulations, runs
 from service.api.content import content_of
 from service.api.deps import MaxPoints, PartsDep, ReadSession
 from service.errors import NotFound
+from service.schemas_free_runs import FreeRunIn, FreeRunOut
 from service.schemas_profiles import ProfileIn, ProfilesOut
 from service.schemas_runs import HistoryOut, MigrationsOut, ResidualsOut, ResponseOut, RunOut
 from service.schemas_simulations import RunSimulateIn, RunSimulationOut
@@ -70,6 +71,14 @@ def simulate(
 ) -> RunSimulationOut:
     """Simulate the identified model on new inputs or under proportional control."""
     return run_simulations.simulate(parts.database, parts.store, run_id, body, max_points)
+
+
+@router.post("/{run_id}:validate")
+def validate(
+    run_id: str, body: FreeRunIn, parts: PartsDep, max_points: MaxPoints = 1000
+) -> FreeRunOut:
+    """Run the identified model freely over another recording: RMS and fit there."""
+    return free_runs.free_run(parts.database, parts.store, run_id, body, max_points)
 
 
 @router.post("/{run_id}:profile")

@@ -7,8 +7,8 @@ from markupsafe import Markup
 
 from service.paper.parts import Plot, Section, verdict
 from service.web import report as jobs
-from service.web.pages import render
-from service.web.theme import template
+from service.web.embedding import as_json, bare, templates
+from service.web.rendering import render
 
 
 def page(sections: Sequence[Section], *, quick: bool) -> str:
@@ -16,10 +16,10 @@ def page(sections: Sequence[Section], *, quick: bool) -> str:
     return render(
         "paper.html", sections=sections, made=datetime.now(UTC), quick=quick,
         policy=jobs.policy(), style=jobs.style(), plotly_code=jobs.plotly(), draw=jobs.draw(),
-        templates=jobs.as_json({"light": template("light"), "dark": template("dark")}),
+        templates=templates(),
         figure_json=_figure_json, verdict=verdict,
     )  # fmt: skip
 
 
 def _figure_json(plot: Plot) -> Markup:
-    return jobs.as_json(jobs.bare(dict(plot.figure)))
+    return as_json(bare(dict(plot.figure)))

@@ -24,18 +24,18 @@ def response(
     start, stop : float, optional
         Only this stretch (s), so that a zoom shows more of the samples.
     """
-    figure = _stack(_response_rows(len(experiment.outputs), len(experiment.inputs)))
+    figure = stack(_response_rows(len(experiment.outputs), len(experiment.inputs)))
     for number, output in enumerate(experiment.outputs):
         span = window(output.measured.times, start, stop)
         figure["data"] += _output_traces(output, span, f"y{2 * number + 1}", number == 0)
         figure["data"].append(_residual(output, span, f"y{2 * number + 2}", number == 0))
-        unit = _bracketed(output.measured.unit)
-        _name_axis(figure, 2 * number + 1, f"{output.measured.name}{unit}")
-        _name_axis(figure, 2 * number + 2, f"residual<br>{unit}")
+        unit = bracketed(output.measured.unit)
+        name_axis(figure, 2 * number + 1, f"{output.measured.name}{unit}")
+        name_axis(figure, 2 * number + 2, f"residual<br>{unit}")
     for number, signal in enumerate(experiment.inputs, 2 * len(experiment.outputs) + 1):
         span = window(signal.times, start, stop)
-        figure["data"].append(_line(signal, span, f"y{number}", theme.GREEN, legend=True))
-        _name_axis(figure, number, f"{signal.name}{_bracketed(signal.unit)}")
+        figure["data"].append(line(signal, span, f"y{number}", theme.GREEN, legend=True))
+        name_axis(figure, number, f"{signal.name}{bracketed(signal.unit)}")
     figure["layout"].update(_shading(experiment), uirevision=experiment.name)
     traces = [output.measured for output in experiment.outputs] + list(experiment.inputs)
     figure["layout"]["meta"] = {"thinned": _is_thinned(traces)}
@@ -56,12 +56,12 @@ def signals(
     channels: Sequence[Trace], start: float | None = None, stop: float | None = None
 ) -> Figure:
     """The channels of a dataset, one under the other."""
-    figure = _stack([_SIGNAL_PX] * len(channels))
+    figure = stack([_SIGNAL_PX] * len(channels))
     for number, signal in enumerate(channels, 1):
         span = window(signal.times, start, stop)
         colour = theme.SERIES[(number - 1) % len(theme.SERIES)]
-        figure["data"].append(_line(signal, span, f"y{number}", colour, legend=False))
-        _name_axis(figure, number, f"{signal.name}{_bracketed(signal.unit)}")
+        figure["data"].append(line(signal, span, f"y{number}", colour, legend=False))
+        name_axis(figure, number, f"{signal.name}{bracketed(signal.unit)}")
     figure["layout"]["meta"] = {"thinned": _is_thinned(channels)}
     return figure
 
@@ -79,7 +79,7 @@ def _is_thinned(traces: Sequence[Trace]) -> bool:
     return any(trace.times.size > MAX_POINTS for trace in traces)
 
 
-def _stack(heights: Sequence[int]) -> Figure:
+def stack(heights: Sequence[int]) -> Figure:
     """Empty plots of these heights (px), one under the other over one time axis."""
     total = sum(heights) + _GAP_PX * max(len(heights) - 1, 0)
     shared: dict[str, Any] = layout(
@@ -97,17 +97,20 @@ def _stack(heights: Sequence[int]) -> Figure:
     return {"data": [], "layout": shared}
 
 
-def _name_axis(figure: Figure, number: int, text: str) -> None:
+def name_axis(figure: Figure, number: int, text: str) -> None:
+    """Write the name of the numbered axis (from 1) of a stack."""
     figure["layout"][f"yaxis{number if number > 1 else ''}"]["title"] = {
         "text": text, "standoff": 6, "font": {"size": 11},
     }  # fmt: skip
 
 
-def _bracketed(unit: str) -> str:
+def bracketed(unit: str) -> str:
+    """A unit as it follows a name; nothing for a number without dimension."""
     return "" if unit == "1" else f" [{unit}]"
 
 
-def _axis(name: str) -> str:
+def axis_id(name: str) -> str:
+    """Plotly's name of an axis: the first has no number."""
     return "y" if name == "y1" else name
 
 
@@ -118,7 +121,7 @@ def _output_traces(
     kept = thinned(values, MAX_POINTS)
     identified = output.identified[span]
     also = thinned(identified, MAX_POINTS)
-    shared = {"type": "scatter", "yaxis": _axis(axis), "showlegend": in_legend}
+    shared = {"type": "scatter", "yaxis": axis_id(axis), "showlegend": in_legend}
     return [
         {
             **shared, "name": "measured", "x": finite(times[kept]), "y": finite(values[kept]),
@@ -147,18 +150,19 @@ def _residual(output: OutputTraces, span: slice, axis: str, in_legend: bool) -> 
     values = output.measured.values[span] - output.identified[span]
     kept = thinned(values, MAX_POINTS)
     return {
-        "type": "scatter", "mode": "lines", "name": "residual", "yaxis": _axis(axis),
+        "type": "scatter", "mode": "lines", "name": "residual", "yaxis": axis_id(axis),
         "showlegend": in_legend, "x": finite(times[kept]), "y": finite(values[kept]),
         "line": {"color": theme.VERMILLION, "width": 1},
         "hovertemplate": "%{y:.4g}<extra>residual</extra>",
     }  # fmt: skip
 
 
-def _line(signal: Trace, span: slice, axis: str, colour: str, *, legend: bool) -> dict[str, Any]:
+def line(signal: Trace, span: slice, axis: str, colour: str, *, legend: bool) -> dict[str, Any]:
+    """A signal as one line of a stack, thinned to what a screen shows."""
     times, values = signal.times[span], signal.values[span]
     kept = thinned(values, MAX_POINTS)
     return {
-        "type": "scatter", "mode": "lines", "name": signal.name, "yaxis": _axis(axis),
+        "type": "scatter", "mode": "lines", "name": signal.name, "yaxis": axis_id(axis),
         "showlegend": legend, "x": finite(times[kept]), "y": finite(values[kept]),
         "line": {"color": colour, "width": 1.2, "shape": "hv" if signal.is_held else "linear"},
         "hovertemplate": f"%{{y:.6g}}<extra>{signal.name}</extra>",

@@ -2,14 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from functools import cache
-from pathlib import Path
 from pprint import pformat
 from typing import Any
 from urllib.parse import urlencode
 
 import yaml
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from sqlalchemy.orm import Session
 
 from service import models
@@ -21,7 +18,7 @@ from service.storage.jobs import JobRepository
 from service.storage.lineage import LineageRepository
 from service.storage.runs import RunRepository
 from service.storage.tables import Job, Run, State
-from service.web import assets, figures_signals, formats
+from service.web import figures_signals, formats
 from service.web.cells import grid_of
 from service.web.figures import WATERFALL_HEIGHT, convergence_height, correlation_height
 from service.web.figures_noise import noise_height, noise_keys
@@ -30,6 +27,7 @@ from service.web.findings import findings_of
 from service.web.links import dataset_links, unnamed
 from service.web.reading import model_of, run_body, sought_parameters, unit_of
 from service.web.reference import operations
+from service.web.rendering import render
 from service.web.trend_view import TrendView, trend_of, trend_view
 from service.web.views import JobView, RunView, cell_text, event_view, job_view, run_view
 
@@ -37,25 +35,6 @@ JOBS_PER_PAGE = 50
 RUNS_PER_PAGE = 100
 EVENTS_SHOWN = 100
 COMPARED = 50
-
-
-@cache
-def environment() -> Environment:
-    """The templates. Every text of a user is escaped, and a name that is not given is an error."""
-    made = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    made.filters.update(formats.FILTERS)
-    made.globals.update(
-        static=lambda name: f"/static/{name}", plotly=f"/static/{assets.plotly_name()}"
-    )
-    return made
-
-
-def render(template: str, **context: Any) -> str:
-    """A template with its context, as of now."""
-    return environment().get_template(template).render(now=datetime.now(UTC), **context)
 
 
 def reference_page(document: Mapping[str, Any]) -> str:

@@ -2,7 +2,6 @@
 
 import base64
 import hashlib
-import json
 from datetime import UTC, datetime
 from functools import cache
 from typing import Any
@@ -16,15 +15,15 @@ from service.storage.objects import ObjectStore
 from service.storage.runs import RunOrder, RunRepository
 from service.storage.tables import Job, Run
 from service.web import assets, figures, figures_signals
-from service.web.figures import Figure
+from service.web.embedding import as_json, bare, templates
 from service.web.figures_trend import trend_figure
 from service.web.findings import residual_figure
 from service.web.links import dataset_links, unnamed
-from service.web.pages import render, run_in_full, run_summary
+from service.web.pages import run_in_full, run_summary
 from service.web.reading import evidence_of, unit_of
+from service.web.rendering import render
 from service.web.results import FigureChoice, job_figure
 from service.web.signals import experiments_of
-from service.web.theme import template
 from service.web.trend_view import trend_of, trend_view
 from service.web.views import job_view
 
@@ -53,7 +52,7 @@ def job_report(session: Session, store: ObjectStore, job_id: str) -> str:
         datasets=dataset_links(session, job), more_datasets=unnamed(job),
         policy=policy(), style=style(),
         plotly_code=plotly(), draw=draw(),
-        templates=as_json({"light": template("light"), "dark": template("dark")}),
+        templates=templates(),
     )  # fmt: skip
 
 
@@ -103,18 +102,6 @@ def _figures(
 
 def _has_points(trace: dict[str, Any]) -> bool:
     return len(trace["x"]) > 0
-
-
-def bare(figure: Figure) -> Figure:
-    """Without the template, which the report holds once for all its figures."""
-    kept = {name: value for name, value in figure["layout"].items() if name != "template"}
-    return {"data": figure["data"], "layout": kept}
-
-
-def as_json(value: object) -> Markup:
-    """JSON inside a script element: no text in it can end the element."""
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
-    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
 @cache

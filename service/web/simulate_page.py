@@ -1,0 +1,258 @@
+"""The page on which an identified model is simulated; its address carries the whole request."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+from urllib.parse import urlencode
+
+from pydantic import ValidationError
+from sqlalchemy.orm import Session
+
+from service import free_runs, run_simulations
+from service.conversion import faults_of
+from service.errors import FieldError, InvalidRequest, ServiceError
+from service.free_runs import FreeRun
+from service.models import model_of_run
+from service.pointers import explained
+from service.record_checks import signals_of
+from service.schemas_free_runs import FreeRunIn
+from service.schemas_simulations import RunSimulateIn, RunSimulationOut, StepMetricsOut
+from service.storage.datasets import DatasetRepository
+from service.storage.errors import StorageError
+from service.storage.jobs import JobRepository
+from service.storage.objects import ObjectStore
+from service.storage.runs import RunRepository
+from service.storage.sessions import Database
+from service.storage.tables import Dataset
+from service.sweeps import body_of
+from service.web.decimation import MAX_POINTS
+from service.web.embedding import as_json, bare, templates
+from service.web.evidence import Experiment, OutputTraces, Trace
+from service.web.figures import Figure, as_csv
+from service.web.figures_signals import response
+from service.web.figures_simulation import in_units, simulation
+from service.web.rendering import render
+from service.web.simulate_form import (
+    KINDS,
+    Asked,
+    Kind,
+    asked,
+    at_home,
+    is_asked,
+    kind_of,
+    label_of,
+)
+from sysid.errors import SysidError
+from sysid.models.model import Model
+from sysid.records import Record
+
+DATASETS_LISTED = 200
+RECORDS_LISTED = 50
+MOST_DEFAULT_SAMPLES = 5000
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """What the form is made from."""
+
+    run: str
+    title: str
+    job: str
+    job_name: str
+    model: Model
+    datasets: Sequence[Dataset]
+    has_estimates: bool
+    units: Mapping[str, str]
+    defaults: Mapping[str, str]
+
+    @property
+    def inputs(self) -> list[tuple[str, str]]:
+        """Choices of an input."""
+        return [(one.name, one.name) for one in self.model.inputs]
+
+    @property
+    def outputs(self) -> list[tuple[str, str]]:
+        """Choices of an output."""
+        return [(one.name, one.name) for one in self.model.outputs]
+
+    @property
+    def recordings(self) -> list[tuple[str, str]]:
+        """Choices of a stored recording."""
+        return [("", "choose one…"), *((one.id, one.name) for one in self.datasets)]
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """The answer to a request: a page, or the numbers of its figure."""
+
+    text: str
+    is_csv: bool
+    status: int = 200
+
+
+def simulate_page(
+    database: Database, store: ObjectStore, run_id: str, query: Mapping[str, str], base_url: str
+) -> Shown:
+    """The form, and what the model does where the query asks for it.
+
+    Raises
+    ------
+    NotFound
+        If there is no such run.
+    """
+    with database.read() as session:
+        known = _known(session, run_id, query)
+    kind: Kind = "loop"
+    context: dict[str, Any] = {}
+    faults: list[FieldError] = []
+    try:
+        kind = kind_of(query)
+        if is_asked(query):
+            wanted = asked(known.model, query)
+            figure, context = _simulated(database, store, known, wanted)
+            if query.get("format") == "csv":
+                return Shown(as_csv(figure), is_csv=True)
+            context |= _figure_context(figure) | _request(known.run, wanted, base_url)
+    except (ServiceError, StorageError, SysidError) as error:
+        faults = [at_home(one) for one in _faults(error)]
+    page = render(
+        "simulate.html", known=known, kind=kind, kinds=KINDS,
+        values={**known.defaults, **query}, faults={f.pointer[1:]: f.detail for f in faults},
+        lines=[_line(one) for one in faults], query=_address(query), label_of=label_of,
+        **{"result": None, "free": None, "figure": None, **context},
+    )  # fmt: skip
+    return Shown(page, is_csv=False, status=422 if faults else 200)
+
+
+def _known(session: Session, run_id: str, query: Mapping[str, str]) -> _Known:
+    run = RunRepository(session).get(run_id)
+    job = JobRepository(session).get(run.job_id)
+    request = body_of(job.spec, run.cell)
+    model = model_of_run(session, run, job)
+    datasets = list(DatasetRepository(session).page(limit=DATASETS_LISTED).items)
+    for wanted in (query.get("dataset"), request["datasets"][0]):
+        if wanted and wanted not in [one.id for one in datasets]:
+            datasets += _one(session, wanted)
+    fitted = next((one for one in datasets if one.id == request["datasets"][0]), None)
+    return _Known(
+        run=run.id, title=f"run {run.number + 1}", job=job.id, job_name=job.name, model=model,
+        datasets=datasets, has_estimates=bool((run.result or {}).get("parameters")),
+        units=_units(model, request, fitted), defaults=_defaults(model, request, fitted),
+    )  # fmt: skip
+
+
+def _one(session: Session, dataset: str) -> list[Dataset]:
+    try:
+        return [DatasetRepository(session).get(dataset)]
+    except StorageError:  # deleted since, or never there: the form says so where it is chosen
+        return []
+
+
+def _units(model: Model, request: Mapping[str, Any], fitted: Dataset | None) -> dict[str, str]:
+    """Unit of every signal: the model's, or where it leaves it open that of the recording."""
+    recorded = {one["name"]: str(one["unit"]) for one in (fitted.channels if fitted else [])}
+    own = {one.name: one.unit for one in model.inputs} | {o.name: o.unit for o in model.outputs}
+    channels = request.get("channels", {})
+    return {
+        name: recorded.get(channels.get(name, name), unit) if unit == "1" else unit
+        for name, unit in own.items()
+    }
+
+
+def _defaults(model: Model, request: Mapping[str, Any], fitted: Dataset | None) -> dict[str, str]:
+    period = (fitted.sample_time if fitted else None) or model.solver.step or 0.01
+    duration = min(fitted.duration if fitted else 10.0, MOST_DEFAULT_SAMPLES * period)
+    channels = request.get("channels", {})
+    return {
+        "input": model.inputs[0].name if model.inputs else "", "output": model.outputs[0].name,
+        "gain": "1", "amplitude": "1", "time": "0", "offset": "0", "skip": "0",
+        "duration": f"{duration:.6g}", "sample_time": f"{period:.6g}",
+        **{f"channel.{name}": channels.get(name, name) for name in chain(*signals_of(model))},
+    }  # fmt: skip
+
+
+def _simulated(
+    database: Database, store: ObjectStore, known: _Known, wanted: Asked
+) -> tuple[Figure, dict[str, Any]]:
+    if wanted.kind == "recording":
+        body = _valid(FreeRunIn, wanted.body)
+        free = free_runs.judged(database, store, known.run, body)
+        name = next((d.name for d in known.datasets if d.id == free.dataset), free.dataset)
+        return response(_experiment(free)), {"free": free, "dataset_name": name,
+                                             "records": RECORDS_LISTED}  # fmt: skip
+    body = _valid(RunSimulateIn, wanted.body)
+    told = run_simulations.simulate(database, store, known.run, body, MAX_POINTS)
+    found = in_units(told, known.units)
+    since = wanted.body["control"]["reference"]["time"] if wanted.kind == "loop" else None
+    return simulation(found, since), {"result": found, "verdict": _verdict(found)}
+
+
+def _valid(kind: type[Any], body: Mapping[str, Any]) -> Any:
+    try:
+        return kind.model_validate(body)
+    except ValidationError as error:
+        raise InvalidRequest(explained(error.errors(), body, kind)) from None
+
+
+def _verdict(found: RunSimulationOut) -> tuple[str, str]:
+    """The verdict on a step response as the sheet styles it, and in words."""
+    metrics: StepMetricsOut | None = found.metrics
+    if metrics is None:
+        return "", ""
+    if metrics.runs_away:
+        return "failed", "runs away"
+    return ("passed", "settles") if metrics.is_settled else ("apart", "does not settle")
+
+
+def _experiment(free: FreeRun) -> Experiment:
+    """The first record; a table tells the agreement of all."""
+    record, simulated = free.records[0], free.simulated[0]
+    outputs = tuple(
+        OutputTraces(Trace(one.name, one.unit, one.times, one.values), values)
+        for one, values in zip(record.outputs, simulated, strict=True)
+    )
+    return Experiment("record 1", outputs, _inputs(record))
+
+
+def _inputs(record: Record) -> tuple[Trace, ...]:
+    return tuple(
+        Trace(one.name, one.unit, one.times, one.values, one.hold == "zero")
+        for one in record.inputs
+    )
+
+
+def _figure_context(figure: Figure) -> dict[str, Any]:
+    return {"figure": as_json(bare(figure)), "height": figure["layout"]["height"],
+            "templates": templates()}  # fmt: skip
+
+
+def _request(run: str, wanted: Asked, base_url: str) -> dict[str, str]:
+    """The same over REST."""
+    verb = "validate" if wanted.kind == "recording" else "simulate"
+    body = json.dumps(wanted.body, indent=2, ensure_ascii=False)
+    url = f"{base_url.rstrip('/')}/v1/runs/{run}:{verb}"
+    return {
+        "curl": f"curl -X POST {url} -H 'Content-Type: application/json' "
+        f"--data-binary @- <<'LAGID'\n{body}\nLAGID"
+    }
+
+
+def _faults(error: ServiceError | StorageError | SysidError) -> Iterator[FieldError]:
+    if isinstance(error, SysidError):
+        yield from faults_of(error)
+    elif isinstance(error, ServiceError) and error.errors:
+        yield from error.errors
+    else:
+        yield FieldError("", str(error))
+
+
+def _line(fault: FieldError) -> str:
+    field = fault.pointer.removeprefix("?")
+    column = f" (column {fault.column})" if fault.column else ""
+    return f"{label_of(field)}: {fault.detail}{column}" if field else f"{fault.detail}{column}"
+
+
+def _address(query: Mapping[str, str]) -> str:
+    return urlencode({name: value for name, value in query.items() if name != "format"})

@@ -1,0 +1,215 @@
+"""The page on which an identified model is simulated, and the free run over a recording."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from service.app import create_app
+from tests.identified import identified
+from tests.rest import refused, settings_of
+
+INPUT = {"kind": "binary", "period": 2}
+TRUE = {"K": 2.0, "T": 1.0, "L": 0.5}
+NOISELESS = {"model": "fopdt", "inputs": {"u": INPUT}, "samples": 200, "sample_time": 0.1}
+
+
+@dataclass(frozen=True)
+class Place:
+    """A client, a run that found the true parameters, and recordings to run it over."""
+
+    client: TestClient
+    run: str
+    other: str
+    faster: str
+    lonely: str
+    page: str
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+    with TestClient(create_app(settings_of(tmp_path_factory.mktemp("simulated")))) as client:
+
+        def made(name: str, parameters: dict[str, float], **changes: Any) -> str:
+            body = {**NOISELESS, "name": name, "parameters": parameters, **changes}
+            answer = client.post("/v1/datasets:simulate", json=body)
+            assert answer.status_code == 201, answer.text
+            return str(answer.json()["id"])
+
+        fitted = made("fitted", {**TRUE, "y0": 0})
+        seeds = {"inputs": {"u": {**INPUT, "seed": 5}}}
+        other = made("other", {**TRUE, "y0": 0, "x(0)": 1}, **seeds)
+        faster = made("faster", {**TRUE, "T": 0.3, "y0": 0}, **seeds)
+        answer = client.post(
+            "/v1/datasets?name=lonely", content=b"t,u\n0,1\n1,2\n2,3\n",
+            headers={"content-type": "text/csv"},
+        )  # fmt: skip
+        body = {"model": "fopdt", "datasets": [fitted], "name": "found",
+                "parameters": {"L": {"upper": 2}},
+                "algorithm": {"stop": {"evaluations": 6000}}}  # fmt: skip
+        _, [run] = identified(client.app.state.parts, body)  # type: ignore[attr-defined]
+        yield Place(client, run, other, faster, answer.json()["id"], f"/runs/{run}/simulate")
+
+
+def validated(place: Place, **body: Any) -> Any:
+    return place.client.post(f"/v1/runs/{place.run}:validate", json=body)
+
+
+def test_over_a_recording_of_the_same_system_the_model_is_right_wherever_it_starts(
+    place: Place,
+) -> None:
+    found = validated(place, dataset=place.other).json()
+    assert found["rms"] < 1e-6
+    assert found["fit_percent"] > 99.999
+    assert found["starts"]["x(0)"] == pytest.approx(1, abs=1e-5)  # it was 0 where it was fitted
+    [experiment] = found["experiments"]
+    assert experiment["measured"][0]["values"][:3] == pytest.approx(
+        experiment["simulated"][0]["values"][:3], abs=1e-5
+    )
+
+
+def test_over_a_recording_of_another_system_it_is_not(place: Place) -> None:
+    found = validated(place, dataset=place.faster).json()
+    assert 20 < found["fit_percent"] < 95
+    [one] = found["agreement"]
+    assert (one["output"], one["samples"], one["rms"]) == ("y", 200, found["rms"])
+
+
+def test_samples_that_are_skipped_are_not_judged(place: Place) -> None:
+    found = validated(place, dataset=place.faster, skip=150).json()
+    assert found["agreement"][0]["samples"] == 50
+
+
+@pytest.mark.parametrize(
+    ("body", "pointer", "words"),
+    [
+        ({"channels": {"u": "nothing"}}, "/channels/u", "has no channel 'nothing'"),
+        ({"channels": {"w": "u"}}, "/channels/w", "has no signal 'w'"),
+        ({"skip": 200}, "/dataset", "200"),
+    ],
+)
+def test_what_does_not_fit_is_refused_with_its_place(
+    place: Place, body: dict[str, Any], pointer: str, words: str
+) -> None:
+    faults = refused(validated(place, dataset=place.other, **body), 422, "invalid")
+    assert [one["pointer"] for one in faults] == [pointer]
+    assert words in faults[0]["detail"]
+
+
+def test_a_recording_without_the_output_is_refused(place: Place) -> None:
+    faults = refused(validated(place, dataset=place.lonely), 422, "invalid")
+    assert faults[0]["pointer"] == "/channels/y"
+
+
+def test_the_form_is_shown_with_the_values_of_the_run(place: Place) -> None:
+    answer = place.client.get(place.page)
+    assert answer.status_code == 200
+    assert 'name="duration" value="19.9"' in answer.text
+    assert 'name="sample_time" value="0.1"' in answer.text
+    assert "figure-simulation" not in answer.text
+    assert f'href="/runs/{place.run}/simulate"' in place.client.get(f"/runs/{place.run}").text
+
+
+def test_a_loop_of_small_gain_settles_and_the_page_says_by_how_much(place: Place) -> None:
+    query = "?kind=loop&gain=0.5&amplitude=1&duration=30&sample_time=0.05"
+    answer = place.client.get(place.page + query)
+    assert answer.status_code == 200
+    assert "✓" not in answer.text  # the sign comes with the sheet
+    assert '<span class="verdict passed">settles</span>' in answer.text
+    # K·g/(1 + K·g) = 1/2 of the reference is reached
+    assert re.search(r"Final value</dt><dd>0\.5000", answer.text)
+    assert "figure-simulation" in answer.text
+
+
+def test_a_loop_of_large_gain_runs_away_and_the_page_says_so(place: Place) -> None:
+    query = "?kind=loop&gain=5&amplitude=1&duration=40&sample_time=0.05"
+    answer = place.client.get(place.page + query)
+    assert '<span class="verdict failed">runs away</span>' in answer.text
+
+
+def test_a_loop_that_is_cut_short_does_not_settle(place: Place) -> None:
+    query = "?kind=loop&gain=1&amplitude=1&duration=2&sample_time=0.05"
+    answer = place.client.get(place.page + query)
+    assert '<span class="verdict apart">does not settle</span>' in answer.text
+
+
+def test_the_page_of_a_free_run_tells_the_agreement_of_the_rest_interface(place: Place) -> None:
+    answer = place.client.get(f"{place.page}?kind=recording&dataset={place.faster}")
+    fit = validated(place, dataset=place.faster).json()["fit_percent"]
+    assert f"{fit:.2f} %" in answer.text
+    assert f'<option value="{place.faster}" selected>faster</option>' in answer.text
+
+
+def test_a_signal_is_given_as_an_expression_and_its_numbers_come_as_csv(place: Place) -> None:
+    query = "?kind=signal&input.u=1%2B0*t&duration=20&sample_time=0.1"
+    assert "figure-simulation" in place.client.get(place.page + query).text
+    table = place.client.get(f"{place.page}{query}&format=csv")
+    assert table.headers["content-type"].startswith("text/csv")
+    last = [line for line in table.text.splitlines() if line.startswith("y,")][-1].split(",")
+    assert float(last[1]) == 20
+    assert float(last[2]) == pytest.approx(2, rel=1e-3)  # K times the input
+
+
+@pytest.mark.parametrize(
+    ("query", "line"),
+    [
+        ("gain=abc&duration=5&sample_time=0.1", "gain: found &#39;abc&#39;; need a number"),
+        ("gain=nan&duration=5&sample_time=0.1", "gain: found &#39;nan&#39;; need a number"),
+        ("gain=1&duration=5", "sampling period: it is missing"),
+        ("gain=1&duration=1e9&sample_time=0.1", "duration: 1e+09 s in steps of 0.1 s are"),
+        ("gain=1&duration=-1&sample_time=0.1", "duration: found -1; need a time above 0 s"),
+        ("input=w&duration=5&sample_time=0.1", "controlled input: the model has no input"),
+        ("limit=-2&duration=5&sample_time=0.1", "limit of the command:"),
+        ("time=7&duration=5&sample_time=0.1", "time of the step: 7 s is outside the simulation"),
+        ("transport_delay=9&duration=5&sample_time=0.1", "transport time lag: found 9 s"),
+        ("gain=1e9&duration=60&sample_time=0.1", "gain: found 1e+09; with it the loop runs away"),
+        ("kind=years", "kind: found &#39;years&#39;; need one of"),
+        ("gian=1&duration=5&sample_time=0.1", "gian: there is no such field"),
+        ("kind=recording&dataset=ds_x", "there is no dataset ds_x"),
+        ("kind=recording&skip=1", "recording: it is missing"),
+        ("kind=signal&duration=5&sample_time=0.1", "input u: it is missing"),
+        ("kind=signal&input.u=sin(&duration=5&sample_time=0.1", "input u: "),
+        ("kind=signal&input.u=w&duration=5&sample_time=0.1", "input u: "),
+    ],
+)
+def test_a_wrong_input_is_answered_on_the_page_by_one_line(
+    place: Place, query: str, line: str
+) -> None:
+    answer = place.client.get(f"{place.page}?{query}")
+    assert answer.status_code == 422
+    assert answer.headers["content-type"].startswith("text/html")
+    [told] = re.findall(r'role="alert"><b>It cannot be simulated:</b>(.*?)</div>', answer.text)
+    assert line in told
+    assert "<li>" not in told
+    assert "figure-simulation" not in answer.text
+
+
+def test_several_wrong_inputs_are_told_together_each_at_its_field(place: Place) -> None:
+    text = place.client.get(f"{place.page}?gain=a&limit=b&duration=5&sample_time=0.1").text
+    assert text.count('aria-invalid="true"') == 2
+    assert text.count("<li>") == 2
+
+
+def test_what_is_typed_is_escaped(place: Place) -> None:
+    text = place.client.get(f"{place.page}?gain=%22%3E%3Cscript%3E&duration=5&sample_time=1").text
+    assert "<script>" not in text
+
+
+def test_a_run_that_is_not_there_is_not_found(place: Place) -> None:
+    assert place.client.get("/runs/run_x/simulate").status_code == 404
+
+
+def test_a_run_without_estimates_says_so(tmp_path: Path) -> None:
+    from tests.e2e.filled import fill
+
+    with TestClient(create_app(settings_of(tmp_path))) as client:
+        parts = client.app.state.parts  # type: ignore[attr-defined]
+        filled = fill(parts.database, parts.store, parts.settings)
+        answer = client.get(f"/runs/{filled.running_run}/simulate")
+    assert answer.status_code == 200
+    assert "has no estimates" in answer.text
+    assert "<form" not in answer.text
