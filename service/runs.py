@@ -103,7 +103,7 @@ def history(session: Session, run_id: str) -> HistoryOut:
         islands[row.island].append(
             ImprovementOut(
                 generation=row.generation, evaluations=row.evaluations, rms=row.rms,
-                phase=row.phase, parameters=row.parameters,
+                phase=row.phase, parameters=list(row.parameters),
             )
         )  # fmt: skip
     return HistoryOut(id=run.id, names=_free_names(session, run), islands=islands)

@@ -9,10 +9,12 @@ from sqlalchemy import func, select
 
 from benchmarks.breaking.stand import Stand
 from service.storage.patience import PASSING
-from service.storage.tables import Event, Job, Run, RunHistory, State
+from service.storage.runs import RunRepository
+from service.storage.tables import Event, Job, Run, State
 
 CLOCKED = ("seconds", "job")
 """Fields of a summary that tell of time and place, not of the result."""
+KILLED = "its worker process died"
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,13 +30,28 @@ class Finding:
     given_up : bool
         Whether the job failed because its dispatchers ended or fell silent too often.
     figures : str
-        Summary, evaluations and history, without clock fields, as text: equal for equal bits.
+        Summary, evaluations, history, estimates and reasons, without clock fields, as text: equal
+        for equal bits.
+    killed : tuple of bool
+        Of its runs, whether each failed because its workers died.
+    unplotted : int
+        Runs that succeeded and whose fitted signals are not stored.
     """
 
     states: tuple[str, ...]
     doubled: int
     given_up: bool
     figures: str
+    killed: tuple[bool, ...]
+    unplotted: int
+
+    def given_up_beside(self, undisturbed: "Finding") -> int:
+        """Runs that were given up, alone or with the job, because they met too many faults."""
+        if self.given_up:
+            pairs = zip(self.states, undisturbed.states, strict=False)
+            return sum(mine != theirs for mine, theirs in pairs)
+        killed = zip(self.killed, undisturbed.killed, strict=False)
+        return sum(mine and not theirs for mine, theirs in killed)
 
     def lost_beside(self, undisturbed: "Finding") -> int:
         """Runs that did not come to the end they had there."""
@@ -43,24 +60,40 @@ class Finding:
         return missing + sum(mine != theirs for mine, theirs in pairs)
 
 
-def audit(stand: Stand, job_id: str) -> Finding:
-    """Count what a job has left in the tables, and take its summary over REST."""
+def audit(stand: Stand, job_id: str, *, ends: int = 1) -> Finding:
+    """Count what a job has left in the tables, and take its summary over REST.
+
+    Parameters
+    ----------
+    ends : int
+        How often it may have ended: once more than it was resumed.
+    """
     with stand.database.read() as session:
         job = session.get_one(Job, job_id)
         runs = list(session.scalars(select(Run).where(Run.job_id == job_id).order_by(Run.number)))
         kinds = session.execute(select(Event.kind, Event.data).where(Event.job_id == job_id))
-        ends = sum(State(data["state"]).is_terminal for kind, data in kinds if kind == "state")
-        points = select(func.count()).where(RunHistory.run_id.in_([run.id for run in runs]))
-        n_points = session.scalar(points)
+        ended = sum(State(data["state"]).is_terminal for kind, data in kinds if kind == "state")
+        n_points = sum(len(RunRepository(session).history(run.id)) for run in runs)
     numbers = Counter(run.number for run in runs)
     doubled = sum(numbers.values()) - len(numbers) + max(0, job.n_done - job.n_runs)
-    doubled += max(0, ends - 1)
+    doubled += max(0, ended - ends)
     summary = without_clock(stand.client.summary(job_id))
     total = sum(run.evaluations for run in runs)
-    figures = [summary, job.evaluations, total, n_points, [run.estimates for run in runs]]
+    estimates, reasons = [run.estimates for run in runs], [reason(run.error) for run in runs]
+    figures = [summary, job.evaluations, total, n_points, estimates, reasons]
     given_up = job.state is State.FAILED and job.lost_leases >= job.max_attempts
     states = tuple(run.state.value for run in runs)
-    return Finding(states, doubled, given_up, json.dumps(figures, sort_keys=True))
+    killed = tuple((run.error or "").startswith(KILLED) for run in runs)
+    unplotted = sum(
+        run.state is State.SUCCEEDED and run.signals_sha256 is None for run in runs
+    )  # fmt: skip
+    text = json.dumps(figures, sort_keys=True)
+    return Finding(states, doubled, given_up, text, killed, unplotted)
+
+
+def reason(error: str | None) -> str:
+    """Why a run failed, without the numbers of processes."""
+    return (error or "").split(";")[0]
 
 
 def without_clock(document: Any) -> Any:

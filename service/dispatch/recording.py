@@ -12,7 +12,8 @@ from service.dispatch.checkpoints import packed
 from service.dispatch.results import history_points, migrant_points, outcome_of
 from service.storage.columns import Document
 from service.storage.errors import ObjectStoreFailed
-from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOutcome
+from service.storage.ledger import RunLedger, RunOutcome
+from service.storage.points import HistoryPoint, MigrantPoint
 from service.storage.queue import Claim, Progress, Queue
 from service.storage.reuse import take_over
 from service.storage.sessions import Database

@@ -4,7 +4,8 @@ import math
 from collections.abc import Iterator, Mapping
 
 from service.result_document import finite, result_document
-from service.storage.ledger import HistoryPoint, MigrantPoint, RunOutcome
+from service.storage.ledger import RunOutcome
+from service.storage.points import HistoryPoint, MigrantPoint
 from service.storage.tables import State
 from sysid.result import Improvement, Migrant
 from workers.ports import Concluded
@@ -38,8 +39,8 @@ def history_points(
         for number, one in enumerate(improvements[first:], start=first):
             if math.isfinite(one.rms):
                 yield HistoryPoint(
-                    run, island, number, int(one.generation), int(one.evaluations),
-                    float(one.rms), one.phase, [float(value) for value in one.parameters],
+                    run, island, number, one.generation, one.evaluations, one.rms, one.phase,
+                    one.parameters,
                 )  # fmt: skip
 
 
@@ -47,7 +48,4 @@ def migrant_points(run: str, migrants: tuple[Migrant, ...], written: int) -> Ite
     """Migrants beyond the first `written`."""
     for number, one in enumerate(migrants[written:], start=written):
         if math.isfinite(one.fitness):
-            yield MigrantPoint(
-                run, number, int(one.epoch), int(one.source), int(one.destination),
-                float(one.fitness),
-            )  # fmt: skip
+            yield MigrantPoint(run, number, *one)

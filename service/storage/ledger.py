@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
@@ -10,6 +10,7 @@ from sqlalchemy.orm import Session
 from service.storage.clocks import Clock
 from service.storage.columns import Document, utc_now
 from service.storage.ids import new_ids
+from service.storage.points import HistoryPoint, MigrantPoint, history_parts, migrant_parts
 from service.storage.queue import Lease, Outcome, Queue, smaller
 from service.storage.statements import CHUNK, IN_PLACE, chunks, insert_missing, update_by_id, upsert
 from service.storage.tables import OPEN, Checkpoint, Job, MigrationLog, Run, RunHistory, State
@@ -31,30 +32,6 @@ class Cell:
     sigma: float | None = None
 
 
-class HistoryPoint(NamedTuple):
-    """A better champion of an island; `number` counts them on the island from 0."""
-
-    run_id: str
-    island: int
-    number: int
-    generation: int
-    evaluations: int
-    rms: float
-    phase: str
-    parameters: list[float]
-
-
-class MigrantPoint(NamedTuple):
-    """One migrant of a run; `number` counts them from 0."""
-
-    run_id: str
-    number: int
-    epoch: int
-    source: int
-    destination: int
-    fitness: float
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunOutcome:
     """How a run ended. `result` is the document of the run result; None when it failed."""
@@ -72,6 +49,8 @@ class RunOutcome:
     generations: int = 0
     seconds: float | None = None
     signals_sha256: str | None = None
+    signals_start: int | None = None
+    signals_size: int | None = None
 
 
 class RunLedger:
@@ -148,9 +127,10 @@ class RunLedger:
     def append(
         self, history: Iterable[HistoryPoint], migrants: Iterable[MigrantPoint] = ()
     ) -> None:
-        """Add to the history of runs; points that are there already stay as they are.
+        """Add to the history of runs.
 
-        A run that goes on from a checkpoint finds the same points again, bit for bit.
+        A run that goes on from a checkpoint finds the same points again, bit for bit; they count
+        once.
         """
         self._queue.hold(self._lease)
         self._insert(history, migrants)
@@ -185,8 +165,8 @@ class RunLedger:
         return found
 
     def _insert(self, history: Iterable[HistoryPoint], migrants: Iterable[MigrantPoint]) -> None:
-        insert_missing(self._session, RunHistory, (point._asdict() for point in history))
-        insert_missing(self._session, MigrationLog, (point._asdict() for point in migrants))
+        insert_missing(self._session, RunHistory, history_parts(history))
+        insert_missing(self._session, MigrationLog, migrant_parts(migrants))
 
     def _count(self, ended: Sequence[RunOutcome]) -> None:
         values: dict[str, Any] = {

@@ -6,14 +6,14 @@ from typing import Any
 from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
-from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOutcome
+from service.storage.ledger import RunLedger, RunOutcome
 from service.storage.queue import Lease, Queue
-from service.storage.statements import IN_PLACE, chunks, update_by_id
+from service.storage.statements import IN_PLACE, chunks, insert_missing, update_by_id
 from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory, State
 
 _COPIED = (
     "result", "valid", "best_rms", "rms_noise_free", "fit_estimation", "fit_validation",
-    "evaluations", "generations", "seconds", "signals_sha256",
+    "evaluations", "generations", "seconds", "signals_sha256", "signals_start", "signals_size",
 )  # fmt: skip
 
 
@@ -49,11 +49,9 @@ def take_over(session: Session, lease: Lease, sources: Mapping[str, str]) -> lis
         query = select(Run).where(Run.id.in_(set(pairs.values())))
         known = {run.id: run for run in session.scalars(query)}
         outcomes = [_outcome(run, known[source]) for run, source in pairs.items()]
-        written = ledger.record(
-            outcomes,
-            _copies(session, RunHistory, HistoryPoint, pairs),
-            _copies(session, MigrationLog, MigrantPoint, pairs),
-        )
+        written = ledger.record(outcomes)
+        for table in (RunHistory, MigrationLog):
+            insert_missing(session, table, _copies(session, table, pairs))
         more = update(Job).where(*lease.fence()).values(n_reused=Job.n_reused + len(written))
         session.execute(more, execution_options=IN_PLACE)
         taken += outcomes
@@ -67,11 +65,12 @@ def _outcome(run: str, source: Run) -> RunOutcome:
     return RunOutcome(run_id=run, state=State.SUCCEEDED, **values)
 
 
-def _copies(session: Session, table: Any, point: Any, sources: Mapping[str, str]) -> Iterator[Any]:
-    columns = [getattr(table, name) for name in point._fields]
+def _copies(session: Session, table: Any, sources: Mapping[str, str]) -> Iterator[dict[str, Any]]:
+    columns = table.__table__.c
     rows: dict[str, list[Any]] = {}
-    for row in session.execute(select(*columns).where(table.run_id.in_(set(sources.values())))):
-        rows.setdefault(row.run_id, []).append(row)
+    query = select(*columns).where(columns.run_id.in_(set(sources.values())))
+    for row in session.execute(query).mappings():
+        rows.setdefault(row["run_id"], []).append(row)
     for run, source in sources.items():
         for row in rows.get(source, []):
-            yield point(*row)._replace(run_id=run)
+            yield {**row, "run_id": run}

@@ -10,6 +10,7 @@ from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from service.storage.columns import Document, to_json
 from service.storage.errors import InvalidCursor, NotFound
+from service.storage.points import HistoryPoint, MigrantPoint, history_of, migrants_of
 from service.storage.statements import Page, page_of
 from service.storage.tables import DEFAULT_PROJECT, MigrationLog, Run, RunHistory, State
 
@@ -101,15 +102,17 @@ class RunRepository:
         query = select(*columns).where(*self._of(job_id)).order_by(Run.number)
         return [RunRow(*row) for row in self._session.execute(query)]
 
-    def history(self, run_id: str) -> list[RunHistory]:
+    def history(self, run_id: str) -> list[HistoryPoint]:
         """Better champions of a run, island by island, in the order they were found."""
-        query = select(RunHistory).where(RunHistory.run_id == self.get(run_id).id)
-        return list(self._session.scalars(query.order_by(RunHistory.island, RunHistory.number)))
+        parts = select(RunHistory.points, RunHistory.n_parameters).where(
+            RunHistory.run_id == self.get(run_id).id
+        )
+        return history_of(run_id, ((row[0], row[1]) for row in self._session.execute(parts)))
 
-    def migrations(self, run_id: str) -> list[MigrationLog]:
+    def migrations(self, run_id: str) -> list[MigrantPoint]:
         """Migrants of a run, in order."""
-        query = select(MigrationLog).where(MigrationLog.run_id == self.get(run_id).id)
-        return list(self._session.scalars(query.order_by(MigrationLog.number)))
+        parts = select(MigrationLog.migrants).where(MigrationLog.run_id == self.get(run_id).id)
+        return migrants_of(run_id, self._session.scalars(parts))
 
     def _of(self, job_id: str) -> tuple[ColumnElement[bool], ...]:
         return Run.job_id == job_id, Run.project_id == self._project_id

@@ -198,7 +198,9 @@ class Run(Base):
     `number` is the cell's place in the sweep, `spec_hash` names what is computed. `result` is the
     document of the run result; `estimates` repeats {name: {"value", "stderr"}} of it for summaries
     over many runs. `rms_noise_free` is the RMS against the records before noise was added.
-    `kills` is how often a worker died over it alone since it last went on.
+    `kills` is how often a worker died over it alone since it last went on. `signals_sha256` names
+    the object of its fitted signals; where several runs share one, its own file is `signals_size`
+    bytes of it from `signals_start`.
     """
 
     __tablename__ = "runs"
@@ -233,6 +235,8 @@ class Run(Base):
     estimates: Mapped[Document | None]
     result: Mapped[Document | None]
     signals_sha256: Mapped[str | None] = mapped_column(index=True)
+    signals_start: Mapped[int | None] = mapped_column(LargeInteger)
+    signals_size: Mapped[int | None] = mapped_column(LargeInteger)
     error: Mapped[str | None]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     started_at: Mapped[datetime | None]
@@ -240,31 +244,31 @@ class Run(Base):
 
 
 class RunHistory(Base):
-    """A better champion of one island of a run; `number` counts them on the island from 0."""
+    """Some of the better champions of a run's islands, packed by `service.storage.points`.
+
+    `digest` is the hash of `points`. `generation` and `evaluations` are the largest in it, `rms`
+    the least.
+    """
 
     __tablename__ = "run_history"
 
     run_id: Mapped[str] = mapped_column(ForeignKey("runs.id"), primary_key=True)
-    island: Mapped[int] = mapped_column(primary_key=True)
-    number: Mapped[int] = mapped_column(primary_key=True)
+    digest: Mapped[int] = mapped_column(LargeInteger, primary_key=True)
+    n_parameters: Mapped[int]
     generation: Mapped[int]
     evaluations: Mapped[int] = mapped_column(LargeInteger)
     rms: Mapped[float]
-    phase: Mapped[str]
-    parameters: Mapped[list[Any]]
+    points: Mapped[bytes] = mapped_column(LargeBinary)
 
 
 class MigrationLog(Base):
-    """One migrant of a run; `number` counts them from 0."""
+    """Some of a run's migrants, packed by `service.storage.points`; `digest` is their hash."""
 
     __tablename__ = "migrations_log"
 
     run_id: Mapped[str] = mapped_column(ForeignKey("runs.id"), primary_key=True)
-    number: Mapped[int] = mapped_column(primary_key=True)
-    epoch: Mapped[int]
-    source: Mapped[int]
-    destination: Mapped[int]
-    fitness: Mapped[float]
+    digest: Mapped[int] = mapped_column(LargeInteger, primary_key=True)
+    migrants: Mapped[bytes] = mapped_column(LargeBinary)
 
 
 class Checkpoint(Base):

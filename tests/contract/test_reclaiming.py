@@ -6,7 +6,8 @@ from service.dispatch.checkpoints import packed, unpacked
 from service.dispatch.preparing import JobRuns
 from service.dispatch.recording import Recorder
 from service.storage.events import EventRepository
-from service.storage.ledger import HistoryPoint, RunLedger, RunOutcome
+from service.storage.ledger import RunLedger, RunOutcome
+from service.storage.points import HistoryPoint
 from service.storage.queue import Queue
 from service.storage.runs import RunRepository
 from service.storage.tables import Checkpoint, State

@@ -6,12 +6,11 @@ from service.storage.errors import InvalidCursor, NotFound, UnstorableValue
 from service.storage.jobs import JobRepository
 from service.storage.ledger import (
     Cell,
-    HistoryPoint,
-    MigrantPoint,
     RunLedger,
     RunOutcome,
     add_runs,
 )
+from service.storage.points import HistoryPoint, MigrantPoint
 from service.storage.queue import Queue
 from service.storage.runs import RunRepository
 from service.storage.tables import State

@@ -16,8 +16,9 @@ from service.datasets import add_recording
 from service.schemas_jobs import JobIn
 from service.settings import Settings
 from service.signals.writer import FittedOutput, write_fit
-from service.storage.ledger import HistoryPoint, MigrantPoint, RunLedger, RunOutcome
+from service.storage.ledger import RunLedger, RunOutcome
 from service.storage.objects import ObjectStore
+from service.storage.points import HistoryPoint, MigrantPoint
 from service.storage.queue import Claim, Progress, Queue
 from service.storage.runs import RunRepository
 from service.storage.sessions import Database

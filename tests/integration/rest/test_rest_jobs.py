@@ -5,7 +5,8 @@ from typing import Any
 from starlette.testclient import TestClient
 
 from service.api.deps import Parts
-from service.storage.ledger import HistoryPoint, RunLedger
+from service.storage.ledger import RunLedger
+from service.storage.points import HistoryPoint
 from service.storage.queue import Queue
 from service.storage.tables import State
 from tests.rest import CSV, recording, refused
