@@ -121,6 +121,19 @@ class AsyncClient:
         """Simulate the identified model on a new input or under proportional control."""
         return await self._json(calls.act("runs", run, "simulate", body, max_points=max_points))
 
+    async def validate_run(
+        self,
+        run: str,
+        dataset: str,
+        channels: Mapping[str, str] | None = None,
+        *,
+        skip: int = 0,
+        max_points: int = 1000,
+    ) -> Document:
+        """Run the identified model freely over another recording: RMS and fit there."""
+        body = {"dataset": dataset, "channels": dict(channels or {}), "skip": skip}
+        return await self._json(calls.act("runs", run, "validate", body, max_points=max_points))
+
     async def runs(self, job: str) -> AsyncIterator[Document]:
         """Runs of a job, page by page."""
         async for item in self._items("jobs", job, "runs"):

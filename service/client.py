@@ -259,6 +259,19 @@ class Client:
         """Simulate the identified model on a new input or under proportional control."""
         return self._json(calls.act("runs", run, "simulate", body, max_points=max_points))
 
+    def validate_run(
+        self,
+        run: str,
+        dataset: str,
+        channels: Mapping[str, str] | None = None,
+        *,
+        skip: int = 0,
+        max_points: int = 1000,
+    ) -> Document:
+        """Run the identified model freely over another recording: RMS and fit there."""
+        body = {"dataset": dataset, "channels": dict(channels or {}), "skip": skip}
+        return self._json(calls.act("runs", run, "validate", body, max_points=max_points))
+
     def migrations(self, run: str) -> Document:
         """The migration log."""
         return self._json(calls.read("runs", run, "migrations"))
