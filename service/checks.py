@@ -46,18 +46,30 @@ class JobChecker:
         self._models: dict[str, tuple[Model, Any] | list[FieldError]] = {}
         self._datasets: dict[str, Dataset | str] = {one.id: one for one in unstored}
 
+    def names(self, body: Body) -> list[FieldError]:
+        """Faults of single fields: names that nothing has, values that are none.
+
+        They stand, whatever else of the body is changed.
+        """
+        found = list(self._conversions(body))
+        found += self._missing_datasets(body)
+        model = self.model(body["model"])
+        if isinstance(model, list):
+            return found + model
+        _overridden(found, self._all_parameters(body, model[0]), body["parameters"])
+        found += warm_starts.faults(self._session, body["warm_start"], model[0])
+        return found + list(signal_faults(body, model[0]))
+
     def errors(self, body: Body) -> list[FieldError]:
         """Every fault of a body in its normal form."""
         found = list(self._conversions(body))
         model = self.model(body["model"])
         if isinstance(model, list):
             return found + model + list(self._missing_datasets(body))
-        parameters = _tried(
-            override, found, self._all_parameters(body, model[0]), body["parameters"]
-        )
+        parameters = _overridden(found, self._all_parameters(body, model[0]), body["parameters"])
         found += _freedom_faults(parameters, body["algorithm"]["population"])
-        own = (parameters or model[0].parameters)[: len(model[0].parameters)]
-        ties = _tried(ties_of, found, model[0], parameters or model[0].parameters)
+        own = parameters[: len(model[0].parameters)]
+        ties = _tried(ties_of, found, model[0], parameters)
         tied = tied_model(model[0], ties or {})
         _tried(check_lags, found, tied, own)
         if model[0].rule is not None:
@@ -211,8 +223,8 @@ def _references(body: Body) -> Iterator[tuple[str, str]]:
         yield f"/validation/datasets/{index}", reference
 
 
-def _sample_faults(parameters: tuple[Parameter, ...] | None, samples: int) -> Iterator[FieldError]:
-    free = sum(one.is_free for one in parameters or ())
+def _sample_faults(parameters: tuple[Parameter, ...], samples: int) -> Iterator[FieldError]:
+    free = sum(one.is_free for one in parameters)
     if 0 < samples < free:
         yield FieldError(
             "/datasets",
@@ -221,11 +233,9 @@ def _sample_faults(parameters: tuple[Parameter, ...] | None, samples: int) -> It
         )
 
 
-def _freedom_faults(
-    parameters: tuple[Parameter, ...] | None, population: int
-) -> Iterator[FieldError]:
-    free = [one for one in parameters or () if one.is_free]
-    if parameters is not None and not free:
+def _freedom_faults(parameters: tuple[Parameter, ...], population: int) -> Iterator[FieldError]:
+    free = [one for one in parameters if one.is_free]
+    if not free:
         yield FieldError("/parameters", "every parameter is fixed; leave one free")
     if population * len(free) > MOST_GENES:
         yield FieldError(
@@ -233,6 +243,15 @@ def _freedom_faults(
             f"found {population} individuals of {len(free)} free parameters; need at most "
             f"{MOST_GENES // len(free)}, so that the population fits into memory",
         )
+
+
+def _overridden(
+    errors: list[FieldError], parameters: tuple[Parameter, ...], changes: Mapping[str, Any]
+) -> tuple[Parameter, ...]:
+    """The parameters with all changes that can be made; of each of the others its fault."""
+    for name, change in changes.items():
+        parameters = _tried(override, errors, parameters, {name: change}) or parameters
+    return parameters
 
 
 def _tried(make: Any, errors: list[FieldError], *arguments: Any) -> Any:

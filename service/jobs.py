@@ -22,8 +22,8 @@ from service.storage.ledger import Cell, add_runs
 from service.storage.lineage import LineageRepository
 from service.storage.sessions import Database
 from service.storage.tables import Dataset, Job, State
-from service.sweep_checks import check_sweep, check_trend
-from service.sweeps import count, groups_of, steps_of
+from service.sweep_checks import faults_of_job
+from service.sweeps import count, grouped, steps_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,17 +80,12 @@ def check(
     """
     document = body.normal_form()
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
-    axes = groups_of(body)
-    n_runs = count(body, axes)
-    if n_runs > settings.max_runs_per_job:
-        raise InvalidRequest.at(
-            "/sweep/axes",
-            f"the sweep has {n_runs} runs; at most {settings.max_runs_per_job} a job",
-        )
-    groups = steps_of(body.sweep.axes, axes)
     checker = JobChecker(session, unstored)
-    check_sweep(checker, document, groups)
-    check_trend(session, checker, body)
+    faults = faults_of_job(session, checker, body, document, settings.max_runs_per_job)
+    if faults:
+        raise InvalidRequest(faults)
+    numbers = grouped(body.sweep.axes)
+    n_runs, groups = count(body, numbers), steps_of(body.sweep.axes, numbers)
     spec = checker.resolved(document)
     spec["sweep"] = {"axes": resolved_axes(checker, spec, groups)}
     new = NewJob(

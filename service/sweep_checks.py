@@ -7,9 +7,18 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.orm import Session
 
 from service.checks import JobChecker, value_faults
-from service.errors import FieldError, InvalidRequest
+from service.errors import FieldError
 from service.schemas_jobs import JobIn, Seed, Sigma
-from service.sweeps import Cell, Step, body_of, value_at
+from service.sweeps import (
+    Cell,
+    Step,
+    axis_faults,
+    body_of,
+    count,
+    grouped,
+    steps_of,
+    value_at,
+)
 from service.trend_checks import trend_faults
 
 # Fields that no other field depends on: their values are checked alone, a whole body for each of
@@ -19,38 +28,44 @@ ALONE: Mapping[str, TypeAdapter[Any]] = {
     "/noise/seed": TypeAdapter(Seed),
     "/noise/sigma": TypeAdapter(Sigma),
 }
+SINGLE = ("/trend/parameters", "/trend/reference")
+"""Fields of a trend that do not depend on the axes."""
 
 
-def check_sweep(
-    checker: JobChecker, document: dict[str, Any], groups: Sequence[Sequence[Step]]
-) -> None:
-    """Refuse a job with faults, or with values of axes that have some.
+def faults_of_job(
+    session: Session, checker: JobChecker, body: JobIn, document: dict[str, Any], most_runs: int
+) -> list[FieldError]:
+    """Every fault that can be known before the job runs.
 
-    Raises
-    ------
-    InvalidRequest
-        With every fault that can be known before the job runs.
+    Values of axes are looked at where the axes are sound, and no more than `most_runs` of them.
     """
-    errors = checker.errors(body_of(document, {}))
-    errors += _sweep_faults(checker, document, groups, frozenset(errors))
-    if errors:
-        unique = dict.fromkeys(errors)
-        raise InvalidRequest(unique)
-
-
-def check_trend(session: Session, checker: JobChecker, body: JobIn) -> None:
-    """Refuse a job whose trend, or chain of warm starts, cannot be made.
-
-    Raises
-    ------
-    InvalidRequest
-        With the reasons.
-    """
+    found = list(axis_faults(body))
+    known = checker.errors(body_of(document, {}))
+    if not found:
+        groups = grouped(body.sweep.axes)
+        n_runs = count(body, groups)
+        if n_runs > most_runs:
+            found.append(FieldError(
+                "/sweep/axes", f"the sweep has {n_runs} runs; at most {most_runs} a job"
+            ))  # fmt: skip
+        else:
+            steps = steps_of(body.sweep.axes, groups)
+            found += _sweep_faults(checker, document, steps, frozenset(known))
+            found += _repeated_recordings(checker, body)
     model = checker.model(body.model)
-    errors = list(trend_faults(session, body, None if isinstance(model, list) else model[0]))
-    errors += _repeated_recordings(checker, body)
-    if errors:
-        raise InvalidRequest(errors)
+    found += trend_faults(session, body, None if isinstance(model, list) else model[0])
+    return list(dict.fromkeys([*known, *found]))
+
+
+def faults_of_names(session: Session, body: JobIn) -> list[FieldError]:
+    """Faults of a body of which fields are left out: those that stand without them as well."""
+    checker = JobChecker(session)
+    found = checker.names(body_of(body.normal_form(), {})) + list(axis_faults(body))
+    model = checker.model(body.model)
+    if not isinstance(model, list):
+        trend = trend_faults(session, body, model[0])
+        found += [one for one in trend if one.pointer.startswith(SINGLE)]
+    return list(dict.fromkeys(found))
 
 
 def _repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldError]:

@@ -72,7 +72,7 @@ def groups_of(job: JobIn) -> list[list[int]]:
         If a path is not a field of the body, axes of one zip differ in length, or labels in
         number from values.
     """
-    errors = list(_faults(job))
+    errors = list(axis_faults(job))
     if errors:
         raise InvalidRequest(errors)
     return grouped(job.sweep.axes)
@@ -176,7 +176,8 @@ def _pointer(number: int, axis: Axis, position: int) -> str:
     return f"/sweep/axes/{number}/{kind}" + (f"/{position}" if kind == "values" else "")
 
 
-def _faults(job: JobIn) -> Iterator[FieldError]:
+def axis_faults(job: JobIn) -> Iterator[FieldError]:
+    """What is wrong with the axes themselves: paths, lengths, labels."""
     document = job.normal_form()
     lengths: dict[str, int] = {}
     seen: set[str] = set()

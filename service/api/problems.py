@@ -12,6 +12,7 @@ from sqlalchemy.exc import TimeoutError as SqlTimeout
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
+from service.api.beside import faults_beside
 from service.conversion import faults_of
 from service.errors import (
     Conflict,
@@ -139,7 +140,10 @@ def _validation_error(request: Request, error: Exception) -> Response:
         return _service_error(
             request, UnsupportedMediaType(f"found {kind!r}; need application/json")
         )
-    return _service_error(request, InvalidRequest(_field_errors(request, error)))
+    faults = list(_field_errors(request, error))
+    kind = body_type(request.scope.get("endpoint"))
+    more = faults_beside(request.app.state.parts, kind, error.body, faults)
+    return _service_error(request, InvalidRequest(dict.fromkeys([*faults, *more])))
 
 
 def _unexpected(request: Request, error: Exception) -> Response:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from sqlalchemy.orm import Session
 
-from service import jobs
+from service import jobs, sweep_checks
 from service.checks import JobChecker
 from service.conversion import faults_of
 from service.errors import FieldError, InvalidRequest
@@ -66,7 +66,10 @@ def submit(
     KeyReused
         If the idempotency key was used with another body.
     """
-    _check(body, settings)
+    own = list(_own_faults(body, settings.max_runs_per_job))
+    if own:
+        with database.read() as session:
+            raise InvalidRequest(dict.fromkeys([*own, *faults_of_names(session, body)]))
     source = _source(database, store, body)
     try:
         with database.read() as session:
@@ -84,15 +87,22 @@ def submit(
         raise InvalidRequest(_at_home(one, body) for one in error.errors) from None
 
 
-def _check(body: NoiseSweepIn, settings: Settings) -> None:
+def faults_of_names(session: Session, body: NoiseSweepIn) -> list[FieldError]:
+    """Faults of a body of which fields are left out: those that stand without them as well."""
+    job = JobIn.model_validate({**body.shared, "datasets": body.datasets or [UNSTORED]})
+    found = sweep_checks.faults_of_names(session, job)
+    return [one for one in found if body.datasets or not one.pointer.startswith("/datasets")]
+
+
+def _own_faults(body: NoiseSweepIn, most_runs: int) -> Iterator[FieldError]:
     if "method" in body.algorithm.model_fields_set:
-        raise InvalidRequest.at("/algorithm/method", "the sweep takes its methods from 'methods'")
+        yield FieldError("/algorithm/method", "the sweep takes its methods from 'methods'")
     count = len(body.sigma) * body.replicates * len(body.methods)
-    if count > settings.max_runs_per_job:
-        raise InvalidRequest.at(
+    if count > most_runs:
+        yield FieldError(
             "/replicates",
             f"{len(body.sigma)} σ × {body.replicates} replicates × {len(body.methods)} methods "
-            f"are {count} runs; at most {settings.max_runs_per_job} a job",
+            f"are {count} runs; at most {most_runs} a job",
         )
 
 

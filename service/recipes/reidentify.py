@@ -1,8 +1,11 @@
 """Batch re-identification: one run for each value of a label, warm-started, with a trend."""
 
+from collections.abc import Iterator
 from typing import Any
 
-from service import jobs
+from sqlalchemy.orm import Session
+
+from service import jobs, sweep_checks
 from service.errors import FieldError, InvalidRequest
 from service.schemas_jobs import PREVIOUS, REFERENCE, RUN, JobIn, JobOut
 from service.schemas_reidentify import ReidentifyIn
@@ -24,13 +27,36 @@ def submit(
     KeyReused
         If the idempotency key was used with another body.
     """
-    if body.warm_start == "reference" and body.reference is None:
-        raise InvalidRequest.at("/warm_start", "'reference' needs one: give \"reference\"")
-    order = sorted(range(len(body.batch)), key=lambda number: body.batch[number].x)
+    order = order_of(body)
+    own = list(_own_faults(body))
     try:
+        if own:
+            with database.read() as session:
+                jobs.check(session, job_of(body, order), settings)
+            raise InvalidRequest(own)
         return jobs.submit_to(database, job_of(body, order), settings, key)
     except InvalidRequest as error:
-        raise InvalidRequest(_at_home(one, order) for one in error.errors) from None
+        found = [*own, *(_at_home(one, order) for one in error.errors)]
+        raise InvalidRequest(dict.fromkeys(found)) from None
+
+
+def faults_of_names(session: Session, body: ReidentifyIn) -> list[FieldError]:
+    """Faults of a body of which fields are left out: those that stand without them as well."""
+    order = order_of(body)
+    found = sweep_checks.faults_of_names(session, job_of(body, order))
+    return [*_own_faults(body), *(_at_home(one, order) for one in found)]
+
+
+def order_of(body: ReidentifyIn) -> list[int]:
+    """Places in the batch, in the order of x."""
+    return sorted(range(len(body.batch)), key=lambda number: body.batch[number].x)
+
+
+def _own_faults(body: ReidentifyIn) -> Iterator[FieldError]:
+    if body.warm_start == "reference" and body.reference is None:
+        yield FieldError(
+            "/warm_start", "to begin at a reference one has to be named; give a reference as well"
+        )
 
 
 def job_of(body: ReidentifyIn, order: list[int]) -> JobIn:

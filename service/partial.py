@@ -1,0 +1,75 @@
+"""What can be told of a body of which some fields cannot be read: the faults of all the others."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from service.errors import FieldError
+
+Whole = TypeVar("Whole", bound=BaseModel)
+
+# What stands for a field that has to be there; nothing is told of it.
+STAND_INS: Mapping[str, Any] = {
+    "datasets": [""], "batch": [{"x": 0.0, "datasets": [""]}], "label": "x", "sigma": [0.0],
+}  # fmt: skip
+
+
+def beside(
+    kind: type[Whole],
+    body: Any,
+    faults: Sequence[FieldError],
+    meant: Callable[[Whole], Iterable[FieldError]],
+) -> list[FieldError]:
+    """Faults of what a body means, where other fields of it have faults that keep it from its type.
+
+    Parameters
+    ----------
+    kind : type
+        The body's wire type.
+    faults : sequence of FieldError
+        Of the fields that cannot be read; nothing more is told of these.
+    meant : callable
+        Faults of a body of that type that do not depend on the fields left out.
+    """
+    left_out = [one.pointer for one in faults]
+    if not isinstance(body, dict) or "" in left_out:
+        return []
+    highest = ["/".join(one.split("/")[:2]) for one in left_out]  # where what holds it is no more
+    whole = _whole(kind, _without(body, left_out)) or _whole(kind, _without(body, highest))
+    if whole is None:
+        return []
+    return [one for one in meant(whole) if not any(_overlap(one.pointer, p) for p in left_out)]
+
+
+def _without(body: dict[str, Any], pointers: Iterable[str]) -> dict[str, Any]:
+    """The body without the fields at these places; a list goes with any of its entries."""
+    rest = deepcopy(body)
+    for pointer in pointers:
+        here: Any = rest
+        last: tuple[dict[str, Any], str] | None = None
+        for part in (one.replace("~1", "/").replace("~0", "~") for one in pointer.split("/")[1:]):
+            if not isinstance(here, dict):
+                break
+            if part not in here:  # a field that is missing: what should hold it goes
+                break
+            last, here = (here, part), here[part]
+        if last is not None:
+            last[0].pop(last[1], None)
+    return rest
+
+
+def _whole(kind: type[Whole], rest: dict[str, Any]) -> Whole | None:
+    absent = [name for name in STAND_INS if name in kind.model_fields and name not in rest]
+    needed = [name for name in absent if kind.model_fields[name].is_required()]
+    for names in (needed, absent):
+        try:
+            return kind.model_validate(rest | {name: STAND_INS[name] for name in names})
+        except ValidationError:
+            continue
+    return None
+
+
+def _overlap(pointer: str, other: str) -> bool:
+    return f"{pointer}/".startswith(f"{other}/") or f"{other}/".startswith(f"{pointer}/")

@@ -1,0 +1,89 @@
+"""One answer has every fault: of fields that cannot be read, and of what the others mean."""
+
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.errors import FieldError
+from service.partial import beside
+from service.schemas_jobs import JobIn
+from tests.rest import refused
+
+SWEEP = {"sigma": [0.1], "replicates": 2}
+TRUTH = {"parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0}, "samples": 50, "sample_time": 0.1,
+         "inputs": {"u": {"kind": "step"}}}  # fmt: skip
+
+
+def faults(answer: Any) -> dict[str, str]:
+    return {one["pointer"]: one["detail"] for one in refused(answer, 422, "invalid")}
+
+
+@pytest.mark.parametrize(
+    ("changes", "pointers"),
+    [
+        ({"seed": "x", "parameters": {"LL": {"upper": 1}, "K": {"upper": "x"}}},
+         {"/seed", "/parameters/LL", "/parameters/K/upper"}),
+        ({"parameters": {"LL": {"upper": 1}, "KK": {"upper": 1}, "T": {"lower": 9, "upper": 1}}},
+         {"/parameters/LL", "/parameters/KK", "/parameters/T"}),
+        ({"model": "fopd", "seed": "x"}, {"/model", "/seed"}),
+        ({"model": "fopd", "datasets": ["none"], "algoritm": {}},
+         {"/model", "/datasets/0", "/algoritm"}),
+        ({"algorithm": {"populaton": 3, "mutation": [[5, 0.2]]}, "hold": {"y": "zero"}},
+         {"/algorithm/populaton", "/algorithm/mutation", "/hold/y"}),
+        ({"datasets": 3, "parameters": {"LL": {"upper": 1}}}, {"/datasets", "/parameters/LL"}),
+        ({"channels": {"w": "u"}, "sweep": {"axes": [{"path": "/sed", "range": [0, 2]}]},
+          "parameters": {"LL": {"upper": 1}}},
+         {"/channels/w", "/sweep/axes/0/path", "/parameters/LL"}),
+        ({"sweep": {"axes": [{"path": "/seed", "range": [0, 900_000]}]}, "hold": {"y": "zero"}},
+         {"/sweep/axes", "/hold/y"}),
+        ({"trend": {"x": "n", "parameters": ["LL"]}, "weights": {"z": 1}},
+         {"/trend/x", "/trend/parameters/0", "/weights/z"}),
+        ({"sweep": {"axes": [{"values": [1]}]}, "trend": {"x": "n", "parameters": ["LL"]}},
+         {"/sweep/axes/0/path", "/trend/parameters/0"}),
+        ({"validation": {"fraction": 2}, "skip": 10_000}, {"/validation/fraction"}),
+    ],
+)  # fmt: skip
+def test_a_job_is_told_all_its_faults_and_none_that_follows_from_another(
+    server: TestClient, dataset: str, changes: dict[str, Any], pointers: set[str]
+) -> None:
+    body = {"model": "fopdt", "datasets": [dataset], **changes}
+    assert set(faults(server.post("/v1/jobs", json=body))) == pointers
+
+
+def test_a_noise_sweep_is_told_all_its_faults(server: TestClient, dataset: str) -> None:
+    body = {**SWEEP, "model": "fopdt", "datasets": [dataset], "sigma": [-1], "replicates": 0,
+            "parameters": {"LL": {"upper": 1}}}  # fmt: skip
+    found = faults(server.post("/v1/recipes/noise-sweep", json=body))
+    assert set(found) == {"/sigma/0", "/replicates", "/parameters/LL"}
+    body = {**SWEEP, "model": "fopdt", "truth": {**TRUTH, "samples": "x"}, "hold": {"y": "zero"}}
+    found = faults(server.post("/v1/recipes/noise-sweep", json=body))
+    assert set(found) == {"/truth/samples", "/hold/y"}
+    body = {**SWEEP, "model": "fopdt", "truth": TRUTH, "hold": {"y": "zero"},
+            "algorithm": {"method": "simple"}}  # fmt: skip
+    found = faults(server.post("/v1/recipes/noise-sweep", json=body))
+    assert set(found) == {"/algorithm/method", "/hold/y"}
+
+
+def test_a_batch_is_told_all_its_faults(server: TestClient, dataset: str) -> None:
+    batch = [{"x": 5, "datasets": [dataset]}]
+    body = {"model": "fopdt", "label": "n", "batch": batch, "look_at": ["LL"], "seed": "x"}
+    assert set(faults(server.post("/v1/recipes/reidentify", json=body))) == {"/look_at/0", "/seed"}
+    body = {"model": "fopdt", "batch": 3, "look_at": ["LL"], "warm_start": "reference"}
+    found = faults(server.post("/v1/recipes/reidentify", json=body))
+    assert set(found) == {"/label", "/batch", "/look_at/0", "/warm_start"}
+    body = {"model": "fopdt", "label": "n", "batch": batch, "warm_start": "reference",
+            "parameters": {"LL": {"upper": 1}}}  # fmt: skip
+    found = faults(server.post("/v1/recipes/reidentify", json=body))
+    assert set(found) == {"/warm_start", "/parameters/LL"}
+
+
+@pytest.mark.parametrize(
+    "body", [[], 3, None, {"model": "m"}, {"model": "m", "datasets": ["d"], "seed": []}]
+)
+def test_of_what_is_no_body_nothing_more_is_told(body: Any) -> None:
+    def everything(job: JobIn) -> list[FieldError]:
+        return [FieldError("", "of the whole"), FieldError("/seed", "of the seed")]
+
+    told = beside(JobIn, body, [FieldError("/seed", "x")], everything)
+    assert told == []
