@@ -37,10 +37,12 @@ def beside(
     if not isinstance(body, dict) or "" in left_out:
         return []
     highest = ["/".join(one.split("/")[:2]) for one in left_out]  # where what holds it is no more
-    whole = _whole(kind, _without(body, left_out)) or _whole(kind, _without(body, highest))
-    if whole is None:
+    found = _whole(kind, _without(body, left_out)) or _whole(kind, _without(body, highest))
+    if found is None:
         return []
-    return [one for one in meant(whole) if not any(_overlap(one.pointer, p) for p in left_out)]
+    whole, stand_ins = found
+    silent = [*left_out, *(f"/{name}" for name in stand_ins)]
+    return [one for one in meant(whole) if not any(_overlap(one.pointer, p) for p in silent)]
 
 
 def _without(body: dict[str, Any], pointers: Iterable[str]) -> dict[str, Any]:
@@ -60,12 +62,14 @@ def _without(body: dict[str, Any], pointers: Iterable[str]) -> dict[str, Any]:
     return rest
 
 
-def _whole(kind: type[Whole], rest: dict[str, Any]) -> Whole | None:
+def _whole(kind: type[Whole], rest: dict[str, Any]) -> tuple[Whole, list[str]] | None:
+    """The body as its type, and the fields that something stands for."""
     absent = [name for name in STAND_INS if name in kind.model_fields and name not in rest]
     needed = [name for name in absent if kind.model_fields[name].is_required()]
     for names in (needed, absent):
         try:
-            return kind.model_validate(rest | {name: STAND_INS[name] for name in names})
+            whole = kind.model_validate(rest | {name: STAND_INS[name] for name in names})
+            return whole, names
         except ValidationError:
             continue
     return None
