@@ -3,8 +3,9 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Response, status
+from fastapi.responses import StreamingResponse
 
-from service import jobs, runs, summaries, trends
+from service import jobs, runs, runs_table, summaries, trends
 from service.api.deps import Cursor, Limit, PartsDep, ReadSession, WriteSession
 from service.rms_units import unit_of
 from service.schemas import Page
@@ -73,6 +74,14 @@ def resume(job_id: str, parts: PartsDep, session: WriteSession, response: Respon
 def clone(job_id: str, parts: PartsDep, response: Response) -> JobOut:
     """Queue the same request as a new job."""
     return _accepted(jobs.clone(parts.database, job_id, parts.settings), response)
+
+
+@router.get("/{job_id}/runs.csv", response_class=StreamingResponse)
+def table_of_runs(job_id: str, parts: PartsDep) -> StreamingResponse:
+    """All runs of a job as CSV: one row each, with its cell, its estimates and their errors."""
+    disposition = {"Content-Disposition": f'attachment; filename="{job_id}.csv"'}
+    rows = runs_table.table(parts.database, job_id)
+    return StreamingResponse(rows, media_type="text/csv", headers=disposition)
 
 
 @router.get("/{job_id}/runs")

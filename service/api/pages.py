@@ -150,9 +150,9 @@ def dataset_figure(
 
 
 @router.get("/v1/jobs/{job_id}/report", tags=["jobs"], response_class=HTMLResponse)
-def job_report(job_id: str, parts: PartsDep, session: ReadSession) -> Response:
+def job_report(job_id: str, request: Request, parts: PartsDep, session: ReadSession) -> Response:
     """The job as one HTML file that needs no server: tables, figures, the exact request."""
-    made = report.job_report(session, parts.store, job_id)
+    made = report.job_report(session, parts.store, job_id, str(request.base_url))
     policy = {"Content-Security-Policy": report.policy(), "X-Content-Type-Options": "nosniff"}
     return HTMLResponse(made, headers=policy)
 

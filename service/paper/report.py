@@ -9,13 +9,14 @@ from service.paper.parts import Plot, Section, verdict
 from service.web import report as jobs
 from service.web.embedding import as_json, bare, templates
 from service.web.rendering import render
+from service.web.report_parts import style
 
 
 def page(sections: Sequence[Section], *, quick: bool) -> str:
     """The report: tables, figures with captions, and what held."""
     return render(
         "paper.html", sections=sections, made=datetime.now(UTC), quick=quick,
-        policy=jobs.policy(), style=jobs.style(), plotly_code=jobs.plotly(), draw=jobs.draw(),
+        policy=jobs.policy(), style=style(), plotly_code=jobs.plotly(), draw=jobs.draw(),
         templates=templates(),
         figure_json=_figure_json, verdict=verdict,
     )  # fmt: skip

@@ -15,6 +15,7 @@ from service.storage.objects import ObjectStore
 from service.storage.runs import RunOrder, RunRepository
 from service.storage.tables import Job, Run
 from service.web import assets, figures, figures_signals
+from service.web.cells import LISTED
 from service.web.embedding import as_json, bare, templates
 from service.web.figures_trend import trend_figure
 from service.web.findings import residual_figure
@@ -22,22 +23,28 @@ from service.web.links import dataset_links, unnamed
 from service.web.pages import run_in_full, run_summary
 from service.web.reading import evidence_of, unit_of
 from service.web.rendering import render
+from service.web.report_large import large_report
+from service.web.report_parts import style
 from service.web.results import FigureChoice, job_figure
 from service.web.signals import experiments_of
 from service.web.trend_view import trend_of, trend_view
 from service.web.views import job_view
 
-RUNS_IN_TABLE = 1000
 RUNS_IN_FULL = 6
 EXPERIMENTS_SHOWN = 4
 
 
-def job_report(session: Session, store: ObjectStore, job_id: str) -> str:
-    """The report of a job: every run in a table, the few best (of a batch first) in full."""
+def job_report(session: Session, store: ObjectStore, job_id: str, base_url: str = "") -> str:
+    """The report of a job: every run in a table, the few best (of a batch first) in full.
+
+    Of a job of more runs than a page lists: what they have in common, and those that stand out.
+    """
     job = JobRepository(session).get(job_id)
     made, batch = datetime.now(UTC), trend_of(session, job)
+    if job.n_runs > LISTED:
+        return large_report(session, store, job, batch, made, base_url)
     view = job_view(job, unit_of(session, job.spec), made)
-    runs = RunRepository(session).page(job.id, limit=RUNS_IN_TABLE).items
+    runs = RunRepository(session).page(job.id, limit=LISTED).items
     is_in_order = view.is_batch or len(runs) <= RUNS_IN_FULL
     order: RunOrder = "number" if is_in_order else "best_rms"
     chosen = RunRepository(session).page(job.id, limit=RUNS_IN_FULL, order=order).items
@@ -114,12 +121,6 @@ def plotly() -> Markup:
 def draw() -> Markup:
     """What draws the figures, as the content of a script element."""
     return _script((assets.STATIC / "report.js").read_text(encoding="utf-8"))
-
-
-@cache
-def style() -> Markup:
-    """The sheet of pages and reports."""
-    return Markup((assets.STATIC / "lagid.css").read_text(encoding="utf-8"))
 
 
 def _script(text: str) -> Markup:
