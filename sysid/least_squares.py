@@ -4,18 +4,24 @@ Levenberg-Marquardt with Marquardt's scaling [1]_; a place at a bound whose slop
 held there. Robust losses go by reweighting. The batches are what our kernels are made for: one
 gives the residuals of the steps for several dampings, one those for the Jacobian.
 
+A search is compiled as a whole, but on long records cut into calls of a few steps, between which a
+cancel is heard. What it needs to go on lies in its arrays, so the cuts change no bit.
+
 .. [1] D. W. Marquardt, An algorithm for least-squares estimation of nonlinear parameters,
    SIAM J. Appl. Math. 11 (1963) 431.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from sysid.ga.gauss_newton import damped_step
+from sysid.ga.chromosome import located
+from sysid.ga.gauss_newton import damped_step, product
 from sysid.kernels.caching import compiled
-from sysid.types import FloatArray
+from sysid.kernels.evaluation import partial_predictions
+from sysid.kernels.evaluator import Evaluator
+from sysid.types import FloatArray, IntArray
 
 _DAMPINGS = np.array([0.0, 1e-4, 1e-2, 1.0, 1e2])
 """Tried in one batch, times the present damping; 0 stands for the least one."""
@@ -23,6 +29,20 @@ TRIED = _DAMPINGS.size
 """Simulations of a batch of steps; the Jacobian takes one for each parameter besides."""
 _LEAST, _MOST = 1e-11, 1e12
 _STOPPED = 2  # steps in a row that gain next to nothing
+_DIFFERENCE = 1e-6  # of the range
+
+_N_MEMORY = 6
+_VALUE, _DAMPING, _IDLE, _FRESH, _SPENT, _END = range(_N_MEMORY)
+"""What a search remembers: the loss at its place, the damping, steps in a row that gained next to
+nothing, whether the Jacobian is of this place, simulations run, whether it is at its end."""
+
+
+class Scored(NamedTuple):
+    """A problem's scored samples: which of the M measured values, and the weight of each."""
+
+    evaluator: Evaluator
+    rows: IntArray
+    weight: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,104 +55,164 @@ class Solution:
         (D,) in [0, 1].
     is_converged : bool
         Whether the next step promises less than the tolerance; False after too many steps.
+    evaluations : int
+        Simulations run.
     """
 
     place: FloatArray
     is_converged: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Loss:
-    """Σe², or with a scale s > 0 soft-l1, Σ 2s²(√(1 + (e/s)²) - 1)."""
-
-    scale: float = 0.0
-
-    def total(self, errors: FloatArray) -> FloatArray:
-        """The losses (P,) of residuals (P, n); ``inf`` where one is not finite."""
-        if self.scale == 0.0:
-            values = np.einsum("pn,pn->p", errors, errors)
-        else:
-            roots = np.sqrt(1 + (errors / self.scale) ** 2)
-            values = 2 * self.scale**2 * np.sum(roots - 1, axis=1)
-        values[~np.isfinite(values)] = np.inf
-        return np.asarray(values)
+    evaluations: int
 
 
 def solve(
-    residuals: Callable[[FloatArray], FloatArray],
-    jacobian: Callable[[FloatArray, FloatArray], FloatArray],
-    place: FloatArray,
-    loss: Loss,
-    *,
-    steps: int,
+    scored: Scored, place: FloatArray, scale: float, *, steps: int, at_once: int,
     tolerance: float = 1e-10,
-) -> Solution:
+) -> Solution:  # fmt: skip
     """The local minimum that Levenberg-Marquardt finds from a place (D,).
 
     Parameters
     ----------
-    residuals : callable
-        Of places (P, D), the residuals (P, n).
-    jacobian : callable
-        Of a place (D,) and its residuals (n,), the Jacobian (n, D).
+    scale : float
+        Of the soft-l1 loss, Σ 2s²(√(1 + (e/s)²) - 1), in the residuals' unit; 0: Σe².
     steps : int
         Batches of steps at most.
+    at_once : int
+        So many of them in one compiled call.
     tolerance : float
         Of the loss: the part that a step must promise to be worth taking.
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # a simulation may diverge
-        return _solved(residuals, jacobian, np.array(place), loss, steps, tolerance)
+    place = np.array(place)
+    error, columns = np.empty(scored.rows.size), np.empty((place.size, scored.rows.size))
+    memory = np.zeros(_N_MEMORY)
+    while steps > 0 and not memory[_END]:
+        _descend(scored, place, error, columns, memory, scale, min(steps, at_once), tolerance)
+        steps -= at_once
+    return Solution(place, bool(memory[_END]), int(memory[_SPENT]))
 
 
-def _solved(
-    residuals: Callable[[FloatArray], FloatArray],
-    jacobian: Callable[[FloatArray, FloatArray], FloatArray],
-    place: FloatArray, loss: Loss, steps: int, tolerance: float,
-) -> Solution:  # fmt: skip
-    damping, idle = 1e-3, 0
-    error = residuals(place[None])[0]
-    value = float(loss.total(error[None])[0])
-    columns = None
+@compiled
+def _descend(
+    scored: Scored, place: FloatArray, error: FloatArray, columns: FloatArray, memory: FloatArray,
+    scale: float, steps: int, tolerance: float,
+) -> None:  # fmt: skip
+    """Go some steps on from a place (D,) with residuals (n,) and slopes (D, n), all in place."""
+    if memory[_SPENT] == 0.0:
+        error[:] = residuals(scored, place.reshape((1, place.size)))[0]
+        memory[_VALUE], memory[_DAMPING], memory[_SPENT] = _total(error, scale), 1e-3, 1.0
     for _ in range(steps):
-        tried = np.maximum(_DAMPINGS * damping, _LEAST)
-        if columns is None:
-            columns = np.ascontiguousarray(jacobian(place, error))
-        places, promised = _proposals(error, columns, place, tried, loss.scale)
-        if promised <= tolerance * value:
-            return Solution(place, True)
-        errors = residuals(places)
-        values = loss.total(errors)
-        best = int(np.argmin(values))
-        if not values[best] < value:
-            damping *= 1e3
-            if damping > _MOST:  # no step gains: rounding is all that is left
-                return Solution(place, True)
-            continue
-        gained = (value - values[best]) / value
-        place, error, value, columns = places[best], errors[best], float(values[best]), None
-        damping = float(np.clip(tried[best] if best else damping * 1e-2, _LEAST, _MOST))
-        idle = idle + 1 if gained <= tolerance else 0
-        if idle == _STOPPED:
-            return Solution(place, True)
-    return Solution(place, False)
+        if not memory[_END]:
+            _step(scored, place, error, columns, memory, scale, tolerance)
+
+
+@compiled
+def _step(
+    scored: Scored, place: FloatArray, error: FloatArray, columns: FloatArray, memory: FloatArray,
+    scale: float, tolerance: float,
+) -> None:  # fmt: skip
+    """One step, the best of those tried; or a larger damping where none gains."""
+    if not memory[_FRESH]:
+        _slopes(scored, place, error, columns)
+        memory[_FRESH], memory[_SPENT] = 1.0, memory[_SPENT] + place.size
+    tried = np.maximum(_DAMPINGS * memory[_DAMPING], _LEAST)
+    places, promised = _proposals(error, columns, place, tried, scale)
+    if promised <= tolerance * memory[_VALUE]:
+        memory[_END] = 1.0
+        return
+    errors = residuals(scored, places)
+    memory[_SPENT] += TRIED
+    best, value = _least(errors, memory[_VALUE], scale)
+    if best < 0:
+        memory[_DAMPING] *= 1e3
+        if memory[_DAMPING] > _MOST:  # no step gains: rounding is all that is left
+            memory[_END] = 1.0
+        return
+    gained = (memory[_VALUE] - value) / memory[_VALUE]
+    place[:], error[:], memory[_VALUE], memory[_FRESH] = places[best], errors[best], value, 0.0
+    damping = tried[best] if best > 0 else memory[_DAMPING] * 1e-2
+    memory[_DAMPING] = min(max(damping, _LEAST), _MOST)
+    memory[_IDLE] = memory[_IDLE] + 1.0 if gained <= tolerance else 0.0
+    if memory[_IDLE] == _STOPPED:
+        memory[_END] = 1.0
+
+
+@compiled
+def _least(errors: FloatArray, value: float, scale: float) -> tuple[int, float]:
+    """Which residuals (P, n) have the least loss below `value`, -1 if none has, and that loss."""
+    best = -1
+    for p in range(errors.shape[0]):
+        total = _total(errors[p], scale)
+        if total < value:
+            best, value = p, total
+    return best, value
+
+
+@compiled
+def residuals(scored: Scored, places: FloatArray) -> FloatArray:
+    """Weighted residuals (P, n) of the scored values at places (P, D)."""
+    evaluator = scored.evaluator
+    predicted = partial_predictions(evaluator, located(evaluator, places), 1.0)
+    errors = np.empty((places.shape[0], scored.rows.size))
+    for i in range(scored.rows.size):
+        row = scored.rows[i]
+        for p in range(places.shape[0]):
+            errors[p, i] = scored.weight[i] * (predicted[row, p] - evaluator.measured[row])
+    return errors
+
+
+@compiled
+def _slopes(scored: Scored, place: FloatArray, error: FloatArray, columns: FloatArray) -> None:
+    """Write the slopes (D, n) of the residuals (n,) at a place (D,); 0 where a neighbour diverges.
+
+    By forward differences away from the nearer bound, one batch of D simulations.
+    """
+    evaluator = scored.evaluator
+    places, steps = np.empty((place.size, place.size)), np.empty(place.size)
+    for d in range(place.size):
+        steps[d] = _DIFFERENCE if place[d] < 0.5 else -_DIFFERENCE
+        for k in range(place.size):
+            places[d, k] = place[k] + (steps[d] if k == d else 0.0)
+    predicted = partial_predictions(evaluator, located(evaluator, places), 1.0)
+    for i in range(scored.rows.size):
+        row = scored.rows[i]
+        for d in range(place.size):
+            there = scored.weight[i] * (predicted[row, d] - evaluator.measured[row])
+            slope = (there - error[i]) / steps[d]
+            columns[d, i] = slope if np.isfinite(slope) else 0.0
+
+
+@compiled
+def _total(error: FloatArray, scale: float) -> float:
+    """The loss of residuals (n,); ``inf`` where one is not finite."""
+    total = 0.0
+    if scale == 0.0:
+        for m in range(error.size):
+            total += error[m] * error[m]
+    else:
+        for m in range(error.size):
+            total += 2.0 * scale**2 * (np.sqrt(1.0 + (error[m] / scale) ** 2) - 1.0)
+    return total if np.isfinite(total) else np.inf
 
 
 @compiled
 def _normal_equations(
     error: FloatArray, columns: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray]:
-    """JᵀJ and Jᵀe of residuals (n,) and Jacobian (n, D), reweighted for the loss's slope here."""
-    n, d = columns.shape
-    sums, row = np.zeros((d + 1, d + 1)), np.empty(d + 1)
-    for m in range(n):
-        root = 1.0 if scale == 0.0 else (1.0 + (error[m] / scale) ** 2) ** -0.25
-        for i in range(d):
-            row[i] = root * columns[m, i]
-        row[d] = root * error[m]
-        for i in range(d + 1):
-            for j in range(i + 1):
-                sums[i, j] += row[i] * row[j]
-    return sums[:d, :d], sums[d, :d].copy()
+    """JᵀJ and Jᵀe of residuals (n,) and slopes (D, n), reweighted for the loss's slope here."""
+    d, n = columns.shape
+    if scale > 0.0:
+        rooted, rows = np.empty(n), np.empty((d, n))
+        for m in range(n):
+            root = (1.0 + (error[m] / scale) ** 2) ** -0.25
+            rooted[m] = root * error[m]
+            for i in range(d):
+                rows[i, m] = root * columns[i, m]
+        error, columns = rooted, rows
+    normal, slope = np.zeros((d, d)), np.empty(d)
+    for i in range(d):
+        slope[i] = product(columns[i], error, n)
+        for j in range(i + 1):
+            normal[i, j] = product(columns[i], columns[j], n)
+    return normal, slope
 
 
 @compiled

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import sqrt
 from typing import Any
 
@@ -22,12 +23,12 @@ from sysid.parameters import Parameter, override
 from sysid.records import Record
 from sysid.settings import Loss, Prediction
 from sysid.ties import Ties, tied_model, ties_of
-from sysid.types import FloatArray
+from sysid.types import FloatArray, IntArray
 
 _Rebuild = tuple[Callable[..., "Problem"], tuple[Any, ...]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Problem:
     """Fitness and predictions of candidates, J = √(Σ w²(y - ŷ)² / n) (Eq. 10).
 
@@ -147,12 +148,22 @@ class Problem:
         """Unit of J: that of the output, or 1 if several are weighted together."""
         return self.model.outputs[0].unit if len(self.model.outputs) == 1 else "1"
 
+    @cached_property
+    def scored(self) -> IntArray:
+        """Which of the M measured values enter J."""
+        return np.flatnonzero(self.evaluator.weight > 0)
+
     @property
     def n_scored(self) -> int:
         """Number of samples that enter J."""
-        return int(np.count_nonzero(self.evaluator.weight))
+        return self.scored.size
 
-    @property
+    @cached_property
+    def n_steps(self) -> int:
+        """Steps of integration, or of the recursion, that a simulation takes."""
+        return sum(one.grid.points * one.grid.substeps for one in self.experiments)
+
+    @cached_property
     def output_scale(self) -> float:
         """J of a simulation that gives each output's mean: what a model should stay well below."""
         total = 0.0
@@ -242,6 +253,11 @@ def _built(
         raise InvalidRecord("there is no record to compare the model with; need one or more")
     if prediction not in ("simulation", "one-step"):
         raise InvalidSettings("/prediction", f"{prediction!r} is not 'simulation' or 'one-step'")
+    if prediction == "one-step" and loss.noise_model != "white":
+        raise InvalidSettings(
+            "/loss/noise_model",
+            f"{loss.noise_model} is for free runs; predictions one step ahead contain the noise",
+        )
     if skip < 0:
         raise InvalidSettings("/skip", f"{skip!r} is not a number of samples, 0 or more")
     since = (-np.inf,) * len(records) if scored_from is None else scored_from

@@ -8,18 +8,18 @@ import numpy as np
 from sysid.ga.chromosome import located, placed
 from sysid.islands.archipelago import loss_scale
 from sysid.kernels.caching import compiled
-from sysid.kernels.evaluation import partial_predictions
+from sysid.kernels.evaluation import population_fitness
 from sysid.kernels.evaluator import Evaluator
-from sysid.least_squares import TRIED, Loss, solve
+from sysid.least_squares import TRIED, Scored, solve
 from sysid.problem import Problem
 from sysid.pulls import AT_BOUND
-from sysid.types import FloatArray, IntArray
+from sysid.types import FloatArray
 
 _SAME = 1e-3  # of the range: nearer champions lie in one valley
-_DIFFERENCE = 1e-6  # of the range
 _STEPS = 60
 _LONG = 2_000_000  # measured values times parameters: from here on, few starts and steps
 _ENDS = 3  # simulations of a start and of an end, besides the steps
+_AT_ONCE = 10_000_000  # steps of integration or recursion in one compiled call: about 0.1 s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,80 +70,35 @@ def refine_one(
 def _refined(
     problem: Problem, start: FloatArray, place: FloatArray, rms: float, left: int
 ) -> Refined:
-    """Least squares from one start; the search may use `left` simulations."""
-    search = _LeastSquares(problem, max(problem.output_scale, rms))
-    steps = min(_STEPS, (left - _ENDS) // (place.size + TRIED))
-    loss = Loss(loss_scale(problem) / search.unit)
-    solved = solve(search.residuals, search.jacobian, place, loss, steps=steps)
-    theta, reached = search.best(solved.place)
-    if reached > rms:
-        theta, reached = start, rms
-    return Refined(np.array(theta), reached, search.evaluations)
+    """Least squares from one start; the search may use `left` simulations.
 
-
-@compiled
-def _residuals(
-    evaluator: Evaluator, places: FloatArray, scored: IntArray, weight: FloatArray
-) -> FloatArray:
-    """Weighted residuals (P, n) of the scored values at places (P, D)."""
-    predicted = partial_predictions(evaluator, located(evaluator, places), 1.0)
-    errors = np.empty((places.shape[0], scored.size))
-    for i in range(scored.size):
-        for p in range(places.shape[0]):
-            errors[p, i] = weight[i] * (predicted[scored[i], p] - evaluator.measured[scored[i]])
-    return errors
-
-
-@compiled
-def _slopes(
-    evaluator: Evaluator, place: FloatArray, error: FloatArray, scored: IntArray, weight: FloatArray
-) -> FloatArray:
-    """Slopes (n, D) of the residuals (n,) at a place (D,); 0 where a neighbour diverges."""
-    places, steps = np.empty((place.size, place.size)), np.empty(place.size)
-    for d in range(place.size):
-        steps[d] = _DIFFERENCE if place[d] < 0.5 else -_DIFFERENCE
-        for k in range(place.size):
-            places[d, k] = place[k] + (steps[d] if k == d else 0.0)
-    predicted = partial_predictions(evaluator, located(evaluator, places), 1.0)
-    slopes = np.empty((scored.size, place.size))
-    for i in range(scored.size):
-        for d in range(place.size):
-            there = weight[i] * (predicted[scored[i], d] - evaluator.measured[scored[i]])
-            slope = (there - error[i]) / steps[d]
-            slopes[i, d] = slope if np.isfinite(slope) else 0.0
-    return slopes
-
-
-class _LeastSquares:
-    """Residuals and Jacobian over places in [0, 1], counting simulations.
-
-    Residuals are in units of about the outputs' `scale`, so that the tolerances of the search and
+    Residuals are in units of about the outputs' scale, so that the tolerances of the search and
     what counts as diverged do not depend on the outputs' unit. It is a power of two: no rounding.
     """
+    size = max(problem.output_scale, rms)
+    unit = float(np.ldexp(1.0, int(np.frexp(size)[1]))) if size > 0 else 1.0
+    evaluator, rows = problem.evaluator, problem.scored
+    batch = place.size + TRIED
+    solved = solve(
+        Scored(evaluator, rows, evaluator.weight[rows] / unit), place, loss_scale(problem) / unit,
+        steps=min(_STEPS, (left - _ENDS) // batch),
+        at_once=max(1, _AT_ONCE // (batch * problem.n_steps)),
+    )  # fmt: skip
+    theta, reached = _end(evaluator, solved.place)
+    if reached > rms:
+        theta, reached = start, rms
+    return Refined(np.array(theta), reached, solved.evaluations + 2)
 
-    def __init__(self, problem: Problem, scale: float) -> None:
-        self.problem, self.evaluations = problem, 0
-        self.unit = float(np.ldexp(1.0, int(np.frexp(scale)[1]))) if scale > 0 else 1.0
-        evaluator = problem.evaluator
-        self._scored = np.flatnonzero(evaluator.weight > 0)
-        self._weight = evaluator.weight[self._scored] / self.unit
 
-    def residuals(self, places: FloatArray) -> FloatArray:
-        """Weighted residuals (P, n) of places (P, D), in one batch."""
-        self.evaluations += places.shape[0]
-        evaluator = self.problem.evaluator
-        return _residuals(evaluator, np.ascontiguousarray(places), self._scored, self._weight)
-
-    def jacobian(self, place: FloatArray, error: FloatArray) -> FloatArray:
-        """Forward differences away from the nearer bound, one batch of D simulations."""
-        self.evaluations += place.size
-        return _slopes(self.problem.evaluator, place, error, self._scored, self._weight)
-
-    def best(self, place: FloatArray) -> tuple[FloatArray, float]:
-        """The solution, moved onto a bound that it only approaches if that is not worse."""
-        snapped = np.where(place < AT_BOUND, 0.0, np.where(place > 1 - AT_BOUND, 1.0, place))
-        theta = located(self.problem.evaluator, np.vstack([snapped, place]))
-        values = self.problem.fitness(theta)
-        self.evaluations += 2
-        chosen = 0 if values[0] <= values[1] * (1 + 1e-9) else 1
-        return theta[chosen], float(values[chosen])
+@compiled
+def _end(evaluator: Evaluator, place: FloatArray) -> tuple[FloatArray, float]:
+    """A solution (D,), moved onto a bound that it only approaches if that is not worse."""
+    places = np.empty((2, place.size))
+    for d in range(place.size):
+        places[1, d] = place[d]
+        low, high = place[d] < AT_BOUND, place[d] > 1.0 - AT_BOUND
+        places[0, d] = 0.0 if low else 1.0 if high else place[d]
+    theta = located(evaluator, places)
+    values = population_fitness(evaluator, theta)
+    chosen = 0 if values[0] <= values[1] * (1.0 + 1e-9) else 1
+    return theta[chosen], values[chosen]

@@ -54,7 +54,7 @@ def _sensed(
 
 
 @compiled
-def _product(one: FloatArray, other: FloatArray, count: int) -> float:
+def product(one: FloatArray, other: FloatArray, count: int) -> float:
     """Inner product of the first `count` entries, as four sums that do not wait for each other."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     whole = count // 4 * 4
@@ -94,9 +94,9 @@ def normal_equations(
         count += 1
     matrix, gradient = np.zeros((n, n)), np.zeros(n)
     for d in range(n):
-        gradient[d] = _product(rows[d], rows[n], count) / steps[d]
+        gradient[d] = product(rows[d], rows[n], count) / steps[d]
         for e in range(d + 1):
-            matrix[d, e] = _product(rows[d], rows[e], count) / (steps[d] * steps[e])
+            matrix[d, e] = product(rows[d], rows[e], count) / (steps[d] * steps[e])
     fitness = np.sqrt(total / max(count, 1))
     return matrix, gradient, fitness if np.isfinite(fitness) else np.inf
 
