@@ -13,10 +13,10 @@ from sqlalchemy.orm import Session
 
 from service.errors import NotFound, ServiceError
 from service.evidence import test_document
+from service.fitted import fits_of
 from service.models import model_of_run
 from service.recordings import recording_of
 from service.schemas_runs import CorrelationOut, ResidualsOut
-from service.signals.reader import read_fit
 from service.signals.writer import FittedOutput
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import StorageError
@@ -80,15 +80,16 @@ def residuals_of(session: Session, store: ObjectStore, job: Job, run: Run) -> Te
     if run.signals_sha256 is None:
         return None
     body = body_of(job.spec, run.cell)
-    fits = read_fit(store.get(run.signals_sha256))
+    fits = fits_of(store, run)
     kept = [fit for fit in fits if fit.experiment.startswith("validation")]
     model = model_of_run(session, run, job)
     inputs, missing = _inputs(session, store, model, body, bool(kept))
     counts = {} if kept else _coefficients(model, body)
+    times = (run.result or {}).get("correlation_times") or {}
     found = correlations(
         [
             one._replace(coefficients=counts.get(one.output, 0))
-            for one in _series(body, kept or list(fits), fits, inputs)
+            for one in _series(body, kept or list(fits), fits, inputs, times)
         ]
     )
     names = [name for name, _ in groupby(fit.experiment for fit in kept or fits)]
@@ -117,7 +118,7 @@ def _out(one: Correlation) -> CorrelationOut:
 
 def _series(
     body: Body, tested: Sequence[FittedOutput], fits: Sequence[FittedOutput],
-    inputs: Sequence[tuple[Channel, ...]],
+    inputs: Sequence[tuple[Channel, ...]], times: Mapping[str, float],
 ) -> Iterator[Series]:  # fmt: skip
     """Residuals of the tested outputs as the loss saw them, less those that were skipped."""
     loss = body["loss"]
@@ -132,7 +133,7 @@ def _series(
         yield series(
             number, fit.name, fit.times, weight * fit.measured, weight * fit.simulated,
             scored & np.isfinite(fit.measured), inputs[number] if number < len(inputs) else (),
-            scale,
+            scale, times.get(fit.name, 0.0),
         )  # fmt: skip
 
 

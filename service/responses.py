@@ -6,8 +6,8 @@ from sqlalchemy.orm import Session
 
 from service.datasets import series
 from service.errors import NotFound
+from service.fitted import fits_of
 from service.schemas_runs import ExperimentOut, ResponseOut
-from service.signals.reader import read_fit
 from service.signals.writer import FittedOutput
 from service.storage.objects import ObjectStore
 from service.storage.runs import RunRepository
@@ -25,7 +25,7 @@ def response(session: Session, store: ObjectStore, run_id: str, max_points: int)
     run = RunRepository(session).get(run_id)
     if run.signals_sha256 is None:
         raise NotFound("response of run", run_id, f"; the run is {run.state.value}")
-    fits = read_fit(store.get(run.signals_sha256))
+    fits = fits_of(store, run)
     experiments = [
         _experiment(name, list(outputs), max_points)
         for name, outputs in groupby(fits, key=lambda fit: fit.experiment)

@@ -26,8 +26,19 @@ class ByteRange:
     stop: int
 
 
-def content_of(request: Request, store: ObjectStore, sha256: str, file_name: str) -> Response:
+def content_of(
+    request: Request,
+    store: ObjectStore,
+    sha256: str,
+    file_name: str,
+    part_of: ByteRange | None = None,
+) -> Response:
     """An object, or the part of it that was asked for.
+
+    Parameters
+    ----------
+    part_of : ByteRange, optional
+        Where the file is in the object; the whole object is the file if this is not given.
 
     Raises
     ------
@@ -36,7 +47,7 @@ def content_of(request: Request, store: ObjectStore, sha256: str, file_name: str
     StaleVersion
         If ``If-Match`` names another version.
     """
-    etag = f'"{sha256}"'
+    etag = f'"{sha256}"' if part_of is None else f'"{sha256}-{part_of.start}"'
     headers = {
         **CROSS_ORIGIN,
         "Accept-Ranges": "bytes",
@@ -48,7 +59,9 @@ def content_of(request: Request, store: ObjectStore, sha256: str, file_name: str
         raise StaleVersion(f"the content is {etag}; asked for {request.headers['if-match']}")
     if _names(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
-    size = store.size(sha256)
+    whole = ByteRange(0, store.size(sha256))  # asked in any case: it may be missing
+    file = whole if part_of is None else part_of
+    size = file.stop - file.start
     part = _asked(request, size, etag)
     status, wanted = (200, ByteRange(0, size)) if part is None else (206, part)
     if part is not None:
@@ -56,7 +69,7 @@ def content_of(request: Request, store: ObjectStore, sha256: str, file_name: str
     headers["Content-Length"] = str(wanted.stop - wanted.start)
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=MCAP_TYPE)
-    blocks = store.stream(sha256, wanted.start, wanted.stop - wanted.start)
+    blocks = store.stream(sha256, file.start + wanted.start, wanted.stop - wanted.start)
     return StreamingResponse(blocks, status, headers, MCAP_TYPE)
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 
 from service import exports, free_runs, profiles, residuals, responses, run_simulations, runs
-from service.api.content import content_of
+from service.api.content import ByteRange, content_of
 from service.api.deps import MaxPoints, PartsDep, ReadSession
 from service.errors import NotFound
 from service.schemas_free_runs import FreeRunIn, FreeRunOut
@@ -95,4 +95,7 @@ def signals(run_id: str, request: Request, session: ReadSession, parts: PartsDep
     run = RunRepository(session).get(run_id)
     if run.signals_sha256 is None:
         raise NotFound("signals file of run", run_id, f"; the run is {run.state.value}")
-    return content_of(request, parts.store, run.signals_sha256, f"{run_id}.mcap")
+    part = None
+    if run.signals_start is not None and run.signals_size is not None:
+        part = ByteRange(run.signals_start, run.signals_start + run.signals_size)
+    return content_of(request, parts.store, run.signals_sha256, f"{run_id}.mcap", part)

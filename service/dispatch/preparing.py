@@ -12,7 +12,7 @@ from service.cells import stored_cells, stored_groups
 from service.conversion import algorithm_of, loss_of
 from service.dispatch.checkpoints import unpacked
 from service.dispatch.open_chains import OpenChains
-from service.dispatch.signals import save_fit
+from service.dispatch.signals import Shelf, Shelved, save_fit
 from service.dispatch.warm_starts import WarmStarts
 from service.errors import ServiceError
 from service.recordings import recording_of
@@ -79,6 +79,7 @@ class JobRuns:
     ) -> None:
         self._database, self._lease, self._job = database, claim.lease, claim.job
         self._store = store
+        self._shelf = Shelf(store)
         self._problems: dict[str, ProblemSpec] = {}
         self._models: dict[str, Model] = {}
         self._data: dict[str, DataKey] = {}
@@ -205,8 +206,8 @@ class JobRuns:
         with self._database.read() as session:
             return DatasetRepository(session, self._job.project_id).get_all(datasets)
 
-    def save(self, run: str, found: Identification) -> str | None:
-        """Store the fitted signals of a run; gives the hash of the object.
+    def save(self, run: str, found: Identification) -> Shelved | None:
+        """Make the file of a run's fitted signals, to be stored with those of others.
 
         Raises
         ------
@@ -220,7 +221,7 @@ class JobRuns:
         parts = [("estimation", estimation, found.simulated)]
         if validation is not None:
             parts.append(("validation", validation, found.simulated_validation))
-        return save_fit(self._store, run, parts)
+        return save_fit(self._shelf, run, parts)
 
     def failed(self, run: str) -> None:
         """Nothing will be saved of a run: those behind it in its chain wait no longer."""

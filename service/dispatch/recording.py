@@ -3,13 +3,14 @@
 import logging
 import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 from sqlalchemy.orm import Session
 
 from service.dispatch.checkpoints import packed
 from service.dispatch.results import history_points, migrant_points, outcome_of
+from service.dispatch.signals import Place, Shelved
 from service.storage.columns import Document
 from service.storage.errors import ObjectStoreFailed
 from service.storage.ledger import RunLedger, RunOutcome
@@ -31,8 +32,8 @@ PROGRESS_SECONDS = 1.0
 CHECKPOINT_SECONDS = 4.0
 KEPT_REASONS = 3
 
-SaveSignals = Callable[[str, Identification], str | None]
-"""Stores the fitted signals of a run; gives the object's hash."""
+SaveSignals = Callable[[str, Identification], Shelved | None]
+"""Makes the file of a run's fitted signals, which can be stored."""
 
 
 def _nobody(_run: str) -> None:
@@ -60,6 +61,7 @@ class _Pending:
     outcomes: list[RunOutcome] = field(default_factory=list)
     history: list[HistoryPoint] = field(default_factory=list)
     migrants: list[MigrantPoint] = field(default_factory=list)
+    signals: dict[str, Shelved] = field(default_factory=dict)
     complaints: list[str] = field(default_factory=list)
     kills: dict[str, int] = field(default_factory=dict)
 
@@ -129,15 +131,12 @@ class Recorder:
         self._collect_history(run, found.history, found.migrations, live)
         try:
             signals = self._save_signals(run, found)
-        except (
-            ObjectStoreFailed,
-            RecordsUnavailable,
-        ) as error:  # the numbers are worth more than the plot
-            text = f"the signals of {run} are not stored: {error}"
-            _log.error(text)
-            self._pending.complaints.append(text)
+        except (ObjectStoreFailed, RecordsUnavailable) as error:
+            self._complain_of_signals([run], error)
             signals = None
-        self._pending.outcomes.append(outcome_of(run, concluded, seconds, signals))
+        if signals is not None:
+            self._pending.signals[run] = signals
+        self._pending.outcomes.append(outcome_of(run, concluded, seconds))
         self._evaluations += found.evaluations
         self._generation = max(self._generation, found.generations)
         self._best = min(self._best, found.rms)
@@ -188,21 +187,18 @@ class Recorder:
         keep = bool(self._live) and now - self._kept > CHECKPOINT_SECONDS
         some = self._pending.has_runs
         if tell or keep or (some and now - self._wrote > RESULTS_SECONDS):
-            with self._database.write() as session:
-                self._write(session, tell=tell, keep=keep)
-            self._written(now, tell=tell, keep=keep)
+            self._commit(now, tell=tell, keep=keep)
 
     def keep(self) -> None:
         """Write everything, checkpoints too, because the dispatcher stops."""
-        with self._database.write() as session:
-            self._write(session, tell=True, keep=True)
-        self._written(time.monotonic(), tell=True, keep=True)
+        self._commit(time.monotonic(), tell=True, keep=True)
 
     def finish(self, floors: Document | None = None) -> None:
         """Write the last results and end the job, in one transaction.
 
         Where floors are told, the results were written before (`store`): they are made of them.
         """
+        self._store_signals()
         with self._database.write() as session:
             self._write(session, tell=True, keep=False)
             queue = Queue(session)
@@ -221,12 +217,11 @@ class Recorder:
 
     def store(self) -> None:
         """Write the last results; the job goes on."""
-        with self._database.write() as session:
-            self._write(session, tell=True, keep=False)
-        self._written(time.monotonic(), tell=True, keep=False)
+        self._commit(time.monotonic(), tell=True, keep=False)
 
     def cancel(self) -> None:
         """End the job as cancelled; what its runs gave before stays."""
+        self._store_signals()
         with self._database.write() as session:
             self._write(session, tell=True, keep=True)
             Queue(session).finish(self.lease, State.CANCELLED)
@@ -278,6 +273,36 @@ class Recorder:
         self._pending.history.extend(history_points(run, history, written))
         self._pending.migrants.extend(migrant_points(run, migrants, logged))
 
+    def _commit(self, now: float, *, tell: bool, keep: bool) -> None:
+        self._store_signals()
+        with self._database.write() as session:
+            self._write(session, tell=tell, keep=keep)
+        self._written(now, tell=tell, keep=keep)
+
+    def _complain_of_signals(self, runs: Sequence[str], error: Exception) -> None:
+        """The numbers are worth more than the plot: they are written without it."""
+        others = f" and {len(runs) - 1} others" if len(runs) > 1 else ""
+        text = f"the signals of {runs[0]}{others} are not stored: {error}"
+        _log.error(text)
+        self._pending.complaints.append(text)
+
+    def _store_signals(self) -> None:
+        """Store the files of ended runs, before the rows that name them."""
+        places: dict[str, Place] = {}
+        failed: dict[int, tuple[Exception, list[str]]] = {}
+        for run, shelved in self._pending.signals.items():
+            try:
+                places[run] = shelved.place()
+            except ObjectStoreFailed as error:
+                failed.setdefault(id(error), (error, []))[1].append(run)
+        for reason, runs in failed.values():
+            self._complain_of_signals(runs, reason)
+        self._pending.signals = {}
+        self._pending.outcomes = [
+            one if one.run_id not in places else _with_signals(one, places[one.run_id])
+            for one in self._pending.outcomes
+        ]
+
     def _write(self, session: Session, *, tell: bool, keep: bool) -> None:
         ledger, pending = RunLedger(session, self.lease), self._pending
         self._taken = take_over(session, self.lease, pending.known)
@@ -310,6 +335,12 @@ class Recorder:
             self._kept = now
             for live in self._live.values():
                 live.changed = False
+
+
+def _with_signals(one: RunOutcome, place: Place) -> RunOutcome:
+    return replace(
+        one, signals_sha256=place.sha256, signals_start=place.start, signals_size=place.size
+    )
 
 
 def _rms_of(outcomes: list[RunOutcome]) -> list[float]:

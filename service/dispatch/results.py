@@ -11,8 +11,8 @@ from sysid.result import Improvement, Migrant
 from workers.ports import Concluded
 
 
-def outcome_of(run: str, concluded: Concluded, seconds: float, signals: str | None) -> RunOutcome:
-    """The row of a run that succeeded."""
+def outcome_of(run: str, concluded: Concluded, seconds: float) -> RunOutcome:
+    """The row of a run that succeeded, its signals left out."""
     found, without = concluded.identification, finite(concluded.rms_noise_free)
     return RunOutcome(
         run_id=run,
@@ -26,7 +26,6 @@ def outcome_of(run: str, concluded: Concluded, seconds: float, signals: str | No
         evaluations=found.evaluations,
         generations=found.generations,
         seconds=seconds,
-        signals_sha256=signals,
     )
 
 

@@ -1,21 +1,116 @@
-"""The fitted signals of a run, as an object."""
+"""The fitted signals of runs: a file of each, the files of several as one object."""
 
 import io
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 from service.signals.writer import FittedOutput, write_fit
+from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import ObjectStore
 from sysid.records import Record
 from sysid.types import FloatArray
 from workers.ports import Records
 
+PARCEL_BYTES = 4 << 20
+"""Bytes that are kept in memory until they are stored with those of other runs."""
+
+
+class Place(NamedTuple):
+    """Where a run's file is stored; `start` is None where it is the whole object."""
+
+    sha256: str
+    start: int | None = None
+    size: int | None = None
+
+
+class _Parcel:
+    """Files behind one another, which become one object. What made that fail is told to all."""
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+        self._files: list[bytes] = []
+        self._sha256: str | None = None
+        self._failed: ObjectStoreFailed | None = None
+        self.size = self._n_files = 0
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether another file would come too late."""
+        return self._sha256 is not None or self._failed is not None
+
+    def add(self, file: bytes) -> int:
+        start = self.size
+        self._files.append(file)
+        self._n_files += 1
+        self.size += len(file)
+        return start
+
+    def stored(self) -> str:
+        if self._failed is not None:
+            raise self._failed
+        if self._sha256 is None:
+            try:
+                self._sha256 = self._store.put_stream(self._files).sha256
+            except ObjectStoreFailed as error:
+                self._failed = error
+                raise
+            finally:
+                self._files = []
+        return self._sha256
+
+    def place(self, start: int, size: int) -> Place:
+        sha256 = self.stored()
+        return Place(sha256, start, size) if self._n_files > 1 else Place(sha256)
+
+
+class Shelved(NamedTuple):
+    """A run's file that waits to be stored."""
+
+    parcel: _Parcel
+    start: int
+    size: int
+
+    def place(self) -> Place:
+        """Store it, with the others of its parcel.
+
+        Raises
+        ------
+        ObjectStoreFailed
+            If it cannot be written, now or before.
+        """
+        return self.parcel.place(self.start, self.size)
+
+
+class Shelf:
+    """Collects the files of runs: an object of each would cost more than the file itself."""
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+        self._parcel = _Parcel(store)
+
+    def add(self, file: bytes) -> Shelved:
+        """Put a file to those that are stored next; a full parcel is stored at once.
+
+        Raises
+        ------
+        ObjectStoreFailed
+            If that cannot be written.
+        """
+        parcel = self._parcel
+        if parcel.is_closed:
+            parcel = self._parcel = _Parcel(self._store)
+        start = parcel.add(file)
+        if parcel.size >= PARCEL_BYTES:
+            parcel.stored()
+        return Shelved(parcel, start, len(file))
+
 
 def save_fit(
-    store: ObjectStore,
+    shelf: Shelf,
     run: str,
     parts: Sequence[tuple[str, Records, tuple[tuple[FloatArray, ...], ...]]],
-) -> str:
-    """Store what a run's model gives beside what was measured; gives the object's hash.
+) -> Shelved:
+    """What a run's model gives beside what was measured, as a file on the shelf.
 
     Parameters
     ----------
@@ -25,7 +120,7 @@ def save_fit(
     target = io.BytesIO()
     fits = [fit for role, records, simulated in parts for fit in _fits(role, records, simulated)]
     write_fit(run, fits, target)
-    return store.put_bytes(target.getvalue()).sha256
+    return shelf.add(target.getvalue())
 
 
 def _fits(

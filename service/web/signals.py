@@ -1,15 +1,14 @@
 """Signals of datasets and runs out of the object store, as figures want them."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache
 from math import inf
 from typing import Any
 
 import numpy as np
 from sqlalchemy.orm import Session
 
+from service.fitted import fits_of
 from service.recordings import recording_of
-from service.signals.reader import read_fit
 from service.signals.writer import FittedOutput
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import StorageError
@@ -20,9 +19,6 @@ from service.web.reading import model_of, run_body
 from sysid.errors import SysidError
 from sysid.models.model import Model
 from sysid.records import Channel, Recording
-
-# An object never changes, so what was read of it stays true; a zoom asks for it again and again.
-_KEPT = 4
 
 
 def traces_of(store: ObjectStore, dataset: Dataset) -> list[Trace]:
@@ -35,7 +31,7 @@ def experiments_of(session: Session, store: ObjectStore, job: Job, run: Run) -> 
     if run.signals_sha256 is None:
         return []
     body = run_body(job, run)
-    fitted = _by_name(_fit(store, run.signals_sha256))
+    fitted = _by_name(fits_of(store, run))
     kept = body.get("validation") or {}
     inputs = list(_inputs(session, store, body, body["datasets"]))
     found = [
@@ -50,11 +46,6 @@ def experiments_of(session: Session, store: ObjectStore, job: Job, run: Run) -> 
         Experiment(f"validation {number}", _outputs(parts), _at(other, number), -inf)
         for number, parts in validation
     ]
-
-
-@lru_cache(maxsize=_KEPT)
-def _fit(store: ObjectStore, sha256: str) -> tuple[FittedOutput, ...]:
-    return read_fit(store.get(sha256))
 
 
 def _by_name(fits: Iterable[FittedOutput]) -> dict[str, list[FittedOutput]]:

@@ -1,0 +1,102 @@
+"""The fitted signals of runs that were stored together, over REST: each run has its own file."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from service.api.deps import Parts
+from service.app import create_app
+from service.signals.reader import read_fit
+from service.storage.errors import ObjectStoreFailed
+from service.storage.runs import RunRepository
+from service.storage.tables import Run
+from tests.identified import identified
+from tests.rest import CSV, recording, settings_of
+
+SMALL = {"population": 8, "generations": 5, "islands": 1}
+SIGMAS = [0.0, 0.1, 0.2]
+
+
+class Served(NamedTuple):
+    server: TestClient
+    parts: Parts
+    runs: list[str]
+    body: dict[str, object]
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    app = create_app(settings_of(tmp_path_factory.mktemp("data")))
+    with TestClient(app) as server:
+        stored = server.post("/v1/datasets?name=steps", content=recording(), headers=CSV).json()
+        body = {
+            "model": "fopdt", "datasets": [stored["id"]], "algorithm": SMALL, "reuse": False,
+            "sweep": {"axes": [{"path": "/noise/sigma", "values": SIGMAS}]},
+        }  # fmt: skip
+        _, runs = identified(app.state.parts, body)
+        yield Served(server, app.state.parts, runs, body)
+
+
+def rows(served: Served, runs: list[str]) -> list[Run]:
+    with served.parts.database.read() as session:
+        return [RunRepository(session).get(run) for run in runs]
+
+
+def test_each_run_has_a_file_of_its_own_in_one_object(served: Served) -> None:
+    found = [served.server.get(f"/v1/runs/{run}/signals.mcap") for run in served.runs]
+    assert len({row.signals_sha256 for row in rows(served, served.runs)}) == 1
+    assert len({one.headers["etag"] for one in found}) == len(found)
+    assert len({read_fit(one.content)[0].measured.tobytes() for one in found}) == len(SIGMAS)
+    for answer, run in zip(found, served.runs, strict=True):
+        (fit,) = read_fit(answer.content)
+        shown = served.server.get(f"/v1/runs/{run}/response?max_points=10000").json()
+        (experiment,) = shown["experiments"]
+        assert experiment["simulated"][0]["values"] == fit.simulated.tolist()
+        assert experiment["measured"][0]["values"] == fit.measured.tolist()
+        told = served.server.get(f"/v1/runs/{run}").json()["rms"]
+        assert np.sqrt(np.mean((fit.measured - fit.simulated) ** 2)) == pytest.approx(told)
+
+
+def test_ranges_are_of_the_runs_own_file(served: Served) -> None:
+    path = f"/v1/runs/{served.runs[1]}/signals.mcap"
+    whole = served.server.get(path)
+    head = served.server.head(path)
+    assert int(head.headers["content-length"]) == len(whole.content)
+    part = served.server.get(path, headers={"Range": "bytes=5-20"})
+    assert (part.status_code, part.content) == (206, whole.content[5:21])
+    assert part.headers["content-range"] == f"bytes 5-20/{len(whole.content)}"
+    last = served.server.get(path, headers={"Range": "bytes=-8"})
+    assert last.content == whole.content[-8:] == whole.content[:8]  # the magic of a whole file
+    beyond = served.server.get(path, headers={"Range": f"bytes={len(whole.content)}-"})
+    assert beyond.status_code == 416
+    etag = whole.headers["etag"]
+    assert served.server.get(path, headers={"If-None-Match": etag}).status_code == 304
+
+
+def test_a_run_that_is_taken_over_shows_the_same_signals(served: Served) -> None:
+    _, again = identified(served.parts, {**served.body, "reuse": True})
+    for old, new in zip(served.runs, again, strict=True):
+        first, second = (
+            served.server.get(f"/v1/runs/{run}/signals.mcap").content for run in (old, new)
+        )
+        assert first == second
+
+
+def test_signals_that_cannot_be_stored_cost_no_result_and_are_told_once(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_blocks: object) -> None:
+        raise ObjectStoreFailed("the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(served.parts.store, "put_stream", full)
+        job, runs = identified(served.parts, served.body)
+    found = rows(served, runs)
+    assert [(row.state.value, row.signals_sha256) for row in found] == [("succeeded", None)] * 3
+    assert served.server.get(f"/v1/runs/{runs[0]}/signals.mcap").status_code == 404
+    events = served.server.get(f"/v1/jobs/{job}/events").text
+    assert events.count("are not stored") == 1
+    assert f"{runs[0]} and 2 others" in events

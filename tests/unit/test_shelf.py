@@ -1,0 +1,80 @@
+"""Files of fitted signals, stored with those of other runs: each comes back as it was."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.dispatch import signals
+from service.dispatch.signals import Place, Shelf
+from service.storage.errors import ObjectStoreFailed
+from service.storage.objects import open_store
+
+
+class FullStore:
+    """A store that takes nothing, and counts how often it was asked."""
+
+    def __init__(self):
+        self.asked = 0
+
+    def put_stream(self, blocks):
+        self.asked += 1
+        raise ObjectStoreFailed("the disk is full")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return open_store(f"file://{tmp_path_factory.mktemp('objects')}")
+
+
+def read(store, place):
+    if place.start is None:
+        return store.get(place.sha256)
+    return store.get_range(place.sha256, place.start, place.size)
+
+
+@given(st.lists(st.tuples(st.binary(min_size=1, max_size=50), st.booleans()), max_size=12))
+def test_files_come_back_whatever_they_were_stored_with(store, files):
+    shelf, shelved = Shelf(store), []
+    for file, is_asked_for in files:
+        shelved.append(shelf.add(file))
+        if is_asked_for:
+            shelved[-1].place()
+    assert [read(store, one.place()) for one in shelved] == [file for file, _ in files]
+
+
+def test_a_file_by_itself_is_the_whole_object(store):
+    place = Shelf(store).add(b"alone").place()
+    assert place == Place(place.sha256, None, None)
+    assert store.get(place.sha256) == b"alone"
+
+
+def test_files_that_wait_together_are_one_object(store):
+    shelf = Shelf(store)
+    first, second = shelf.add(b"first"), shelf.add(b"second one")
+    assert (first.place().start, second.place()) == (0, Place(first.place().sha256, 5, 10))
+    assert shelf.add(b"late").place().sha256 != first.place().sha256
+
+
+def test_no_more_is_kept_in_memory_than_a_parcel(store, monkeypatch):
+    monkeypatch.setattr(signals, "PARCEL_BYTES", 10)
+    shelf = Shelf(store)
+    small, large = shelf.add(b"12345"), shelf.add(b"1234567890")
+    assert store.get(small.place().sha256) == b"123451234567890"
+    assert large.parcel is small.parcel
+    assert shelf.add(b"x").parcel is not small.parcel
+
+
+def test_what_cannot_be_stored_is_tried_once_for_all_files_of_a_parcel():
+    full = FullStore()
+    shelf = Shelf(full)
+    shelved = [shelf.add(b"a"), shelf.add(b"b")]
+    told = []
+    for one in shelved:
+        with pytest.raises(ObjectStoreFailed) as caught:
+            one.place()
+        told.append(caught.value)
+    assert told[0] is told[1]
+    assert full.asked == 1
+    with pytest.raises(ObjectStoreFailed):
+        shelf.add(b"c").place()
+    assert full.asked == 2
