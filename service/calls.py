@@ -81,11 +81,13 @@ class NotFinite(ClientError):
     ----------
     pointer : str
         Where it stands in the body.
+    reason : str
+        What was found there.
     """
 
     def __init__(self, pointer: str, value: float) -> None:
-        super().__init__(f"{pointer or 'body'}: found {value}; need a finite number")
-        self.pointer = pointer
+        self.pointer, self.reason = pointer, f"found {value}; need a finite number"
+        super().__init__(f"{pointer or 'body'}: {self.reason}")
 
 
 @dataclass(frozen=True, slots=True)

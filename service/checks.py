@@ -7,7 +7,7 @@ from pydantic import ValidationError
 from sqlalchemy.orm import Session
 
 from service import models, warm_starts
-from service.conversion import algorithm_of, faults_of, loss_of
+from service.conversion import faults_of
 from service.errors import FieldError
 from service.named_datasets import dataset_of
 from service.pointers import explained
@@ -15,17 +15,23 @@ from service.record_checks import (
     channel_faults,
     length_faults,
     pieces_of,
-    signal_faults,
     unit_faults,
 )
 from service.schemas_jobs import JobIn
+from service.setting_checks import (
+    conversion_faults,
+    overridden,
+    setting_faults,
+    signal_faults,
+    tried,
+)
 from service.storage.tables import Dataset
 from sysid.errors import SysidError
 from sysid.models.initial import initial_parameters
 from sysid.models.lags import check_lags
 from sysid.models.model import Model
 from sysid.models.polynomial import check_samples
-from sysid.parameters import Parameter, override
+from sysid.parameters import Parameter
 from sysid.ties import tied_model, ties_of
 from sysid.unused import unused
 
@@ -51,29 +57,27 @@ class JobChecker:
 
         They stand, whatever else of the body is changed.
         """
-        found = list(self._conversions(body))
-        found += self._missing_datasets(body)
+        found = list(self._missing_datasets(body))
         model = self.model(body["model"])
         if isinstance(model, list):
-            return found + model
-        _overridden(found, self._all_parameters(body, model[0]), body["parameters"])
-        found += warm_starts.faults(self._session, body["warm_start"], model[0])
-        return found + list(signal_faults(body, model[0]))
+            return [*conversion_faults(body), *found, *model]
+        found += setting_faults(body, model[0], self._all_parameters(body, model[0]))
+        return found + warm_starts.faults(self._session, body["warm_start"], model[0])
 
     def errors(self, body: Body) -> list[FieldError]:
         """Every fault of a body in its normal form."""
-        found = list(self._conversions(body))
+        found = conversion_faults(body)
         model = self.model(body["model"])
         if isinstance(model, list):
             return found + model + list(self._missing_datasets(body))
-        parameters = _overridden(found, self._all_parameters(body, model[0]), body["parameters"])
+        parameters = overridden(found, self._all_parameters(body, model[0]), body["parameters"])
         found += _freedom_faults(parameters, body["algorithm"]["population"])
         own = parameters[: len(model[0].parameters)]
-        ties = _tried(ties_of, found, model[0], parameters)
+        ties = tried(ties_of, found, model[0], parameters)
         tied = tied_model(model[0], ties or {})
-        _tried(check_lags, found, tied, own)
+        tried(check_lags, found, tied, own)
         if model[0].rule is not None:
-            _tried(check_samples, found, len(model[0].terms), self._samples(body))
+            tried(check_samples, found, len(model[0].terms), self._samples(body))
         found += [FieldError(one.pointer, one.detail)
                   for one in unused(tied, own, body["weights"])]  # fmt: skip
         found += self._repeated(body)
@@ -152,12 +156,6 @@ class JobChecker:
         samples = self._samples(body)
         skipped = body["skip"] * len(body["datasets"])
         return int(samples - round(kept * samples) - skipped) * len(model.outputs)
-
-    def _conversions(self, body: Body) -> Iterator[FieldError]:
-        found: list[FieldError] = []
-        _tried(algorithm_of, found, body["algorithm"])
-        _tried(loss_of, found, body["loss"])
-        yield from found
 
     def _missing_datasets(self, body: Body) -> Iterator[FieldError]:
         for pointer, reference in _references(body):
@@ -243,20 +241,3 @@ def _freedom_faults(parameters: tuple[Parameter, ...], population: int) -> Itera
             f"found {population} individuals of {len(free)} free parameters; need at most "
             f"{MOST_GENES // len(free)}, so that the population fits into memory",
         )
-
-
-def _overridden(
-    errors: list[FieldError], parameters: tuple[Parameter, ...], changes: Mapping[str, Any]
-) -> tuple[Parameter, ...]:
-    """The parameters with all changes that can be made; of each of the others its fault."""
-    for name, change in changes.items():
-        parameters = _tried(override, errors, parameters, {name: change}) or parameters
-    return parameters
-
-
-def _tried(make: Any, errors: list[FieldError], *arguments: Any) -> Any:
-    try:
-        return make(*arguments)
-    except SysidError as error:
-        errors += faults_of(error)
-        return None

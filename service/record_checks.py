@@ -1,8 +1,7 @@
-"""What can be known of the records of a job before it runs: channels, units, lengths, weights."""
+"""What can be known of the records of a job before it runs: channels, units, lengths."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from service.errors import FieldError
 from service.storage.tables import Dataset
@@ -12,8 +11,6 @@ from sysid.models.model import Model
 from sysid.models.sections import interval
 from sysid.parameters import Parameter
 from sysid.signal_units import SignalUnits
-
-Body = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,27 +35,6 @@ class Piece:
 def signals_of(model: Model) -> tuple[list[str], list[str]]:
     """Names of a model's inputs and outputs: the signals that channels are given to."""
     return [one.name for one in model.inputs], [one.name for one in model.outputs]
-
-
-def signal_faults(body: Body, model: Model) -> Iterator[FieldError]:
-    """Channels, holds and weights of signals that the model does not have."""
-    inputs, outputs = signals_of(model)
-    for name in body["channels"]:
-        if name not in (*inputs, *outputs):
-            hint = nearest(name, (*inputs, *outputs))
-            yield FieldError(
-                f"/channels/{name}", f"model {model.name!r} has no signal {name!r}{hint}"
-            )
-    for name in body["hold"]:
-        if name not in inputs:
-            hint = nearest(name, inputs)
-            yield FieldError(f"/hold/{name}", f"model {model.name!r} has no input {name!r}{hint}")
-    for name, weight in (body["weights"] or {}).items():
-        if name not in outputs:
-            hint = nearest(name, outputs)
-            yield FieldError(f"/weights/{name}", f"the model has no output {name!r}{hint}")
-        elif not weight > 0:
-            yield FieldError(f"/weights/{name}", f"found {weight:g}; need a positive number")
 
 
 def channel_faults(

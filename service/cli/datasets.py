@@ -19,10 +19,12 @@ from service.cli.common import (
     print_listing,
     read_file,
 )
+from service.cli.places import Places, told_at
 from service.documents import read_yaml
 
 app = typer.Typer(help="Add, simulate and derive recordings.", no_args_is_help=True)
 
+UPLOAD = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
 DOCUMENT = "YAML or JSON file with the body of the request."
 
 
@@ -53,7 +55,7 @@ def add(
     """Store a recording."""
     if not file.is_file():
         fail(f"there is no file {file}")
-    with connected(url, key) as client:
+    with connected(url, key) as client, told_at(Places(UPLOAD, rest=f"{file} …")):
         stored = client.add_dataset(file, name, segments=segments, sample_time=sample_time)
     _tell(stored, as_json)
 
@@ -88,8 +90,9 @@ def simulate(
     if sets:
         given = dict(_parameter(one) for one in sets)
         body["parameters"] = {**(body.get("parameters") or {}), **given}
-    with connected(url, key) as client:
-        _tell(client.simulate_dataset(body), as_json)
+    with connected(url, key) as client, told_at(_places(file, sets)):
+        stored = client.simulate_dataset(body)
+    _tell(stored, as_json)
 
 
 @app.command()
@@ -107,8 +110,17 @@ def derive(
         steps = steps.get("steps")
     if not isinstance(steps, list):
         fail(f"{file} has no list of steps, such as - detrend: {{}}")
-    with connected(url, key) as client:
-        _tell(client.derive(dataset, steps, name), as_json)
+    with connected(url, key) as client, told_at(Places({"/name": "--name"}, rest=f"{file} …")):
+        stored = client.derive(dataset, steps, name)
+    _tell(stored, as_json)
+
+
+def _places(file: Path | None, sets: list[str] | None) -> Places:
+    """Where the fields of a simulation were given: by options, or all others in the file."""
+    given = {f"/parameters/{one.partition('=')[0].strip()}": "--set {}" for one in sets or ()}
+    named = {place: option.format(place.rpartition("/")[2]) for place, option in given.items()}
+    options = {"/plant": "--plant", "/name": "--name", **named}
+    return Places(options, rest="--set {}" if file is None else f"{file} …")
 
 
 def _tell(stored: dict[str, Any], as_json: bool) -> None:

@@ -22,8 +22,11 @@ from service.cli.common import (
     status_of,
     usage,
 )
+from service.cli.places import Places
+from sysid.errors import nearest
 
 if TYPE_CHECKING:
+    from service.errors import FieldError
     from service.schemas_jobs import JobIn
     from sysid.models.model import Model
     from sysid.records import Record, Recording
@@ -38,6 +41,7 @@ ELSEWHERE = {
     "model": "use --model",
     "validation.datasets": "use --validation FILE",
 }
+PLACES = Places({"/model": "--model …", "/datasets": "DATA", "/channels": "--channels {}"})
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 
 
@@ -69,35 +73,76 @@ def identify(
     ] = None,
 ) -> None:
     """Identify a model's parameters and lags from a recording, in this process."""
-    body = job_body(data, model, changes or [], _pairs(channels))
-    loaded = _model(model)
+    given = _given(data, model, changes or [], _pairs(channels))
     _refuse_same(data, validation)
     reading = Reading(sample_time, _names(segments))
-    records = _records(data, reading, loaded, body)
-    kept = [] if validation is None else _records(validation, reading, loaded, body)
+    recording = read(data, reading)
+    body, loaded = checked(given, max(1, len(recording.segments)))
+    records = _records(recording, data, loaded, body)
+    kept = []
+    if validation is not None:
+        kept = _records(read(validation, reading), validation, loaded, body)
     begun = time.perf_counter()
     found = _identified(loaded, records, kept, body, quiet=json_file == "-")
     tell(loaded, found, time.perf_counter() - begun, json_file)
 
 
-def job_body(data: Path, model: str, changes: list[str], channels: dict[str, str]) -> "JobIn":
-    """The job body that the options stand for; its checks are those of the service."""
-    from pydantic import ValidationError
-
-    from service.pointers import explained
-    from service.schemas_jobs import JobIn
-
+def _given(data: Path, model: str, changes: list[str], channels: dict[str, str]) -> dict[str, Any]:
+    """The job body that the options stand for, unchecked."""
     body: dict[str, Any] = {"model": model, "datasets": [str(data)], "channels": channels}
     for change in changes:
         _refuse_elsewhere(change, parts_of(change))
         put(body, change)
+    return body
+
+
+def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
+    """The body as its type, and the model; ends the command with every fault that is known now.
+
+    Parameters
+    ----------
+    pieces : int
+        Records in the recording, each of which may have initial states of its own.
+    """
+    from pydantic import ValidationError
+
+    from service.conversion import faults_of
+    from service.errors import FieldError
+    from service.partial import beside
+    from service.pointers import explained
+    from service.schemas_jobs import JobIn
+    from sysid.errors import SysidError
+
+    job, model = None, None
+    unread: list[FieldError] = []
+    found: list[FieldError] = []
     try:
         job = JobIn.model_validate(body)
     except ValidationError as error:
-        usage("; ".join(map(str, explained(error.errors(), body, JobIn))))
-    if job.validation is not None and job.validation.datasets is not None:
+        unread += explained(error.errors(), body, JobIn)
+    try:
+        model = _model(body["model"])
+    except SysidError as error:
+        found += [
+            FieldError("/model" + one.pointer.removeprefix("/model"), one.detail, one.column)
+            for one in faults_of(error)
+        ]
+    if job is not None and job.validation is not None and job.validation.datasets is not None:
         usage(f"--set validation: {ELSEWHERE['validation.datasets']}")
-    return job
+    if model is not None:
+        loaded = model
+        found += beside(JobIn, body, unread, lambda whole: _meant(whole, loaded, pieces))
+    if unread or found or job is None or model is None:
+        fail(PLACES.told((*unread, *found)), 2 if unread else 1)
+    return job, model
+
+
+def _meant(job: "JobIn", model: "Model", pieces: int) -> "list[FieldError]":
+    from service.setting_checks import setting_faults
+    from sysid.models.initial import initial_parameters
+
+    parameters = (*model.parameters, *initial_parameters(model, pieces))
+    return setting_faults(job.normal_form(), model, parameters)
 
 
 def _refuse_elsewhere(change: str, parts: list[str]) -> None:
@@ -204,18 +249,16 @@ def _model(name: str) -> "Model":
     return load_model(Path(name) if name.endswith(MODEL_SUFFIXES) else name)
 
 
-def _records(path: Path, reading: Reading, model: "Model", body: "JobIn") -> "list[Record]":
+def _records(recording: "Recording", path: Path, model: "Model", body: "JobIn") -> "list[Record]":
     inputs, outputs = [one.name for one in model.inputs], [one.name for one in model.outputs]
-    for signal in body.channels:
-        if signal not in (*inputs, *outputs):
-            known = ", ".join((*inputs, *outputs))
-            fail(f"model {model.name!r} has no signal {signal!r}; it has {known}")
     chosen = {signal: body.channels.get(signal, signal) for signal in (*inputs, *outputs)}
-    for signal in body.hold:
-        if signal not in inputs:
-            fail(f"model {model.name!r} has no input {signal!r}; it has {', '.join(inputs)}")
+    for signal, channel in chosen.items():
+        if channel not in recording.names:
+            given = f"--channels {signal}" if signal in body.channels else "--channels"
+            fail(f"{given}: {path} has no channel {channel!r} for signal {signal!r} of the model"
+                 f"{nearest(channel, recording.names)}")  # fmt: skip
     roles = ({one: chosen[one] for one in inputs}, {one: chosen[one] for one in outputs})
-    held = read(path, reading).held({chosen[one]: hold for one, hold in body.hold.items()})
+    held = recording.held({chosen[one]: hold for one, hold in body.hold.items()})
     return list(held.records(*roles, path.stem))
 
 

@@ -24,6 +24,7 @@ from service.cli.common import (
 )
 from service.cli.many_runs import MOST, print_many
 from service.cli.one_run import place_of, show_run
+from service.cli.places import in_file, told_at
 from service.cli.watching import follow
 from service.documents import read_yaml
 
@@ -59,7 +60,8 @@ def submit(
     """Submit a job."""
     body = job_of(file)
     with connected(url, key) as client:
-        job = client.submit(body, idempotency_key=idempotency_key)
+        with told_at(in_file(file)):
+            job = client.submit(body, idempotency_key=idempotency_key)
         if not wait:
             if as_json:
                 print_json(job)

@@ -18,6 +18,7 @@ from service.cli.common import (
     print_listing,
     read_file,
 )
+from service.cli.places import in_file, told_at
 from service.documents import read_yaml
 from service.errors import InvalidRequest
 
@@ -117,7 +118,7 @@ def add(
     document = read_yaml(read_file(file))
     if not isinstance(document, dict):
         fail(f"{file} does not hold a model (name, equations, …)")
-    with connected(url, key) as client:
+    with connected(url, key) as client, told_at(in_file(file)):
         stored = client.add_model(document)
     out.print(f"{stored['name']}@{stored['version']}", markup=False)
 

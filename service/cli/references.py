@@ -16,8 +16,11 @@ from service.cli.common import (
     print_listing,
     print_table,
 )
+from service.cli.places import Places, told_at
 
 app = typer.Typer(help="List, show and accept references.", no_args_is_help=True)
+
+PLACES = Places({"/run": "RUN", "/by": "--by", "/note": "--note", "{name}": "NAME"})
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the reference.")]
 
@@ -62,7 +65,7 @@ def accept(
     as_json: AsJson = False,
 ) -> None:
     """Make a run the reference of a name; the one before stays in the history."""
-    with connected(url, key) as client:
+    with connected(url, key) as client, told_at(PLACES):
         found = client.accept_reference(name, run, by=by, note=note)
     if as_json:
         print_json(found)

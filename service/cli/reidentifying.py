@@ -19,6 +19,7 @@ from service.cli.common import (
     read_file,
     usage,
 )
+from service.cli.places import Places, told_at
 from service.cli.trends import print_trend
 from service.cli.watching import follow
 from service.documents import read_yaml
@@ -103,7 +104,8 @@ def reidentify(
         put(body, change)
     with connected(url, key) as client:
         body["batch"] = _uploaded(client, batch)
-        job = client.reidentify(body)
+        with told_at(_places(experiments)):
+            job = client.reidentify(body)
         if not (wait or accept or json_file):
             runs = job["progress"]["runs"]
             out.print(f"{job['id']}  {job['name']}: {runs} runs, {job['state']}", markup=False)
@@ -112,6 +114,16 @@ def reidentify(
         _tell(client, ended, json_file)
         if accept is not None:
             _accept(client, ended, accept, label, chosen)
+
+
+def _places(experiments: list[str]) -> Places:
+    """Where the fields of the body stand on the command line; entries of the batch as typed."""
+    batch = {f"/batch/{number}": text for number, text in enumerate(experiments)}
+    return Places({
+        "/model": "--model …", "/label": "--label", "/look_at": "--parameters",
+        "/predict": "--predict", "/reference": "--reference", "/warm_start": "--warm-start",
+        "/name": "--name", "/channels": "--channels {}", **batch,
+    })  # fmt: skip
 
 
 def _tell(client: "Client", job: dict[str, Any], json_file: str | None) -> None:

@@ -20,9 +20,11 @@ from service.cli.common import (
     read_file,
 )
 from service.cli.jobs import runs as listing
+from service.cli.places import Places, told_at
 from service.documents import read_yaml
 
 LISTING = "list"
+PROFILE = Places({"/parameters": "PARAMETER", "/points": "--points"})
 
 RunName = Annotated[str, typer.Argument(metavar="RUN", help="Id of a run.")]
 
@@ -76,7 +78,8 @@ def simulate(
     body = read_yaml(read_file(file))
     if not isinstance(body, dict):
         fail(f"{file} does not hold an object (name: value)")
-    with connected(url, key) as client:
+    places = Places({"?max_points": "--max-points"}, rest=f"{file} …")
+    with connected(url, key) as client, told_at(places):
         found = client.simulate_run(run, body, max_points)
     if as_json:
         print_json(found)
@@ -105,7 +108,7 @@ def profile(
     as_json: AsJson = False,
 ) -> None:
     """Profile likelihood: 95 % intervals with all other parameters estimated anew."""
-    with connected(url, key) as client:
+    with connected(url, key) as client, told_at(PROFILE):
         found = client.profile(run, *(parameters or ()), points=points)
     if as_json:
         print_json(found)
@@ -126,7 +129,7 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Compare runs of several models on the same data."""
-    with connected(url, key) as client:
+    with connected(url, key) as client, told_at(Places({"?run": "RUN"})):
         found = client.compare(*runs)
     if as_json:
         print_json(found)

@@ -21,6 +21,7 @@ from service.cli.common import (
     usage,
     with_unit,
 )
+from service.cli.places import Places, told_at
 from service.cli.watching import follow
 from service.documents import read_yaml
 
@@ -35,7 +36,13 @@ A_TABLE = 4  # parameters beside each other
 LOW, MIDDLE, HIGH = 0, 2, 4  # places of 5, 50 and 95 % among the quantiles of a summary
 
 Named = list[str] | None
-
+PLACES = Places({
+    "/model": "--model …", "/sigma": "--sigma", "/relative": "--relative",
+    "/replicates": "--replicates", "/methods": "--methods", "/seed": "--seed", "/name": "--name",
+    "/datasets": "--data", "/channels": "--channels {}", "/truth": "--true",
+    "/truth/parameters": "--true {}", "/truth/inputs": "--input {}", "/truth/samples": "--samples",
+    "/truth/sample_time": "--sample-time",
+})  # fmt: skip
 
 Data = Annotated[
     str | None, typer.Option("--data", help="Datasets on the server: ids or names, by commas.")
@@ -101,7 +108,8 @@ def noise(
     for change in changes or []:
         put(body, change)
     with connected(url, key) as client:
-        job = client.noise_sweep(body, idempotency_key=idempotency_key)
+        with told_at(PLACES):
+            job = client.noise_sweep(body, idempotency_key=idempotency_key)
         if wait:
             job = follow(client, job["id"], quiet=as_json)
         _tell(client, job, wait=wait, as_json=as_json)

@@ -54,9 +54,7 @@ def order_of(body: ReidentifyIn) -> list[int]:
 
 def _own_faults(body: ReidentifyIn) -> Iterator[FieldError]:
     if body.warm_start == "reference" and body.reference is None:
-        yield FieldError(
-            "/warm_start", "to begin at a reference one has to be named; give a reference as well"
-        )
+        yield FieldError("/warm_start", "'reference' needs one: name the reference too")
 
 
 def job_of(body: ReidentifyIn, order: list[int]) -> JobIn:

@@ -111,7 +111,7 @@ def test_a_command_that_is_called_wrongly_exits_with_2(data: Path) -> None:
         (["--set", "validation={datasets: [other]}"], "--validation FILE"),
         (["--set", "datasets=[other]"], "DATA"),
         (["--set", "model=tube"], "--model"),
-        (["--set", f"algorithm.stagnation={10**30}"], "/algorithm/stagnation"),
+        (["--set", f"algorithm.stagnation={10**30}"], "lagid: --set algorithm.stagnation: "),
         (["--set", f"algorithm.stagnation={'9' * 5000}"], "lagid: "),
         (["--validation", "{data}"], "the recording that is fitted"),
     ],
@@ -296,7 +296,7 @@ def test_a_number_that_is_none_is_one_line_and_never_sent(tmp_path: Path) -> Non
     job = tmp_path / "job.yaml"
     job.write_text("model: fopdt\ndatasets: [a]\nparameters: {L: {upper: .inf}}\n")
     said = refused(lagid("submit", job), 2)
-    assert said == "lagid: /parameters/L/upper: found inf; need a finite number"
+    assert said == f"lagid: {job}: /parameters/L/upper: found inf; need a finite number"
 
 
 NOISE = (
@@ -325,9 +325,9 @@ def test_a_mistake_of_a_noise_sweep_is_one_line(server: str) -> None:
         ((*NOISE, "--sigma", "0:1"), 2, "start:stop:step"),
         ((*NOISE, "--sigma", "0.1", "--data", "steps"), 2, "either --data"),
         ((*NOISE, "--sigma", "0.1", "--true", "K"), 2, "NAME=VALUE"),
-        ((*NOISE, "--sigma", "0.1", "--true", "Q=1"), 1, "/truth/parameters/Q"),
-        ((*NOISE, "--sigma", "-0.1"), 1, "/sigma/0"),
-        ((*NOISE, "--sigma", "0.1", "--replicates", 0), 1, "/replicates"),
-        ((*NOISE, "--sigma", "0.1", "--methods", "best"), 1, "/methods/0"),
+        ((*NOISE, "--sigma", "0.1", "--true", "Q=1"), 1, "lagid: --true Q: the model has no"),
+        ((*NOISE, "--sigma", "-0.1"), 1, "lagid: --sigma: found -0.1; need 0 or"),
+        ((*NOISE, "--sigma", "0.1", "--replicates", 0), 1, "--replicates: found 0; need 1"),
+        ((*NOISE, "--sigma", "0.1", "--methods", "best"), 1, "--methods: found 'best'"),
     ):
         assert expected in refused(lagid(*words, LAGID_URL=server), code)

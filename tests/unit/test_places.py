@@ -1,0 +1,81 @@
+"""Faults of a body are told at the option or in the file that the user wrote."""
+
+from typing import Any
+
+import pytest
+import typer
+
+from service.calls import NotFinite, ProblemError
+from service.cli import sweeps
+from service.cli.places import Places, in_file, told_at
+from service.errors import FieldError
+
+
+@pytest.mark.parametrize(
+    ("pointer", "place"),
+    [
+        ("/sigma/2", "--sigma"), ("/relative", "--relative"), ("/truth/parameters/K", "--true K"),
+        ("/truth/parameters", "--true"), ("/truth/inputs/u/expression", "--input u"),
+        ("/truth/sample_time", "--sample-time"), ("/truth/samples", "--samples"),
+        ("/datasets/0", "--data"), ("/channels/u", "--channels u"), ("/channels", "--channels"),
+        ("/model", "--model"), ("/model/equations/x", "--model: /equations/x"),
+        ("/algorithm/population", "--set algorithm.population"), ("/hold/a~1b", "--set hold.a/b"),
+    ],
+)  # fmt: skip
+def test_a_pointer_is_told_as_the_option_that_gives_it(pointer: str, place: str) -> None:
+    assert sweeps.PLACES.of(pointer) == place
+
+
+def test_every_field_that_an_option_gives_is_told_at_that_option() -> None:
+    from service.schemas_noise import NoiseSweepIn
+
+    by_options = {place.split("/")[1] for place in sweeps.PLACES.options}
+    by_set = {"hold", "parameters", "prediction", "loss", "weights", "skip", "algorithm",
+              "priority", "reuse"}  # fmt: skip
+    assert by_options | by_set == set(NoiseSweepIn.model_fields)
+
+
+def test_a_pointer_into_a_file_follows_its_name() -> None:
+    assert in_file("job.yaml").of("/seed") == "job.yaml: /seed"
+
+
+def test_where_else_a_field_is_is_told_as_it_would_be_typed() -> None:
+    fault = FieldError("/population", "unknown field; there is /algorithm/population")
+    told = Places().told([fault])
+    assert told == "--set population: unknown field; there is --set algorithm.population"
+
+
+def refusal(status: int, *entries: dict[str, Any]) -> ProblemError:
+    return ProblemError(status, {"title": "refused", "errors": list(entries)})
+
+
+def test_all_faults_are_one_line_with_columns_and_without_the_servers_words(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    entries = (
+        {"pointer": "/sigma/0", "detail": "found -1"}, {"pointer": "", "detail": "whole"},
+        {"pointer": "/truth/inputs/u/expression", "column": 3, "detail": "ends"},
+    )  # fmt: skip
+    with pytest.raises(typer.Exit) as ended, told_at(sweeps.PLACES):
+        raise refusal(422, *entries)
+    assert ended.value.exit_code == 1
+    line = capsys.readouterr().err
+    assert line == "lagid: --sigma: found -1; whole; --input u, column 3: ends\n"
+
+
+@pytest.mark.parametrize(
+    "error", [refusal(409, {"pointer": "/a", "detail": "b"}), refusal(422), refusal(404)]
+)
+def test_what_is_no_fault_of_the_body_goes_on_as_it_is(error: ProblemError) -> None:
+    with pytest.raises(ProblemError) as told, told_at(Places()):
+        raise error
+    assert told.value is error
+
+
+def test_a_number_that_is_none_is_wrong_usage_at_its_option(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(typer.Exit) as ended, told_at(sweeps.PLACES):
+        raise NotFinite("/truth/parameters/K", float("inf"))
+    assert ended.value.exit_code == 2
+    assert capsys.readouterr().err == "lagid: --true K: found inf; need a finite number\n"
