@@ -7,13 +7,13 @@ from sqlalchemy.orm import Session
 
 from service.errors import InvalidRequest
 from service.floors import Floors, at_sigma
+from service.kept_groups import groups_of
 from service.rms_units import unit_of
 from service.schemas_summaries import GroupOut, ParameterSummaryOut, ReferenceOut, SummaryOut
 from service.storage.jobs import JobRepository
 from service.storage.runs import RunRepository
 from service.storage.summaries import QUANTILES, Group, GroupKey, Quantity, groups
 from service.storage.tables import Job, Run, State
-from service.unmade import all_groups
 from sysid.errors import nearest
 
 MOST_GROUPS = 2_000
@@ -56,7 +56,7 @@ def summary(
     if not errors_only:
         quantities += [RMS, ESTIMATION, VALIDATION]
         quantities += [Quantity("stderr", name) for name in units]
-    found = all_groups(session, job, keys, quantities, MOST_GROUPS)
+    found = groups_of(session, job, keys, quantities, MOST_GROUPS)
     if len(found) > MOST_GROUPS:
         raise InvalidRequest.at(
             "?by", f"gives more than {MOST_GROUPS} groups; name fewer axes, such as no seed"

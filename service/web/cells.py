@@ -8,10 +8,10 @@ from urllib.parse import urlencode
 
 from sqlalchemy.orm import Session
 
+from service.kept_groups import groups_of
 from service.storage.columns import to_json
 from service.storage.summaries import Group, GroupKey, Quantity
 from service.storage.tables import Job, State
-from service.unmade import all_groups
 from service.web import formats
 from service.web.figures_noise import SIGMA
 
@@ -56,7 +56,7 @@ def grid_of(session: Session, job: Job, chosen: Mapping[str, Any]) -> GridView |
         return None
     error = Quantity("rms_noise_free" if SIGMA in keys else "rms")
     named = [GroupKey("axis", path) for path in keys]
-    found = all_groups(session, job, named, [error], MOST_CELLS)
+    found = groups_of(session, job, named, [error], MOST_CELLS)
     is_cut, found = len(found) > MOST_CELLS, found[:MOST_CELLS]
     split = len(keys) - 1 if _fits_across([one.key[-1] for one in found]) else len(keys)
     columns = _distinct([one.key[split:] for one in found])

@@ -66,9 +66,11 @@ def text_of(text: str) -> str:
 
 def _grid(figure: Figure, axes: Mapping[str, Axis]) -> Iterator[str]:
     for x, y in _pairs(figure, axes):
+        # Of several plots over one axis the one that it is anchored to has its labels.
+        is_below = figure["layout"][f"xaxis{x.name[1:]}"].get("anchor", "y") == y.name
         for axis in (x, y):
             for place, label in axis.ticks():
-                yield _tick(axis, x, y, place, label)
+                yield _tick(axis, x, y, place, label if axis is y or is_below else "")
         yield (f'<path class="frame" d="M{x.start:.1f} {y.stop:.1f}V{y.start:.1f}'
                f'H{x.stop:.1f}"/>')  # fmt: skip
 

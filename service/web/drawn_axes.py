@@ -159,7 +159,7 @@ def _decades(axis: Axis) -> Iterator[float]:
 
 def _round_values(axis: Axis) -> Iterator[float]:
     low, high = (10**axis.low, 10**axis.high) if axis.is_log else (axis.low, axis.high)
-    rough = (high - low) / max(axis.n_ticks - 1, 1)
+    rough = (high - low) / max(axis.n_ticks, 1)
     power = 10.0 ** floor(log10(rough))
     step = next(power * one for one in _STEPS if power * one >= rough * (1 - 1e-9))
     for number in range(ceil(low / step - 1e-9), floor(high / step + 1e-9) + 1):

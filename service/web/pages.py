@@ -74,14 +74,17 @@ def job_page(
     runs = RunRepository(session)
     chosen_cell = wanted("cell", cell)
     grid = grid_of(session, job, chosen_cell)
-    page = runs.page(job.id, cursor=cursor, limit=RUNS_PER_PAGE, cell=chosen_cell)
+    is_listed = grid is None or bool(chosen_cell)
+    page = runs.page(
+        job.id, cursor=cursor, limit=RUNS_PER_PAGE if is_listed else 1, cell=chosen_cell
+    )
     chosen = runs.get(run_id) if run_id else _best(runs, job)
     view = job_view(job, unit_of(session, job.spec), datetime.now(UTC))
     return render(
         "job.html", job=view, runs=[run_summary(session, job, run) for run in page.items],
         run=run_in_full(session, job, chosen) if chosen else None,
         next_runs=_query({"cell": cell, "cursor": page.next}) if page.next else "",
-        grid=grid, is_listed=grid is None or bool(chosen_cell),
+        grid=grid, is_listed=is_listed,
         cell_title=cell_text(chosen_cell, {}),
         noise_height=_noise_height(job, chosen), trend=_trend(session, job),
         comparable=_comparable(page.items),
