@@ -1,5 +1,6 @@
 """Residuals laid out evenly, and their sums with lagged inputs, with the covariance of those."""
 
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -99,16 +100,16 @@ def lagged_sums(
     """The sums over these lags, or why there are none."""
     shifted = _shifted(laid, channel, lags * laid.period)
     # Of every lag the same samples, so that no lag is judged by more than another.
-    known = laid.present & np.all(np.isfinite(shifted), axis=0)
+    known = laid.present & np.isfinite(shifted.sum(axis=0))
     if np.count_nonzero(known) < FEWEST:
         return "it overlaps the output too little"
     columns = np.where(known, shifted, 0.0)
-    columns -= np.where(known, columns.sum(axis=1, keepdims=True) / known.sum(), 0.0)
-    sizes = np.sqrt(np.sum(np.square(columns), axis=1))
+    columns -= np.outer(columns.sum(axis=1) / np.count_nonzero(known), known)
+    sizes = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     if not np.min(sizes) > ROUNDING * np.max(np.abs(channel.values)):
         return "the input is constant there"
-    seen = rfft(columns, 2 * (colour.size - 1), axis=1) * colour
-    covariance = np.asarray((seen @ seen.conj().T).real)
+    seen = (rfft(columns, 2 * (colour.size - 1), axis=1) * colour).view(np.float64)
+    covariance = seen @ seen.T  # real part of the product with the conjugate
     norm = sizes * np.sqrt(float(residual[known] @ residual[known]))
     tiny = np.finfo(float).tiny
     deviation = np.sqrt(np.maximum(np.diag(covariance), tiny))
@@ -131,29 +132,48 @@ def _shifted(laid: Laid, channel: Channel, lags: FloatArray) -> FloatArray:
     return np.asarray(np.where((wanted >= first) & (wanted <= last), values, np.nan))
 
 
-def colour_of(residual: FloatArray, present: BoolArray) -> FloatArray:
+def colour_of(residual: FloatArray, present: BoolArray, room: int | None = None) -> FloatArray:
     """Root of the smoothed spectrum of residuals (N,), one value for each frequency of a transform.
 
     The covariance of Σ e(i) a(i) and Σ e(i) b(i) over the noise e is the product of the transforms
-    of a and b, each times this.
+    of a and b, each times this. The transform is `room` samples longer than the record, or as many
+    as the window reaches: beyond, the record's beginning would be neighbour to its end.
     """
     n = residual.size
-    length = 1 << (2 * n - 1).bit_length()
-    raw = irfft(np.square(np.abs(rfft(residual, length))), length)[:n]
-    pairs = np.rint(irfft(np.square(np.abs(rfft(present.astype(float), length))), length)[:n])
-    complete = np.where(pairs > 0, np.arange(n, 0.0, -1.0) / np.maximum(pairs, 1.0), 0.0)
-    autocovariance = raw * complete / n  # as if no sample were missing
+    width = _width(residual, present)
+    reach = min(ceil(width), n - 1)
+    length = _good_length(n + (reach if room is None else max(reach, room)))
+    autocovariance = _autocorrelated(residual, length)[: reach + 1] / n
+    if not present.all():
+        pairs = np.rint(_autocorrelated(present.astype(np.float64), length)[: reach + 1])
+        complete = np.arange(n, n - reach - 1.0, -1.0) / np.maximum(pairs, 1.0)
+        autocovariance *= np.where(pairs > 0, complete, 0.0)  # as if no sample were missing
     kernel = np.zeros(length)
-    kernel[:n] = autocovariance * _parzen(n, _width(autocovariance, n))
-    kernel[length - n + 1 :] = kernel[1:n][::-1]
+    kernel[: reach + 1] = autocovariance * _parzen(reach + 1, width)
+    kernel[length - reach :] = kernel[1 : reach + 1][::-1]
     spectrum = np.maximum(rfft(kernel).real, 0.0)
     spectrum[1:-1] *= 2.0  # each frequency stands for its negative too
     return np.asarray(np.sqrt(spectrum / length))
 
 
-def _width(autocovariance: FloatArray, n: int) -> float:
+def _autocorrelated(values: FloatArray, length: int) -> FloatArray:
+    """Σ v(t) v(t + k) for k from 0 on; right as long as the transform has room for k."""
+    seen = rfft(values, length)
+    return irfft(np.square(seen.real) + np.square(seen.imag), length)
+
+
+def _good_length(least: int) -> int:
+    """The next even length that a fast transform likes: a power of two times 1, 3, 5, 9 or 15."""
+    return min(one << max(1, (-(-least // one) - 1).bit_length()) for one in (1, 3, 5, 9, 15))
+
+
+def _width(residual: FloatArray, present: BoolArray) -> float:
     """Width of a Parzen window, by the rule of Andrews (1991) for first-order colour."""
-    rho = float(np.clip(autocovariance[1] / autocovariance[0], -0.99, 0.99))
+    n = residual.size
+    pairs = max(int(np.count_nonzero(present[1:] & present[:-1])), 1)
+    alike = float(residual[1:] @ residual[:-1]) * (n - 1) / pairs
+    power = max(float(residual @ residual), np.finfo(float).tiny) * n / np.count_nonzero(present)
+    rho = min(max(alike / power, -0.99), 0.99)
     curvature = 4.0 * rho**2 / (1.0 - rho) ** 4
     return float(np.clip(2.66 * (curvature * n) ** 0.2, n ** (1 / 3), 0.25 * n))
 

@@ -19,10 +19,11 @@ independence
 Only scored samples count. Missing samples leave their pairs out. Where samples are not regular
 the lags of whiteness count samples; u is read between its samples as it was held, so τ is a time
 all the same, and nothing is resampled. With soft-l1 the residuals are those that the loss sees,
-ψ(e) = e/√(1 + (e/s)²), so that an outlier counts as what it counted for the estimate.
+ψ(e) = e/√(1 + (e/s)²), so that an outlier counts as what it counted for the estimate. Under a noise
+model they are whitened by it (`sysid.whitening`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -33,6 +34,7 @@ from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, lagged_sums, la
 from sysid.past_outputs import coefficients_on_past_outputs
 from sysid.records import Channel
 from sysid.types import BoolArray, FloatArray
+from sysid.whitening import Whitening, owed
 
 if TYPE_CHECKING:  # the pages read these results without a compiler
     from sysid.problem import Problem
@@ -129,10 +131,14 @@ class Series(NamedTuple):
 
 
 def residual_tests(
-    problem: "Problem", simulated: FloatArray, data: Literal["estimation", "validation"]
-) -> ResidualTests:
-    """Test the residuals of simulated values (M,) on the records of a problem."""
-    found = series_of(problem, simulated)
+    problem: "Problem", simulated: FloatArray, data: Literal["estimation", "validation"],
+    correlation_times: Mapping[str, float] | None = None,
+) -> ResidualTests:  # fmt: skip
+    """Test the residuals of simulated values (M,) on the records of a problem.
+
+    Of an output whose noise has a correlation time (s) they are whitened first.
+    """
+    found = series_of(problem, simulated, correlation_times)
     if data == "estimation" and problem.prediction == "one-step":
         counts = coefficients_on_past_outputs(problem.model, problem.all_parameters)
         found = [one._replace(coefficients=counts[one.output]) for one in found]
@@ -149,7 +155,9 @@ def verdict(
     return ResidualTests(data, passed, tests)
 
 
-def series_of(problem: "Problem", simulated: FloatArray) -> list[Series]:
+def series_of(
+    problem: "Problem", simulated: FloatArray, correlation_times: Mapping[str, float] | None = None
+) -> list[Series]:
     """The residuals of every output of every experiment, from simulated values (M,)."""
     loss = problem.loss
     scale = loss.scale if loss.kind == "soft-l1" else 0.0
@@ -166,7 +174,8 @@ def series_of(problem: "Problem", simulated: FloatArray) -> list[Series]:
             factor = problem.output_weights[output]
             found.append(
                 series(number, output, times[output], factor * measured[output],
-                       factor * model[output], weight[output] > 0, inputs, scale)
+                       factor * model[output], weight[output] > 0, inputs, scale,
+                       (correlation_times or {}).get(output, 0.0))
             )  # fmt: skip
     return found
 
@@ -174,10 +183,12 @@ def series_of(problem: "Problem", simulated: FloatArray) -> list[Series]:
 def series(
     experiment: int, output: str, times: FloatArray, measured: FloatArray, simulated: FloatArray,
     scored: BoolArray, inputs: tuple[Channel, ...], loss_scale: float = 0.0,
+    correlation_time: float = 0.0,
 ) -> Series:  # fmt: skip
     """Residuals from weighted outputs (N,); of a long record the last 20 000 scored samples.
 
-    `loss_scale` is that of a soft-l1 loss, 0 with squares.
+    `loss_scale` is that of a soft-l1 loss, 0 with squares; `correlation_time` (s) that of the
+    noise, 0 for white noise.
     """
     with np.errstate(all="ignore"):  # a missing measurement, or a simulation that diverged
         error = measured - simulated
@@ -185,6 +196,8 @@ def series(
     where = np.flatnonzero(scored & np.isfinite(seen))[-_MOST:]
     usable = np.zeros(times.size, dtype=np.bool_)
     usable[where] = True
+    if correlation_time > 0:
+        seen[where] = Whitening(owed(times[where], correlation_time)).of(seen[where])
     kept = slice(int(where[0]), int(where[-1]) + 1) if where.size else slice(0, 0)
     size = float(np.max(np.abs(measured[where]), initial=0.0))
     return Series(experiment, output, times[kept], seen[kept], usable[kept], size, inputs)
@@ -285,8 +298,9 @@ def _test(
     size = np.abs(scaled)
     return ResidualTest(
         one.experiment, one.output, kind, channel, "passed" if p >= level else "failed",
-        int(np.count_nonzero(one.scored)), scaled.size, float(np.mean(size <= _BAND95)),
-        float(np.mean(size <= _BAND99)), statistic, degrees, p,
+        int(np.count_nonzero(one.scored)), scaled.size,
+        np.count_nonzero(size <= _BAND95) / size.size,
+        np.count_nonzero(size <= _BAND99) / size.size, statistic, degrees, p,
     )  # fmt: skip
 
 

@@ -131,7 +131,6 @@ class Evolved:
 class Concluded:
     """The run is complete; `rms_noise_free` is its RMS against the records without noise."""
 
-    state: RunState
     identification: Identification
     rms_noise_free: float | None = None
 

@@ -100,7 +100,7 @@ def _advanced(
     except SysidError as error:
         return Failure(str(error), type(error).__name__, state.evaluations)
     without = found.rms if noise_free is None else rms_against(problem, found.simulated, noise_free)
-    return Concluded(state, found, without)
+    return Concluded(found, without)
 
 
 def _evolved(item: Evolve, problem: Problem) -> Island:

@@ -21,6 +21,13 @@ def concluded() -> Concluded:
     return done.outcome
 
 
+@pytest.fixture(scope="module")
+def advanced() -> Advanced:
+    (done,) = advance((Advance("any", spec(), None, 0.0),), ("short",), RECORDS["short"])
+    assert isinstance(done.outcome, Advanced)
+    return done.outcome
+
+
 @pytest.fixture(autouse=True)
 def slow_observers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every observer takes all the time that a step has for it: each is told of one result."""
@@ -49,7 +56,7 @@ def test_every_result_is_told_once_before_the_job_ends(concluded: Concluded) -> 
 
 
 def test_a_slice_of_a_single_run_goes_on_while_results_of_a_sweep_are_told(
-    concluded: Concluded,
+    concluded: Concluded, advanced: Advanced
 ) -> None:
     slices = 0
 
@@ -58,7 +65,7 @@ def test_a_slice_of_a_single_run_goes_on_while_results_of_a_sweep_are_told(
         if not item.run.startswith("single"):
             return Done(item.run, concluded, 0.01)
         slices += 1
-        outcome = concluded if slices == 8 else Advanced(concluded.state)
+        outcome = concluded if slices == 8 else advanced
         return Done(item.run, outcome, PACK_SECONDS)
 
     feeder = Feeder(ScriptedCrew(answer))
