@@ -239,7 +239,8 @@ def _notes(ordered: Sequence[_Candidate]) -> Iterator[str]:
             "some runs predict one step ahead and some simulate: "
             "their RMS, fits and criteria do not compare"
         )
-    if len({repr(sorted(one.body["loss"].items())) for one in ordered}) > 1:
+    losses = ({"noise_model": "white", **one.body["loss"]} for one in ordered)
+    if len({repr(sorted(loss.items())) for loss in losses}) > 1:
         yield "the runs were fitted with different losses, which favour each its own measure"
     counts = {(one.result.get("criteria") or {}).get("samples") for one in ordered}
     if len(counts - {None}) > 1:

@@ -46,10 +46,14 @@ class ValidationIn(Body):
 
 
 class LossIn(Body):
-    """What is minimised: squares, or soft-l1 with a scale in the output's unit."""
+    """What is minimised: squares, or soft-l1 with a scale in the output's unit.
+
+    With the noise model ar1 the estimates are those of generalised least squares in the end.
+    """
 
     kind: Literal["squares", "soft-l1"] = "squares"
     scale: float = Field(default=1.0, gt=0)
+    noise_model: Literal["white", "ar1"] = "white"
 
 
 class NoiseIn(Body):
@@ -80,8 +84,9 @@ class MigrationIn(Body):
 class StopIn(Body):
     """End conditions besides the generations.
 
-    `settled`: `improved` ends when that many searches from new random places, and two thirds of
-    all, have led to the best individual, and so have nine of ten from beside it; null: never.
+    `settled`: `improved` ends when searches from random places and from beside the best individual
+    found it again two times more than that, a third of all of them; where the fitness jumps
+    nearby, that many of either kind, and nearly all; null: never.
     """
 
     evaluations: Evaluations | None = None

@@ -1,5 +1,6 @@
 """From the end of a search to its result: refinement, uncertainty, validation, warnings."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from sysid.islands.archipelago import analysis_budget, of_island
 from sysid.islands.run_state import RunState
 from sysid.metrics import Metrics
 from sysid.neighbours import affordable, neighbourhood, widened
+from sysid.noise_model import Generalised, generalised, whitening
 from sysid.onset import onset_delays
 from sysid.problem import Problem, metrics_of
 from sysid.refinement import Refined, refine
@@ -19,7 +21,7 @@ from sysid.settings import GeneticAlgorithm
 from sysid.threads import one_thread
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis, analyse
-from sysid.warnings import warnings_of
+from sysid.warnings import noise_notes, warnings_of
 
 
 def conclude(
@@ -63,12 +65,17 @@ def _concluded(
         theta = end.theta
         ends[best] = theta, end.rms
         refined = (*refined[:best], end, *refined[best + 1 :])
+    noise, analysis = _under_noise(problem, algorithm, state, refined, theta, analysis)
+    theta = noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
         raise NothingIdentifiable(p.name for p in problem.space)
     simulated = problem.predictions(theta[None])[0]
     metrics = metrics_of(problem, simulated)
-    kept = None if validation is None else _validated(validation, problem, analysis.estimates)
-    tests = _tests(problem, simulated, kept)
+    times = noise.correlation_times
+    kept = (
+        None if validation is None else _validated(validation, problem, analysis.estimates, times)
+    )
+    tests = kept.tests if kept else residual_tests(problem, simulated, "estimation", times)
     limit = algorithm.safe_limit
     return Identification(
         estimates=analysis.estimates,
@@ -87,11 +94,15 @@ def _concluded(
         simulated_validation=() if kept is None else kept.simulated,
         agreement=metrics.channels,
         agreement_validation=() if kept is None else kept.metrics.channels,
-        warnings=warnings_of(problem, algorithm, analysis, simulated, metrics.rms, tests),
+        warnings=(
+            *warnings_of(problem, algorithm, analysis, simulated, metrics.rms, tests),
+            *noise_notes(problem, times, noise.is_complete),
+        ),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         criteria=analysis.criteria,
         residual_tests=tests,
         onset_delays=onset_delays(problem.model, problem.records),
+        correlation_times=times,
     )
 
 
@@ -155,6 +166,32 @@ def _with_neighbours(
     return Refined(theta, rms, spent), analysis
 
 
+def _under_noise(
+    problem: Problem, algorithm: GeneticAlgorithm, state: RunState,
+    refined: tuple[Refined | None, ...], theta: FloatArray, analysis: Analysis,
+) -> tuple[Generalised, Analysis]:  # fmt: skip
+    """The estimates under the noise model that was asked for, and their analysis.
+
+    Those of the paper's methods stay as found; so do all where residuals may as well be white.
+    """
+    if problem.loss.noise_model == "white":
+        return Generalised(theta, {}, 0, True), analysis
+    if not _polishes(algorithm, len(state.islands)):
+        return Generalised(theta, {}, 0, False), analysis
+    left = _left(algorithm, state, refined)
+    kept = analysis.evaluations + analysis_budget(theta.size)
+    most = None if left is None else max(0, left - kept)
+    nothing = np.zeros((theta.size, theta.size))
+    covariance = nothing if analysis.uncertainty is None else analysis.uncertainty.covariance
+    found = generalised(problem, theta, covariance, state.seed, most)
+    spent = analysis.evaluations + found.evaluations
+    if any(found.correlation_times.values()):
+        white = whitening(problem, found.correlation_times)
+        analysis = analyse(problem, found.theta, None if left is None else left - spent, white)
+        spent += analysis.evaluations
+    return found, replace(analysis, evaluations=spent)
+
+
 def _left(
     algorithm: GeneticAlgorithm, state: RunState, refined: tuple[Refined | None, ...]
 ) -> int | None:
@@ -212,14 +249,10 @@ class _Validated(NamedTuple):
     tests: ResidualTests
 
 
-def _tests(problem: Problem, simulated: FloatArray, kept: "_Validated | None") -> ResidualTests:
-    """Of residuals that the parameters were not fitted to, where there are any."""
-    return residual_tests(problem, simulated, "estimation") if kept is None else kept.tests
-
-
 def _validated(
-    validation: Problem, estimation: Problem, estimates: tuple[Estimate, ...]
-) -> _Validated:
+    validation: Problem, estimation: Problem, estimates: tuple[Estimate, ...],
+    correlation_times: Mapping[str, float],
+) -> _Validated:  # fmt: skip
     """Agreement and simulation on data that were not used.
 
     The model's parameters are those of the estimate, and so are the weights, so that both RMS
@@ -242,7 +275,7 @@ def _validated(
     simulated = known.predictions(theta[None])[0]
     return _Validated(
         metrics_of(known, simulated), _judged(known, _split(known, simulated)),
-        residual_tests(known, simulated, "validation"),
+        residual_tests(known, simulated, "validation", correlation_times),
     )  # fmt: skip
 
 

@@ -103,6 +103,12 @@ def profile(
     names = [p.name for p in problem.space]
     if name not in names:
         raise InvalidSettings("/parameters", f"no free parameter {name!r}{nearest(name, names)}")
+    if problem.loss.noise_model != "white":
+        raise InvalidSettings(
+            "/loss/noise_model",
+            f"profiles are of plain squares, not of those under {problem.loss.noise_model}; fit "
+            "with the noise model 'white', or use the standard errors",
+        )
     if points < _LEAST:
         raise InvalidSettings("/points", f"found {points}; need {_LEAST} or more")
     best = _best(problem, np.array(theta, dtype=np.float64))

@@ -1,6 +1,7 @@
 """What an identification gives: estimates with their uncertainty, and the evidence."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from sysid.metrics import ChannelMetrics
@@ -9,7 +10,7 @@ from sysid.onset import OnsetDelay
 from sysid.residuals import ResidualTests
 from sysid.types import FloatArray
 
-NoiseColour = Literal["white", "coloured", "drifting"]
+NoiseColour = Literal["white", "first-order", "coloured", "drifting"]
 EstimateStatus = Literal["identified", "group", "at bound", "unidentifiable", "fixed", "tied"]
 Phase = Literal["start", "genetic", "sequence", "migration", "refinement"]
 
@@ -146,7 +147,8 @@ class Identification:
     per island. `simulated` has per experiment, per output, the model's output at the measured
     times. `fit_percent_validation` and `rms_validation` are None without validation data.
     `agreement` and `agreement_validation` tell each output of each experiment on its own.
-    `selection` has the terms that were selected, if the model asked for it.
+    `selection` has the terms that were selected, if the model asked for it. `correlation_times`
+    (s) are those of each output's noise, where the noise model found any.
     """
 
     estimates: tuple[Estimate, ...]
@@ -170,3 +172,4 @@ class Identification:
     criteria: Criteria | None = None
     residual_tests: ResidualTests | None = None
     onset_delays: tuple[OnsetDelay, ...] = ()
+    correlation_times: Mapping[str, float] = field(default_factory=dict)

@@ -68,9 +68,10 @@ class Coloured(NamedTuple):
         return float(told * reach * self.samples / self.degrees)
 
 
-class _Part(NamedTuple):
+class Part(NamedTuple):
     """One output of one experiment: its scored samples among all of them, with their times."""
 
+    output: str
     rows: slice
     times: FloatArray
     size: float
@@ -88,14 +89,14 @@ def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloure
     """
     if problem.prediction == "one-step":
         return None
-    parts = [(part, _in_order(part, seen[part.rows])) for part in _parts(problem)]
-    told = [_is_coloured(laid, part.size) for part, laid in parts]
+    found = [(part, _in_order(part, seen[part.rows])) for part in parts(problem)]
+    told = [_is_coloured(laid, part.size) for part, laid in found]
     if not any(told):
         return None
     whole = Coloured(np.zeros((columns.shape[1], columns.shape[1])), 0.0, drifts=False)
-    for (part, _), is_coloured in zip(parts, told, strict=True):
+    for (part, _), has_colour in zip(found, told, strict=True):
         own, values = columns[part.rows], seen[part.rows]
-        if is_coloured:
+        if has_colour:
             one = _with_colour(laid_out(part.times, values), own)
         else:
             mean = float(np.mean(np.square(values)))
@@ -106,7 +107,13 @@ def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloure
     return whole
 
 
-def _parts(problem: Problem) -> Iterator[_Part]:
+def is_coloured(part: Part, values: FloatArray) -> bool:
+    """Whether the residuals (n,) of a part are clearly not white."""
+    return _is_coloured(_in_order(part, values), part.size)
+
+
+def parts(problem: Problem) -> Iterator[Part]:
+    """The series of a problem's scored samples, in their order."""
     measured = problem.split(problem.evaluator.weight * problem.evaluator.measured)
     weights = problem.split(problem.evaluator.weight)
     first = 0
@@ -117,11 +124,11 @@ def _parts(problem: Problem) -> Iterator[_Part]:
             n = int(np.count_nonzero(scored))
             if n:
                 size = float(np.max(np.abs(sizes[output][scored])))
-                yield _Part(slice(first, first + n), times[output][scored], size)
+                yield Part(output, slice(first, first + n), times[output][scored], size)
             first += n
 
 
-def _in_order(part: _Part, values: FloatArray) -> Laid:
+def _in_order(part: Part, values: FloatArray) -> Laid:
     """The residuals one after the other; laid out anew only where samples are missing."""
     steps = np.diff(part.times)
     if steps.size and np.ptp(steps) > _EVEN * steps[0]:
@@ -145,7 +152,7 @@ def _with_colour(laid: Laid, columns: FloatArray) -> Coloured:
     found = float(before @ after / (before @ before))
     pole = min(max(found, -_STEEPEST), _STEEPEST)
     left = np.where(both, laid.values[1:] - pole * laid.values[:-1], 0.0)
-    colour = colour_of(left, both)
+    colour = colour_of(left, both, room=2 * left.size)  # the recursion rings on
     frequency = np.linspace(0.0, np.pi, colour.size)
     colour /= np.abs(1.0 - pole * np.exp(-1j * frequency))
     moved = rfft(spread, 2 * (colour.size - 1), axis=1) * colour

@@ -11,6 +11,8 @@ from sysid.errors import InvalidSettings
 SearchMethod = Literal["simple", "improved-paper", "improved"]
 TopologyName = Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"]
 Prediction = Literal["simulation", "one-step"]
+NoiseModel = Literal["white", "ar1"]
+NOISE_MODELS: tuple[NoiseModel, ...] = ("white", "ar1")
 METHODS: tuple[SearchMethod, ...] = ("simple", "improved-paper", "improved")
 # What the compiled search counts in 64 bits, with room to add; no run of years comes near them.
 MOST_GENERATIONS = 10**9
@@ -58,10 +60,11 @@ class Migration:
 class Stop:
     """End conditions besides the generations; whichever comes first. None: not used.
 
-    `settled`: the best individual was found that often, each time from new random places, and by
-    at least two thirds of all such searches, and nine of ten searches from beside it, that many at
-    least, led back to it. Only the adaptive sequence search makes these, so
-    that the paper's methods never end by it.
+    `settled`: the best individual was found again by two searches more than that, a third of them
+    at least from new random places and a third from beside it, and by a third of all searches.
+    Where the fitness jumps nearby, by that many of either kind, by two thirds of those from random
+    places and nine of ten from beside it. Only the adaptive sequence search makes these, so that
+    the paper's methods never end by it.
     """
 
     evaluations: int | None = None
@@ -152,16 +155,30 @@ class GeneticAlgorithm:
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """What is minimised: squares (Eq. 10), or soft-l1 with a scale in the output's unit."""
+    """What is minimised: squares (Eq. 10), or soft-l1 with a scale in the output's unit.
+
+    With the noise model ``ar1`` the search minimises squares; from its end on the estimates are
+    those of generalised least squares under first-order noise (`sysid.noise_model`).
+    """
 
     kind: Literal["squares", "soft-l1"] = "squares"
     scale: float = 1.0
+    noise_model: NoiseModel = "white"
 
     def __post_init__(self) -> None:
         if self.kind not in ("squares", "soft-l1"):
             raise InvalidSettings("/loss/kind", f"{self.kind!r} is not 'squares' or 'soft-l1'")
         if not self.scale > 0:
             raise InvalidSettings("/loss/scale", f"{self.scale!r} is not a positive number")
+        if self.noise_model not in NOISE_MODELS:
+            raise InvalidSettings(
+                "/loss/noise_model", f"{self.noise_model!r} is not {' or '.join(NOISE_MODELS)}"
+            )
+        if self.noise_model != "white" and self.kind != "squares":
+            raise InvalidSettings(
+                "/loss/noise_model",
+                f"{self.noise_model} is not available with {self.kind}; need the loss 'squares'",
+            )
 
 
 def _require(holds: bool, pointer: str, found: object, right: str) -> None:

@@ -8,6 +8,7 @@ With squares the covariance is s²(SᵀS)⁻¹, s² = Σe²/(n − D). With the 
 M-estimator (sandwich): n/(n − D) · (SᵀKS)⁻¹ (SᵀΨ²S) (SᵀKS)⁻¹ with ψ = e/√(1 + (e/s)²) and
 K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals unduly. Where
 residuals of a free run are clearly not white, both are that of coloured ones (`sysid.serial`).
+Under a noise model e and S are whitened first (`sysid.noise_model`).
 
 Where the output does not change on a plateau of width w (a lag that is rounded to whole samples),
 nothing tells where in it the parameter lies: w²/12 is added to its variance, and the interval is
@@ -36,6 +37,7 @@ from sysid.serial import Coloured, coloured
 from sysid.symmetries import scalings
 from sysid.translations import translations
 from sysid.types import BoolArray, FloatArray
+from sysid.whitening import Whitening
 
 _SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
 # Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
@@ -87,19 +89,27 @@ class _Directions:
     member: BoolArray
 
 
-def analyse(problem: Problem, theta: FloatArray, most: int | None = None) -> Analysis:
+def analyse(
+    problem: Problem, theta: FloatArray, most: int | None = None, white: Whitening | None = None
+) -> Analysis:
     """Standard errors, correlations and identifiability at an estimate (D,).
 
     With no more than `most` simulations; where they do not suffice there are no standard errors.
+    With a whitening all is of the whitened residuals and sensitivities.
     """
     try:
         sensitive = sensitivities(problem, theta, most)
     except BudgetSpentError as spent:
-        return _unexplored(problem, theta, spent)
-    return _analysed(problem, theta, sensitive, most)
+        return _unexplored(problem, theta, spent, white)
+    if white is not None:
+        columns = white.of(sensitive.columns.T).T
+        sensitive = sensitive._replace(error=white.of(sensitive.error), columns=columns)
+    return _analysed(problem, theta, sensitive, most, white)
 
 
-def _unexplored(problem: Problem, theta: FloatArray, spent: BudgetSpentError) -> Analysis:
+def _unexplored(
+    problem: Problem, theta: FloatArray, spent: BudgetSpentError, white: Whitening | None
+) -> Analysis:
     """What is known without a look at the neighbours of the estimate.
 
     With nothing left it is that of the simulation that a result shows: no budget counts it.
@@ -109,17 +119,18 @@ def _unexplored(problem: Problem, theta: FloatArray, spent: BudgetSpentError) ->
         weight = problem.evaluator.weight
         errors = weight * (problem.predictions(theta[None])[0] - problem.evaluator.measured)
         error = errors[weight > 0]
-    criteria = criteria_of(error, theta.size)
+    criteria = criteria_of(error if white is None else white.of(error), theta.size, white)
     reason = "the budget of simulations left too few for standard errors"
     return Analysis(_without(problem, theta, reason), None, 0.0, spent.evaluations, criteria)
 
 
 def _analysed(
-    problem: Problem, theta: FloatArray, sensitive: Sensitivities, most: int | None
-) -> Analysis:
+    problem: Problem, theta: FloatArray, sensitive: Sensitivities, most: int | None,
+    white: Whitening | None = None,
+) -> Analysis:  # fmt: skip
     error, columns, plateau, one_sided, aside, count = sensitive
     n, d = columns.shape
-    criteria = criteria_of(error, d)
+    criteria = criteria_of(error, d, white)
     if n <= d:
         reason = f"{n} samples are not more than {d} parameters"
         return Analysis(_without(problem, theta, reason), None, 0.0, count, criteria)
@@ -157,12 +168,12 @@ def _analysed(
         condition=float(singular[0] / singular[-1]) if kept.all() else float("inf"),
         singular_values=singular,
         noise_sd=noise,
-        noise_colour=_named(colour),
+        noise_colour=_named(colour, white),
         groups=tuple(g for one in found for g in written(one, names, theta, scale, physical)),
     )
     statuses = _statuses(place, found, [p.name for p in pulled], problem)
     told = Known(
-        theta, statuses, physical, float(stdtrit(_degrees(n, d, colour), 0.975)), member,
+        theta, statuses, physical, float(stdtrit(_told_by(n, d, colour, white), 0.975)), member,
         uncertainty.groups, rows[~kept], scale,
     )  # fmt: skip
     estimates = _beside_jumps(problem, estimates_of(problem, told), one_sided, aside * scale)
@@ -174,11 +185,16 @@ def _analysed(
     return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, pulled, linear)
 
 
-def criteria_of(error: FloatArray, parameters: int) -> Criteria:
-    """Information criteria from the weighted residuals (n,); see `Criteria` for the formulae."""
-    n, counted = error.size, parameters + 1
+def criteria_of(error: FloatArray, parameters: int, white: Whitening | None = None) -> Criteria:
+    """Information criteria from the weighted residuals (n,); see `Criteria` for the formulae.
+
+    Of whitened residuals the likelihood is still that of the outputs, so that criteria with and
+    without a noise model compare; correlation times count as parameters.
+    """
+    n, counted = error.size, parameters + 1 + (0 if white is None else white.n_times)
     mean = float(error @ error) / n
     twice = -n * (np.log(2.0 * np.pi * mean) + 1.0) if mean > 0 else np.inf  # 2 ln ℓ
+    twice -= 0.0 if white is None else white.log_determinant
     aic = 2.0 * counted - twice
     left = n - counted - 1
     aicc = aic + 2.0 * counted * (counted + 1) / left if left > 0 else None
@@ -284,9 +300,18 @@ def _degrees(n: int, d: int, colour: Coloured | None) -> float:
     return float(n - d) if colour is None else colour.degrees
 
 
-def _named(colour: Coloured | None) -> NoiseColour:
+def _told_by(n: int, d: int, colour: Coloured | None, white: Whitening | None) -> float:
+    """Degrees of freedom of the intervals: of whitened samples too, what a mean would have.
+
+    The correlation time is estimated from no more than that.
+    """
+    degrees = _degrees(n, d, colour)
+    return degrees if white is None else min(degrees, max(white.samples - d, 1.0))
+
+
+def _named(colour: Coloured | None, white: Whitening | None) -> NoiseColour:
     if colour is None:
-        return "white"
+        return "white" if white is None else "first-order"
     return "drifting" if colour.drifts else "coloured"
 
 

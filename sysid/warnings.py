@@ -25,10 +25,13 @@ _ROUNDING = 1e-9  # of the output: below, the residual is rounding and has no op
 
 _ALLOWED: Mapping[NoiseColour, str] = {
     "white": "the standard errors are too small",
+    "first-order": "the standard errors are those of the noise model",
     "coloured": "the standard errors allow for the colour of the residuals, not for what the model "
     "lacks",
     "drifting": "the residuals drift over the whole record, so the standard errors are too small",
 }
+
+_SUGGESTION = "; if it is the noise that is coloured, use loss: {noise_model: ar1}"
 
 
 def warnings_of(
@@ -63,7 +66,9 @@ def warnings_of(
     if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING * problem.output_scale:
         found.append(_not_an_optimum(algorithm, analysis.possible_gain))
     elif tests is not None and lagged:
-        found += _coloured(tests, lagged, analysis.uncertainty)
+        loss = problem.loss
+        plain = loss.kind == "squares" and loss.noise_model == "white"
+        found += _coloured(tests, lagged, analysis.uncertainty, may_be_noise=plain)
     return (*found, *unread_units(problem.model, problem.records))
 
 
@@ -215,7 +220,9 @@ def _is_vague_lag(estimate: Estimate) -> bool:
     return estimate.stderr is not None and abs(estimate.value) < _SEPARABLE * estimate.stderr
 
 
-def _coloured(tests: ResidualTests, lagged: set[str], uncertainty: Uncertainty | None) -> list[str]:
+def _coloured(
+    tests: ResidualTests, lagged: set[str], uncertainty: Uncertainty | None, *, may_be_noise: bool
+) -> list[str]:
     """Residuals that are clearly not white: the model lacks something, most often an order.
 
     A lag makes up for an order that is missing. Of whether the tests are passed the result tells
@@ -224,11 +231,35 @@ def _coloured(tests: ResidualTests, lagged: set[str], uncertainty: Uncertainty |
     if all(one.kind != "whiteness" or one.p is None or one.p > _CHANCE for one in tests.tests):
         return []
     colour = "white" if uncertainty is None else uncertainty.noise_colour
+    suggestion = _SUGGESTION if may_be_noise and colour in ("coloured", "drifting") else ""
     return [
         f"the residuals are not white (on the {tests.data} data): something of the dynamics is "
         f"not in the model, the estimate of {', '.join(sorted(lagged))} depends on the order of "
-        f"the model, and {_ALLOWED[colour]}"
+        f"the model, and {_ALLOWED[colour]}{suggestion}"
     ]
+
+
+def noise_notes(
+    problem: Problem, correlation_times: Mapping[str, float], is_complete: bool
+) -> tuple[str, ...]:
+    """What a noise model did, or why it did nothing."""
+    if problem.loss.noise_model == "white":
+        return ()
+    found = [f"{name} {time:.3g} s" for name, time in correlation_times.items() if time > 0]
+    notes = []
+    if found:
+        notes.append(
+            "estimates and standard errors are those under first-order noise with a correlation "
+            f"time of {', '.join(found)}; squares alone would give a smaller RMS"
+        )
+    elif is_complete:
+        notes.append("the residuals may as well be white, so the noise model changes nothing")
+    if not is_complete:
+        notes.append(
+            "the noise model was not estimated to its end: it needs the method 'improved' with "
+            "refinement, and more simulations than the budget left"
+        )
+    return tuple(notes)
 
 
 def _without_excitation(problem: Problem, estimates: tuple[Estimate, ...]) -> list[str]:

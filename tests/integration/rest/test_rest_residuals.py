@@ -91,19 +91,39 @@ def result(served: Served, run: str) -> dict[str, Any]:
     return document
 
 
+def agree(served: Served, run: str, data: str) -> None:
+    """The functions of a run are those of the verdicts that were stored with it."""
+    stored = result(served, run)["residual_tests"]
+    asked = served.server.get(f"/v1/runs/{run}/residuals").json()
+    assert asked["passed"] == stored["passed"]
+    assert asked["data"] == stored["data"] == data
+    assert asked["note"] == ""
+    for one, kept in zip(asked["tests"], stored["tests"], strict=True):
+        for name, value in kept.items():
+            # The two processes may add up in another order: the last bits differ.
+            close = isinstance(value, float)
+            assert one[name] == (pytest.approx(value, rel=1e-6, abs=1e-9) if close else value)
+        assert len(one["lags"]) == len(one["values"]) == len(one["band99"])
+
+
 def test_functions_that_are_asked_for_have_the_verdicts_that_were_stored(served: Served) -> None:
     for run in served.runs:
-        stored = result(served, run)["residual_tests"]
-        asked = served.server.get(f"/v1/runs/{run}/residuals").json()
-        assert asked["passed"] == stored["passed"]
-        assert asked["data"] == stored["data"] == "validation"
-        assert asked["note"] == ""
-        for one, kept in zip(asked["tests"], stored["tests"], strict=True):
-            for name, value in kept.items():
-                # The two processes may add up in another order: the last bits differ.
-                close = isinstance(value, float)
-                assert one[name] == (pytest.approx(value, rel=1e-6, abs=1e-9) if close else value)
-            assert len(one["lags"]) == len(one["values"]) == len(one["band99"])
+        agree(served, run, "validation")
+
+
+def test_under_a_noise_model_they_are_of_the_whitened_residuals(served: Served) -> None:
+    body = {
+        "model": "fopdt", "datasets": [served.dataset], "hold": {"u": "zero"}, "algorithm": SMALL,
+        "parameters": BOUNDS, "loss": {"noise_model": "ar1"},
+    }  # fmt: skip
+    _, (run,) = identified(served.parts, body)
+    assert result(served, run)["correlation_times"]["y"] > STEP
+    agree(served, run, "estimation")
+    faults = refused(
+        served.server.post(f"/v1/runs/{run}:profile", json={"parameters": ["L"]}), 422, "invalid"
+    )
+    assert faults[0]["pointer"] == "/loss/noise_model"
+    assert "plain squares" in faults[0]["detail"]
 
 
 def test_the_true_structure_passes_and_a_simpler_one_fails(served: Served) -> None:

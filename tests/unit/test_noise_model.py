@@ -1,0 +1,159 @@
+"""Generalised least squares under first-order noise, against its closed form and repetition."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sysid.errors import InvalidSettings
+from sysid.identify import identify
+from sysid.models.library import load_model
+from sysid.noise_model import generalised, whitening
+from sysid.problem import Problem
+from sysid.profiles import profile
+from sysid.records import Channel, Record
+from sysid.refinement import refine
+from sysid.settings import GeneticAlgorithm, Loss, Stop
+from sysid.types import FloatArray
+from sysid.whitening import Whitening, owed
+from tests.unit.test_serial import coloured
+
+GAIN = {
+    "name": "gain", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
+    "parameters": {"g": {"lower": -10, "upper": 10}, "m": {"lower": -10, "upper": 10}},
+    "equations": {"x": "g*u + m"}, "outputs": {"y": "x"}, "initial": {"x": 0},
+}  # fmt: skip
+STEP, N, POLE = 0.1, 400, 0.95
+AR1 = Loss(noise_model="ar1")
+SMALL = GeneticAlgorithm(population=24, generations=20)
+
+
+def record(seed: int, pole: float = POLE, kept: FloatArray | None = None) -> Record:
+    """y = 2 u + 1 + noise of sd 0.2, with a u that is white."""
+    times = STEP * np.arange(N)
+    u = np.random.default_rng([seed, 1]).choice([-1.0, 1.0], N)
+    y = 2.0 * u + 1.0 + 0.2 * coloured(N, pole, seed)
+    here = np.ones(N, dtype=bool) if kept is None else kept.astype(bool)
+    return Record((Channel("u", times, u),), (Channel("y", times[here], y[here]),))
+
+
+def posed(*records: Record, loss: Loss = AR1) -> Problem:
+    return Problem.build(load_model(GAIN), records, loss=loss, skip=1)
+
+
+def squares(problem: Problem) -> FloatArray:
+    end = refine(problem, [np.zeros(len(problem.space))])[0]
+    assert end is not None
+    return end.theta
+
+
+def regression(problem: Problem, white: Whitening) -> FloatArray:
+    """The generalised least-squares estimate of this linear model, in closed form."""
+    base = problem.predictions(np.zeros((1, 2)))[0]
+    columns = (problem.predictions(np.eye(2)) - base).T
+    scored = problem.evaluator.weight > 0
+    seen, y = white.of(columns[scored].T).T, white.of(problem.evaluator.measured[scored])
+    return np.asarray(np.linalg.lstsq(seen, y, rcond=None)[0])
+
+
+def test_whitening_takes_the_correlation_out_of_first_order_noise_at_any_times() -> None:
+    times = np.cumsum(np.random.default_rng(1).exponential(1.0, 12))
+    noise = np.exp(-np.abs(times[:, None] - times) / 2.5)
+    white = Whitening(owed(times, 2.5))
+    of = white.of(np.eye(12)).T
+    np.testing.assert_allclose(of @ noise @ of.T, np.eye(12), atol=1e-12)
+    assert white.log_determinant == pytest.approx(np.linalg.slogdet(noise)[1])
+
+
+def test_estimates_are_those_of_generalised_least_squares_in_closed_form() -> None:
+    problem = posed(record(1), record(2))
+    found = generalised(problem, squares(problem), np.zeros((2, 2)), 1)
+    assert found.is_complete
+    white = whitening(problem, found.correlation_times)
+    np.testing.assert_allclose(found.theta, regression(problem, white), rtol=1e-5)
+
+
+def test_the_correlation_time_is_found_with_and_without_missing_samples() -> None:
+    kept = np.random.default_rng(5).random(N) < 0.8
+    kept[0] = True
+    true = -STEP / np.log(0.8)
+    for chosen in (None, kept):
+        found = []
+        for seed in range(20):
+            problem = posed(record(seed, 0.8, chosen))
+            end = generalised(problem, squares(problem), np.zeros((2, 2)), 1)
+            found.append(end.correlation_times["y"])
+        assert np.mean(found) == pytest.approx(true, rel=0.15)
+
+
+def test_under_slow_noise_a_fast_input_tells_more_than_squares_make_of_it() -> None:
+    errors = []
+    for seed in range(20):
+        problem = posed(record(seed))
+        plain = squares(problem)
+        found = generalised(problem, plain, np.zeros((2, 2)), 1)
+        errors.append([plain[0] - 2.0, found.theta[0] - 2.0])
+    plain_size, size = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert size < 0.5 * plain_size
+
+
+def test_intervals_under_first_order_noise_hold_the_truth() -> None:
+    held = []
+    for seed in range(30):
+        found = identify(load_model(GAIN), record(seed, 0.9), SMALL, loss=AR1, skip=1, seed=seed)
+        assert found.uncertainty is not None
+        assert found.uncertainty.noise_colour == "first-order"
+        assert found.uncertainty.noise_sd == pytest.approx(0.2, rel=0.5)
+        for one, true in zip(found.estimates, (2.0, 1.0), strict=True):
+            assert one.interval95 is not None
+            held.append(one.interval95[0] <= true <= one.interval95[1])
+    assert np.mean(held) >= 0.85  # 95 % but for four binomial deviations
+
+
+def test_the_likelihood_tells_that_the_noise_model_is_the_better_one() -> None:
+    plain, found = (
+        identify(load_model(GAIN), record(3), SMALL, loss=loss, skip=1) for loss in (Loss(), AR1)
+    )
+    assert plain.criteria is not None
+    assert found.criteria is not None
+    assert found.criteria.bic < plain.criteria.bic - 100.0
+    assert found.rms > plain.rms
+    assert any("first-order noise" in text for text in found.warnings)
+
+
+def test_residuals_are_tested_without_what_the_noise_model_explains() -> None:
+    plain, found = (
+        identify(load_model(GAIN), record(3), SMALL, loss=loss, skip=1) for loss in (Loss(), AR1)
+    )
+    assert plain.residual_tests is not None
+    assert found.residual_tests is not None
+    assert plain.residual_tests.passed is False
+    assert found.residual_tests.passed is True
+
+
+def test_white_residuals_leave_everything_as_it_is() -> None:
+    plain, found = (
+        identify(load_model(GAIN), record(3, 0.0), SMALL, loss=loss, skip=1)
+        for loss in (Loss(), AR1)
+    )
+    assert [replace(one) for one in found.estimates] == list(plain.estimates)
+    assert not found.correlation_times
+    assert any("may as well be white" in text for text in found.warnings)
+
+
+def test_a_budget_that_does_not_suffice_is_told_and_kept() -> None:
+    settings = replace(SMALL, stop=Stop(evaluations=200, settled=None))
+    found = identify(load_model(GAIN), record(3), settings, loss=AR1, skip=1)
+    assert found.evaluations <= 200
+    assert any("not estimated to its end" in text for text in found.warnings)
+
+
+def test_what_a_noise_model_cannot_do_is_refused() -> None:
+    with pytest.raises(InvalidSettings, match="need the loss 'squares'"):
+        Loss("soft-l1", 0.1, "ar1")
+    with pytest.raises(InvalidSettings, match="white or ar1"):
+        Loss(noise_model="pink")  # type: ignore[arg-type]
+    with pytest.raises(InvalidSettings, match="for free runs"):
+        Problem.build(load_model(GAIN), [record(1)], loss=AR1, prediction="one-step")
+    with pytest.raises(InvalidSettings, match="profiles are of plain squares"):
+        profile(posed(record(1)), np.array([2.0, 1.0]), "g")
