@@ -11,7 +11,8 @@ An event is clear if the input moves by 10 % of its range or more, if the output
 it (going on as it went there, it would not have come half way to its threshold), if its threshold
 is not above 5 % of its excursion, and if no other input moves in between.
 The input's own onset is taken the same way, so that a ramp is not counted as delay; an input that
-is held moves at its samples. Both read the measurement: no model enters.
+is held moves at its samples. Both read the measurement: no model enters. Of very many events some,
+spread evenly over the record, are enough for a median.
 """
 
 from collections.abc import Iterator, Sequence
@@ -36,6 +37,7 @@ _REST = 10  # samples at least
 _LAST = 0.25  # of a rest: the part from which the level is taken
 _CREEP = 0.5  # of the threshold: what still moves so far by itself is not at rest
 _STAYS = 3  # samples beyond the threshold that make an onset
+_MOST = 500  # events that are looked at
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +53,7 @@ class OnsetDelay:
     spread : float or None
         Standard deviation over the events, s; None with fewer than two.
     events : int
-        How many were clear.
+        How many were clear, of those looked at.
     threshold : float or None
         Part of the excursion at which the output counted as having left, the largest of them.
     """
@@ -108,7 +110,7 @@ def _pair(number: int, first: Channel, then: Channel, others: Sequence[Channel])
     notable = _NOTABLE * float(np.ptp(first.values))
     still = [(one, _tolerance(one.values)) for one in others]
     found: list[tuple[float, float]] = []
-    for event in events:
+    for event in _spread(events):
         pair = _at_event(event, first, (times, values), noise, notable)
         if pair is not None and not any(_moves(*one, event.rest, pair[1].time) for one in still):
             found.append((pair[1].time - pair[0].time, pair[1].share))
@@ -121,6 +123,13 @@ def _pair(number: int, first: Channel, then: Channel, others: Sequence[Channel])
     return OnsetDelay(
         number, first.name, then.name, float(np.median(delays)), spread, len(found), share
     )
+
+
+def _spread(events: Sequence[_Event]) -> Sequence[_Event]:
+    """All events, or of more than are needed as many as are, from the first to the last."""
+    if len(events) <= _MOST:
+        return events
+    return [events[i] for i in np.linspace(0, len(events) - 1, _MOST).round().astype(int)]
 
 
 def _at_event(
@@ -171,10 +180,12 @@ def _crossing(
 ) -> _Onset | None:
     """The first time at which a distance passes a threshold and stays beyond for a few samples."""
     beyond: BoolArray = distance > threshold
-    stays = np.flatnonzero(np.lib.stride_tricks.sliding_window_view(beyond, _STAYS).all(axis=1))
-    if stays.size == 0:
+    stays = beyond[: beyond.size - _STAYS + 1].copy()
+    for later in range(1, _STAYS):
+        stays &= beyond[later : later + stays.size]
+    k = int(np.argmax(stays))
+    if not stays[k]:
         return None
-    k = int(stays[0])
     time = float(times[k])
     if k > 0 and not held:
         low, high = float(distance[k - 1]), float(distance[k])

@@ -152,3 +152,17 @@ def test_a_channel_s_noise_is_taken_as_often_for_many_events_as_for_one(
         assert delays(u, response(TIMES), others=(other,)).events > 0
         counts.append(len(calls))
     assert counts[0] == counts[1]
+
+
+def test_of_many_events_an_even_part_gives_the_same_delay(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = np.arange(200 * HOLD) * STEP
+    u = np.tile(steps(), 34)[: times.size]
+    lag = 13
+    y = np.concatenate([np.zeros(lag), u[:-lag]])
+    record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
+    (every,) = onset_delays(load_model("fopdt"), (record,))
+    monkeypatch.setattr(onset, "_MOST", 40)
+    (some,) = onset_delays(load_model("fopdt"), (record,))
+    assert every.events > 150
+    assert 20 < some.events <= 40
+    assert some.delay == pytest.approx(every.delay, abs=1e-9)
