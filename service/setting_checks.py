@@ -41,6 +41,9 @@ def conversion_faults(body: Body) -> list[FieldError]:
     found: list[FieldError] = []
     tried(algorithm_of, found, body["algorithm"])
     tried(loss_of, found, body["loss"])
+    if body["prediction"] == "one-step" and body["loss"].get("noise_model") == "ar1":
+        detail = "ar1 is for free runs; predictions one step ahead contain the noise"
+        found.append(FieldError("/loss/noise_model", detail))
     return found
 
 

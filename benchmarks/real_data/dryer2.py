@@ -36,6 +36,13 @@ def measure(client: Client, folder: Path) -> list[Row]:
             Row(f"L, {model}", lag["value"], "s"),
             Row(f"standard error of L, {model}", lag["stderr"], "s"),
         ]
+    slow = {"name": "dryer2 sopdt, noise model", "model": "sopdt", "loss": {"noise_model": "ar1"}}
+    run = identify(client, {**common, **slow})
+    print_estimates("dryer2, sopdt, first-order noise", run)
+    rows += [
+        Row("fit, sopdt, noise model ar1", run["fit_percent"]["validation"], "%"),
+        Row("L, sopdt, noise model ar1", parameter(run, "L")["value"], "s"),
+    ]
     body = {**common, "name": "dryer2 sopdt, skip", "model": "sopdt", "skip": FIRST_SAMPLES}
     run = identify(client, body)
     name = f"fit, sopdt, first {FIRST_SAMPLES} samples not scored"

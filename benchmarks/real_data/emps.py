@@ -43,6 +43,15 @@ def measure(client: Client, folder: Path) -> list[Row]:
         Row("RMS, train", 1e3 * run["agreement"]["estimation"][0]["rms"], "mm"),
         Row("RMS, test", 1e3 * run["agreement"]["validation"][0]["rms"], "mm", 4.8),
     ]
+    noise = {**common, "name": "EMPS, noise model", "model": "emps", "loss": {"noise_model": "ar1"}}
+    slow = identify(client, noise)
+    print_estimates("EMPS, symmetric friction, first-order noise", slow)
+    rms = [1e3 * slow["agreement"][part][0]["rms"] for part in ("estimation", "validation")]
+    rows += [
+        Row("RMS, train, noise model ar1", rms[0], "mm"),
+        Row("RMS, test, noise model ar1", rms[1], "mm", 4.8),
+        Row("correlation time, noise model ar1", slow["correlation_times"]["y"], "s"),
+    ]
     _print_ridge(client, common)
     document = asymmetric(client.model("emps")["document"])
     both = identify(client, {**common, "name": "EMPS, asymmetric friction", "model": document})

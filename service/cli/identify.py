@@ -66,6 +66,10 @@ def identify(
     validation: Annotated[
         Path | None, typer.Option(help="Recording that is kept for validation.")
     ] = None,
+    noise_model: Annotated[
+        str | None,
+        typer.Option(help="white, or ar1: least squares generalised to first-order noise."),
+    ] = None,
     segments: Segments = None,
     sample_time: SampleTime = None,
     json_file: Annotated[
@@ -73,7 +77,10 @@ def identify(
     ] = None,
 ) -> None:
     """Identify a model's parameters and lags from a recording, in this process."""
-    given = _given(data, model, changes or [], _pairs(channels))
+    changes = list(changes or ())
+    if noise_model is not None:
+        changes.append(f"loss.noise_model={noise_model}")
+    given = _given(data, model, changes, _pairs(channels))
     _refuse_same(data, validation)
     reading = Reading(sample_time, _names(segments))
     recording = read(data, reading)

@@ -204,6 +204,11 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
         (["--model", "fopdt", "--channels", "u=volts"], "no channel 'volts'"),
         (["--model", "fopdt", "--channels", "w=u"], "no signal 'w'"),
         (["--model", "fopdt", "--set", "parameters.L.lower=9"], "[9, 5]"),
+        (["--model", "fopdt", "--noise-model", "pink"], "need 'white' or 'ar1'"),
+        (
+            ["--model", "fopdt", "--noise-model", "ar1", "--set", "prediction=one-step"],
+            "--set loss.noise_model: ar1 is for free runs",
+        ),
     ],
 )
 def test_a_mistake_of_identify_is_one_line(data: Path, words: list[str], expected: str) -> None:

@@ -124,6 +124,10 @@ def test_under_a_noise_model_they_are_of_the_whitened_residuals(served: Served) 
     )
     assert faults[0]["pointer"] == "/loss/noise_model"
     assert "plain squares" in faults[0]["detail"]
+    refusals = [{"prediction": "one-step"}, {"loss": {"kind": "soft-l1", "noise_model": "ar1"}}]
+    for change in refusals:
+        (fault,) = refused(served.server.post("/v1/jobs", json={**body, **change}), 422, "invalid")
+        assert fault["pointer"] == "/loss/noise_model"
 
 
 def test_the_true_structure_passes_and_a_simpler_one_fails(served: Served) -> None:
