@@ -9,7 +9,7 @@ from service.api.deps import Cursor, PartsDep, ReadSession
 from service.api.jobs import Filter
 from service.errors import NotFound
 from service.storage.tables import State
-from service.web import assets, figures, pages, report, results
+from service.web import assets, figures, pages, recipe_pages, report, results
 from service.web.results import FigureChoice, FigureName
 from service.web.simulate_page import simulate_page as simulate
 
@@ -53,6 +53,18 @@ def reference_page(request: Request) -> Response:
 def jobs_page(session: ReadSession, state: StateFilter = None, cursor: Cursor = None) -> Response:
     """The list of jobs, and the form of a new identification."""
     return _Page(pages.jobs_page(session, state, cursor))
+
+
+@router.get("/new/noise-sweep", **Hidden)
+def noise_sweep_page(session: ReadSession) -> Response:
+    """The form of a noise sweep."""
+    return _Page(recipe_pages.noise_sweep_page(session))
+
+
+@router.get("/new/reidentify", **Hidden)
+def reidentify_page(session: ReadSession) -> Response:
+    """The form of a batch re-identification."""
+    return _Page(recipe_pages.reidentify_page(session))
 
 
 @router.get("/jobs/{job_id}", **Hidden)
