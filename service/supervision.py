@@ -129,7 +129,7 @@ class Supervisor:
 def supervised_dispatcher(settings: Settings) -> Iterator[Supervisor]:
     """Keep a dispatcher with these settings running for the length of the block."""
     supervisor = Supervisor(
-        [sys.executable, "-m", "service.dispatcher"],
+        [sys.executable, "-m", "service.dispatcher_process"],
         environment_of(settings),
         settings.data_dir.absolute() / "logs" / "dispatcher.log",
     )

@@ -77,7 +77,7 @@ class Place:
         """A dispatcher for the length of the block; nothing of it is left afterwards."""
         log = (self.settings.data_dir / "dispatcher.log").open("ab")
         child = subprocess.Popen(
-            [sys.executable, "-m", "service.dispatcher"],
+            [sys.executable, "-m", "service.dispatcher_process"],
             env={**os.environ, **environment_of(self.settings)},
             stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
         )  # fmt: skip

@@ -7,8 +7,6 @@ when its raylet is gone, and listens on every interface (therefore the token).
 
 import logging
 import os
-import secrets
-import shutil
 import threading
 import time
 from collections.abc import Sequence
@@ -20,8 +18,9 @@ from sysid.program import program
 from workers.errors import ClusterLost, ClusterUnavailable, PackCancelled, PackFailed, WorkerDied
 from workers.joining import check_address, reason
 from workers.limits import advance_within, memory_for_each
+from workers.local_ray import COMMON, ENVIRONMENT, ONE_THREAD, REFUSALS, LocalRay
 from workers.ports import Done, Handle, Item, Records
-from workers.processes import children, clear_after_the_dead, folder_of, is_running, kill, of_folder
+from workers.processes import children, is_running, kill, of_folder
 from workers.warming import warm
 
 _log = logging.getLogger(__name__)
@@ -39,21 +38,6 @@ PULSE_SECONDS = 0.1
 """Between two looks at the processes of a local Ray."""
 VITAL = ("gcs_server", "raylet")
 """Programs without which a local Ray is lost."""
-OBJECT_STORE_BYTES = 200 * 2**20
-"""Records are small; the default of Ray, 30 % of the memory, is not."""
-
-ONE_THREAD = {
-    "NUMBA_NUM_THREADS": "1",
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "MKL_NUM_THREADS": "1",
-}
-_RAY_ENVIRONMENT = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_task_events_report_interval_ms": "0",  # else the GCS keeps 3-4 kB for each task
-    "RAY_memory_monitor_refresh_ms": "0",  # it kills the youngest task, not the largest
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # tomorrow's default; silences a warning
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,28 +56,29 @@ class ClusterSettings:
 class RayCrew:
     """The workers of a Ray cluster; implements `workers.ports.Crew`.
 
+    Parameters
+    ----------
+    local : LocalRay, optional
+        One that was started before; else one is, unless the settings name a cluster.
+
     Raises
     ------
     ClusterUnavailable
         If Ray cannot be started or joined.
     """
 
-    def __init__(self, settings: ClusterSettings) -> None:
-        os.environ.update(_RAY_ENVIRONMENT)
-        if settings.address is not None:
+    def __init__(self, settings: ClusterSettings, local: LocalRay | None = None) -> None:
+        os.environ.update(ENVIRONMENT)
+        self._local = None
+        if settings.address is None:
+            self._local = local or LocalRay(settings.cpus)
+        else:
             check_address(settings.address)
-        self._folder = None if settings.address else _fresh_folder()
-        if settings.address is None:  # the token is read when Ray is imported
-            os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
-            os.environ.update(ONE_THREAD)  # inherited by the local workers
-        import ray
+        import ray  # it reads its environment now, unless the local one has imported it
 
         self._ray: Any = ray
-        try:
-            _initialise(ray, settings, self._folder)
-        except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
-            self._forget_folder()
-            raise ClusterUnavailable(reason(settings.address, error)) from error
+        if settings.address is not None:
+            _join(ray, settings.address)
         self._advance = ray.remote(num_cpus=1, max_retries=0)(advance_within)
         self._noop = ray.remote(num_cpus=0, max_retries=0)(_answer)
         self._flying: set[Any] = set()
@@ -135,7 +120,7 @@ class RayCrew:
             raise ClusterUnavailable(f"Ray's workers do not come up: {last}") from error
         for one in late:
             self._ray.cancel(one, force=False)
-        if self._folder is None:
+        if self._local is None:
             _require_one_program(found)
         self._heard = time.monotonic()
 
@@ -227,7 +212,7 @@ class RayCrew:
 
     def abandon(self) -> None:
         """Let go of a cluster that is lost, without asking it anything."""
-        if self._folder is not None:
+        if self._local is not None:
             kill(of_folder(os.getpid()))
             self._forget_folder()
 
@@ -256,23 +241,15 @@ class RayCrew:
                 self.slots = there
 
     def _forget_folder(self) -> None:
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+        if self._local is not None:
+            self._local.forget_folder()
 
 
-def _initialise(ray: Any, settings: ClusterSettings, folder: Path | None) -> None:
-    common = {"log_to_driver": False, "logging_level": logging.ERROR}
-    if settings.address is not None:
-        ray.init(address=settings.address, runtime_env={"env_vars": ONE_THREAD}, **common)
-        return
-    ray.init(
-        address="local",  # never a cluster that happens to run on this host
-        num_cpus=settings.cpus,
-        include_dashboard=False,
-        object_store_memory=OBJECT_STORE_BYTES,
-        _temp_dir=str(folder),
-        **common,
-    )
+def _join(ray: Any, address: str) -> None:
+    try:
+        ray.init(address=address, runtime_env={"env_vars": ONE_THREAD}, **COMMON)
+    except REFUSALS as error:
+        raise ClusterUnavailable(reason(address, error)) from error
 
 
 def _require_one_program(found: Sequence[str]) -> None:
@@ -286,18 +263,3 @@ def _require_one_program(found: Sequence[str]) -> None:
 
 def _answer() -> bool:
     return True
-
-
-def _fresh_folder() -> Path:
-    """Make Ray's folder for this process; what dispatchers that are gone have left is cleared."""
-    clear_after_the_dead()
-    folder = folder_of(os.getpid())
-    shutil.rmtree(folder, ignore_errors=True)
-    try:
-        folder.mkdir(mode=0o700)  # fails for whatever is there, so that it is ours and new
-    except OSError as error:
-        raise ClusterUnavailable(
-            f"Ray's folder {folder} cannot be made ({error.strerror}): remove it if it is there, "
-            "or set TMPDIR to a folder of your own"
-        ) from error
-    return folder

@@ -12,9 +12,10 @@ from service.storage.patience import PASSING
 from service.storage.runs import RunRepository
 from service.storage.tables import Event, Job, Run, State
 
-CLOCKED = ("seconds", "job")
+CLOCKED = ("seconds", "job", "run")
 """Fields of a summary that tell of time and place, not of the result."""
 KILLED = "its worker process died"
+SHOWN = 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,13 @@ class Finding:
     figures: str
     killed: tuple[bool, ...]
     unplotted: int
+
+    def beside(self, undisturbed: "Finding") -> str:
+        """Which figures differ from those, and the first that does in both forms."""
+        mine, theirs = json.loads(self.figures), json.loads(undisturbed.figures)
+        apart = [name for name in mine if mine[name] != theirs[name]]
+        shown = {name: f"{mine[name]} instead of {theirs[name]}" for name in apart}
+        return "; ".join(f"{name}: {text[:SHOWN]}" for name, text in shown.items())
 
     def given_up_beside(self, undisturbed: "Finding") -> int:
         """Runs that were given up, alone or with the job, because they met too many faults."""
@@ -80,7 +88,10 @@ def audit(stand: Stand, job_id: str, *, ends: int = 1) -> Finding:
     summary = without_clock(stand.client.summary(job_id))
     total = sum(run.evaluations for run in runs)
     estimates, reasons = [run.estimates for run in runs], [reason(run.error) for run in runs]
-    figures = [summary, job.evaluations, total, n_points, estimates, reasons]
+    figures = {
+        "summary": summary, "evaluations of the job": job.evaluations, "of its runs": total,
+        "points of history": n_points, "estimates": estimates, "reasons": reasons,
+    }  # fmt: skip
     given_up = job.state is State.FAILED and job.lost_leases >= job.max_attempts
     states = tuple(run.state.value for run in runs)
     killed = tuple((run.error or "").startswith(KILLED) for run in runs)

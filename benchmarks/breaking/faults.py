@@ -18,6 +18,7 @@ from sqlalchemy import select
 
 from benchmarks.breaking.audit import owners, steps
 from benchmarks.breaking.stand import Stand, until
+from benchmarks.breaking.work import Stream
 from service.storage.tables import Dispatcher
 from workers.processes import standing
 
@@ -28,12 +29,24 @@ PAUSED_SECONDS = 11.0
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """A service at work: the jobs that are open at the moment, and its server if it has one."""
+    """A service at work: its jobs, and what else of it can be broken.
+
+    Attributes
+    ----------
+    postgres : PostgresServer or None
+        Its server, if it has one.
+    clock, ray_away : Path or None
+        Files that break it from inside (`shim`).
+    disks : tuple of Path
+        Folders on small file systems, with its objects and checkpoints.
+    """
 
     stand: Stand
-    open_jobs: Callable[[], list[str]]
+    stream: Stream
     postgres: Any = None
     clock: Path | None = None
+    ray_away: Path | None = None
+    disks: tuple[Path, ...] = ()
 
 
 def kill_worker(bench: Bench) -> float:
@@ -41,29 +54,29 @@ def kill_worker(bench: Bench) -> float:
     family = bench.stand.family
     busy = family.named("ray::advance") or family.named("ray::IDLE")
     before = len(family.named("ray::advance") + family.named("ray::IDLE"))
-    return _recovery(bench, lambda: _kill(busy[:1]), lambda: len(_workers(bench)) >= before)
+    return recovery(bench, lambda: kill(busy[:1]), lambda: len(_workers(bench)) >= before)
 
 
 def kill_raylet(bench: Bench) -> float:
     """Kill the raylet of the dispatcher."""
-    return _renewal(bench, lambda: _kill(bench.stand.family.named("raylet")))
+    return renewal(bench, lambda: kill(bench.stand.family.named("raylet")))
 
 
 def kill_gcs(bench: Bench) -> float:
     """Kill Ray's store of what is where."""
-    return _renewal(bench, lambda: _kill(bench.stand.family.named("gcs_server")))
+    return renewal(bench, lambda: kill(bench.stand.family.named("gcs_server")))
 
 
 def kill_dispatcher(bench: Bench) -> float:
     """Kill the dispatcher."""
-    return _renewal(bench, lambda: _kill(bench.stand.family.dispatchers()))
+    return renewal(bench, lambda: kill(bench.stand.family.dispatchers()))
 
 
 def kill_web(bench: Bench) -> float:
     """Kill the web process; its dispatcher ends with it, and comes again with the next."""
     web = bench.stand.web
     assert web is not None
-    return _renewal(bench, lambda: _kill([web.pid]))
+    return renewal(bench, lambda: kill([web.pid]))
 
 
 def kill_postgres(bench: Bench) -> float:
@@ -71,14 +84,14 @@ def kill_postgres(bench: Bench) -> float:
 
     def restart() -> None:
         killed = bench.postgres.get_pid()
-        _kill([killed])
+        kill([killed])
         until(lambda: standing(killed) is None, "it was buried", LIMIT_SECONDS)
         status = bench.stand.answers()
         if status not in (200, 503, None):
             raise AssertionError(f"the web answered {status} while its database was away")
         until(lambda: _is_started(bench.postgres), "PostgreSQL started again", LIMIT_SECONDS)
 
-    return _recovery(bench, restart, lambda: bench.stand.answers() == 200)
+    return recovery(bench, restart, lambda: bench.stand.answers() == 200)
 
 
 def _is_started(server: Any) -> bool:
@@ -104,7 +117,7 @@ def pause_dispatcher(bench: Bench) -> float:
                 lambda: not any(held in owner for owner in owners(bench.stand)),
                 "the paused dispatcher's jobs were given to another", LIMIT_SECONDS,
             )  # fmt: skip
-            took = _goes_on(bench, begun)
+            took = goes_on(bench, begun)
             time.sleep(max(0.0, PAUSED_SECONDS - (time.monotonic() - begun)))
         finally:
             with contextlib.suppress(ProcessLookupError):
@@ -117,7 +130,7 @@ def step_clock_back(bench: Bench) -> float:
     """Set the clock back by an hour more."""
     clock = bench.clock
     assert clock is not None
-    return _recovery(bench, lambda: _write(clock, float(clock.read_text() or 0) - 3600.0))
+    return recovery(bench, lambda: _write(clock, float(clock.read_text() or 0) - 3600.0))
 
 
 def step_clock_and_kill(bench: Bench) -> float:
@@ -126,46 +139,47 @@ def step_clock_and_kill(bench: Bench) -> float:
     assert clock is not None
 
     def both() -> None:
-        _kill(bench.stand.family.dispatchers())
+        kill(bench.stand.family.dispatchers())
         _write(clock, float(clock.read_text() or 0) - 3600.0)
 
-    return _renewal(bench, both)
+    return renewal(bench, both)
 
 
-def _renewal(bench: Bench, fault: Callable[[], None]) -> float:
+def renewal(bench: Bench, fault: Callable[[], None]) -> float:
     """Of what only another dispatcher than the present one mends."""
-    known = _known(bench)
+    before = known(bench)
     begun = time.monotonic()
     fault()
     until(
-        lambda: bench.stand.answers() == 200 and bool(owners(bench.stand) - known),
+        lambda: bool(owners(bench.stand) - before) and bench.stand.answers() == 200,
         "another dispatcher has the jobs", LIMIT_SECONDS,
     )  # fmt: skip
-    return _goes_on(bench, begun)
+    return goes_on(bench, begun)
 
 
-def _known(bench: Bench) -> set[str]:
+def known(bench: Bench) -> set[str]:
     """Dispatchers that were ever heard of."""
     with bench.stand.database.read() as session:
         return {*session.scalars(select(Dispatcher.owner)), *owners(bench.stand)}
 
 
-def _recovery(
+def recovery(
     bench: Bench, fault: Callable[[], None], works: Callable[[], bool] = lambda: True
 ) -> float:
+    """Of what mends itself under the same dispatcher."""
     begun = time.monotonic()
     fault()
-    _goes_on(bench, begun)
+    goes_on(bench, begun)
     until(works, "what was broken works again", LIMIT_SECONDS)
     return time.monotonic() - begun
 
 
-def _goes_on(bench: Bench, begun: float) -> float:
+def goes_on(bench: Bench, begun: float) -> float:
     """Wait until a result is stored that was not yet there; gives the seconds since `begun`."""
     seen: dict[str, int] = {}
 
     def is_further() -> bool:
-        for job in bench.open_jobs():
+        for job in bench.stream.jobs():
             now = steps(bench.stand, [job])
             if now is not None and now > seen.setdefault(job, now):
                 return True
@@ -180,7 +194,8 @@ def _workers(bench: Bench) -> list[int]:
     return family.named("ray::advance") + family.named("ray::IDLE")
 
 
-def _kill(pids: list[int]) -> None:
+def kill(pids: list[int]) -> None:
+    """Kill processes, those that have ended meanwhile excepted."""
     for pid in pids:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)

@@ -23,6 +23,8 @@ from service.storage.sessions import Database, sqlite_url
 
 SHIM = Path(__file__).with_name("shim")
 START_SECONDS = 180.0
+PAUSE_SECONDS = 0.1
+"""Between two looks, which take processor time of the service themselves."""
 RESTART_SECONDS = 0.5
 """What the caretaker waits before it starts a web process that has ended."""
 
@@ -63,7 +65,7 @@ class Stand:
         self.client = Client(self.url)
         self.web: subprocess.Popen[bytes] | None = None
         self._before = set(shared_memory())
-        self._ending = threading.Event()
+        self._ending, self._down = threading.Event(), threading.Event()
         self._caretaker = threading.Thread(target=self._take_care, daemon=True)
 
     def start(self, *, wait: bool = True) -> None:
@@ -72,6 +74,12 @@ class Stand:
         self._caretaker.start()
         if wait:
             until(self.is_ready, "the service was ready", START_SECONDS)
+
+    @property
+    def log(self) -> str:
+        """What the dispatchers have told."""
+        file = self.folder / "logs" / "dispatcher.log"
+        return file.read_text(errors="replace") if file.exists() else ""
 
     def is_ready(self) -> bool:
         """Whether database, store and a dispatcher are."""
@@ -91,7 +99,7 @@ class Stand:
         """A second dispatcher for the length of the block, which ends in order."""
         with (self.folder / "second.log").open("ab") as log:
             child = subprocess.Popen(
-                [sys.executable, "-m", "service.dispatcher"], env=self.environment,
+                [sys.executable, "-m", "service.dispatcher_process"], env=self.environment,
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
         try:
@@ -103,14 +111,21 @@ class Stand:
             child.kill()
             child.wait()
 
+    @contextmanager
+    def down(self) -> Iterator[None]:
+        """End it in order, and start it again after the block."""
+        self._down.set()
+        try:
+            self._end_web()
+            yield
+        finally:
+            self._down.clear()
+
     def stop(self) -> None:
         """End it in order."""
         self._ending.set()
         self._caretaker.join()
-        if self.web is not None and self.web.poll() is None:
-            self.web.send_signal(signal.SIGTERM)
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self.web.wait(20.0)
+        self._end_web()
         self.client.close()
         self.database.dispose()
 
@@ -138,9 +153,16 @@ class Stand:
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
 
+    def _end_web(self) -> None:
+        if self.web is not None and self.web.poll() is None:
+            self.web.send_signal(signal.SIGTERM)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.web.wait(20.0)
+
     def _take_care(self) -> None:
         while not self._ending.wait(RESTART_SECONDS):
-            if self.web is not None and self.web.poll() is not None:
+            has_ended = self.web is not None and self.web.poll() is not None
+            if has_ended and not self._down.is_set():
                 self._spawn()
 
 
@@ -171,7 +193,7 @@ def until(holds: Callable[[], bool], what: str, seconds: float) -> float:
     while not holds():
         if time.monotonic() - begun > seconds:
             raise TimeoutError(f"not within {seconds:g} s: {what}")
-        time.sleep(0.05)
+        time.sleep(PAUSE_SECONDS)
     return time.monotonic() - begun
 
 

@@ -3,6 +3,9 @@
 import threading
 import time
 from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,44 +20,73 @@ from service.storage.tables import Checkpoint, Job
 
 STUCK_SECONDS = 180.0
 """A job that has not ended so long after the last fault is stuck."""
+DEADLY, GREEDY = (9013, 9014), (9077,)
+"""Seeds of runs that kill their workers, and of one that takes all memory (`shim`)."""
+ALWAYS = ("sweep", "diverging", "long")
+"""Kinds of jobs of which one is open at any time; the others are what a fault submits."""
 
 
 def bodies(dataset: str) -> dict[str, dict[str, Any]]:
-    """The jobs: a sweep, one of which half the cells diverge, and one long run on islands."""
+    """The jobs, by kind.
+
+    A sweep; one of which half the cells diverge; a long run on islands; a sweep with runs that
+    kill their workers or take all memory; one to be cancelled, which ends with making floors.
+    """
     common = {"model": "duffing-eq16", "datasets": [dataset], "reuse": False}
-    seeds = {"path": "/seed", "values": list(range(1, 201))}
     unstable = {"path": "/parameters/b", "values": [
         {"fixed": 5.0}, {"lower": -1e9, "upper": 10.0, "fixed": -1e8},
     ]}  # fmt: skip
-    few = {"path": "/seed", "values": list(range(1, 31))}
     endless = {"generations": 40_000, "islands": 4, "stop": {"settled": None}}
+    bad = [*range(1, 6), *DEADLY, *range(6, 11), *GREEDY, *range(11, 16)]
+    sigmas = {"path": "/noise/sigma", "values": [0.01, 0.02]}
     return {
-        "sweep": {**common, "sweep": {"axes": [seeds]}},
-        "diverging": {**common, "sweep": {"axes": [unstable, few]}},
+        "sweep": {**common, "sweep": {"axes": [_seeds(range(1, 201))]}},
+        "diverging": {**common, "sweep": {"axes": [unstable, _seeds(range(1, 31))]}},
         "long": {**common, "seed": 7, "algorithm": endless},
+        "bad": {**common, "sweep": {"axes": [_seeds(bad)]}},
+        "cancelled": {**common, "sweep": {"axes": [sigmas, _seeds(range(1, 31))]}},
     }
 
 
+def _seeds(values: Collection[int]) -> dict[str, Any]:
+    return {"path": "/seed", "values": list(values)}
+
+
+@dataclass(frozen=True, slots=True)
+class _Open:
+    """A job that has not ended, as far as is known; `ends` is how often it may."""
+
+    kind: str
+    ends: int = 1
+
+
 class Stream:
-    """Keeps one job of each kind open, from a thread of its own."""
+    """Keeps one job of each usual kind open, from a thread of its own, and watches others."""
 
     def __init__(self, stand: Stand, folder: Path) -> None:
         path = paper_example.write_csv(folder / "record.csv", seed=1)
         dataset = stand.client.add_dataset(path, name="example 1")["id"]
         self._stand, self._bodies = stand, bodies(dataset)
         self.undisturbed: dict[str, Finding] = {}
-        self.open: dict[str, str] = {}
+        self._open: dict[str, _Open] = {}
         self.counts: Counter[str] = Counter()
         self._rate = 1.0  # evaluations a second of the long run, alone
         self.different: list[str] = []
+        self._n_submitted = 0
+        self._lock = threading.RLock()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._go_on, daemon=True)
 
-    def measure(self) -> dict[str, float]:
-        """Carry out every kind once, undisturbed; gives their seconds."""
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """All that can be submitted."""
+        return tuple(self._bodies)
+
+    def measure(self, kinds: Collection[str] = ALWAYS) -> dict[str, float]:
+        """Carry out these kinds once, undisturbed; gives their seconds."""
         took = {}
-        for kind, body in self._bodies.items():
-            job = self._stand.client.submit(body)["id"]
+        for kind in kinds:
+            job = self._stand.client.submit(self._bodies[kind])["id"]
             took[kind] = until(lambda job=job: is_over(self._stand, job), f"{kind} ended", 300.0)
             self.undisturbed[kind] = audit(self._stand, job)
             if kind == "long":
@@ -63,7 +95,8 @@ class Stream:
 
     def at_risk(self) -> float:
         """Seconds of work of the long run that are in no checkpoint: what a kill now repeats."""
-        job = self.open.get("long")
+        with self._lock:
+            job = next((job for job, one in self._open.items() if one.kind == "long"), None)
         if job is None:
             return 0.0
         told, kept = self._evaluations(job)
@@ -82,44 +115,82 @@ class Stream:
 
     def jobs(self) -> list[str]:
         """The jobs that are open now."""
-        return list(self.open.values())
+        with self._lock:
+            return list(self._open)
+
+    def submit(self, kind: str) -> str:
+        """Submit a job, which nobody watches yet; gives its id.
+
+        Raises
+        ------
+        ClientError
+            If the web does not take it. With a key, a submission whose answer was lost is not
+            made twice.
+        """
+        with self._lock:
+            key = f"{kind}-{self._n_submitted}"
+            made = self._stand.client.submit(self._bodies[kind], idempotency_key=key)
+            self._n_submitted += 1
+        return str(made["id"])
+
+    def watch(self, job: str, kind: str, *, ends: int = 1) -> None:
+        """Hold a job against the undisturbed one when it has ended, for the last of `ends`."""
+        with self._lock:
+            self._open[job] = _Open(kind, ends)
+
+    @contextmanager
+    def quiet(self) -> Iterator[None]:
+        """Neither submit nor look meanwhile."""
+        with self._lock:
+            yield
 
     def finish(self) -> int:
         """Submit nothing more and wait for what is open; gives the jobs that are stuck."""
         self._ending.set()
         self._thread.join()
         limit = time.monotonic() + STUCK_SECONDS
-        while self.open and time.monotonic() < limit:
+        while self._open and time.monotonic() < limit:
             self._look(submits=False)
             time.sleep(0.2)
-        return len(self.open)
+        return len(self._open)
 
     def _go_on(self) -> None:
         while not self._ending.wait(0.2):
             self._look(submits=True)
 
     def _look(self, *, submits: bool) -> None:
-        for kind, body in self._bodies.items():
-            try:
-                if kind in self.open:
-                    self._compare(kind, self.open[kind])
-                elif submits:
-                    # With a key, a submission whose answer was lost is not made twice.
-                    key = f"{kind}-{self.counts[kind]}"
-                    made = self._stand.client.submit(body, idempotency_key=key)
-                    self.open[kind] = made["id"]
-            except (ClientError, *PASSING):
-                continue  # a part is away; tried again at the next look
+        for job in self.jobs():
+            with self._lock:
+                self._try(lambda job=job: self._compare(job))
+        there = {one.kind for one in self._open.values()}
+        for kind in ALWAYS if submits else ():
+            if kind not in there:
+                self._try(lambda kind=kind: self.watch(self.submit(kind), kind))
 
-    def _compare(self, kind: str, job: str) -> None:
+    @staticmethod
+    def _try(work: Any) -> None:
+        try:
+            work()
+        except (ClientError, *PASSING):
+            return  # a part is away; tried again at the next look
+
+    def _compare(self, job: str) -> None:
         if not is_over(self._stand, job):
             return
-        found, wanted = audit(self._stand, job), self.undisturbed[kind]
-        self.counts[kind] += 1
-        self.counts["runs"] += len(found.states)
-        self.counts["lost"] += found.lost_beside(wanted)
-        self.counts["doubled"] += found.doubled
-        self.counts["given up"] += found.given_up
-        if found.figures != wanted.figures:
-            self.different.append(job)
-        del self.open[kind]
+        one = self._open[job]
+        found = audit(self._stand, job, ends=one.ends)
+        wanted, counts = self.undisturbed[one.kind], self.counts
+        counts["jobs"] += 1
+        counts[one.kind] += 1
+        counts["runs"] += len(found.states)
+        counts["doubled"] += found.doubled
+        counts["unplotted"] += found.unplotted
+        given_up = found.given_up_beside(wanted)
+        counts["given up"] += found.given_up
+        counts["runs given up"] += given_up
+        if not given_up:
+            counts["lost"] += found.lost_beside(wanted)
+            if found.figures != wanted.figures:
+                self.different.append(job)
+                print(f"{one.kind} {job} differs: {found.beside(wanted)}", flush=True)
+        del self._open[job]

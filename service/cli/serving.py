@@ -43,17 +43,18 @@ def serve(
     settings.check_exposure()
     settings.prepare_folder()
     with listening(settings.host, settings.port) as listener:
-        from service.opening import open_storage
         from service.supervision import supervised_dispatcher
 
-        database, _ = open_storage(settings)  # what cannot be opened is told now, in one line
-        database.dispose()
         _end_on_signals()
         child: AbstractContextManager[Supervisor | None] = nullcontext()
         if with_dispatcher:
             child = supervised_dispatcher(settings)
-        with child as supervisor:
-            from service.app import create_app  # the dispatcher starts beside this import
+        with child as supervisor:  # the dispatcher starts beside all that follows
+            from service.opening import open_storage
+
+            database, _ = open_storage(settings)  # what cannot be opened is told in one line
+            database.dispose()
+            from service.app import create_app
 
             bound = listener.getsockname()[1]
             folder = settings.data_dir.absolute()
@@ -66,9 +67,9 @@ def dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
     """Claim jobs and have them computed, until told to end (`serve` starts one by itself)."""
     settings = settings_of(data_dir=data_dir, cpus=cpus)
     settings.prepare_folder()
-    from service.dispatcher import run_to_the_end
+    from service.dispatcher_process import run
 
-    raise typer.Exit(run_to_the_end(settings))
+    raise typer.Exit(run(settings))
 
 
 def settings_of(**given: Any) -> "Settings":

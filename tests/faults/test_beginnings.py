@@ -1,7 +1,6 @@
 """A service that begins badly: no Ray, tables of an earlier version, a full disk."""
 
 import os
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from sqlalchemy import select
 
 from benchmarks import paper_example
 from benchmarks.breaking.audit import is_over
+from benchmarks.breaking.disks import filled, small_disk
 from benchmarks.breaking.stand import Stand, standing_service, until
 from service.storage.migrate import downgrade
 from service.storage.tables import Checkpoint, Job, Run, State
@@ -57,58 +57,38 @@ def test_jobs_wait_for_ray_and_survive_an_upgrade_of_their_tables(tmp_path: Path
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
+def disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 16 MB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(folder)]
-    try:
-        mounted = subprocess.run(command, check=False, capture_output=True).returncode == 0
-    except FileNotFoundError:
-        mounted = False
-    if not mounted:
-        pytest.skip("mounting a small tmpfs needs root")
-    yield folder
-    subprocess.run(["umount", "-l", str(folder)], check=True)
+    with small_disk(tmp_path / "disk", 16) as folder:
+        if folder is None:
+            pytest.skip("mounting a small tmpfs needs root")
+        yield folder
 
 
-def fill(folder: Path) -> Path:
-    """Take all the space that is left."""
-    ballast = folder / "ballast"
-    with ballast.open("wb", buffering=0) as file:
-        try:
-            while file.write(b"\0" * 4096):
-                pass
-        except OSError:
-            pass
-    return ballast
-
-
-def test_a_full_disk_stops_nothing_for_good(small_disk: Path, tmp_path: Path) -> None:
-    stand = Stand(small_disk / "data")
+def test_a_full_disk_stops_nothing_for_good(disk: Path, tmp_path: Path) -> None:
+    stand = Stand(disk / "data")
     record = paper_example.write_csv(tmp_path / "record.csv", seed=1)
     with standing_service(stand):
         dataset = stand.client.add_dataset(record, name="example 1")["id"]
         body = {"model": "duffing-eq16", "datasets": [dataset], "reuse": False}
         job = stand.client.submit({**body, "algorithm": LONG})["id"]
         until(lambda: checkpoints(stand) > 0, "a checkpoint", LIMIT_SECONDS)
-        ballast = fill(small_disk)
-        upload = httpx.post(f"{stand.url}/v1/datasets", content=record.read_bytes() + b" ",
-                            headers=CSV, timeout=60.0)  # fmt: skip
-        assert upload.status_code == 503
-        assert upload.headers["content-type"] == PROBLEM
-        log = small_disk / "data" / "logs" / "dispatcher.log"
+        log = disk / "data" / "logs" / "dispatcher.log"
         (dispatcher,) = stand.family.dispatchers()
-        os.sync()
-        until(lambda: refused(stand, body), "a job was refused", LIMIT_SECONDS)
-        ballast.unlink()
+        with filled(disk):
+            upload = httpx.post(f"{stand.url}/v1/datasets", content=record.read_bytes() + b" ",
+                                headers=CSV, timeout=60.0)  # fmt: skip
+            assert upload.status_code == 503
+            assert upload.headers["content-type"] == PROBLEM
+            os.sync()
+            until(lambda: refused(stand, body), "a job was refused", LIMIT_SECONDS)
         until(lambda: is_over(stand, job), "the job ended", LIMIT_SECONDS)
         assert state_of(stand, job) is State.SUCCEEDED
         assert log.exists()
         assert stand.family.dispatchers() == [dispatcher]
         with stand.database.read() as session:
             hashes = list(session.scalars(select(Run.signals_sha256)))
-        objects = {path.stem for path in (small_disk / "data/objects/sha256").rglob("*.mcap")}
+        objects = {path.stem for path in (disk / "data/objects/sha256").rglob("*.mcap")}
         assert set(hashes) - {None} <= objects
     assert stand.leftovers() == []
 

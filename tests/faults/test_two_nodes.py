@@ -97,7 +97,9 @@ def log_of(place: Place) -> str:
 
 
 @pytest.mark.parametrize(
-    "command", [["service.dispatcher"], ["service.cli.main", "dispatcher"]], ids=["module", "lagid"]
+    "command",
+    [["service.dispatcher_process"], ["service.cli.main", "dispatcher"]],
+    ids=["module", "lagid"],
 )
 @pytest.mark.parametrize(
     ("address", "told"),

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from benchmarks.breaking import faults
+from benchmarks.breaking import cancelling, faults
 from benchmarks.breaking.faults import Bench
 from benchmarks.breaking.stand import Stand, standing_service
-from benchmarks.breaking.work import Stream
+from benchmarks.breaking.work import ALWAYS, Stream
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -23,6 +23,8 @@ FAULTS = [
     faults.step_clock_back,
     faults.step_clock_and_kill,
     faults.pause_dispatcher,
+    cancelling.cancel_running,
+    cancelling.cancel_finishing,
 ]
 
 
@@ -34,9 +36,9 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, Str
     clock.write_text("0")
     with standing_service(Stand(folder / "data", environment={"BREAK_CLOCK": str(clock)})) as stand:
         stream = Stream(stand, folder)
-        stream.measure()
+        stream.measure((*ALWAYS, "cancelled"))
         stream.start()
-        yield Bench(stand, stream.jobs, clock=clock), stream
+        yield Bench(stand, stream, clock=clock), stream
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
@@ -54,6 +56,6 @@ def test_nothing_is_lost_doubled_stuck_different_or_left(bench: tuple[Bench, Str
     assert stream.counts["given up"] == 0
     states = {job["state"] for job in stand.client.jobs()}
     assert states == {"succeeded"}
-    assert broken.open_jobs() == []
+    assert broken.stream.jobs() == []
     stand.stop()
     assert stand.leftovers() == []

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from service import temporary
-from workers import cluster, processes
+from workers import local_ray, processes
 from workers.errors import ClusterUnavailable
 
 LEAVE = "import sys; from service import temporary; open(sys.argv[1] + temporary.prefix(), 'w')"
@@ -80,9 +80,9 @@ def test_rays_folder_is_not_one_that_somebody_else_has_made(
     target.mkdir()
     folder.symlink_to(target)  # as what another has made, it cannot be removed as a folder is
     with pytest.raises(ClusterUnavailable, match="cannot be made"):
-        cluster._fresh_folder()
+        local_ray.fresh_folder()
     folder.unlink()
-    made = cluster._fresh_folder()
+    made = local_ray.fresh_folder()
     assert made == folder
     assert made.stat().st_mode & 0o077 == 0
 

@@ -70,7 +70,7 @@ _BREAKERS = {
     ("service.storage.columns", "BREAK_CLOCK"): _break_clock,
     ("workers.tasks", "BREAK_SEEDS"): _break_runs,
     ("workers.tasks", "BREAK_MEMORY"): _break_memory,
-    ("workers.cluster", "BREAK_RAY"): _break_start,
+    ("workers.local_ray", "BREAK_RAY"): _break_start,
 }
 
 

@@ -1,0 +1,113 @@
+"""Jobs that are cancelled in every state and resumed, and runs that harm whoever computes them.
+
+The jobs go on while the next faults come, and end as those that nobody has disturbed.
+"""
+
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from benchmarks.breaking.faults import LIMIT_SECONDS, Bench, goes_on, kill, recovery, renewal
+from benchmarks.breaking.stand import until
+from service.calls import ClientError, ProblemError
+from service.storage.patience import PASSING
+from service.storage.tables import Job, State
+
+T = TypeVar("T")
+CONFLICT = 409
+
+
+def cancel_without_dispatcher(bench: Bench) -> float:
+    """Kill the dispatcher; cancel one of its jobs and one that has just been queued."""
+    running = _insist(lambda: bench.stream.submit("cancelled"))
+    until(lambda: _has_begun(bench, running), "it was begun", LIMIT_SECONDS)
+
+    def both() -> None:
+        kill(bench.stand.family.dispatchers())
+        queued = _insist(lambda: bench.stream.submit("cancelled"))
+        for job in (queued, running):
+            _cancel_and_resume(bench, job)
+
+    return renewal(bench, both)
+
+
+def cancel_running(bench: Bench) -> float:
+    """Cancel a job of which some runs have ended."""
+    return _cancelled(bench, _has_begun)
+
+
+def cancel_finishing(bench: Bench) -> float:
+    """Cancel a job whose runs are over, while its floors are made; or soon after."""
+    return _cancelled(bench, _is_finishing)
+
+
+def bad_runs(bench: Bench) -> float:
+    """Submit runs that kill their workers, and one that takes all the memory it gets."""
+
+    def submit() -> None:
+        bench.stream.watch(_insist(lambda: bench.stream.submit("bad")), "bad")
+
+    return recovery(bench, submit)
+
+
+def _cancelled(bench: Bench, is_time: Callable[[Bench, str], bool]) -> float:
+    job = _insist(lambda: bench.stream.submit("cancelled"))
+    until(lambda: is_time(bench, job), "it was time to cancel", LIMIT_SECONDS)
+    begun = time.monotonic()
+    _cancel_and_resume(bench, job)
+    return goes_on(bench, begun)
+
+
+def _cancel_and_resume(bench: Bench, job: str) -> None:
+    """Do both, and watch the job from then on; nothing is cancelled that has already ended."""
+    met = _job(bench, job)
+    try:
+        _insist(lambda: bench.stand.client.cancel(job))
+    except ProblemError:
+        bench.stream.counts["cancelled too late"] += 1
+        bench.stream.watch(job, "cancelled")
+        return
+    until(lambda: _job(bench, job).state.is_terminal, "it was cancelled", LIMIT_SECONDS)
+    if _job(bench, job).state is not State.CANCELLED:  # it ended before anybody looked
+        bench.stream.counts["cancelled too late"] += 1
+        bench.stream.watch(job, "cancelled")
+        return
+    state = "finishing" if met.n_done >= met.n_runs else met.state.value
+    bench.stream.counts[f"cancelled while {state}"] += 1
+    try:
+        _insist(lambda: bench.stand.client.resume(job))
+    except ProblemError:  # the answer to an earlier try was lost
+        if _job(bench, job).state is State.CANCELLED:
+            raise
+    bench.stream.watch(job, "cancelled", ends=2)
+
+
+def _has_begun(bench: Bench, job: str) -> bool:
+    found = _job(bench, job)
+    return found.state.is_terminal or (found.state is State.RUNNING and found.n_done > 0)
+
+
+def _is_finishing(bench: Bench, job: str) -> bool:
+    found = _job(bench, job)
+    return found.state.is_terminal or found.n_done >= found.n_runs
+
+
+def _job(bench: Bench, job: str) -> Job:
+    def read() -> Job:
+        with bench.stand.database.read() as session:
+            return session.get_one(Job, job)
+
+    return _insist(read)
+
+
+def _insist(work: Callable[[], T]) -> T:
+    """Do something until it is answered; a conflict is an answer."""
+    limit = time.monotonic() + LIMIT_SECONDS
+    while True:
+        try:
+            return work()
+        except (ClientError, *PASSING) as error:
+            is_answer = isinstance(error, ProblemError) and error.status == CONFLICT
+            if is_answer or time.monotonic() > limit:
+                raise
+            time.sleep(0.1)

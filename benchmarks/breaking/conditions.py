@@ -1,0 +1,92 @@
+"""Faults that last a while: no space, no Ray, tables of an earlier version.
+
+They are over when there is space, or Ray, again, and recovery counts from then; that of an
+upgrade, from the order to stop.
+"""
+
+import contextlib
+import time
+
+import httpx
+
+from benchmarks.breaking.audit import owners
+from benchmarks.breaking.disks import filled
+from benchmarks.breaking.faults import LIMIT_SECONDS, Bench, goes_on, kill, known, renewal
+from benchmarks.breaking.stand import until
+from service.storage.migrate import downgrade
+
+FULL_SECONDS = 8.0
+"""So long a disk stays full, if the database does not complain before."""
+TRIES = 2
+"""So often a dispatcher tries to start Ray in vain."""
+EARLIER = ("0005", "0004")
+"""Revisions of the tables that hold all that a result consists of."""
+REFUSED = "Ray could not be started"
+FULL = ("the database does not answer", "are not stored", "no heartbeat could be written")
+
+
+def fill_disks(bench: Bench) -> float:
+    """Leave no space for objects and checkpoints; a recording that comes now is refused."""
+    before = _complaints(bench)
+    with filled(*bench.disks):
+        until(
+            lambda: _is_refused(bench), "a recording was refused for want of space", LIMIT_SECONDS
+        )
+        with contextlib.suppress(TimeoutError):
+            until(lambda: _complaints(bench) > before, "the dispatcher met it too", FULL_SECONDS)
+    bench.stream.counts["full disks that the dispatcher met"] += _complaints(bench) > before
+    begun = time.monotonic()
+    goes_on(bench, begun)
+    until(lambda: bench.stand.answers() == httpx.codes.OK, "the web answered", LIMIT_SECONDS)
+    return time.monotonic() - begun
+
+
+def _complaints(bench: Bench) -> int:
+    return sum(bench.stand.log.count(text) for text in FULL)
+
+
+def _is_refused(bench: Bench) -> bool:
+    """Whether an upload meets the full disk, as a problem document."""
+    new = time.monotonic()  # else it would be one that is stored already
+    rows = [f"{0.02 * i:.2f},{new + i},{new - i}" for i in range(5_000)]
+    text = "\n".join(["t,q [N],y [m]", *rows, ""])
+    answer = httpx.post(
+        f"{bench.stand.url}/v1/datasets", content=text, headers={"Content-Type": "text/csv"},
+        timeout=60.0,
+    )  # fmt: skip
+    if answer.status_code == httpx.codes.INTERNAL_SERVER_ERROR:
+        raise AssertionError(f"the web answered 500 while its disk was full: {answer.text}")
+    return answer.status_code == httpx.codes.SERVICE_UNAVAILABLE
+
+
+def withhold_ray(bench: Bench) -> float:
+    """Kill the dispatcher while Ray cannot be started; meanwhile no job may be shown as running."""
+    flag = bench.ray_away
+    assert flag is not None
+    before, seen = bench.stand.log.count(REFUSED), known(bench)
+    flag.touch()
+    try:
+        kill(bench.stand.family.dispatchers())
+        until(lambda: bench.stand.log.count(REFUSED) >= before + TRIES, "tries", LIMIT_SECONDS)
+        if held := owners(bench.stand):
+            raise AssertionError(f"jobs are shown as running by {held}, and nobody runs them")
+        if bench.stand.answers() != httpx.codes.OK:
+            raise AssertionError("the web does not answer without Ray")
+    finally:
+        flag.unlink()
+    begun = time.monotonic()
+    until(lambda: bool(owners(bench.stand) - seen), "another dispatcher", LIMIT_SECONDS)
+    return goes_on(bench, begun)
+
+
+def upgrade(bench: Bench) -> float:
+    """Stop the service with jobs in its queue, go back to earlier tables, start it again."""
+    with bench.stream.quiet():
+        revision = EARLIER[bench.stream.counts["upgrades"] % len(EARLIER)]
+        bench.stream.counts["upgrades"] += 1
+
+        def replace() -> None:
+            with bench.stand.down():
+                downgrade(bench.stand.database, revision)
+
+        return renewal(bench, replace)
