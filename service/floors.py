@@ -41,9 +41,18 @@ class Floors:
                 "the true values are not known: errors of parameters are from the estimate of the "
                 "best run with the least noise, and floors are those at that estimate"
             )
+        if any(_is_as_measured(one["reference"] or {}) for one in self.problems):
+            yield (
+                "σ = 0 is the record as it was measured, to which no noise was added; it is run "
+                "for that estimate even where it was not asked for"
+            )
         yield from dict.fromkeys(one["note"] for one in self.problems if one["note"])
         if self._note:
             yield self._note
+
+
+def _is_as_measured(reference: Mapping[str, Any]) -> bool:
+    return reference.get("kind") == "estimate" and reference.get("sigma") == 0
 
 
 def at_sigma(per_sigma: float | None, sigma: tuple[float, float] | None) -> float | None:

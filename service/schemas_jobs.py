@@ -260,7 +260,9 @@ class Progress(Answer):
     finished: int
     failed: int
     reused: int = Field(default=0, description="taken over from runs that were computed before")
-    best_rms: float | None = None
+    best_rms: float | None = Field(
+        default=None, description="of the best run; of runs on other data or noise it tells nothing"
+    )
     evaluations: int = 0
     generation: int = 0
     seconds_left: float | None = None
@@ -276,7 +278,7 @@ class JobOut(Answer):
     created_at: datetime
     started_at: datetime | None = None
     finished_at: datetime | None = None
-    attempt: int
+    attempt: int = Field(description="how often it was begun, when it was resumed as well")
     error: str | None = None
     model: str
     priority: int

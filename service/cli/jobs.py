@@ -91,12 +91,9 @@ def listing(
     print_listing(
         found,
         as_json,
-        ("id", "name", "state", "model", ">runs", ">best RMS", "unit",
-         "submitted"),
-        lambda one: (one["id"], one["name"], one["state"], one["model"],
-                     f"{one['progress']['finished']}/{one['progress']['runs']}",
-                     one["progress"]["best_rms"], _unit(one),
-                     one["created_at"][:19].replace("T", " ")),
+        ("id", "name", "state", "model", "runs", ">RMS", "unit", "submitted"),
+        lambda one: (one["id"], one["name"], one["state"], one["model"], _counts(one),
+                     *_rms(one), one["created_at"][:19].replace("T", " ")),
         empty=f"no jobs are {' or '.join(state)}" if state
         else "no jobs; submit one: lagid submit job.yaml",
     )  # fmt: skip
@@ -214,9 +211,22 @@ def _latest(client: "Client") -> str:
     return str(found[0]["id"])
 
 
-def _unit(job: dict[str, Any]) -> str | None:
-    """Unit of a best RMS; none beside a dash."""
-    return job["rms_unit"] if job["progress"]["best_rms"] is not None else None
+def _counts(job: dict[str, Any]) -> str:
+    """Runs that are over, of all; of several also how they ended."""
+    done = job["progress"]
+    told = f"{done['finished']}/{done['runs']}"
+    if done["runs"] == 1 or not done["finished"]:
+        return told
+    succeeded = done["finished"] - done["failed"]
+    return f"{told}: {succeeded} succeeded, {done['failed']} failed"
+
+
+def _rms(job: dict[str, Any]) -> tuple[float | None, str | None]:
+    """RMS of a job of one run and its unit; the best of several, on other data, tells nothing."""
+    best = job["progress"]["best_rms"]
+    if job["progress"]["runs"] != 1 or best is None:
+        return None, None
+    return best, job["rms_unit"]
 
 
 def _percent(value: float | None) -> str | None:

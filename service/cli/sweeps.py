@@ -32,6 +32,10 @@ app = typer.Typer(help="Recipes: sweeps made for one purpose.", no_args_is_help=
 
 MOST_POINTS = 100_000
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
+SIGMA, RELATIVE, METHOD = "/noise/sigma", "relative", "/algorithm/method"
+# Of a relative σ the rows tell what was typed beside what it is in the output's unit.
+GROUPS = {False: None, True: [RELATIVE, SIGMA, METHOD]}
+IN_DEVIATIONS = "a relative σ is in standard deviations of the output, the σ beside it in its unit"
 A_TABLE = 4  # parameters beside each other
 LOW, MIDDLE, HIGH = 0, 2, 4  # places of 5, 50 and 95 % among the quantiles of a summary
 
@@ -112,7 +116,7 @@ def noise(
             job = client.noise_sweep(body, idempotency_key=idempotency_key)
         if wait:
             job = follow(client, job["id"], quiet=as_json)
-        _tell(client, job, wait=wait, as_json=as_json)
+        _tell(client, job, is_relative=relative, wait=wait, as_json=as_json)
 
 
 def grid(text: str) -> list[float]:
@@ -146,11 +150,20 @@ def tables_of(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]
     """
     groups = summary["groups"]
     units = {one["name"]: one["unit"] for group in groups for one in group["parameters"]}
-    others = [key for key in summary["by"] if key != "/noise/sigma"]
-    cells = [[_short(one["sigma"], 4), *(str(one["key"][key]) for key in others)] for one in groups]
+    others = [key for key in summary["by"] if key not in (SIGMA, RELATIVE)]
+    relative = [f">{RELATIVE} σ"] if RELATIVE in summary["by"] else []
+    cells = [
+        [*(_short(one["key"][RELATIVE], 4) for _ in relative), _short(one["sigma"], 4),
+         *(str(one["key"][key]) for key in others)]
+        for one in groups
+    ]  # fmt: skip
     unit = summary.get("rms_unit")
     one_output = None if unit == "σ" else unit
-    keys = [f">{with_unit('σ', one_output)}", *(key.rsplit("/", 1)[-1] for key in others)]
+    keys = [
+        *relative,
+        f">{with_unit('σ', one_output)}",
+        *(key.rsplit("/", 1)[-1] for key in others),
+    ]
     found = [(
         [*keys, ">runs", ">success", ">evaluations",
          f"RMS error{'' if unit in (None, '1') else f' in {unit}'} [5 %, 95 %]", ">floor"],
@@ -184,7 +197,9 @@ def _errors(group: dict[str, Any], names: list[str]) -> list[str]:
             for text in (_band(one["error"], signed=True), _short(one["floor"]))]  # fmt: skip
 
 
-def _tell(client: "Client", job: dict[str, Any], *, wait: bool, as_json: bool) -> None:
+def _tell(
+    client: "Client", job: dict[str, Any], *, is_relative: bool, wait: bool, as_json: bool
+) -> None:
     if not wait:
         if as_json:
             print_json(job)
@@ -192,14 +207,14 @@ def _tell(client: "Client", job: dict[str, Any], *, wait: bool, as_json: bool) -
             runs = job["progress"]["runs"]
             out.print(f"{job['id']}  {job['name']}: {runs} runs, {job['state']}", markup=False)
         return
-    summary = client.summary(job["id"])
+    summary = client.summary(job["id"], GROUPS[is_relative])
     if as_json:
         print_json({**job, "summary": summary})
     else:
         for headings, rows in tables_of(summary):
             print_table(headings, rows, empty="no runs")
             out.print()
-        for note in summary["notes"]:
+        for note in [*summary["notes"], *([IN_DEVIATIONS] if is_relative else [])]:
             out.print(f"note: {note}", markup=False, soft_wrap=True)
         out.print(f"{job['id']}: {summary['reused']} of {summary['runs']} runs reused",
                   markup=False)  # fmt: skip

@@ -1,7 +1,7 @@
 """What the templates show of jobs and runs: values of their rows, ready to be written."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
@@ -71,7 +71,8 @@ class JobView:
     cancel_requested: bool
     model_name: str
     unit: str
-    attempt: int
+    starts: int
+    lost_leases: int
     max_attempts: int
     n_runs: int
     n_done: int
@@ -114,7 +115,8 @@ def job_view(job: Job, unit: str, now: datetime) -> JobView:
         id=job.id, name=job.name, state=job.state.value, is_open=not job.state.is_terminal,
         can_resume=job.state in (State.FAILED, State.CANCELLED),
         cancel_requested=job.cancel_requested, model_name=model_name(job.spec), unit=unit,
-        attempt=job.attempt, max_attempts=job.max_attempts, n_runs=job.n_runs, n_done=job.n_done,
+        starts=job.attempt, lost_leases=job.lost_leases, max_attempts=job.max_attempts,
+        n_runs=job.n_runs, n_done=job.n_done,
         n_failed=job.n_failed, n_reused=job.n_reused,
         progress=share, progress_text=_progress_text(job, share),
         best_rms=None if is_batch else job.best_rms, is_batch=is_batch, evaluations=job.evaluations,
@@ -195,8 +197,15 @@ def axes_of(spec: Document) -> list[Document]:
 def cell_text(cell: Document, labels: Document) -> str:
     """What distinguishes a run from the others of its job; labels tell data better than ids."""
     told = {path: value for path, value in cell.items() if not (labels and path == DATASETS)}
-    pairs = [(path.rsplit("/", 1)[-1], value) for path, value in told.items()]
+    pairs = [(_field_name(path, told), value) for path, value in told.items()]
     return ", ".join(f"{name} {_plain(value)}" for name, value in [*labels.items(), *pairs])
+
+
+def _field_name(path: str, others: Iterable[str]) -> str:
+    """Last part of a pointer; all of it where others end like it, as those of two seeds do."""
+    last = path.rsplit("/", 1)[-1]
+    same = [one for one in others if one.rsplit("/", 1)[-1] == last]
+    return last if len(same) == 1 else path.removeprefix("/").replace("/", " ")
 
 
 def _run_title(run: Run) -> str:

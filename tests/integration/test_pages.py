@@ -1,6 +1,7 @@
 """Pages, figures and files over HTTP, without a browser."""
 
 import gzip
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from service.settings import Settings
+from service.storage.tables import Job
 from service.web import assets
 from tests.e2e.filled import Filled, fill
 
@@ -141,3 +143,26 @@ def test_a_model_is_shown_as_yaml(client: TestClient) -> None:
     answer = client.get("/pages/models/tube.yaml")
     assert answer.status_code == 200
     assert "equations:" in answer.text
+
+
+def test_the_list_tells_how_runs_of_a_sweep_ended_and_the_rms_of_single_ones(
+    client: TestClient, filled: Filled
+) -> None:
+    rows = client.get("/").text.split("<tr data-job=")
+    (sweep,) = (row for row in rows if row.startswith(f'"{filled.sweep}"'))
+    (single,) = (row for row in rows if row.startswith(f'"{filled.finished}"'))
+    assert re.search(r"<small>\d+ succeeded", sweep)
+    assert not re.search(r"<small>\d+ succeeded", single)
+
+
+def test_starts_are_told_apart_from_dispatchers_that_were_lost(
+    client: TestClient, filled: Filled
+) -> None:
+    parts = client.app.state.parts  # type: ignore[attr-defined]
+    page = client.get(f"/jobs/{filled.finished}").text
+    assert "<dt>Started</dt>" in page
+    assert "dispatchers lost" not in page
+    with parts.database.write() as session:
+        session.get(Job, filled.finished).lost_leases = 1
+    page = client.get(f"/jobs/{filled.finished}").text
+    assert "1 of at most 3 dispatchers lost" in page

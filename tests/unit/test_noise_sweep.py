@@ -89,6 +89,28 @@ def test_the_noise_and_the_error_of_the_response_have_the_unit_of_the_output(uni
     assert error in headings
 
 
+def test_of_a_relative_sigma_what_was_typed_stands_beside_what_it_is_in_the_outputs_unit():
+    one = group(0.1698, "simple")
+    key = {"relative": 0.1, **one.key}
+    told = summary([one.model_copy(update={"key": key})]).model_copy(
+        update={"by": list(key), "rms_unit": "m"}
+    )
+    for headings, rows in tables_of(told.model_dump()):
+        assert headings[:3] == [">relative σ", ">σ [m]", "method"]
+        assert rows[0][:3] == ["0.1", "0.1698", "simple"]
+
+
+@pytest.mark.parametrize(
+    ("reference", "is_told"),
+    [({"kind": "estimate", "sigma": 0.0}, True), ({"kind": "estimate", "sigma": 0.1}, False),
+     ({"kind": "truth"}, False), (None, False)],
+)  # fmt: skip
+def test_a_row_without_noise_is_explained_where_errors_are_told_against_it(reference, is_told):
+    problem = {"cell": {}, "reference": reference, "note": ""}
+    notes = list(Floors({"problems": [problem]}).notes())
+    assert is_told == any("as it was measured" in one for one in notes)
+
+
 def test_what_is_not_known_is_a_dash():
     blank = ParameterSummaryOut(name="L", unit="s", value=[0.0] * 5, stderr=None)
     waiting = group(

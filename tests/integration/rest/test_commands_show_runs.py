@@ -1,6 +1,7 @@
 """What the commands print of jobs and runs: one run in full, labels of a batch, units."""
 
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -104,9 +105,24 @@ def test_a_batch_is_listed_by_its_labels_with_units_in_the_headings(served: Serv
     assert served.data not in told.output
 
 
-def test_a_best_rms_of_the_list_of_jobs_has_its_unit(served: Served) -> None:
+def test_the_list_of_jobs_has_the_counts_of_a_batch_and_no_rms_of_it(served: Served) -> None:
     best = served.client.job(served.job)["progress"]["best_rms"]
-    assert f"{best:.6g}  m " in lagid("jobs").output
+    told = lagid("jobs").output
+    assert "2/2: 2 succeeded, 0 failed" in told
+    assert f"{best:.6g}" not in told
+
+
+def test_the_list_of_jobs_has_the_rms_of_a_single_run_with_its_unit(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = served.client.job(served.job)
+    single = {**job, "progress": {**job["progress"], "runs": 1, "finished": 1}}
+    waiting = {**single, "progress": {**single["progress"], "finished": 0, "best_rms": None}}
+    monkeypatch.setattr(served.client, "jobs", lambda **_: [single, waiting])
+    _, first, second = lagid("jobs").output.splitlines()
+    assert f"{job['progress']['best_rms']:.6g}  m " in first
+    assert "1/1 " in first
+    assert re.search(r"0/1 +– +– ", second)
 
 
 def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
