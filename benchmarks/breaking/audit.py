@@ -1,16 +1,18 @@
 """What became of jobs: nothing lost, nothing doubled, and the numbers of an undisturbed run."""
 
 import json
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 from sqlalchemy import func, select
+from sqlalchemy.orm import Session
 
 from benchmarks.breaking.stand import Stand
 from service.storage.patience import PASSING
-from service.storage.runs import RunRepository
-from service.storage.tables import Event, Job, Run, State
+from service.storage.points import history_of, migrants_of
+from service.storage.tables import Event, Job, MigrationLog, Run, RunHistory, State
 
 CLOCKED = ("seconds", "job", "run")
 """Fields of a summary that tell of time and place, not of the result."""
@@ -81,7 +83,7 @@ def audit(stand: Stand, job_id: str, *, ends: int = 1) -> Finding:
         runs = list(session.scalars(select(Run).where(Run.job_id == job_id).order_by(Run.number)))
         kinds = session.execute(select(Event.kind, Event.data).where(Event.job_id == job_id))
         ended = sum(State(data["state"]).is_terminal for kind, data in kinds if kind == "state")
-        n_points = sum(len(RunRepository(session).history(run.id)) for run in runs)
+        paths = _paths(session, job_id)
     numbers = Counter(run.number for run in runs)
     doubled = sum(numbers.values()) - len(numbers) + max(0, job.n_done - job.n_runs)
     doubled += max(0, ended - ends)
@@ -90,7 +92,8 @@ def audit(stand: Stand, job_id: str, *, ends: int = 1) -> Finding:
     estimates, reasons = [run.estimates for run in runs], [reason(run.error) for run in runs]
     figures = {
         "summary": summary, "evaluations of the job": job.evaluations, "of its runs": total,
-        "points of history": n_points, "estimates": estimates, "reasons": reasons,
+        "histories": [paths.get(run.id) for run in runs],
+        "estimates": estimates, "reasons": reasons,
     }  # fmt: skip
     given_up = job.state is State.FAILED and job.lost_leases >= job.max_attempts
     states = tuple(run.state.value for run in runs)
@@ -100,6 +103,25 @@ def audit(stand: Stand, job_id: str, *, ends: int = 1) -> Finding:
     )  # fmt: skip
     text = json.dumps(figures, sort_keys=True)
     return Finding(states, doubled, given_up, text, killed, unplotted)
+
+
+def _paths(session: Session, job_id: str) -> dict[str, str]:
+    """How each run of a job came to its result, history and migrants, as a hash of all points."""
+    mine = Run.job_id == job_id
+    parts = select(Run.id, RunHistory.points, RunHistory.n_parameters).join(RunHistory)
+    lines = select(Run.id, MigrationLog.migrants).join(MigrationLog)
+    points: dict[str, list[tuple[bytes, int]]] = defaultdict(list)
+    migrants: dict[str, list[bytes]] = defaultdict(list)
+    for run, data, count in session.execute(parts.where(mine)):
+        points[run].append((data, count))
+    for run, data in session.execute(lines.where(mine)):
+        migrants[run].append(data)
+    return {
+        run: sha256(
+            repr([history_of("", found), migrants_of("", migrants[run])]).encode()
+        ).hexdigest()
+        for run, found in points.items()
+    }
 
 
 def reason(error: str | None) -> str:
