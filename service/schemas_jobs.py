@@ -220,25 +220,35 @@ def model_reference(value: Any) -> Any:
     return value
 
 
-class JobIn(Body):
-    """A job: what is to be identified, from which data, and how."""
+class IdentificationIn(Body):
+    """What a job and the recipes that make jobs have in common: the model, and how to fit it."""
 
     name: str | None = Field(default=None, max_length=200)
     model: Annotated[Any, AfterValidator(model_reference)]
-    datasets: list[str] = Field(min_length=1, max_length=1000)
     channels: dict[str, str] = Field(default={})
     hold: dict[str, Literal["zero", "first", "band-limited"]] = Field(default={})
-    validation: ValidationIn | None = None
     parameters: dict[str, ParameterIn] = Field(default={})
     prediction: Literal["simulation", "one-step"] = "simulation"
     loss: LossIn = LossIn()
     weights: dict[str, float] | None = None
     skip: int = Field(default=0, ge=0)
-    noise: NoiseIn = NoiseIn()
     algorithm: AlgorithmIn = AlgorithmIn()
-    seed: Seed = 1
     priority: int = Field(default=0, ge=-100, le=100)
     reuse: bool = Field(default=True, description="take results of runs that were computed before")
+
+    def given(self, *also: str) -> dict[str, Any]:
+        """These fields, and those named besides, as far as they were given."""
+        names = {*IdentificationIn.model_fields, *also}
+        return self.model_dump(include=names, exclude_unset=True)
+
+
+class JobIn(IdentificationIn):
+    """A job: what is to be identified, from which data, and how."""
+
+    datasets: list[str] = Field(min_length=1, max_length=1000)
+    validation: ValidationIn | None = None
+    noise: NoiseIn = NoiseIn()
+    seed: Seed = 1
     sweep: SweepIn = SweepIn()
     warm_start: Annotated[str, Field(max_length=300), AfterValidator(_warm_start)] | None = None
     trend: TrendIn | None = None

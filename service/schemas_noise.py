@@ -7,7 +7,7 @@ from pydantic_core import PydanticCustomError
 
 from service.schemas import Body
 from service.schemas_datasets import MAX_SIMULATED_SAMPLES, InputIn, SampleTime
-from service.schemas_jobs import AlgorithmIn, JobIn, LossIn, ParameterIn, Sigma, model_reference
+from service.schemas_jobs import IdentificationIn, Sigma
 
 MOST_REPLICATES = 1_000_000
 """Seeds of replicate r are `seed` times this plus r, so that no two sweeps share one by chance."""
@@ -33,7 +33,7 @@ class TruthIn(Body):
     sample_time: SampleTime
 
 
-class NoiseSweepIn(Body):
+class NoiseSweepIn(IdentificationIn):
     """Identification under noise: σ × replicates × methods in one job.
 
     The record is simulated from `truth`, or it is that of `datasets`. Replicate r takes noise and
@@ -43,8 +43,6 @@ class NoiseSweepIn(Body):
     `relative`: σ is in standard deviations of the output. The other fields are those of a job.
     """
 
-    name: str | None = Field(default=None, max_length=200)
-    model: Annotated[Any, AfterValidator(model_reference)]
     truth: TruthIn | None = None
     datasets: list[str] | None = Field(default=None, min_length=1, max_length=1000)
     sigma: Annotated[
@@ -56,16 +54,6 @@ class NoiseSweepIn(Body):
         default=["simple", "improved"], min_length=1
     )
     seed: int = Field(default=1, ge=0, lt=2**32)
-    channels: dict[str, str] = Field(default={})
-    hold: dict[str, Literal["zero", "first", "band-limited"]] = Field(default={})
-    parameters: dict[str, ParameterIn] = Field(default={})
-    prediction: Literal["simulation", "one-step"] = "simulation"
-    loss: LossIn = LossIn()
-    weights: dict[str, float] | None = None
-    skip: int = Field(default=0, ge=0)
-    algorithm: AlgorithmIn = AlgorithmIn()
-    priority: int = Field(default=0, ge=-100, le=100)
-    reuse: bool = True
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -79,5 +67,4 @@ class NoiseSweepIn(Body):
     @property
     def shared(self) -> dict[str, Any]:
         """The fields that the job has as well, as they were given."""
-        names = (set(type(self).model_fields) & set(JobIn.model_fields)) - {"seed", "datasets"}
-        return self.model_dump(include=names, exclude_unset=True)
+        return self.given()
