@@ -1,7 +1,7 @@
 """Laying out experiments: which recorded channel is which signal, where it lies on the grid."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -99,10 +99,7 @@ def lay_out(
         If the record does not have what the model needs.
     """
     inputs = [_input(record, quantity.name) for quantity in model.inputs]
-    outputs = [_channel(record.outputs, output.name, "output") for output in model.outputs]
-    if not simulates_only:
-        for channel in outputs:
-            _check_scored(channel, skip, scored_from)
+    outputs = _outputs(model, record, None if simulates_only else (skip, scored_from))
     grid = grid_of(model, inputs, outputs)
     if is_difference(model) and grid.last < model.memory:
         needed = model.memory * grid.integration_step
@@ -118,6 +115,31 @@ def lay_out(
         tuple(_starts(model, grid, outputs, experiment, rows)),
         max([0.0, *largest_lags(model, "state", spans, grid).values()]),
     )
+
+
+def measured_anew(
+    laid: Experiment, model: Model, record: Record, experiment: int,
+    parameters: Sequence[Parameter], weights: Mapping[str, float], skip: int, scored_from: float,
+) -> Experiment:  # fmt: skip
+    """What `lay_out` makes of a record whose inputs and times are those of one laid out before."""
+    outputs, grid = _outputs(model, record, (skip, scored_from)), laid.grid
+    rows = {p.name: i for i, p in enumerate(parameters)}
+    return replace(
+        laid,
+        outputs=tuple(
+            _samples(model, grid, c, weights[c.name], skip, scored_from) for c in outputs
+        ),
+        starts=tuple(_starts(model, grid, outputs, experiment, rows)),
+    )
+
+
+def _outputs(model: Model, record: Record, scored: tuple[int, float] | None) -> list[Channel]:
+    """The measured outputs in the model's order; each has samples that count, if any are to."""
+    outputs = [_channel(record.outputs, output.name, "output") for output in model.outputs]
+    if scored is not None:
+        for channel in outputs:
+            _check_scored(channel, *scored)
+    return outputs
 
 
 def _channel(channels: Sequence[Channel], name: str, role: str) -> Channel:

@@ -1,7 +1,7 @@
 """A problem: a model, the records it is to explain, and the fitness of a population on them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import sqrt
 from typing import Any
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sysid.errors import InvalidRecord, InvalidSettings
-from sysid.experiments import Experiment, lay_out, output_weights
+from sysid.experiments import Experiment, lay_out, measured_anew, output_weights
 from sysid.kernels.compiler import kernel_address
 from sysid.kernels.evaluation import population_fitness, population_predictions
 from sysid.kernels.evaluator import Evaluator
@@ -122,6 +122,25 @@ class Problem:
     def __reduce__(self) -> _Rebuild:
         rebuild = _built if len(self.arguments) > 2 else simulation_problem
         return rebuild, self.arguments
+
+    def measured_anew(self, records: Sequence[Record]) -> "Problem":
+        """What `build` would make of records that differ in the values of their outputs only.
+
+        Where their noise is all that runs have of their own, most of the work is done once.
+        """
+        model, _, _, prediction, loss, weights, skip, since = self.arguments
+        per_output = output_weights(self.model, records, weights, skip)
+        experiments = tuple(
+            measured_anew(laid, self.model, record, e, self.all_parameters, per_output, skip,
+                          -np.inf if since is None else since[e])
+            for e, (laid, record) in enumerate(zip(self.experiments, records, strict=True))
+        )  # fmt: skip
+        one_step = prediction == "one-step"
+        evaluator = _evaluator(self.model, experiments, self.all_parameters, one_step, loss)
+        return replace(
+            self, records=tuple(records), evaluator=evaluator, experiments=experiments,
+            output_weights=per_output, arguments=(model, tuple(records), *self.arguments[2:]),
+        )  # fmt: skip
 
     def fitness(self, theta: FloatArray) -> FloatArray:
         """J of individuals (P, D) → (P,), smaller is better; ``inf`` where one diverges."""

@@ -7,6 +7,7 @@ from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache, partial
+from typing import TypeAlias
 
 from sysid.errors import SysidError
 from sysid.ga.island import Island
@@ -39,7 +40,10 @@ PACK_LIMIT_SECONDS = 1.0
 
 CACHED_PROBLEMS, CACHED_MODELS = 8, 32
 
-_problems: OrderedDict[str, tuple[Problem, Problem | None]] = OrderedDict()
+Pair: TypeAlias = tuple[Problem, Problem | None]
+"""A problem, and that of its validation data if there are any."""
+
+_problems: OrderedDict[str, tuple[str, Pair]] = OrderedDict()
 
 
 def advance(pack: Sequence[Item], keys: Sequence[str], *shared: Records) -> tuple[Done, ...]:
@@ -122,12 +126,14 @@ def _without_noise(spec: ProblemSpec, records: Mapping[str, Records]) -> Records
     return None if spec.noise.sigma == 0 else prepared(replace(spec, noise=Noise()), records)[0]
 
 
-def _problem(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Problem, Problem | None]:
+def _problem(spec: ProblemSpec, records: Mapping[str, Records]) -> Pair:
     """The problem and its validation; the last few are kept, since slices of a run follow."""
     if spec.key in _problems:
         _problems.move_to_end(spec.key)
-        return _problems[spec.key]
-    _problems[spec.key] = built = build(spec, records)
+        return _problems[spec.key][1]
+    alike = (pair for family, pair in reversed(_problems.values()) if family == spec.family)
+    built = build(spec, records, next(alike, None))
+    _problems[spec.key] = (spec.family, built)
     while len(_problems) > CACHED_PROBLEMS:
         _problems.popitem(last=False)
     return built
@@ -139,16 +145,25 @@ def _model(document: str) -> Model:
     return parse_model(json.loads(document))
 
 
-def build(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Problem, Problem | None]:
+def build(spec: ProblemSpec, records: Mapping[str, Records], alike: Pair | None = None) -> Pair:
     """The problem and that of its validation data, if there are any.
+
+    Parameters
+    ----------
+    alike : pair of problems or None
+        Of a specification that differs in its noise only: they save time, and change nothing.
 
     Raises
     ------
     SysidError
         If model, records or settings cannot be used.
     """
-    model = _model(json.dumps(spec.model))
     estimation, validation = prepared(spec, records)
+    if alike is not None and alike[0].model.selection is None:  # else noise may select others
+        posed = alike[0].measured_anew(estimation)
+        if posed.output_weights == alike[0].output_weights:  # which are those of the validation
+            return posed, alike[1]
+    model = _model(json.dumps(spec.model))
     model, parameters = selected(model, estimation, spec.parameters, spec.skip)
 
     problem = partial(

@@ -11,12 +11,14 @@ from sysid.kernels.layout import Variant
 from sysid.kernels.machine import loaded, machine_name, object_code
 from sysid.models.model import EstimatedInitial, Model
 
+_KEPT = 64
 _addresses: dict[str, int] = {}
+_keys: dict[tuple[int, Variant], tuple[Model, str]] = {}  # by identity: its name is a long walk
 
 
 def kernel_address(model: Model, variant: Variant) -> int:
     """Address of the model's kernel in this process, for `sysid.kernels.calls.call_kernel`."""
-    key = kernel_key(model, variant)
+    key = _key(model, variant)
     if key not in _addresses:
         code = stored(key)
         if code is None:
@@ -24,6 +26,16 @@ def kernel_address(model: Model, variant: Variant) -> int:
             store(key, code)
         _addresses[key] = loaded(code, KERNEL)
     return _addresses[key]
+
+
+def _key(model: Model, variant: Variant) -> str:
+    """`kernel_key`, kept for the many runs of one model."""
+    known = _keys.get((id(model), variant))
+    if known is None or known[0] is not model:
+        if len(_keys) >= _KEPT:
+            _keys.clear()
+        known = _keys[id(model), variant] = (model, kernel_key(model, variant))
+    return known[1]
 
 
 def kernel_key(model: Model, variant: Variant) -> str:

@@ -1,12 +1,17 @@
 """A pack of work as a worker sees it."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import workers.tasks
 from sysid.identify import identify
+from sysid.models.library import document
 from sysid.models.spec import parse_model
+from sysid.noise import Noise
+from sysid.problem import Problem
 from sysid.settings import GeneticAlgorithm
 from tests.polynomials import frols, lagged
 from tests.runs import RECORDS, bits, carry_out, spec
@@ -64,3 +69,51 @@ def test_a_run_that_selects_terms_gives_the_bits_of_the_library_call() -> None:
     assert len(alone.selection) == 4
     assert result.selection == alone.selection
     assert bits(result) == bits(alone)
+
+
+TWO_OUTPUTS = {
+    "name": "two", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1", "z": "1"},
+    "parameters": {"a": {"lower": 0, "upper": 1}, "g": {"lower": 0, "upper": 5}},
+    "equations": {"x": "a*x(k-1) + g*u(k-2)", "z": "0.5*z(k-1) + x(k-1)"},
+    "outputs": {"y": "x", "w": "z"}, "initial": {"x": "measured", "z": 0},
+}  # fmt: skip
+
+
+def laid_out(problem: Problem | None) -> tuple[object, ...]:
+    """All that a search and its result see of a problem."""
+    if problem is None:
+        return ()
+    parts = (one.tobytes() if isinstance(one, np.ndarray) else one for one in problem.evaluator)
+    measured = tuple(
+        channel.values.tobytes() for record in problem.records for channel in record.outputs
+    )
+    return (*parts, measured, problem.output_weights, problem.all_parameters)
+
+
+@pytest.mark.parametrize("fraction", [None, 0.3])
+@pytest.mark.parametrize("model", [document("fopdt"), TWO_OUTPUTS], ids=["one", "two outputs"])
+def test_runs_that_differ_in_noise_only_see_the_bits_they_would_see_alone(
+    model: Mapping[str, object], fraction: float | None
+) -> None:
+    (short,) = RECORDS["short"]
+    other = replace(short.outputs[0], name="w", values=2.0 * short.outputs[0].values)
+    records = {"r": (replace(short, outputs=(*short.outputs, other)),)}
+    quiet = ProblemSpec(model, "r", validation_fraction=fraction, skip=2)
+    alike = workers.tasks.build(quiet, records)
+    for seed in (1, 2):
+        noisy = replace(quiet, noise=Noise(0.1, seed))
+        assert noisy.family == quiet.family
+        assert noisy.key != quiet.key
+        alone = workers.tasks.build(noisy, records)
+        beside = workers.tasks.build(noisy, records, alike)
+        for one, same in zip(alone, beside, strict=True):
+            assert laid_out(one) == laid_out(same)
+        alike = beside
+
+
+def test_terms_are_selected_anew_for_other_noise() -> None:
+    quiet = ProblemSpec(model=lagged(frols(4)), records="short", skip=3)
+    noisy = replace(quiet, noise=Noise(2.0, 1))
+    alone = workers.tasks.build(noisy, RECORDS)[0]
+    beside = workers.tasks.build(noisy, RECORDS, workers.tasks.build(quiet, RECORDS))[0]
+    assert beside.model.selection == alone.model.selection
