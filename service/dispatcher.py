@@ -41,9 +41,9 @@ _log = logging.getLogger("lagid.dispatcher")
 
 IDLE_SECONDS = 1.0
 """Longest wait for work; a submission wakes the dispatcher at once."""
-BUSY_SECONDS = 0.1
+BUSY_SECONDS = 0.2
 """How often a busy dispatcher looks for cancelled and waiting jobs."""
-STEP_SECONDS = 0.05
+STEP_SECONDS = 0.1
 LEAVE_SECONDS = 5.0
 """What giving the jobs back may take once the parent or the workers are gone."""
 MAX_JOBS = 64
@@ -222,11 +222,6 @@ class Dispatcher:
         _log.info("stopped")
 
 
-def main() -> int:
-    """Run a dispatcher with the settings of the environment; gives the exit code."""
-    return run_to_the_end(Settings())
-
-
 def run_to_the_end(settings: Settings, local: LocalRay | None = None) -> int:
     """Run a dispatcher; what cannot be used is told in one line. Gives the exit code.
 
@@ -317,7 +312,3 @@ def _end_at_once(crew: RayCrew) -> None:
     crew.abandon()
     logging.shutdown()
     os._exit(AGAIN)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

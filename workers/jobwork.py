@@ -106,7 +106,7 @@ class JobWork:
         else:
             shared_by = self._crew.slots if self._has_no_more else 1  # else more follow
             size = pack_size(self._cost, len(self._ready), shared_by)
-            self._send([run.whole() for run in self._take_fresh(size)])
+            self._send([run.whole(self._cost) for run in self._take_fresh(size)])
 
     def absorb(self, handle: Handle, done: tuple[Done, ...]) -> None:
         """Take in what a pack gave."""
@@ -199,7 +199,7 @@ class JobWork:
                 self._cost = self._cost.observe(one.seconds)
                 self._fail(run.run, failure)
             case Concluded() as concluded:
-                self._cost = self._cost.observe(one.seconds)
+                self._cost = self._cost.observe(run.seconds)
                 del self._active[run.run]
                 self._untold.append((run.run, concluded, run.seconds))
             case Advanced(state):

@@ -20,6 +20,9 @@ PACKS_PER_CPU = 2
 WORTH_SPREADING_SECONDS = 0.02
 """An island's epoch that takes less is not worth a task of its own."""
 
+ROOM = 1.5
+"""A run so many times as long as the mean of its job still fits into a pack that is not cut."""
+
 KEPT = 0.7
 """Weight of what was known when a new cost is measured."""
 
@@ -50,8 +53,13 @@ def pack_size(cost: Cost, waiting: int, slots: int) -> int:
     return min(max(1, min(by_cost, share)), waiting)
 
 
-def slice_seconds(slices: int) -> float:
-    """Length of a run's next time slice after `slices` of them."""
+def slice_seconds(slices: int, cost: Cost | None = None) -> float:
+    """Length of a run's next time slice after `slices` of them.
+
+    Where `cost` tells that such a run fits into a pack, it is not cut: each cut is a task more.
+    """
+    if cost is not None and cost.seconds is not None and cost.seconds <= PACK_SECONDS / ROOM:
+        return PACK_SECONDS
     return min(PACK_SECONDS, FIRST_SLICE_SECONDS * 2.0 ** min(slices, 10))
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from sysid.ga.island import Island
 from sysid.islands.run_state import RunState
 from sysid.run import border, exchange, is_finished
-from workers.packing import is_worth_spreading, slice_seconds
+from workers.packing import Cost, is_worth_spreading, slice_seconds
 from workers.ports import Advance, Evolve, Evolved, Item, QueuedRun, RunSpec
 
 MAX_KILLS = 2
@@ -66,9 +66,9 @@ class ActiveRun:
         epoch = self.generation_seconds * algorithm.n_islands * algorithm.migration.every
         return is_worth_spreading(epoch, algorithm.n_islands, idle)
 
-    def whole(self) -> Item:
-        """The next time slice of the whole run."""
-        return Advance(self.run, self.spec, self.state, slice_seconds(self.slices))
+    def whole(self, cost: Cost | None = None) -> Item:
+        """The next time slice of the whole run; `cost` is that of a run of its job."""
+        return Advance(self.run, self.spec, self.state, slice_seconds(self.slices, cost))
 
     def split(self) -> list[Evolve]:
         """The islands that have not got to the next border, one item each; at least one."""

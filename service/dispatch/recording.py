@@ -27,7 +27,8 @@ from workers.ports import Concluded, Failure
 
 _log = logging.getLogger(__name__)
 
-RESULTS_SECONDS = 0.2
+RESULTS_SECONDS = 1.0
+"""A transaction costs as much as the rows of many runs; what comes after a pause goes at once."""
 PROGRESS_SECONDS = 1.0
 CHECKPOINT_SECONDS = 4.0
 KEPT_REASONS = 3
