@@ -19,6 +19,7 @@ from service.dispatch.claiming import Leases
 from service.dispatch.floors import floors_for
 from service.dispatch.preparing import JobRuns
 from service.dispatch.recording import Recorder
+from service.dispatcher_process import LOG_FORMAT
 from service.errors import Misconfigured
 from service.settings import Settings
 from service.storage import migrate
@@ -250,8 +251,7 @@ def serve(settings: Settings, local: LocalRay | None = None) -> int:
     Misconfigured, StorageError, WorkersError
         If the data folder, the database, the object store or Ray cannot be used.
     """
-    form = "%(asctime)s %(levelname)s %(name)s: %(message)s"
-    logging.basicConfig(level=logging.INFO, format=form)
+    logging.basicConfig(level=logging.INFO, format=LOG_FORMAT)
     settings.prepare_folder()
     database = Database(settings.database)
     patiently(partial(migrate.upgrade, database))  # it may be starting as well

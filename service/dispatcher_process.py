@@ -12,20 +12,19 @@ from service.settings import Settings
 from workers.errors import ClusterUnavailable
 from workers.local_ray import LocalRay
 
+LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 _log = logging.getLogger("lagid.dispatcher")
 
 
 def run(settings: Settings) -> int:
     """Run a dispatcher until it is told to stop; gives the exit code."""
-    logging.basicConfig(
-        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s"
-    )
     local = None
     if settings.ray_address is None:
         reading = threading.Thread(target=_read, name="reading")
         try:
             local = LocalRay(settings.cpus, meanwhile=reading.start)
         except ClusterUnavailable as error:
+            logging.basicConfig(format=LOG_FORMAT)
             _log.error("%s", error)
             return 1
         reading.join()

@@ -50,10 +50,7 @@ def serve(
         if with_dispatcher:
             child = supervised_dispatcher(settings)
         with child as supervisor:  # the dispatcher starts beside all that follows
-            from service.opening import open_storage
-
-            database, _ = open_storage(settings)  # what cannot be opened is told in one line
-            database.dispose()
+            _try_storage(settings)
             from service.app import create_app
 
             bound = listener.getsockname()[1]
@@ -136,6 +133,29 @@ def _run(app: "FastAPI", listener: socket.socket, supervisor: "Supervisor | None
         app, log_level="warning", access_log=False, timeout_graceful_shutdown=CLOSE_S
     )
     Server(config).run(sockets=[listener])
+
+
+def _try_storage(settings: "Settings") -> None:
+    """Open database and objects once, so that what cannot be opened is told in one line.
+
+    Raises
+    ------
+    Misconfigured, StorageError
+        If one cannot be opened.
+    """
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from service.opening import open_storage
+
+    try:
+        database, _ = open_storage(settings)
+    except SQLAlchemyError as error:
+        reason = str(error).splitlines()[0]
+        raise Misconfigured(
+            f"the database cannot be opened: {reason}; is its server running, and is "
+            "LAGID_DATABASE_URL right?"
+        ) from None
+    database.dispose()
 
 
 def _end_on_signals() -> None:

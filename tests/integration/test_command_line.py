@@ -153,6 +153,14 @@ def test_a_data_folder_that_is_not_writable_is_one_line(tmp_path: Path) -> None:
     assert "not writable" in line
 
 
+def test_a_database_that_cannot_be_opened_is_one_line(tmp_path: Path) -> None:
+    nowhere = "postgresql://lagid:secret@127.0.0.1:1/lagid"
+    line = refused(lagid("serve", "--port", 0, "--data-dir", tmp_path, LAGID_DATABASE_URL=nowhere))
+    assert "the database cannot be opened" in line
+    assert "LAGID_DATABASE_URL" in line
+    assert "secret" not in line
+
+
 def test_another_host_is_refused_without_keys(tmp_path: Path) -> None:
     line = refused(lagid("serve", "--host", "0.0.0.0", "--data-dir", tmp_path))
     assert "LAGID_ALLOW_OPEN_HOST" in line
