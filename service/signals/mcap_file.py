@@ -35,7 +35,7 @@ from service.signals.clock import Nanoseconds
 from service.signals.protobuf import (
     MESSAGE_HEADER,
     Field,
-    flat_fields,
+    double_fields,
     identifiers,
     record_layout,
     schema_of,
@@ -63,8 +63,9 @@ class McapFile:
         self._offset = 0
         self._crc = 0
         self._compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
-        self._schemas: list[Schema] = []
-        self._channels: list[Channel] = []
+        self._schemas: list[bytes] = []
+        self._channels: list[bytes] = []
+        self._messages: set[str] = set()
         self._fields: list[tuple[Field, ...]] = []
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
@@ -92,16 +93,16 @@ class McapFile:
         """Register a schema and a channel of doubles; return the channel's number."""
         number = len(self._channels) + 1
         message = identifiers([path.strip("/").replace("/", "_")])[0].capitalize()
-        if any(schema.name == f"lagid.{message}" for schema in self._schemas):
+        if message in self._messages:
             message = f"{message}_{number}"
         data = schema_of(message, fields)
         schema = Schema(number, data, "protobuf", f"lagid.{message}")
         channel = Channel(number, path, "protobuf", {}, number)
-        for one in (schema, channel):
-            self._put_record(one)
-        self._schemas.append(schema)
-        self._channels.append(channel)
-        self._fields.append(flat_fields(data, schema.name) or ())
+        for record, known in ((schema, self._schemas), (channel, self._channels)):
+            known.append(_bytes_of(record))  # written again in the summary
+            self._put(known[-1])
+        self._messages.add(message)
+        self._fields.append(double_fields(tuple(fields)))
         self._counts[number] = 0
         return number
 
@@ -144,7 +145,7 @@ class McapFile:
         crc = zlib.crc32(footer[:-4], self._crc)
         self._put(footer[:-4] + crc.to_bytes(4, "little") + MAGIC)
 
-    def _summary(self) -> list[tuple[int, Sequence[McapRecord]]]:
+    def _summary(self) -> list[tuple[int, Sequence[McapRecord | bytes]]]:
         first, last = self._span or (0, 0)
         statistics = Statistics(
             attachment_count=len(self._attachments),
@@ -200,11 +201,11 @@ class McapFile:
         known = self._span or (first, last)
         self._span = min(known[0], first), max(known[1], last)
 
-    def _put_records(self, records: Sequence[McapRecord]) -> int:
+    def _put_records(self, records: Sequence[McapRecord | bytes]) -> int:
         return sum(self._put_record(record) for record in records)
 
-    def _put_record(self, record: McapRecord) -> int:
-        data = _bytes_of(record)
+    def _put_record(self, record: McapRecord | bytes) -> int:
+        data = record if isinstance(record, bytes) else _bytes_of(record)
         self._put(data)
         return len(data)
 

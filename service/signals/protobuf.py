@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,9 @@ from google.protobuf.message import DecodeError
 
 MESSAGE_HEADER = 9
 """Opcode and length, which every MCAP record begins with."""
+
+_KEPT = 64
+"""Names and layouts that are remembered: the files of a sweep's runs have the same ones."""
 
 _WIRE_TYPES = {
     FieldDescriptorProto.TYPE_DOUBLE: (1, "<f8"),
@@ -32,6 +36,11 @@ class Field(NamedTuple):
 
 def identifiers(names: Iterable[str]) -> tuple[str, ...]:
     """Return names that protobuf allows, all different, as near to `names` as can be."""
+    return _identifiers(tuple(names))
+
+
+@lru_cache(maxsize=_KEPT)
+def _identifiers(names: tuple[str, ...]) -> tuple[str, ...]:
     made: list[str] = []
     for name in names:
         plain = re.sub(r"\W", "_", name, flags=re.ASCII).strip("_") or "channel"
@@ -68,6 +77,12 @@ def _numbers() -> Iterable[int]:
     yield from range(20_000, 2**29)  # those between belong to protobuf itself
 
 
+@lru_cache(maxsize=_KEPT)
+def double_fields(names: tuple[str, ...]) -> tuple[Field, ...]:
+    """Fields of a message of `schema_of`."""
+    return tuple(Field(name, number) for number, name in zip(_numbers(), names, strict=False))
+
+
 def flat_fields(schema: bytes, message: str) -> tuple[Field, ...] | None:
     """Fields of a message that consists of floats only; None if it is of another kind."""
     try:
@@ -89,7 +104,8 @@ def _flat(message: DescriptorProto) -> tuple[Field, ...] | None:
     return tuple(Field(one.name, one.number, _WIRE_TYPES[one.type][1]) for one in ordered)
 
 
-def record_layout(fields: Sequence[Field]) -> np.dtype[np.void]:
+@lru_cache(maxsize=_KEPT)
+def record_layout(fields: tuple[Field, ...]) -> np.dtype[np.void]:
     """One MCAP message record whose protobuf content writes every field, zeros too.
 
     ``tag0, value0, tag1, …`` follow the record's own fields; a tag is 1 to 5 bytes.
