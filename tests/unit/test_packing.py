@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from workers.packing import (
     FIRST_SLICE_SECONDS,
     PACK_SECONDS,
+    ROOM,
     Cost,
     deal,
     is_worth_spreading,
@@ -83,3 +84,10 @@ def test_islands_are_spread_only_over_idle_cores_and_when_an_epoch_is_long_enoug
     assert not is_worth_spreading(1.0, islands=4, idle=0)
     assert not is_worth_spreading(1.0, islands=1, idle=1)
     assert not is_worth_spreading(0.01, islands=4, idle=1)
+
+
+@given(costs, st.integers(0, 12))
+def test_only_a_run_that_is_known_to_fit_into_a_pack_is_not_cut(mean: float, slices: int) -> None:
+    known = slice_seconds(slices, Cost(mean))
+    assert known == (PACK_SECONDS if mean * ROOM <= PACK_SECONDS else slice_seconds(slices))
+    assert slice_seconds(slices, Cost()) == slice_seconds(slices)
