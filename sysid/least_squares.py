@@ -183,11 +183,10 @@ def _slopes(scored: Scored, place: FloatArray, error: FloatArray, columns: Float
 @compiled
 def _total(error: FloatArray, scale: float) -> float:
     """The loss of residuals (n,); ``inf`` where one is not finite."""
-    total = 0.0
     if scale == 0.0:
-        for m in range(error.size):
-            total += error[m] * error[m]
+        total = product(error, error, error.size)
     else:
+        total = 0.0
         for m in range(error.size):
             total += 2.0 * scale**2 * (np.sqrt(1.0 + (error[m] / scale) ** 2) - 1.0)
     return total if np.isfinite(total) else np.inf

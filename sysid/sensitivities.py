@@ -16,6 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.ga.chromosome import located, placed
+from sysid.kernels.caching import compiled
+from sysid.kernels.evaluation import partial_predictions
+from sysid.kernels.evaluator import Evaluator
 from sysid.problem import Problem
 from sysid.types import BoolArray, FloatArray, IntArray
 
@@ -72,19 +75,13 @@ def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) 
     """
     probe = _Probe(problem, theta, most)
     d = probe.place.size
-    columns, plateau = np.zeros((probe.weight.size, d)), np.zeros(d)
-    middle = np.zeros(d)
+    plateau, middle = np.zeros(d), np.zeros(d)
     one_sided = np.zeros(d, dtype=np.bool_)
-    everything = np.arange(d)
-    low, below = probe.at(everything, np.full(d, -_DIFFERENCE))
-    high, above = probe.at(everything, np.full(d, _DIFFERENCE))
-    here = probe.predicted[:, None]
-    moves = (np.any(below != here, axis=0) | (low == 0.0)) & (
-        np.any(above != here, axis=0) | (high == 0.0)
-    )
+    both = np.arange(2 * d)
+    steps, beside = probe.at(both % d, np.where(both < d, -_DIFFERENCE, _DIFFERENCE))
+    columns, moves, differ = _central(probe.predicted, steps, beside)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        columns[:, moves] = ((above - below) / (high - low))[:, moves]
-        for d in np.flatnonzero(moves & _differ(here, low, below, high, above)).tolist():
+        for d in np.flatnonzero(moves & differ).tolist():
             columns[:, d] = _slope_beside_jumps(probe, d)
         jumping = np.flatnonzero(~moves)
         if jumping.size:
@@ -101,17 +98,54 @@ def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) 
     return Sensitivities(error, columns, plateau, one_sided, middle, probe.evaluations)
 
 
-def _differ(
-    here: FloatArray, low: FloatArray, below: FloatArray, high: FloatArray, above: FloatArray
-) -> BoolArray:
-    """Whether the slopes to both sides differ (D,); also where there is one side only."""
-    left, right = (here - below) / -low, (above - here) / high
-    size = np.minimum(_squares(left), _squares(right))
-    return np.asarray(~(_squares(right - left) <= _ALIKE**2 * size))
+@compiled
+def _central(
+    here: FloatArray, steps: FloatArray, beside: FloatArray
+) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """Central differences (n, D); whether the output moves on both sides at once, whether unlike.
+
+    Parameters
+    ----------
+    here, beside : FloatArray, shape (n,), (n, 2D)
+        Output at the estimate, and after `steps` (2D,) of each parameter down and then up.
+    """
+    d = steps.size // 2
+    slopes = np.zeros((here.size, d))
+    moves, differ = np.empty(d, dtype=np.bool_), np.empty(d, dtype=np.bool_)
+    for j in range(d):
+        low, high = steps[j], steps[d + j]
+        falls, rises, apart, left, right = low == 0.0, high == 0.0, 0.0, 0.0, 0.0
+        for i in range(here.size):
+            below, above = beside[i, j], beside[i, d + j]
+            falls |= below != here[i]
+            rises |= above != here[i]
+            down, up = (here[i] - below) / -low, (above - here[i]) / high
+            left, right, apart = left + down**2, right + up**2, apart + (up - down) ** 2
+        moves[j] = falls and rises
+        differ[j] = not apart <= _ALIKE**2 * min(left, right)  # also where there is one side only
+        if moves[j]:
+            for i in range(here.size):
+                slopes[i, j] = (beside[i, d + j] - beside[i, j]) / (high - low)
+    return slopes, moves, differ
 
 
-def _squares(columns: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("nd,nd->d", columns, columns))
+@compiled
+def _beside(
+    evaluator: Evaluator, rows: IntArray, place: FloatArray, which: IntArray, steps: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Steps taken (k,), cut off at the bounds, and the scored outputs there (n, k)."""
+    around, taken = np.empty((which.size, place.size)), np.empty(which.size)
+    for p in range(which.size):
+        d = which[p]
+        around[p, :] = place
+        around[p, d] = min(max(place[d] + steps[p], 0.0), 1.0)
+        taken[p] = around[p, d] - place[d]
+    predicted = partial_predictions(evaluator, located(evaluator, around), 1.0)
+    outputs = np.empty((rows.size, which.size))
+    for i in range(rows.size):
+        for p in range(which.size):
+            outputs[i, p] = predicted[rows[i], p]
+    return taken, outputs
 
 
 def _slope_beside_jumps(probe: "_Probe", d: int) -> FloatArray:
@@ -145,11 +179,10 @@ class _Probe:
         if most is not None and most < 1:
             raise BudgetSpentError(0, None)
         self._problem, self._most = problem, most
-        self._scored = problem.evaluator.weight > 0
-        self.weight = problem.evaluator.weight[self._scored]
-        self.measured = problem.evaluator.measured[self._scored]
+        self.weight = problem.evaluator.weight[problem.scored]
+        self.measured = problem.evaluator.measured[problem.scored]
         self.place = placed(problem.evaluator, theta[None])[0]
-        self.predicted = problem.predictions(theta[None])[0][self._scored]
+        self.predicted = problem.predictions(theta[None])[0][problem.scored]
         self.evaluations = 1
 
     @property
@@ -161,12 +194,8 @@ class _Probe:
         """Steps taken, cut off at the bounds, and the outputs there: (n, number of `which`)."""
         if self._most is not None and self.evaluations + which.size > self._most:
             raise BudgetSpentError(self.evaluations, self.error)
-        moved = np.clip(self.place[which] + steps, 0.0, 1.0)
-        around = np.repeat(self.place[None], which.size, axis=0)
-        around[np.arange(which.size), which] = moved
-        predicted = self._problem.predictions(located(self._problem.evaluator, around))
         self.evaluations += which.size
-        return moved - self.place[which], np.ascontiguousarray(predicted[:, self._scored].T)
+        return _beside(self._problem.evaluator, self._problem.scored, self.place, which, steps)
 
     def jumps(self, which: IntArray, side: float) -> tuple[FloatArray, FloatArray]:
         """Distance of each parameter's nearest jump on one side, and the outputs beyond it.
