@@ -45,6 +45,7 @@ _LEAST, _MOST = 1e-11, 1e12
 _TOLERANCE = 1e-10  # of the sum: the part that a step must promise
 _SIZES = np.array([0.3, 1.0, 2.0])  # standard errors by which drawn places are off
 _DRAWN, _STARTS = 96, 6
+_WORK = 50_000_000  # steps of integration or recursion: no places are drawn on longer records
 _FALLEN = float(np.exp(-1.0))
 _WHITE = 0.1  # correlation of neighbours: below, it is not worth a model
 
@@ -131,7 +132,8 @@ def _starts(
     random: np.random.Generator,
 ) -> list[tuple[FloatArray, FloatArray]]:  # fmt: skip
     """Places around one (D,), and their residuals, those that lie lowest of some that are drawn."""
-    if search.left < _DRAWN + _STARTS * search.round:
+    count = _DRAWN + _STARTS * search.round
+    if search.left < count or count * search.problem.n_steps > _WORK:
         return []
     evaluator = search.problem.evaluator
     size, rows = np.linalg.eigh(covariance)

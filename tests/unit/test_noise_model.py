@@ -157,3 +157,21 @@ def test_what_a_noise_model_cannot_do_is_refused() -> None:
         Problem.build(load_model(GAIN), [record(1)], loss=AR1, prediction="one-step")
     with pytest.raises(InvalidSettings, match="profiles are of plain squares"):
         profile(posed(record(1)), np.array([2.0, 1.0]), "g")
+
+
+def test_every_output_has_a_noise_of_its_own_and_a_kept_part_is_judged() -> None:
+    both = {**GAIN, "outputs": {"y": "x", "z": "2*x"}}
+    times = STEP * np.arange(N)
+    u = np.random.default_rng(1).choice([-1.0, 1.0], N)
+    y = 2.0 * u + 1.0
+    slow, white = coloured(N, 0.95, 1), coloured(N, 0.0, 2)
+    data = Record(
+        (Channel("u", times, u),),
+        (Channel("y", times, y + 0.2 * slow), Channel("z", times, 2.0 * y + 0.2 * white)),
+    )
+    found = identify(load_model(both), data, SMALL, loss=AR1, skip=1, validation_fraction=0.3)
+    assert set(found.correlation_times) == {"y"}
+    assert found.correlation_times["y"] > 3 * STEP
+    assert found.rms_validation is not None
+    assert found.residual_tests is not None
+    assert {one.output for one in found.residual_tests.tests} == {"y", "z"}
