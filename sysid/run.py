@@ -14,7 +14,7 @@ import numpy as np
 
 from sysid.conclusion import conclude
 from sysid.ga.island import Island, evolve
-from sysid.ga.state import Plan
+from sysid.ga.state import WARMED, Plan
 from sysid.islands.archipelago import found, of_island, plans
 from sysid.islands.migration import migrate
 from sysid.islands.run_state import RunState
@@ -31,8 +31,10 @@ CALL_SECONDS = 0.1
 """Aimed at for one compiled call, by measured cost, so that a cancel is heard in time."""
 
 _TARGET_ROUND = 5  # generations between two looks at the target RMS, or at a warm start
-_AGREE = 2 / 3  # of the searches from random places: a false optimum seldom draws so many
-_RETURN = 0.9  # of the searches from beside the best individual
+_OF_EACH, _MORE = 2, 2
+_SHARE = 1 / 3  # of all searches
+_AGREE = 2 / 3  # of the searches from random places, where the fitness jumps
+_RETURN = 0.9  # of those from beside the best individual
 _WARM_SETTLED = 3  # of the searches that agree, a warm start needs one in three
 
 
@@ -53,6 +55,8 @@ def begin(
     is_warm = any(all(p.name in one for p in problem.space) for one in given)
     starts = equation_error_starts(problem, algorithm)
     islands = found(problem, algorithm, seed, given, starts.values, starts.evaluations)
+    for island in islands:
+        island.counters[WARMED] = is_warm
     return RunState(seed, islands, is_warm=is_warm)
 
 
@@ -108,24 +112,31 @@ def _has_ended(algorithm: GeneticAlgorithm, state: RunState) -> bool:
 
 
 def _is_settled(settled: int, state: RunState) -> bool:
-    """Whether searches from random places agree with the best individual, and it has no rivals.
+    """Whether searches keep finding the best individual, from random places and from beside it.
 
-    Nearly all searches that began beside it have to lead back to it: where the fitness is rough
-    others nearby may be better.
+    Had a better one as many ways that lead to it, all of k searches that found the best again and
+    those that found others would have missed it with a probability below exp(-k). So where the
+    fitness around is smooth, those that led to worse ones say nothing against the best, unless
+    they are the most. Where it jumps, a better one nearby may draw few searches beside a wide one
+    that draws many: then nearly all must agree.
     Behind a warm start stands an earlier result. So a third of them is enough, and so it is that
-    as many from random places, one from beside it and the second half of the generations have
-    found nothing better. Those from beside it alone would not do: around a false optimum they
-    find nothing better.
+    as many from random places, one from beside it (where the fitness jumps, as many) and the
+    second half of the generations have found nothing better. Those from beside it alone would not
+    do: around a false optimum they find nothing better.
     """
     hops, returned = state.hops
     if state.is_warm:
-        tried = state.independent >= settled and hops > 0
+        tried = state.independent >= settled and hops >= (settled if state.has_cliffs else 1)
         if tried and state.is_the_best_since(state.generation // 2):
             return True
         settled = -(-settled // _WARM_SETTLED)
-    if returned < max(settled, _RETURN * hops):
+    if state.has_cliffs:
+        every = returned >= max(settled, _RETURN * hops)
+        return every and state.confirmed >= max(settled, _AGREE * state.independent)
+    again = state.confirmed + returned
+    if min(state.confirmed, returned) < -(-settled // _OF_EACH):
         return False
-    return state.confirmed >= max(settled, _AGREE * state.independent)
+    return again >= max(settled + _MORE, _SHARE * (state.independent + hops))
 
 
 def is_finished(algorithm: GeneticAlgorithm, state: RunState) -> bool:

@@ -12,6 +12,7 @@ from the best of fresh individuals, and take in the rest by and by.
 import numpy as np
 
 from sysid.ga.chromosome import coded, decoded, located
+from sysid.ga.cliffs import MOST, has_cliff
 from sysid.ga.gauss_newton import (
     damped_step,
     factored,
@@ -22,6 +23,7 @@ from sysid.ga.gauss_newton import (
 from sysid.ga.operators import rank
 from sysid.ga.random import DEVELOPMENT, Draws, below, draws, unit
 from sysid.ga.state import (
+    CLIFFS,
     CONFIRMED,
     DAMPING,
     DEVELOPMENTS,
@@ -45,6 +47,7 @@ from sysid.ga.state import (
     STAGNATION,
     STEP,
     TRIED,
+    WARMED,
     Plan,
 )  # fmt: skip
 from sysid.kernels.caching import compiled
@@ -66,6 +69,8 @@ ENOUGH_PART = 1e-2
 EARLY = 4  # developments that follow each other at once and are cheap, before the long ones
 FAR = 1.1  # of the champion's fitness: above, a search ends at the first small gain
 SHORTEST_HOP, LONGEST_HOP = 0.3, 50.0  # standard errors
+LOOKS = 4  # hops that also look for jumps of the fitness, as long as there is none
+LINES = 2  # on which each does
 
 
 @compiled
@@ -114,11 +119,37 @@ def _hop(evaluator: Evaluator, plan: Plan, counters: IntArray, memory: FloatArra
     matrix, gradient, base = normal_equations(evaluator, plan, point, 1.0, difference)
     word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
     size = base * SHORTEST_HOP * (LONGEST_HOP / SHORTEST_HOP) ** unit(word[0])
-    deviation = np.empty(point.size)
-    for d in range(point.size):
-        word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 1 + d)
-        deviation[d] = size * _normal(word)
-    spread(factored(matrix, gradient, point, 0.0), point, deviation, point)
+    factor = factored(matrix, gradient, point, 0.0)
+    _look(evaluator, plan, factor, base, counters, memory)
+    spread(factor, point, _deviation(plan, counters, 0, size, point.size), point)
+
+
+@compiled
+def _deviation(plan: Plan, counters: IntArray, line: int, size: float, n: int) -> FloatArray:
+    """Normal numbers (n,) of that standard deviation."""
+    drawn = np.empty(n)
+    for d in range(n):
+        draw = 1 + line * n + d
+        word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
+        drawn[d] = size * _normal(word)
+    return drawn
+
+
+@compiled
+def _look(
+    evaluator: Evaluator, plan: Plan, factor: FloatArray, base: float, counters: IntArray,
+    memory: FloatArray,
+) -> None:  # fmt: skip
+    """Note whether the fitness jumps on lines through the point; not where a budget ends."""
+    point = memory[POINT:]
+    for line in range(1, LINES + 1):
+        if counters[EVALUATIONS] + MOST + point.size + 1 > plan.evaluations or not np.isfinite(
+            base
+        ):
+            return
+        if counters[CLIFFS] == 0 and counters[HOPS] < LOOKS:
+            direction = _deviation(plan, counters, line, base, point.size)
+            counters[CLIFFS] += has_cliff(evaluator, factor, point, direction, base, counters)
 
 
 @compiled
@@ -127,10 +158,11 @@ def _choose(plan: Plan, size: int, counters: IntArray, memory: FloatArray) -> in
     number = counters[DEVELOPMENTS]
     word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
     grows = number == EARLY or (number > EARLY and number % 2 == 0)
-    settled = counters[SETTLED] == 1 and number > EARLY
+    last_early = EARLY - counters[WARMED]  # behind an earlier result, the last of them is a hop
+    settled = counters[SETTLED] == 1 and number > last_early
     chosen = below(word[1], 3 * size) - size if grows else 0
     memory[ROUGH] = counters[SETTLED] == 1 or grows
-    if settled and (chosen >= size or number % 4 == 3):
+    if settled and (chosen >= size or number % 4 == 1 or number == EARLY):
         counters[HOP] = 1
     elif grows:
         memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
@@ -138,7 +170,7 @@ def _choose(plan: Plan, size: int, counters: IntArray, memory: FloatArray) -> in
         counters[PROBES] = 0 if number == EARLY else size // 3  # in lanes that would idle
     elif settled:
         counters[PROBES] = size
-    if 1 < number <= EARLY:
+    if 1 < number <= EARLY and not counters[HOP]:
         chosen = -1
     return chosen if chosen < size else 0
 

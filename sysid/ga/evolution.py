@@ -10,6 +10,7 @@ from sysid.ga.sequence import fixed_sequence
 from sysid.ga.state import (
     AT_EVALUATIONS,
     AT_GENERATION,
+    CLIFFS,
     CONFIRMED,
     DEVELOPMENTS,
     EVALUATIONS,
@@ -235,7 +236,8 @@ def generations(
         if fitness[0] < best:
             counters[STAGNATION] = 0
             if fitness[0] < best * (1.0 - SAME):
-                counters[CONFIRMED], counters[HOPS], counters[RETURNED] = 0, 0, 0
+                counters[CONFIRMED], counters[CLIFFS] = 0, 0
+                counters[HOPS], counters[RETURNED] = 0, 0
             if phase == GENETIC:
                 counters[SETTLED] = 0
             _note(evaluator, plan, words, fitness, counters, phase, improvements[written])

@@ -4,7 +4,7 @@ import numpy as np
 
 from sysid.ga.chromosome import coded, decoded
 from sysid.ga.island import Island
-from sysid.ga.state import CONFIRMED, HOPS, RETURNED, SAME, SETTLED, STAGNATION
+from sysid.ga.state import CLIFFS, CONFIRMED, HOPS, RETURNED, SAME, SETTLED, STAGNATION
 from sysid.islands.topology import edges
 from sysid.result import Improvement, Migrant
 from sysid.settings import Migration
@@ -68,5 +68,6 @@ def _of_another(island: Island, fitness: float) -> IntArray:
     counters = island.counters.copy()
     counters[STAGNATION], counters[SETTLED] = 0, 0
     if fitness < island.champion_rms * (1.0 - SAME):
-        counters[CONFIRMED], counters[HOPS], counters[RETURNED] = 0, 0, 0
+        counters[CONFIRMED], counters[CLIFFS] = 0, 0
+        counters[HOPS], counters[RETURNED] = 0, 0
     return counters

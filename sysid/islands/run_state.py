@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sysid.ga.island import Island
-from sysid.ga.state import CONFIRMED, HOPS, RETURNED, SAME, TRIED
+from sysid.ga.state import CLIFFS, CONFIRMED, HOPS, RETURNED, SAME, TRIED
 from sysid.result import Improvement, Migrant
 
 
@@ -65,6 +65,12 @@ class RunState:
         most = self.rms * (1.0 + SAME)
         best = [i.counters for i in self.islands if i.champion_rms <= most]
         return sum(int(c[HOPS]) for c in best), sum(int(c[RETURNED]) for c in best)
+
+    @property
+    def has_cliffs(self) -> bool:
+        """Whether a search from beside the best champion has met jumps of the fitness."""
+        most = self.rms * (1.0 + SAME)
+        return any(i.counters[CLIFFS] > 0 for i in self.islands if i.champion_rms <= most)
 
     def is_the_best_since(self, generation: int) -> bool:
         """Whether the best fitness was found by then, and nothing better after."""
