@@ -243,7 +243,8 @@ def _some(epochs: Sequence[int]) -> list[int]:
 
 def _fitness_axis(run: RunEvidence) -> dict[str, Any]:
     title = {"text": f"{run.fitness} [{run.unit}]"}
-    return {"title": title, "type": "log", "exponentformat": "e"}
+    # Over less than a decade the digits between its powers would stand alone, without any power.
+    return {"title": title, "type": "log", "exponentformat": "e", "minorloglabels": "complete"}
 
 
 def _upright(x: float) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """The pages in Chromium: what they show, what they do live, what they must never do."""
 
+import itertools
 import re
 
 import pytest
@@ -209,3 +210,52 @@ def test_the_report_is_drawn_without_a_server(site: Site, page: Page) -> None:
     page.wait_for_selector(".plot .main-svg")
     assert page.locator(".js-plotly-plot").count() == 6
     expect(page.locator("table.estimates tbody tr")).to_have_count(len(TRUE))
+
+
+def test_a_run_is_simulated_in_a_closed_loop_from_its_page(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.finished}")
+    page.get_by_role("link", name="Simulate").click()
+    page.get_by_label("gain").first.fill("0.5")
+    page.get_by_label("height").fill("10")
+    page.get_by_role("button", name="Simulate").click()
+    page.wait_for_selector("#result .main-svg")
+    expect(page.locator("#result .verdict")).to_have_text("settles")
+    assert page.locator(f"#result {LINES}").count() == 3  # reference, output and input
+    address = page.url
+    page.goto(site.url)
+    page.goto(address)  # the address is the request
+    page.wait_for_selector("#result .main-svg")
+    page.set_viewport_size({"width": 390, "height": 900})
+    page.wait_for_function("() => document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_a_run_is_run_freely_over_a_recording_from_its_page(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/runs/{site.filled.finished_run}/simulate?kind=recording")
+    page.get_by_label("stored recording").select_option(site.filled.dataset)
+    page.get_by_role("button", name="Simulate").click()
+    page.wait_for_selector("#result .main-svg")
+    expect(page.locator("#result dl")).to_contain_text(re.compile(r"RMS error\s*0\.\d+\s*kPa"))
+    assert page.locator(f"#result {LINES}").count() == 4
+
+
+def test_a_wrong_gain_is_told_at_its_field(site: Site, page: Page) -> None:
+    page.goto(f"{site.url}/runs/{site.filled.finished_run}/simulate")
+    page.get_by_label("gain").first.fill("much")
+    page.get_by_role("button", name="Simulate").click()
+    expect(page.get_by_role("alert")).to_contain_text("gain: found 'much'; need a number")
+    expect(page.locator("[name=gain]")).to_have_attribute("aria-invalid", "true")
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/docs", "/jobs/{failed}", "/jobs/{sweep}", "/datasets/{dataset}"]
+)
+def test_a_narrow_page_does_not_overflow_and_its_headings_are_in_order(
+    site: Site, page: Page, path: str
+) -> None:
+    page.set_viewport_size({"width": 390, "height": 900})
+    page.goto(site.url + path.format(**vars(site.filled)))
+    assert page.evaluate("() => document.documentElement.scrollWidth <= innerWidth")
+    headings = "() => [...document.querySelectorAll('h1, h2, h3')].map(one => +one.tagName[1])"
+    levels = page.evaluate(headings)
+    assert levels.count(1) == 1
+    assert all(after <= before + 1 for before, after in itertools.pairwise(levels))

@@ -34,7 +34,10 @@ export async function draw(plot, extra = {}) {
   try {
     const figure = await ask(address(plot, extra));
     if (latest.get(plot) !== turn) return;
-    if (!figure.data.length) return tell(plot, plot.dataset.empty ?? 'nothing to show yet');
+    if (!figure.data.length) {
+      if (!document.querySelector('[data-live="chip"][data-open="1"]')) plot.style.height = ''; // nothing comes
+      return tell(plot, plot.dataset.empty ?? 'nothing to show yet');
+    }
     plot.querySelector('.plot-empty')?.remove();
     plot.style.height = `${figure.layout.height}px`;
     const first = !plot.classList.contains('js-plotly-plot');
