@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sysid import least_squares, refinement
 from sysid.models.library import load_model
 from sysid.problem import Problem
 from sysid.records import Channel, Record
@@ -80,3 +81,28 @@ def test_refinement_does_not_depend_on_the_unit_of_the_data(unit: float) -> None
     end = refine(Problem.build(load_model(document), [data]), [np.array([7.0, 0.2])])[0]
     assert end is not None
     assert end.theta == pytest.approx([2.0, 0.5], rel=1e-9)
+
+
+def test_on_long_records_a_compiled_call_makes_few_steps_and_the_bits_are_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls: list[int] = []
+
+    def noted(*arguments: object, at_once: int, **settings: object) -> least_squares.Solution:
+        calls.append(at_once)
+        return least_squares.solve(*arguments, at_once=at_once, **settings)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(refinement, "solve", noted)
+    problem = example()
+    whole = refine(problem, [NEAR])[0]
+    monkeypatch.setattr(refinement, "_AT_ONCE", 2 * problem.n_steps * (4 + least_squares.TRIED))
+    cut = refine(problem, [NEAR])[0]
+    monkeypatch.setattr(refinement, "_AT_ONCE", 1)  # a record longer than any
+    single = refine(problem, [NEAR])[0]
+    assert calls[0] > 60
+    assert calls[1:] == [2, 1]
+    assert whole is not None
+    for other in (cut, single):
+        assert other is not None
+        assert other.theta.tobytes() == whole.theta.tobytes()
+        assert (other.rms, other.evaluations) == (whole.rms, whole.evaluations)

@@ -1,11 +1,14 @@
 """A pack of work as a worker sees it."""
 
+import os
+import signal
 from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+import sysid.conclusion
 import workers.tasks
 from sysid.identify import identify
 from sysid.models.library import document
@@ -117,3 +120,23 @@ def test_terms_are_selected_anew_for_other_noise() -> None:
     alone = workers.tasks.build(noisy, RECORDS)[0]
     beside = workers.tasks.build(noisy, RECORDS, workers.tasks.build(quiet, RECORDS))[0]
     assert beside.model.selection == alone.model.selection
+
+
+@pytest.mark.parametrize("part", ["refine", "analyse", "residual_tests", "onset_delays"])
+def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_later_one(
+    part: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pack = [Advance("r", spec(generations=5), None, 100.0)]
+    (whole,) = workers.tasks.advance(pack, ["short"], RECORDS["short"])
+
+    def cancelled(*arguments: object, **_: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)  # as Ray does to a worker
+
+    with monkeypatch.context() as patched:
+        patched.setattr(sysid.conclusion, part, cancelled)
+        with pytest.raises(KeyboardInterrupt):
+            workers.tasks.advance(pack, ["short"], RECORDS["short"])
+    (again,) = workers.tasks.advance(pack, ["short"], RECORDS["short"])
+    assert isinstance(whole.outcome, Concluded)
+    assert isinstance(again.outcome, Concluded)
+    assert bits(again.outcome.identification) == bits(whole.outcome.identification)
