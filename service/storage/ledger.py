@@ -56,20 +56,22 @@ class RunOutcome:
 class RunLedger:
     """Writes to the runs of one leased job, in one writing session.
 
-    Every method locks the job's row first and raises `LeaseLost` when the lease is not held.
+    The first method that is called locks the job's row, or raises `LeaseLost` when the lease is
+    not held; nobody else can change that until the session ends.
     """
 
     def __init__(self, session: Session, lease: Lease, clock: Clock = utc_now) -> None:
         self._session, self._lease, self._clock = session, lease, clock
         self._queue = Queue(session, clock)
+        self._held: Job | None = None
 
     def create(self, cells: Iterable[Cell]) -> None:
         """Make the job's runs; those that are there already stay, so a second call is harmless."""
-        add_runs(self._session, self._queue.hold(self._lease), cells)
+        add_runs(self._session, self._hold(), cells)
 
     def pending(self, limit: int = CHUNK, after: int = -1) -> list[Run]:
         """Unfinished runs with a `number` above `after`, in order."""
-        self._queue.hold(self._lease)
+        self._hold()
         left = select(Run).where(
             Run.job_id == self._lease.job_id, Run.state.in_(OPEN), Run.number > after
         )
@@ -77,7 +79,7 @@ class RunLedger:
 
     def unfinished(self, numbers: Sequence[int]) -> list[Run]:
         """Those of the runs of these numbers that are unfinished, in their order."""
-        self._queue.hold(self._lease)
+        self._hold()
         found: list[Run] = []
         for chunk in chunks(numbers):
             mine = (Run.job_id == self._lease.job_id) & Run.number.in_(chunk)
@@ -86,7 +88,7 @@ class RunLedger:
 
     def start(self, run_ids: Collection[str]) -> None:
         """Mark queued runs as running."""
-        self._queue.hold(self._lease)
+        self._hold()
         for chunk in chunks(run_ids):
             begun = update(Run).where(self._is_mine(chunk), Run.state == State.QUEUED).values(
                 state=State.RUNNING, attempt=self._lease.attempt,
@@ -96,7 +98,7 @@ class RunLedger:
 
     def blame(self, kills: Mapping[str, int]) -> None:
         """Write how often in a row a worker died over each of these runs."""
-        self._queue.hold(self._lease)
+        self._hold()
         if kills:
             rows = [{"id": run, "kills": count} for run, count in kills.items()]
             update_by_id(self._session, Run, rows)
@@ -111,7 +113,7 @@ class RunLedger:
 
         A run that has ended already keeps its result. Gives the identifiers of those written.
         """
-        self._queue.hold(self._lease)
+        self._hold()
         open_ids = self._open_ids([one.run_id for one in outcomes])
         fresh = [one for one in outcomes if one.run_id in open_ids]
         self._insert(history, migrants)
@@ -132,12 +134,12 @@ class RunLedger:
         A run that goes on from a checkpoint finds the same points again, bit for bit; they count
         once.
         """
-        self._queue.hold(self._lease)
+        self._hold()
         self._insert(history, migrants)
 
     def save(self, states: Iterable[tuple[str, int, bytes]]) -> None:
         """Replace the checkpoints of runs, given as (run, evaluations, state)."""
-        self._queue.hold(self._lease)
+        self._hold()
         now = self._clock()
         rows = (
             {"run_id": run_id, "job_id": self._lease.job_id, "attempt": self._lease.attempt,
@@ -148,11 +150,16 @@ class RunLedger:
 
     def checkpoints(self) -> dict[str, bytes]:
         """The states from which unfinished runs of the job can go on, by run."""
-        self._queue.hold(self._lease)
+        self._hold()
         query = select(Checkpoint.run_id, Checkpoint.state).where(
             Checkpoint.job_id == self._lease.job_id
         )
         return dict(self._session.execute(query).all())
+
+    def _hold(self) -> Job:
+        if self._held is None:
+            self._held = self._queue.hold(self._lease)
+        return self._held
 
     def _is_mine(self, run_ids: Collection[str]) -> Any:
         return (Run.job_id == self._lease.job_id) & Run.id.in_(run_ids)
