@@ -172,7 +172,7 @@ class Torture:
             ("runs given up after too many faults", counts["runs given up"], None),
             ("jobs stuck", stuck, 0),
             ("jobs whose summary differs by a bit", len(stream.different), 0),
-            ("runs whose fitted signals are gone (disk full, tables went back)", counts["unplotted"], None),
+            ("runs without signals (disk full, tables went back)", counts["unplotted"], None),
             ("processes, segments, files left", left, 0),
         ]  # fmt: skip
         rows = [Row(f"{self.name}: {what}", number, "", bar) for what, number, bar in figures]
