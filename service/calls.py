@@ -55,13 +55,15 @@ class ProblemError(ClientError):
     status : int
     document : dict
         The RFC 9457 problem document; ``errors`` lists each fault with its JSON pointer.
+    reason : str
+        What it says, in one line.
     """
 
     def __init__(self, status: int, document: Document) -> None:
         self.status, self.document = status, document
         faults = [_fault(entry) for entry in document.get("errors", [])]
-        head = f"{document.get('title', 'error')} ({status})"
-        super().__init__(f"{head}: {'; '.join(faults) or document.get('detail', '')}")
+        self.reason = "; ".join(faults) or str(document.get("detail", ""))
+        super().__init__(f"{document.get('title', 'error')} ({status}): {self.reason}")
 
 
 class ServerUnreachable(ClientError):

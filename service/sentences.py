@@ -74,10 +74,18 @@ def detail_of(entry: Mapping[str, Any], known: Sequence[str], elsewhere: Sequenc
     if kind == "string_pattern_mismatch" and entry["loc"][-1] == "path":
         return f"found {found}; need a JSON pointer, such as /noise/sigma"
     if kind == "list_type":
-        return f"found {found}; need a list, such as [{_found(entry.get('input'))}]"
+        one = f", such as [{found}]" if isinstance(entry.get("input"), str) else ""
+        return f"found {found}; need a list{one}"
     if kind in _NEEDS:
         return f"found {found}{_size(kind, entry)}; need {_NEEDS[kind](entry.get('ctx', {}))}"
-    if kind in OWN_KINDS:
+    return _raised(entry, found)
+
+
+def _raised(entry: Mapping[str, Any], found: str) -> str:
+    """The sentence that a validator raised; of the other kinds what was found."""
+    if entry["type"] in ("value_error", "assertion_error") and "error" in entry.get("ctx", {}):
+        return str(entry["ctx"]["error"])
+    if entry["type"] in OWN_KINDS:
         return f"found {found}; this cannot be used here"
     return f"{entry['msg']}; found {found}"
 

@@ -55,7 +55,7 @@ def add(
     """Store a recording."""
     if not file.is_file():
         fail(f"there is no file {file}")
-    with connected(url, key) as client, told_at(Places(UPLOAD, rest=f"{file} …")):
+    with connected(url, key) as client, told_at(Places(UPLOAD, rest=str(file))):
         stored = client.add_dataset(file, name, segments=segments, sample_time=sample_time)
     _tell(stored, as_json)
 

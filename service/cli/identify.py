@@ -1,7 +1,10 @@
 """`lagid identify`: one identification in this process, without a server."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -90,7 +93,8 @@ def identify(
     if validation is not None:
         kept = _records(read(validation, reading), validation, loaded, body)
     begun = time.perf_counter()
-    found = _identified(loaded, records, kept, body, quiet=json_file == "-")
+    with _told_at_options():
+        found = _identified(loaded, records, kept, body, quiet=json_file == "-")
     tell(loaded, found, time.perf_counter() - begun, json_file)
 
 
@@ -152,6 +156,18 @@ def _meant(job: "JobIn", model: "Model", pieces: int) -> "list[FieldError]":
     return setting_faults(job.normal_form(), model, parameters)
 
 
+@contextmanager
+def _told_at_options() -> Iterator[None]:
+    """End the command with what the core refuses, at the user's places."""
+    from service.conversion import faults_of
+    from sysid.errors import SysidError
+
+    try:
+        yield
+    except SysidError as error:
+        fail(PLACES.told(faults_of(error)))
+
+
 def _refuse_elsewhere(change: str, parts: list[str]) -> None:
     for place, instead in ELSEWHERE.items():
         if ".".join([*parts, ""]).startswith(f"{place}."):
@@ -211,12 +227,16 @@ def tell(model: "Model", found: "Identification", seconds: float, json_file: str
     )
     unit = model.outputs[0].unit if len(model.outputs) == 1 else "standard deviations"
     fit = f"RMS {found.rms:.6g} {'' if unit == '1' else unit}".rstrip()
-    out.print(f"{fit}, fit {found.fit_percent:.2f} %", markup=False, end="")
+    out.print(f"{fit}, fit {_percent(found.fit_percent)}", markup=False, end="")
     if found.fit_percent_validation is not None:
-        out.print(f", validation {found.fit_percent_validation:.2f} %", markup=False, end="")
+        out.print(f", validation {_percent(found.fit_percent_validation)}", markup=False, end="")
     out.print(f"; {found.evaluations} simulations in {seconds:.2f} s", markup=False)
     for warning in found.warnings:
         err.print(f"note: {warning}", markup=False)
+
+
+def _percent(fit: float) -> str:
+    return f"{fit:.2f} %" if isfinite(fit) else "none (the output is constant)"
 
 
 def _identified(
@@ -234,6 +254,7 @@ def _identified(
     columns = (BarColumn(bar_width=40), TextColumn("{task.percentage:>3.0f} %"),
                TextColumn("RMS {task.fields[rms]}"), TimeElapsedColumn())  # fmt: skip
     console = Console(stderr=True, highlight=False)
+    quiet = quiet or not console.is_terminal  # in a file an ended bar is an empty line
     with Progress(*columns, console=console, disable=quiet, transient=True) as progress:
         bar = progress.add_task("", total=algorithm.generations, rms="–")
 

@@ -2,11 +2,12 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.exceptions import TyperException
 
-from service.calls import ClientError, NotFinite
+from service.calls import ClientError, NotFinite, ProblemError
 from service.cli import (
     datasets,
     exporting,
@@ -24,6 +25,7 @@ from service.cli.paper import paper
 from service.cli.reidentifying import reidentify
 from service.errors import ServiceError
 
+SERVER_FAILS = 500
 app = typer.Typer(
     name="lagid",
     help="Identification of nonlinear systems with unknown time lags.",
@@ -69,7 +71,12 @@ def main() -> None:
     """Run the command line; a user's mistake gives one line, never a traceback."""
     # Errors of the core are imported late: the package may load compiled code.
     try:
-        app()
+        code = app(prog_name="lagid", standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else 0)
+    except TyperException as error:
+        _end(_usage(error), error.exit_code)
+    except ProblemError as error:
+        _end(error.reason if error.status < SERVER_FAILS else str(error))
     except (ServiceError, ClientError) as error:
         _end(str(error), 2 if isinstance(error, NotFinite) else 1)
     except KeyboardInterrupt:
@@ -83,8 +90,24 @@ def main() -> None:
         _end(str(error))
 
 
+def _usage(error: TyperException) -> str:
+    """What is wrong with the words of a command, in our sentences; empty after a help text."""
+    text = error.format_message()
+    if not text.strip() or "\n" in text.strip():  # a command without its words: the help is out
+        return ""
+    cause: Any = error.__cause__
+    if hasattr(cause, "errors"):  # Pydantic's, by which the values of options are read
+        from service.sentences import detail_of
+
+        text = text.replace(error.message, detail_of(cause.errors()[0], ()))
+    context = getattr(error, "ctx", None)
+    command = "lagid" if context is None else context.command_path
+    return f"{text[:1].lower()}{text[1:].rstrip('.')} ({command} --help)"
+
+
 def _end(message: str, code: int = 1) -> None:
-    err.print(f"lagid: {' '.join(message.split())}", markup=False)
+    if message:
+        err.print(f"lagid: {' '.join(message.split())}", markup=False)
     sys.exit(code)
 
 

@@ -10,8 +10,8 @@ from service.cli.common import fail
 from service.errors import FieldError
 
 INVALID = 422
-ELSEWHERE = re.compile(r"(?<=; there is )/\S+")
-"""Where a message says that a field of the name is."""
+INSIDE = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
+"""Pointers in a message: where a field of a name is, and what in a value of an axis is wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,9 @@ class Places:
     def _one(self, fault: FieldError) -> str:
         place = self.of(fault.pointer) if fault.pointer else ""
         column = "" if fault.column is None else f", column {fault.column}"
-        detail = ELSEWHERE.sub(lambda found: self.of(found[0]), fault.detail)
+        detail = fault.detail
+        if not self.rest.endswith("…"):
+            detail = INSIDE.sub(lambda found: self.of(found[0]), detail)
         return f"{place}{column}: {detail}" if place else detail
 
 

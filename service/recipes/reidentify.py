@@ -1,5 +1,6 @@
 """Batch re-identification: one run for each value of a label, warm-started, with a trend."""
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,6 +14,8 @@ from service.settings import Settings
 from service.storage.sessions import Database
 
 FIRST_AXIS = "/sweep/axes/0"
+IN_DATASETS = re.compile(r"/datasets(?P<place>/\d+): ")
+"""How the fault of a value of the axis begins that is one of its recordings'."""
 
 
 def submit(
@@ -28,16 +31,17 @@ def submit(
         If the idempotency key was used with another body.
     """
     order = order_of(body)
+    job = job_of(body, order)
     own = list(_own_faults(body))
     try:
         if own:
             with database.read() as session:
-                jobs.check(session, job_of(body, order), settings)
-            raise InvalidRequest(own)
-        return jobs.submit_to(database, job_of(body, order), settings, key)
+                jobs.check(session, job, settings)
+        else:
+            return jobs.submit_to(database, job, settings, key)
     except InvalidRequest as error:
-        found = [*own, *(_at_home(one, order) for one in error.errors)]
-        raise InvalidRequest(dict.fromkeys(found)) from None
+        own += [_at_home(one, order) for one in error.errors]
+    raise InvalidRequest(dict.fromkeys(own))
 
 
 def faults_of_names(session: Session, body: ReidentifyIn) -> list[FieldError]:
@@ -98,7 +102,11 @@ def _warm_start(body: ReidentifyIn, reference: str | None) -> str | None:
 
 def _at_home(error: FieldError, order: list[int]) -> FieldError:
     """The fault of the job at the place of this body that it comes from."""
-    return FieldError(_place(error.pointer, order), error.detail, error.column)
+    place = _place(error.pointer, order)
+    inner = IN_DATASETS.match(error.detail)
+    if inner and place.startswith("/batch/"):
+        return FieldError(place + inner["place"], error.detail[inner.end() :], error.column)
+    return FieldError(place, error.detail, error.column)
 
 
 def _place(pointer: str, order: list[int]) -> str:

@@ -108,6 +108,33 @@ def test_a_command_that_is_called_wrongly_exits_with_2(data: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
+        (["submitt"], "no such command 'submitt'. Did you mean 'submit'?"),
+        (["identify", "a.csv"], "missing option '--model' (lagid identify --help)"),
+        (["jobs", "--stat", "queued"], "no such option: --stat (Possible options: --state)"),
+        (["jobs", "--state", "late"], "invalid value for '--state': 'late' is not one of"),
+        (["runs", "profile", "run_1", "--points", "2"],
+         "invalid value for '--points': found '2'; need 3 or more (lagid runs profile --help)"),
+        (["identify", "a.csv", "--model", "m", "--sample-time", "x"],
+         "invalid value for '--sample-time': found 'x'; need a number (lagid identify --help)"),
+    ],
+)  # fmt: skip
+def test_words_that_a_command_does_not_have_are_one_line_of_ours(
+    words: list[str], expected: str
+) -> None:
+    assert refused(lagid(*words), 2).startswith(f"lagid: {expected}")
+
+
+def test_a_command_without_its_words_shows_the_help() -> None:
+    for words in ((), ("sweep",)):
+        done = lagid(*words)
+        assert done.returncode == 2
+        assert "--help" in done.stdout + done.stderr
+        assert "lagid: " not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
         (["--set", "sweep.axes=[{path: /seed, values: [1, 2]}]"], "lagid submit"),
         (["--set", "validation.datasets=[other]"], "--validation FILE"),
         (["--set", "validation={datasets: [other]}"], "--validation FILE"),
@@ -215,6 +242,14 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
         (["--model", "fopdt", "--channels", "w=u"], "no signal 'w'"),
         (["--model", "fopdt", "--set", "parameters.L.lower=9"], "[9, 5]"),
         (
+            ["--model", "fopdt", "--set", "parameters.K.tied=T", "--set", "parameters.T.tied=K"],
+            "lagid: --set parameters.K.tied: the ties go in a circle",
+        ),
+        (
+            ["--model", "fopdt", "--set", "parameters.LL.upper=9", "--set", "hold.y=zero"],
+            "did you mean 'L'?; --set hold.y: model 'fopdt' has no input 'y'",
+        ),
+        (
             ["--model", "fopdt", "--noise-model", "ar1", "--set", "prediction=one-step"],
             "--set loss.noise_model: ar1 is for free runs",
         ),
@@ -222,6 +257,14 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
 )
 def test_a_mistake_of_identify_is_one_line(data: Path, words: list[str], expected: str) -> None:
     assert expected in refused(lagid("identify", data, *words))
+
+
+def test_identify_tells_what_cannot_be_read_and_what_has_no_meaning_at_once(data: Path) -> None:
+    words = ("--set", "seed=x", "--set", "parameters.LL.upper=9", "--set", "bits=3")
+    line = refused(lagid("identify", data, "--model", "fopdt", *words), 2)
+    assert "--set seed: found 'x'; need a whole number" in line
+    assert "--set bits: unknown field 'bits'; there is --set algorithm.bits" in line
+    assert "--set parameters.LL: the model has no parameter 'LL'" in line
 
 
 def test_a_recording_that_is_not_there_or_not_readable_is_one_line(tmp_path: Path) -> None:
@@ -342,6 +385,7 @@ def test_a_mistake_of_a_noise_sweep_is_one_line(server: str) -> None:
         ((*NOISE, "--sigma", "0.1", "--true", "Q=1"), 1, "lagid: --true Q: the model has no"),
         ((*NOISE, "--sigma", "-0.1"), 1, "lagid: --sigma: found -0.1; need 0 or"),
         ((*NOISE, "--sigma", "0.1", "--replicates", 0), 1, "--replicates: found 0; need 1"),
+        (("runs", "job_none"), 1, "lagid: there is no job job_none"),
         ((*NOISE, "--sigma", "0.1", "--methods", "best"), 1, "--methods: found 'best'"),
     ):
         assert expected in refused(lagid(*words, LAGID_URL=server), code)

@@ -43,7 +43,8 @@ def told(kind: Any, value: Any) -> str:
         (Annotated[list[int], Field(max_length=1)], [1, 2], "found [1, 2] (2 entries); need at "
          "most 1 entry"),
         (Literal["a", "b"], "c", "found 'c'; need 'a' or 'b'"),
-        (list[int], 3, "found 3; need a list, such as [3]"),
+        (list[int], 3, "found 3; need a list"),
+        (list[str], "a", "found 'a'; need a list, such as ['a']"),
         (dict[str, int], 3, "found 3; need an object (name: value)"),
         (set[int], 3, "found 3; this cannot be used here"),
     ],

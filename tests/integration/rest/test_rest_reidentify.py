@@ -251,7 +251,7 @@ def test_references_are_paged_and_a_new_note_is_kept(served: Served) -> None:
         ({"reference": "nobody"}, "/reference", "there is no reference 'nobody'"),
         ({"warm_start": "reference"}, "/warm_start", "needs one"),
         ({"look_at": ["Q"]}, "/look_at/0", "no parameter 'Q'"),
-        ({"batch": [{"x": 5, "datasets": ["ds_none"]}]}, "/batch/0/datasets", "ds_none"),
+        ({"batch": [{"x": 5, "datasets": ["ds_none"]}]}, "/batch/0/datasets/0", "ds_none"),
         ({"label": 'a"b'}, "/label", "quotation marks"),
         ({"batch": [{"x": 1e300, "datasets": ["ds_none"]}]}, "/batch/0/x", "1e-100 to 1e100"),
         ({"predict": [1.0, 1e-300]}, "/predict/1", "1e-100 to 1e100"),
