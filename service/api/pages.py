@@ -99,6 +99,12 @@ def compare_page(session: ReadSession, run: ComparedRuns) -> Response:
     return _Page(pages.compare_page(session, run))
 
 
+@router.get("/datasets", **Hidden)
+def datasets_page(session: ReadSession, cursor: Cursor = None) -> Response:
+    """The stored recordings."""
+    return _Page(pages.datasets_page(session, cursor))
+
+
 @router.get("/datasets/{dataset_id}", **Hidden)
 def dataset_page(dataset_id: str, session: ReadSession) -> Response:
     """One dataset: signals, channels, lineage."""

@@ -117,6 +117,13 @@ def run_page(session: Session, run_id: str, base_url: str) -> str:
     return job_page(session, run.job_id, base_url, run.id)
 
 
+def datasets_page(session: Session, cursor: str | None) -> str:
+    """The stored recordings, newest first."""
+    page = DatasetRepository(session).page(cursor=cursor, limit=JOBS_PER_PAGE)
+    following = _query({"cursor": page.next}) if page.next else ""
+    return render("datasets.html", datasets=page.items, cursor=cursor, next=following)
+
+
 def dataset_page(session: Session, dataset_id: str) -> str:
     """A dataset: its signals, channels, and lineage."""
     dataset = DatasetRepository(session).get(dataset_id)

@@ -247,7 +247,7 @@ def test_a_wrong_gain_is_told_at_its_field(site: Site, page: Page) -> None:
 
 
 @pytest.mark.parametrize(
-    "path", ["/", "/docs", "/jobs/{failed}", "/jobs/{sweep}", "/datasets/{dataset}"]
+    "path", ["/", "/docs", "/datasets", "/jobs/{failed}", "/jobs/{sweep}", "/datasets/{dataset}"]
 )
 def test_a_narrow_page_does_not_overflow_and_its_headings_are_in_order(
     site: Site, page: Page, path: str

@@ -166,3 +166,22 @@ def test_starts_are_told_apart_from_dispatchers_that_were_lost(
         session.get(Job, filled.finished).lost_leases = 1
     page = client.get(f"/jobs/{filled.finished}").text
     assert "1 of at most 3 dispatchers lost" in page
+
+
+def test_the_recordings_are_listed_page_by_page_with_what_can_be_done(tmp_path: Path) -> None:
+    with TestClient(create_app(Settings(data_dir=tmp_path))) as client:
+        assert "No recording is stored yet" in client.get("/datasets").text
+        for number in range(52):
+            answer = client.post(
+                f"/v1/datasets?name=record+{number}", content=f"t,u\n0,1\n1,{number}\n".encode(),
+                headers={"content-type": "text/csv"},
+            )  # fmt: skip
+            assert answer.status_code == 201
+        first = client.get("/datasets").text
+        [following] = re.findall(r'rel="next" href="([^"]*)"', first)
+        rest = client.get(following).text
+    assert first.count("data-dataset=") == 50
+    assert rest.count("data-dataset=") == 2
+    assert "record 51" in first
+    assert "record 0" in rest
+    assert re.search(r'href="/new/noise-sweep\?dataset=ds_', rest)
