@@ -17,8 +17,6 @@ import numpy as np
 
 from sysid.ga.chromosome import located, placed
 from sysid.kernels.caching import compiled
-from sysid.kernels.evaluation import partial_predictions
-from sysid.kernels.evaluator import Evaluator
 from sysid.problem import Problem
 from sysid.types import BoolArray, FloatArray, IntArray
 
@@ -129,25 +127,6 @@ def _central(
     return slopes, moves, differ
 
 
-@compiled
-def _beside(
-    evaluator: Evaluator, rows: IntArray, place: FloatArray, which: IntArray, steps: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Steps taken (k,), cut off at the bounds, and the scored outputs there (n, k)."""
-    around, taken = np.empty((which.size, place.size)), np.empty(which.size)
-    for p in range(which.size):
-        d = which[p]
-        around[p, :] = place
-        around[p, d] = min(max(place[d] + steps[p], 0.0), 1.0)
-        taken[p] = around[p, d] - place[d]
-    predicted = partial_predictions(evaluator, located(evaluator, around), 1.0)
-    outputs = np.empty((rows.size, which.size))
-    for i in range(rows.size):
-        for p in range(which.size):
-            outputs[i, p] = predicted[rows[i], p]
-    return taken, outputs
-
-
 def _slope_beside_jumps(probe: "_Probe", d: int) -> FloatArray:
     """Slope (n,) in one parameter: the mean of those sides of the estimate that show one."""
     sides = [_slope_of_side(probe, d, side) for side in (-1.0, 1.0)]
@@ -194,8 +173,13 @@ class _Probe:
         """Steps taken, cut off at the bounds, and the outputs there: (n, number of `which`)."""
         if self._most is not None and self.evaluations + which.size > self._most:
             raise BudgetSpentError(self.evaluations, self.error)
+        moved = np.clip(self.place[which] + steps, 0.0, 1.0)
+        around = np.repeat(self.place[None], which.size, axis=0)
+        around[np.arange(which.size), which] = moved
+        predicted = self._problem.predictions(located(self._problem.evaluator, around))
         self.evaluations += which.size
-        return _beside(self._problem.evaluator, self._problem.scored, self.place, which, steps)
+        scored = predicted[:, self._problem.scored]
+        return moved - self.place[which], np.ascontiguousarray(scored.T)
 
     def jumps(self, which: IntArray, side: float) -> tuple[FloatArray, FloatArray]:
         """Distance of each parameter's nearest jump on one side, and the outputs beyond it.
