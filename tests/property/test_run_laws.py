@@ -175,14 +175,14 @@ def test_the_target_rms_ends_a_run() -> None:
 
 
 def test_seconds_end_a_run() -> None:
-    algorithm = small(generations=10**9, stop=Stop(seconds=0.05))
+    algorithm = small(generations=10**9, stop=Stop(seconds=0.05, settled=None))
     state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
     assert is_finished(algorithm, state)
     assert state.seconds >= 0.05
 
 
 def test_should_stop_is_heard_between_calls() -> None:
-    algorithm = small(generations=10**9)
+    algorithm = small(generations=10**9, stop=Stop(settled=None))
     answers = iter([False, False, False, True])
     state = begin(problem(), algorithm, 1)
     state = advance(problem(), algorithm, state, None, lambda: next(answers))
