@@ -247,6 +247,7 @@ def _metrics(
     return StepMetricsOut(
         output=output.name, unit=output.unit, rise_time=known(found.rise_time),
         overshoot_percent=known(found.overshoot_percent),
+        overshoot_of_final_percent=known(found.overshoot_of_final_percent),
         settling_time=known(found.settling_time), band=found.band,
         steady_error=known(found.steady_error), final_value=known(found.final_value),
         runs_away=found.runs_away, is_settled=found.is_settled,

@@ -85,15 +85,17 @@ class StepMetricsOut(Answer):
     """What the response to a step of the reference is judged by; null where it never happens.
 
     `settling_time` is when the output last enters `band` (2 % of the step) around its mean over
-    the last tenth of the record, and null where `is_settled` is false: it leaves the band in that
-    tenth still. `steady_error` is the reference minus that mean. Of a loop that `runs_away`, which
-    leaves the reference farther and farther behind, none of these is told.
+    the last tenth of the record (`final_value`), and null where `is_settled` is false: it leaves
+    the band in that tenth still. `steady_error` is the reference minus that mean.
+    `overshoot_percent` is told of the reference, `overshoot_of_final_percent` and `rise_time`
+    (10 to 90 %) of that mean. Of a loop that `runs_away`, which leaves the reference farther and farther behind, none of these is told.
     """
 
     output: str
     unit: str
     rise_time: float | None
     overshoot_percent: float | None
+    overshoot_of_final_percent: float | None
     settling_time: float | None
     band: float
     steady_error: float | None

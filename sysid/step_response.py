@@ -25,9 +25,12 @@ class StepMetrics:
     Attributes
     ----------
     rise_time : float
-        From 10 % to 90 % of the way to the reference.
+        From 10 % to 90 % of the way to the final value.
     overshoot_percent : float
         Farthest way beyond the reference, in per cent of the step; 0 if it is not passed.
+    overshoot_of_final_percent : float
+        Farthest way beyond the final value, in per cent of the way to it: what is left of the
+        overshoot where a steady error keeps the output from the reference.
     settling_time : float
         From when on the output stays within `band` of its mean over the last tenth of the record;
         ``nan`` if it leaves it in that tenth still.
@@ -48,6 +51,7 @@ class StepMetrics:
 
     rise_time: float
     overshoot_percent: float
+    overshoot_of_final_percent: float
     settling_time: float
     band: float
     steady_error: float
@@ -82,23 +86,36 @@ def step_metrics(
     if height == 0:
         raise InvalidRecord(f"the reference does not change at {at:g} s")
     t, y = times[later] - at, values[later]
-    way = (y - before) / height
-    low, high = (_first_passing(t, way, level) for level in _RISE)
     band = _BAND * abs(height)
     if _runs_away(t, y - after, abs(height)):
-        return StepMetrics(high - low, nan, nan, band, nan, nan, runs_away=True, is_settled=False)
+        return StepMetrics(nan, nan, nan, nan, band, nan, nan, runs_away=True, is_settled=False)
     tail = t >= t[-1] - _TAIL * (t[-1] - t[0])
     final = float(np.mean(y[tail]))
     settling = _settled(t, np.abs(y - final), band, float(t[tail][0]))
     return StepMetrics(
-        rise_time=high - low,
-        overshoot_percent=100.0 * max(float(np.max(way)) - 1.0, 0.0),
+        rise_time=_rise_time(t, y, before, final),
+        overshoot_percent=_overshoot(y, before, after),
+        overshoot_of_final_percent=_overshoot(y, before, final),
         settling_time=settling,
         band=band,
         steady_error=after - final,
         final_value=final,
         is_settled=isfinite(settling),
     )
+
+
+def _rise_time(t: FloatArray, y: FloatArray, before: float, final: float) -> float:
+    if final == before:
+        return nan
+    low, high = (_first_passing(t, (y - before) / (final - before), level) for level in _RISE)
+    return high - low
+
+
+def _overshoot(y: FloatArray, before: float, end: float) -> float:
+    """Farthest way beyond `end` in per cent of the way there; ``nan`` if there is no way."""
+    if end == before:
+        return nan
+    return 100.0 * max(float(np.max((y - before) / (end - before))) - 1.0, 0.0)
 
 
 def _runs_away(t: FloatArray, deviation: FloatArray, height: float) -> bool:

@@ -155,7 +155,8 @@ def _print_step(metrics: dict[str, Any] | None) -> None:
         return
     told = (
         ("rise time (10 to 90 %)", metrics["rise_time"], "s"),
-        ("overshoot", metrics["overshoot_percent"], "%"),
+        ("overshoot of the reference", metrics["overshoot_percent"], "%"),
+        ("overshoot of the final value", metrics["overshoot_of_final_percent"], "%"),
         ("settling time (2 %)", metrics["settling_time"], "s"),
         ("steady error", metrics["steady_error"], metrics["unit"]),
     )

@@ -217,6 +217,18 @@ def test_metrics_of_a_second_order_step_are_those_of_its_formula() -> None:
     )
 
 
+def test_with_a_steady_error_rise_and_overshoot_of_the_final_value_are_told_besides() -> None:
+    values = 4 * (1 - np.exp(-TIMES) * np.cos(4 * TIMES))  # towards 4 of a reference of 10
+    found = step_metrics(TIMES, values, at=0.0, before=0.0, after=10.0)
+    other = step_metrics(TIMES, values, at=0.0, before=0.0, after=found.final_value)
+    assert found.overshoot_percent == 0.0
+    assert found.overshoot_of_final_percent == pytest.approx(other.overshoot_percent)
+    assert found.overshoot_of_final_percent > 30
+    assert found.rise_time == pytest.approx(other.rise_time)
+    down = step_metrics(TIMES, -values, at=0.0, before=0.0, after=-10.0)
+    assert down.overshoot_of_final_percent == pytest.approx(found.overshoot_of_final_percent)
+
+
 def test_a_response_that_grows_or_is_not_finite_runs_away() -> None:
     swing: FloatArray = np.exp(0.5 * TIMES) * np.sin(8 * TIMES)
     for values in (1 + swing, np.where(TIMES < 3, swing, np.inf), -0.1 * TIMES):
