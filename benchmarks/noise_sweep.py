@@ -2,30 +2,41 @@
 
 On a machine that others use the wall clock says little: the CPU seconds of each kind of process
 are told too, and what the sweep would take if they were dealt over two cores evenly. The share of
-that CPU time in compiled loops (search and simulations) comes from runs of the same kind that this
-program times call by call.
+that CPU time in compiled loops (search, least squares, simulations) comes from runs of the same
+kind that this program times call by call.
 """
 
 import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 from benchmarks import paper_example
 from benchmarks.family import cpu_seconds
 from benchmarks.table import Row, parser, report
 from service.client import Client
 from service.embedded import embedded_service
+from sysid import least_squares, problem, sensitivities
 from sysid.ga import island
+from sysid.identify import identify
 from sysid.models.library import load_model
 from sysid.noise import Noise, with_noise
-from sysid.problem import Problem
-from sysid.run import advance, begin
 from sysid.settings import GeneticAlgorithm
 
 SIGMAS = [round(0.05 * i, 2) for i in range(21)]
 METHODS = ["simple", "improved"]
+COMPILED: Sequence[tuple[Any, str]] = (
+    (island, "generations"),
+    (least_squares, "_descend"),
+    (problem, "population_fitness"),
+    (problem, "population_predictions"),
+    (sensitivities, "_central"),
+)
+"""Where Python enters compiled loops during a run: search, least squares, simulations, slopes."""
 
 
 def body(dataset: str, replicates: int) -> dict[str, Any]:
@@ -47,25 +58,27 @@ def compiled_seconds(count: int) -> float:
     """CPU seconds that a run of the sweep spends in compiled loops, mean over `count` draws."""
     model, clean, spent = load_model("duffing-eq16"), paper_example.record(1), 0.0
 
-    def searched(sigma: float, method: str, draw: int) -> None:
-        problem = Problem.build(model, [with_noise(clean, Noise(sigma, draw))])
-        algorithm = GeneticAlgorithm(method=method)  # type: ignore[arg-type]
-        advance(problem, algorithm, begin(problem, algorithm, draw))
+    def carried_out(sigma: float, method: str, draw: int) -> None:
+        noisy = with_noise(clean, Noise(sigma, draw))
+        identify(model, noisy, GeneticAlgorithm(method=method), seed=draw)  # type: ignore[arg-type]
 
-    def timed(*arguments: Any) -> int:
-        nonlocal spent
-        start = time.process_time()
-        written = int(inner(*arguments))
-        spent += time.process_time() - start
-        return written
+    def timed(inner: Callable[..., Any]) -> Callable[..., Any]:
+        def called(*arguments: Any) -> Any:
+            nonlocal spent
+            start = time.process_time()
+            result = inner(*arguments)
+            spent += time.process_time() - start
+            return result
 
-    searched(0.0, METHODS[-1], 0)  # loads what is compiled
-    module: Any = island
-    inner, module.generations = module.generations, timed
-    cells = [*product(SIGMAS, METHODS, range(count))]
-    for cell in cells:
-        searched(*cell)
-    module.generations = inner
+        return called
+
+    carried_out(0.0, METHODS[-1], 0)  # loads what is compiled
+    with ExitStack() as patches:
+        for module, name in COMPILED:
+            patches.enter_context(patch.object(module, name, timed(getattr(module, name))))
+        cells = [*product(SIGMAS, METHODS, range(count))]
+        for cell in cells:
+            carried_out(*cell)
     return spent / len(cells)
 
 
