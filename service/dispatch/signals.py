@@ -1,6 +1,7 @@
 """The fitted signals of runs: a file of each, the files of several as one object."""
 
 import io
+import time
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -13,6 +14,9 @@ from workers.ports import Records
 
 PARCEL_BYTES = 4 << 20
 """Bytes that are kept in memory until they are stored with those of other runs."""
+PATIENCE_SECONDS = 15.0
+"""How long a store that takes nothing, such as a full disk, is waited for."""
+PAUSE_SECONDS = 0.3
 
 
 class Place(NamedTuple):
@@ -23,10 +27,35 @@ class Place(NamedTuple):
     size: int | None = None
 
 
+class _PatientStore:
+    """Puts objects into a store that may be full or away for a while.
+
+    A store that has not come back in time is not waited for again until it has taken something.
+    """
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+        self._is_lost = False
+
+    def put(self, blocks: Sequence[bytes]) -> str:
+        begun = time.monotonic()
+        while True:
+            try:
+                sha256 = self._store.put_stream(blocks).sha256
+            except ObjectStoreFailed:
+                if self._is_lost or time.monotonic() - begun > PATIENCE_SECONDS:
+                    self._is_lost = True
+                    raise
+                time.sleep(PAUSE_SECONDS)
+            else:
+                self._is_lost = False
+                return sha256
+
+
 class _Parcel:
     """Files behind one another, which become one object. What made that fail is told to all."""
 
-    def __init__(self, store: ObjectStore) -> None:
+    def __init__(self, store: _PatientStore) -> None:
         self._store = store
         self._files: list[bytes] = []
         self._sha256: str | None = None
@@ -50,7 +79,7 @@ class _Parcel:
             raise self._failed
         if self._sha256 is None:
             try:
-                self._sha256 = self._store.put_stream(self._files).sha256
+                self._sha256 = self._store.put(self._files)
             except ObjectStoreFailed as error:
                 self._failed = error
                 raise
@@ -85,8 +114,8 @@ class Shelf:
     """Collects the files of runs: an object of each would cost more than the file itself."""
 
     def __init__(self, store: ObjectStore) -> None:
-        self._store = store
-        self._parcel = _Parcel(store)
+        self._store = _PatientStore(store)
+        self._parcel = _Parcel(self._store)
 
     def add(self, file: bytes) -> Shelved:
         """Put a file to those that are stored next; a full parcel is stored at once.

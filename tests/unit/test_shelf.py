@@ -23,6 +23,12 @@ class FullStore:
         raise ObjectStoreFailed("the disk is full")
 
 
+@pytest.fixture(autouse=True)
+def no_patience(monkeypatch):
+    monkeypatch.setattr(signals, "PATIENCE_SECONDS", -1.0)
+    monkeypatch.setattr(signals, "PAUSE_SECONDS", 0.0)
+
+
 class MemoryStore:
     """A store that forgets everything."""
 
@@ -100,3 +106,41 @@ def test_what_cannot_be_stored_is_tried_once_for_all_files_of_a_parcel():
     with pytest.raises(ObjectStoreFailed):
         shelf.add(b"c").place()
     assert full.asked == 2
+
+
+class RecoveringStore(MemoryStore):
+    """A store that is full for so many times."""
+
+    def __init__(self, times):
+        super().__init__()
+        self.left = times
+
+    def put_stream(self, blocks):
+        if self.left > 0:
+            self.left -= 1
+            raise ObjectStoreFailed("the disk is full")
+        return super().put_stream(blocks)
+
+
+def test_a_store_that_is_full_for_a_while_is_waited_for(monkeypatch):
+    monkeypatch.setattr(signals, "PATIENCE_SECONDS", 60.0)
+    store = RecoveringStore(5)
+    shelf = Shelf(store)
+    first, second = shelf.add(b"first"), shelf.add(b"second")
+    assert [read(store, one.place()) for one in (first, second)] == [b"first", b"second"]
+
+
+def test_a_store_that_stays_full_is_waited_for_once_until_it_takes_something(
+    monkeypatch,
+):
+    store = RecoveringStore(4)
+    shelf = Shelf(store)
+    with pytest.raises(ObjectStoreFailed):
+        shelf.add(b"lost").place()
+    monkeypatch.setattr(signals, "PATIENCE_SECONDS", 60.0)
+    before = store.left
+    with pytest.raises(ObjectStoreFailed):
+        shelf.add(b"lost too").place()
+    assert store.left == before - 1
+    store.left = 0
+    assert read(store, shelf.add(b"kept").place()) == b"kept"
