@@ -59,9 +59,13 @@ class ProblemSpec:
 
     @cached_property
     def family(self) -> str:
-        """Equal for specifications that differ in their noise only."""
+        """Equal for specifications that differ in their noise only.
+
+        What is written in another order is another one: the parameters' order is that in which a
+        search draws them.
+        """
         parts = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "noise"}
-        text = json.dumps(parts, sort_keys=True, default=_plain)
+        text = json.dumps(parts, default=_plain)
         return blake2b(text.encode(), digest_size=16).hexdigest()
 
     @property

@@ -114,6 +114,34 @@ def test_runs_that_differ_in_noise_only_see_the_bits_they_would_see_alone(
         alike = beside
 
 
+def test_what_a_worker_did_before_changes_no_bit_of_a_run() -> None:
+    """Nor does the same model with its parameters in another order, which are other genes."""
+    model = document("fopdt")
+    turned = {**model, "parameters": dict(reversed([*model["parameters"].items()]))}
+    first = replace(spec(generations=5), problem=ProblemSpec(model, "short"))
+    runs = [first]
+    for noise in (Noise(), Noise(0.1, 1), Noise(0.3, 2)):
+        for one in (model, turned):
+            problem = replace(first.problem, model=one, noise=noise)
+            runs.append(replace(first, problem=problem))
+    alone = []
+    for run in runs:
+        workers.tasks._problems.clear()
+        alone.append(result_of(run))
+    for order in (runs, runs[::-1]):
+        after = {run.key: result_of(run) for run in order}
+        assert [after[run.key] for run in runs] == alone
+    assert len(set(alone)) == 6
+
+
+def result_of(run: RunSpec) -> tuple[object, ...]:
+    """The bits of what a worker makes of a run."""
+    pack = [Advance("r", run, None, 100.0)]
+    (done,) = workers.tasks.advance(pack, ["short"], RECORDS["short"])
+    assert isinstance(done.outcome, Concluded)
+    return bits(done.outcome.identification)
+
+
 def test_terms_are_selected_anew_for_other_noise() -> None:
     quiet = ProblemSpec(model=lagged(frols(4)), records="short", skip=3)
     noisy = replace(quiet, noise=Noise(2.0, 1))
