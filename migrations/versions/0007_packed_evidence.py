@@ -5,7 +5,7 @@ what was written before reads an object as the signals of one run. All numbers s
 """
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from hashlib import blake2b
 from itertools import groupby
 from typing import Any
@@ -23,7 +23,7 @@ LARGE = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
 JSON = sa.JSON().with_variant(postgresql.JSONB(), "postgresql")
 PHASES = ("start", "genetic", "sequence", "migration", "refinement")
 MIGRANT = struct.Struct("<IIIId")
-RUNS_AT_A_TIME = 200
+RUNS_AT_A_TIME, ROWS_AT_A_TIME = 200, 2000
 PLACES = ("signals_start", "signals_size")
 
 # Columns of the two tables besides `run_id`, as they were and as they are now; keys first.
@@ -44,13 +44,14 @@ PACKED_LINES = {"digest": LARGE, "migrants": sa.LargeBinary}
 
 def upgrade() -> None:
     """Pack the rows of each run, and make room for a place in an object."""
+    # First the table that writers lock first: the other way round they and this would deadlock.
+    for place in PLACES:
+        op.add_column("runs", sa.Column(place, LARGE, nullable=True))
     for name, was, now, keys, convert in (
         ("run_history", POINTS, PARTS, ("digest",), _pack_points),
         ("migrations_log", LINES, PACKED_LINES, ("digest",), _pack_lines),
     ):
         _rebuild(name, was, now, keys, convert)
-    for place in PLACES:
-        op.add_column("runs", sa.Column(place, LARGE, nullable=True))
 
 
 def downgrade() -> None:
@@ -92,7 +93,8 @@ def _table(name: str, columns: Any) -> sa.TableClause:
     )
 
 
-def _of_runs(table: sa.TableClause) -> Iterator[Sequence[Any]]:
+def _of_runs(table: sa.TableClause) -> Iterator[Iterable[Any]]:
+    """Rows of some runs after the other; they stay with the database until they are asked for."""
     connection, last = op.get_bind(), ""
     order = [column for column in table.c if column.name in ("run_id", "island", "number")]
     while True:
@@ -102,7 +104,8 @@ def _of_runs(table: sa.TableClause) -> Iterator[Sequence[Any]]:
             return
         last = names[-1]
         among = table.c.run_id.between(names[0], last)
-        yield connection.execute(sa.select(*table.c).where(among).order_by(*order)).all()
+        rows = sa.select(*table.c).where(among).order_by(*order)
+        yield connection.execute(rows, execution_options={"yield_per": ROWS_AT_A_TIME})
 
 
 def _digest(data: bytes) -> int:

@@ -20,18 +20,20 @@ from service.storage.sessions import Database
 from service.storage.tables import Base
 
 _LOCK = 0x6C61_6769_64  # "lagid": the key of the advisory lock
+TURN_SECONDS = 900.0
+"""How long a process waits for another one that carries the rows of a large database over."""
 
 
 def upgrade(database: Database, revision: str = "head") -> None:
     """Create or bring up to date every table."""
-    with database.engine.begin() as connection:
+    with database.waiting(TURN_SECONDS).begin() as connection:
         _take_turn(connection)
         command.upgrade(_config(connection), revision)
 
 
 def downgrade(database: Database, revision: str = "base") -> None:
     """Go back to an earlier revision. What only later ones can hold is lost."""
-    with database.engine.begin() as connection:
+    with database.waiting(TURN_SECONDS).begin() as connection:
         _take_turn(connection)
         command.downgrade(_config(connection), revision)
 

@@ -63,6 +63,10 @@ class Database:
         with self._read.begin() as session:
             yield session
 
+    def waiting(self, seconds: float) -> Engine:
+        """The engine for transactions that wait so long (s) for what others have locked."""
+        return self.engine.execution_options(**{_BUSY: seconds})
+
     def dispose(self) -> None:
         """Close every pooled connection."""
         self.engine.dispose()

@@ -1,11 +1,13 @@
 """Rows that an earlier version wrote are carried over by the migrations, and back."""
 
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from sqlalchemy import text
 
-from service.storage import migrate
+from service.storage import migrate, sessions
 from service.storage.points import PHASES
 from service.storage.runs import RunRepository
 
@@ -100,3 +102,39 @@ def test_signals_that_share_an_object_are_not_told_as_one_runs_by_the_version_be
     migrate.downgrade(former, BEFORE)
     first, second, *_ = stored(former, "runs", "id")
     assert (first["signals_sha256"], second["signals_sha256"]) == (None, "a" * 64)
+
+
+def test_an_upgrade_waits_for_a_writer_that_has_begun_and_carries_over_what_it_wrote(former):
+    late = {"run_id": "run_b001", "island": 7, "number": 0, "generation": 1, "evaluations": 2,
+            "rms": 0.5, "phase": "genetic", "parameters": "[]"}  # fmt: skip
+    with ThreadPoolExecutor(1) as pool:
+        with former.engine.begin() as writer:
+            writer.execute(text("UPDATE runs SET evaluations = 3 WHERE id = 'run_b001'"))
+            upgraded = pool.submit(migrate.upgrade, former)
+            wait_for_a_lock(former, upgraded)
+            insert(writer, "run_history", [late])
+        upgraded.result()
+    with former.read() as session:
+        points = RunRepository(session).history("run_b001")
+    assert [one.island for one in points] == [0, 7]
+
+
+def wait_for_a_lock(database, upgraded):
+    """Until it waits on PostgreSQL; on SQLite nobody else can have begun."""
+    with database.engine.connect() as looking:
+        if looking.dialect.name == "sqlite":
+            return
+        waiting = text("SELECT count(*) FROM pg_locks WHERE NOT granted")
+        while not (looking.scalar(waiting) or upgraded.done()):
+            time.sleep(0.01)
+
+
+def test_an_upgrade_waits_longer_for_its_turn_than_other_writers(former, monkeypatch):
+    monkeypatch.setattr(sessions, "BUSY_SECONDS", 0.01)
+    with ThreadPoolExecutor(1) as pool:
+        with former.engine.begin() as writer:
+            writer.execute(text("UPDATE runs SET evaluations = 3 WHERE id = 'run_b001'"))
+            upgraded = pool.submit(migrate.upgrade, former)
+            time.sleep(0.3)
+        upgraded.result()
+    assert migrate.differences(former) == []
