@@ -27,11 +27,16 @@ def mark(session: Session, lease: Lease, hashes: Mapping[str, str]) -> None:
 def computed(
     session: Session, hashes: Collection[str], project_id: str = DEFAULT_PROJECT
 ) -> dict[str, str]:
-    """For each hash that a run of the project has succeeded with, the first such run."""
+    """For each hash that a run of the project has succeeded with, the first such run.
+
+    Not those of jobs that were deleted: their signals are garbage, and may be gone.
+    """
     found: dict[str, str] = {}
     for chunk in chunks(hashes):
-        query = select(Run.spec_hash, func.min(Run.id)).where(
-            Run.project_id == project_id, Run.spec_hash.in_(chunk), Run.state == State.SUCCEEDED,
+        first = select(Run.spec_hash, func.min(Run.id)).join(Job, Job.id == Run.job_id)
+        query = first.where(
+            Job.deleted_at.is_(None), Run.project_id == project_id, Run.spec_hash.in_(chunk),
+            Run.state == State.SUCCEEDED,
             Run.signals_sha256.is_not(None),  # one whose signals could not be stored is not whole
         )  # fmt: skip
         found.update({str(one): run for one, run in session.execute(query.group_by(Run.spec_hash))})

@@ -1,8 +1,12 @@
 """Runs that were computed before are taken over, whole, and say so."""
 
+from datetime import timedelta
+
 import pytest
 
 from service.storage.events import EventRepository
+from service.storage.garbage import collect
+from service.storage.jobs import JobRepository
 from service.storage.tables import State
 from tests.dispatching import Place, carry_out
 from workers.inline import InlineCrew
@@ -76,6 +80,18 @@ def test_a_run_taken_over_twice_names_the_one_that_was_computed(place):
     _, (third,), computed = carried_out(place, **sweep(1))
     assert third.result["reused_from"] == first.id
     assert computed == []
+
+
+def test_runs_of_a_deleted_job_are_not_taken_over_as_their_signals_are_garbage(place):
+    first, before, _ = carried_out(place, **sweep(2))
+    with place.database.write() as session:
+        JobRepository(session).delete(first)
+    with place.database.read() as session:
+        collect(session, place.store, older_than=timedelta(0))
+    _, after, computed = carried_out(place, **sweep(2))
+    assert computed == [run.id for run in after]
+    assert [run.best_rms for run in after] == [run.best_rms for run in before]
+    assert all(place.store.exists(run.signals_sha256) for run in after)
 
 
 def test_reuse_can_be_declined(place):
