@@ -1,7 +1,8 @@
 """What can be told of a body of which some fields cannot be read: the faults of all the others."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
+from itertools import accumulate
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -41,8 +42,12 @@ def beside(
     if found is None:
         return []
     whole, stand_ins = found
-    silent = [*left_out, *(f"/{name}" for name in stand_ins)]
-    return [one for one in meant(whole) if not any(_overlap(one.pointer, p) for p in silent)]
+    silent = {*left_out, *(f"/{name}" for name in stand_ins)}
+    above = {place for one in silent for place in _places_down_to(one)}
+    return [
+        one for one in meant(whole)
+        if one.pointer not in above and silent.isdisjoint(_places_down_to(one.pointer))
+    ]  # fmt: skip
 
 
 def _without(body: dict[str, Any], pointers: Iterable[str]) -> dict[str, Any]:
@@ -75,5 +80,6 @@ def _whole(kind: type[Whole], rest: dict[str, Any]) -> tuple[Whole, list[str]] |
     return None
 
 
-def _overlap(pointer: str, other: str) -> bool:
-    return f"{pointer}/".startswith(f"{other}/") or f"{other}/".startswith(f"{pointer}/")
+def _places_down_to(pointer: str) -> Iterator[str]:
+    """The places that hold a place, and the place itself."""
+    return accumulate(pointer.split("/"), "{}/{}".format)

@@ -1,13 +1,36 @@
 """What every wire type shares. Wire types import no core type, so that clients stay light."""
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
 
 Item = TypeVar("Item")
 
 Pointer = Annotated[str, Field(pattern=r"^(/[^/]+)+$", examples=["/noise/sigma"])]
 """A JSON pointer into a job body."""
+
+
+DEEPEST = 50
+"""Levels of lists and objects within one another in a body; a model document has five."""
+
+
+def not_too_deep(value: Any) -> Any:
+    """The value itself; what is nested too deeply cannot be copied or written again."""
+    level, depth = [value], 0
+    while level := [inner for one in level if isinstance(one, dict | list) for inner in _in(one)]:
+        depth += 1
+        if depth > DEEPEST:
+            raise PydanticCustomError(
+                "nesting", "need lists and objects at most {most} levels within one another",
+                {"most": DEEPEST},
+            )  # fmt: skip
+    return value
+
+
+def _in(value: dict[Any, Any] | list[Any]) -> Iterable[Any]:
+    return value.values() if isinstance(value, dict) else value
 
 
 class Body(BaseModel):

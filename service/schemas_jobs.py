@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from service.schemas import Answer, Body, Pointer
+from service.schemas import Answer, Body, Pointer, not_too_deep
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -235,6 +235,11 @@ class IdentificationIn(Body):
     algorithm: AlgorithmIn = AlgorithmIn()
     priority: int = Field(default=0, ge=-100, le=100)
     reuse: bool = Field(default=True, description="take results of runs that were computed before")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _within_reach(cls, value: Any) -> Any:
+        return not_too_deep(value)
 
     def given(self, *also: str) -> dict[str, Any]:
         """These fields, and those named besides, as far as they were given."""

@@ -99,7 +99,10 @@ def _found(value: Any) -> str:
     """A value as it is written in JSON where Python has another word for it."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
-    text = repr(value)
+    try:
+        text = repr(value)
+    except RecursionError:
+        return "lists or objects nested too deeply"
     return text if len(text) <= SHOWN else text[:SHOWN] + "…"
 
 

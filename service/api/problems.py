@@ -32,6 +32,9 @@ from sysid.errors import SysidError
 log = logging.getLogger(__name__)
 
 TRY_AGAIN = {"Retry-After": "1"}
+TOO_DEEP = "the body is nested too deeply"
+MOST_FAULTS = 1000
+"""So many fields that cannot be read are told; each costs a look at what is known there."""
 PROBLEM_TYPE = "application/problem+json"
 KINDS = {
     404: "not-found",
@@ -77,6 +80,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _http_error)
     for passing in (*PASSING, SqlTimeout):
         app.add_exception_handler(passing, _database_away)
+    app.add_exception_handler(RecursionError, _too_deep)
     app.add_exception_handler(OSError, _system_error)
     app.add_exception_handler(Exception, _unexpected)
 
@@ -111,6 +115,13 @@ def _system_error(request: Request, error: Exception) -> Response:
         return _unexpected(request, error)
     log.error("%s %s: %s", request.method, request.url.path, error)
     return _service_error(request, Unavailable("there is no space left on a disk of the server"))
+
+
+def _too_deep(request: Request, error: Exception) -> Response:
+    """Only a body has levels that are followed one by one."""
+    if request.method not in ("POST", "PUT", "PATCH"):
+        return _unexpected(request, error)
+    return _service_error(request, InvalidRequest.at("", TOO_DEEP))
 
 
 def _sysid_error(request: Request, error: Exception) -> Response:
@@ -159,7 +170,7 @@ def _unreadable(cause: BaseException | None) -> str | None:
         case UnicodeDecodeError():
             return f"the body is not UTF-8 text: byte {cause.start} does not fit"
         case RecursionError():
-            return "the body is nested too deeply"
+            return TOO_DEEP
         case ValueError():
             return "the body has a number with too many digits; need at most 4300"
     return None
@@ -178,4 +189,7 @@ def _field_errors(request: Request, error: RequestValidationError) -> Iterator[F
             name = loc[0] if loc else ""
             pointer = f"{{{name}}}" if place == "path" else f"?{name}"
             yield FieldError(pointer, detail_of(entry, ()))
-    yield from explained(entries, error.body, body_type(request.scope.get("endpoint")))
+    kind = body_type(request.scope.get("endpoint"))
+    yield from explained(entries[:MOST_FAULTS], error.body, kind)
+    if len(entries) > MOST_FAULTS:
+        yield FieldError("", f"and {len(entries) - MOST_FAULTS} more faults, not told here")

@@ -87,3 +87,40 @@ def test_of_what_is_no_body_nothing_more_is_told(body: Any) -> None:
 
     told = beside(JobIn, body, [FieldError("/seed", "x")], everything)
     assert told == []
+
+
+@pytest.mark.parametrize("path", ["/v1/jobs", "/v1/recipes/noise-sweep", "/v1/datasets:simulate"])
+@pytest.mark.parametrize("others", ["", '"seed": "x", "skip": -1,'])
+@pytest.mark.parametrize("depth", [60, 300, 600, 900, 960, 990])
+@pytest.mark.parametrize("nested", [("[", "]"), ('{"a":', "}")])
+def test_a_body_that_is_nested_too_deeply_is_refused_wherever_that_is(
+    server: TestClient, path: str, others: str, depth: int, nested: tuple[str, str]
+) -> None:
+    start, end = nested
+    deep = f"{start * depth}1{end * depth}"
+    for field in ("model", "parameters", "sweep", "unknown"):
+        body = f'{{"datasets": ["d"], {others} "{field}": {deep}}}'
+        answer = server.post(path, content=body, headers={"content-type": "application/json"})
+        assert refused(answer, 422, "invalid")
+
+
+def test_of_very_many_unknown_fields_the_first_are_told_and_how_many_more_there_are(
+    server: TestClient, dataset: str
+) -> None:
+    many = {f"x{number}": 1 for number in range(2500)}
+    answer = server.post("/v1/jobs", json={"model": "fopdt", "datasets": [dataset], **many})
+    found = refused(answer, 422, "invalid")
+    assert len(found) == 1001
+    assert found[-1] == {"pointer": "", "detail": "and 1500 more faults, not told here"}
+
+
+def test_what_follows_from_a_fault_is_not_told_above_or_below_it() -> None:
+    silent = ["/a/b", "/seed"]
+    told = ["", "/a", "/a/b", "/a/b/c", "/a/bc", "/b", "/seed/0", "/seeds"]
+    body = {"model": "m", "datasets": ["d"]}
+
+    def everything(_job: JobIn) -> list[FieldError]:
+        return [FieldError(one, "of it") for one in told]
+
+    found = beside(JobIn, body, [FieldError(one, "x") for one in silent], everything)
+    assert [one.pointer for one in found] == ["/a/bc", "/b", "/seeds"]
