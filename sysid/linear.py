@@ -44,6 +44,18 @@ class Linear:
             return np.asarray(gains / self.error)
 
 
+def drawn_along(covariance: FloatArray) -> FloatArray:
+    """R (D, D) of RRᵀ, the covariance: R times standard normal numbers are moves with it.
+
+    By the eigenvalues of the correlation: of parameters whose units differ by many decades those
+    of the covariance would be rounding in all directions but the largest.
+    """
+    variance = np.diag(covariance)
+    deviation = np.sqrt(np.where(variance > 0, variance, 1.0))
+    size, rows = np.linalg.eigh(covariance / np.outer(deviation, deviation))
+    return np.asarray(deviation[:, None] * rows * np.sqrt(np.maximum(size, 0.0)))
+
+
 def linear_model(
     error: FloatArray, columns: FloatArray, held: BoolArray, place: FloatArray,
     stated: FloatArray, scale: FloatArray, inverse: FloatArray, root: FloatArray,

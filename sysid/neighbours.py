@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.linear import Linear
+from sysid.linear import Linear, drawn_along
 from sysid.problem import Problem
 from sysid.refinement import Refined, refine_one
 from sysid.result import Estimate
@@ -111,8 +111,7 @@ class _Look:
         self._problem, self._budget, self.spent = problem, budget, 0
         self._linear = linear
         self._random = np.random.Generator(np.random.Philox(key=seed))
-        size, rows = np.linalg.eigh(linear.covariance)
-        self.root = np.asarray(rows * np.sqrt(np.maximum(size, 0.0)))
+        self.root = drawn_along(linear.covariance)
 
     def is_rough(self, centre: Refined) -> bool:
         """Whether losses around differ from those of the linear model; no, if none can be had."""

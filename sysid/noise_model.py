@@ -31,6 +31,7 @@ from numpy.fft import irfft, rfft
 from sysid.ga.chromosome import located, placed
 from sysid.ga.gauss_newton import damped_step
 from sysid.lagged_sums import laid_out
+from sysid.linear import drawn_along
 from sysid.problem import Problem
 from sysid.serial import Part, is_coloured, parts
 from sysid.types import FloatArray
@@ -136,10 +137,8 @@ def _starts(
     if search.left < count or count * search.problem.n_steps > _WORK:
         return []
     evaluator = search.problem.evaluator
-    size, rows = np.linalg.eigh(covariance)
-    root = rows * np.sqrt(np.maximum(size, 0.0))
     moves = _SIZES[np.arange(_DRAWN) % _SIZES.size, None]
-    moves = moves * random.standard_normal((_DRAWN, place.size)) @ root.T
+    moves = moves * random.standard_normal((_DRAWN, place.size)) @ drawn_along(covariance).T
     theta = located(evaluator, place[None]) + moves
     places = placed(evaluator, np.clip(theta, evaluator.lower, evaluator.upper))
     errors = search.errors(places)

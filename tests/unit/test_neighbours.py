@@ -8,7 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from sysid.identify import identify
-from sysid.linear import linear_model
+from sysid.linear import drawn_along, linear_model
 from sysid.models.library import load_model
 from sysid.neighbours import Neighbourhood, affordable, neighbourhood, widened
 from sysid.problem import Problem
@@ -156,6 +156,15 @@ def test_the_same_seed_finds_the_same_bits() -> None:
     one, other = around(rough(), FALSE, 500), around(rough(), FALSE, 500)
     assert one.values.tobytes() == other.values.tobytes()
     assert one.rms.tobytes() == other.rms.tobytes()
+
+
+def test_moves_have_the_covariance_they_are_drawn_along_whatever_the_units() -> None:
+    correlation = np.array([[1.0, 0.9, -0.5], [0.9, 1.0, -0.3], [-0.5, -0.3, 1.0]])
+    deviation = np.array([1e-9, 1.0, 1e9])
+    root = drawn_along(correlation * np.outer(deviation, deviation)) / deviation[:, None]
+    assert root @ root.T == pytest.approx(correlation, abs=1e-14)
+    held = drawn_along(np.diag([4.0, 0.0]))  # a parameter on a plateau stays
+    assert held @ held.T == pytest.approx(np.diag([4.0, 0.0]), abs=1e-14)
 
 
 def test_without_a_budget_nothing_is_simulated() -> None:

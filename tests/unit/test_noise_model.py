@@ -86,6 +86,21 @@ def test_the_correlation_time_is_found_with_and_without_missing_samples() -> Non
         assert np.mean(found) == pytest.approx(true, rel=0.15)
 
 
+@pytest.mark.parametrize("unit", [2.0**40, 2.0**-40])
+def test_estimates_under_slow_noise_do_not_depend_on_the_inputs_unit(unit: float) -> None:
+    data = record(4)
+    (u,) = data.inputs
+    other = replace(data, inputs=(replace(u, values=u.values * unit),))
+    bounds = {"g": {"lower": -10.0 / unit, "upper": 10.0 / unit}}
+    found = identify(load_model(GAIN), [data], SMALL, seed=1, loss=AR1, skip=1)
+    same = identify(
+        load_model(GAIN), [other], SMALL, seed=1, loss=AR1, skip=1, parameters=bounds
+    )  # fmt: skip
+    g, m = (one.value for one in found.estimates)
+    assert tuple(one.value for one in same.estimates) == (g / unit, m)
+    assert same.correlation_times == found.correlation_times
+
+
 def test_under_slow_noise_a_fast_input_tells_more_than_squares_make_of_it() -> None:
     errors = []
     for seed in range(20):
