@@ -23,6 +23,10 @@ from sysid.types import FloatArray
 from sysid.uncertainty import Analysis, analyse
 from sysid.warnings import noise_notes, warnings_of
 
+_LATE = 20_000_000
+"""Steps of integration or recursion that may follow where the run's time is over: about 0.2 s."""
+_CLOCK = 1e-3  # s: a search that took less says nothing of what a simulation takes
+
 
 def conclude(
     problem: Problem,
@@ -180,16 +184,31 @@ def _under_noise(
         return Generalised(theta, {}, 0, False), analysis
     left = _left(algorithm, state, refined)
     kept = analysis.evaluations + analysis_budget(theta.size)
-    most = None if left is None else max(0, left - kept)
+    limits = (None if left is None else max(0, left - kept), _in_time(problem, algorithm, state))
+    most = min((one for one in limits if one is not None), default=None)
     nothing = np.zeros((theta.size, theta.size))
     covariance = nothing if analysis.uncertainty is None else analysis.uncertainty.covariance
+    is_cut_short = analysis.is_cut_short
     found = generalised(problem, theta, covariance, state.seed, most)
     spent = analysis.evaluations + found.evaluations
     if any(found.correlation_times.values()):
         white = whitening(problem, found.correlation_times)
         analysis = analyse(problem, found.theta, None if left is None else left - spent, white)
         spent += analysis.evaluations
-    return found, replace(analysis, evaluations=spent)
+    return found, replace(analysis, evaluations=spent, is_cut_short=is_cut_short)
+
+
+def _in_time(problem: Problem, algorithm: GeneticAlgorithm, state: RunState) -> int | None:
+    """Simulations that the run's time leaves, by what those of the search took; None: no limit.
+
+    As many as are over at once are there always.
+    """
+    limit = algorithm.stop.seconds
+    if limit is None:
+        return None
+    left = max(0.0, limit - state.seconds)
+    each = max(state.seconds, _CLOCK) / max(state.evaluations, 1)
+    return max(_LATE // max(problem.n_steps, 1), int(left / each))
 
 
 def _left(

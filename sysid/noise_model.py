@@ -115,7 +115,7 @@ def generalised(
         place, error = search.lowest((place, error), starts, white)
         if is_last:
             break
-    return _told(problem, theta, place, known, search, True)
+    return _told(problem, theta, place, known, search, not search.is_cut)
 
 
 def _told(
@@ -218,6 +218,7 @@ class _Search:
 
     def __init__(self, problem: Problem, budget: int) -> None:
         self.problem, self._budget, self.evaluations = problem, budget, 0
+        self.is_cut = False  # whether a minimum was left before its end for want of simulations
         self._rows = np.flatnonzero(problem.evaluator.weight > 0)
         self._weight = problem.evaluator.weight[self._rows]
         self._measured = problem.evaluator.measured[self._rows]
@@ -256,12 +257,11 @@ class _Search:
         """The minimum that Levenberg-Marquardt finds from a place (D,), and its residuals (n,)."""
         damping, columns = 1e-3, None
         for _ in range(_STEPS):
-            if columns is None:
-                if self.left < self._step:
-                    break
-                columns = white.of(self.slopes(place, error).T)
-            elif self.left < _DAMPINGS.size:
+            if self.left < (self._step if columns is None else _DAMPINGS.size):
+                self.is_cut = True
                 break
+            if columns is None:
+                columns = white.of(self.slopes(place, error).T)
             seen = white.of(error)
             total, tried = float(seen @ seen), np.maximum(_DAMPINGS * damping, _LEAST)
             places, promised = _proposals(columns, seen, place, tried)

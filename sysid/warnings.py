@@ -257,7 +257,7 @@ def noise_notes(
     if not is_complete:
         notes.append(
             "the noise model was not estimated to its end: it needs the method 'improved' with "
-            "refinement, and more simulations than the budget left"
+            "refinement, and more simulations than the budget or the time left"
         )
     return tuple(notes)
 

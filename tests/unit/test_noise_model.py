@@ -13,6 +13,7 @@ from sysid.problem import Problem
 from sysid.profiles import profile
 from sysid.records import Channel, Record
 from sysid.refinement import refine
+from sysid.run import advance, begin, conclude
 from sysid.settings import GeneticAlgorithm, Loss, Stop
 from sysid.types import FloatArray
 from sysid.whitening import Whitening, owed
@@ -161,6 +162,24 @@ def test_a_budget_that_does_not_suffice_is_told_and_kept() -> None:
     found = identify(load_model(GAIN), record(3), settings, loss=AR1, skip=1)
     assert found.evaluations <= 200
     assert any("not estimated to its end" in text for text in found.warnings)
+
+
+def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    problem = posed(record(3))
+    timed = replace(SMALL, stop=Stop(seconds=100.0, settled=None))
+    state = advance(problem, timed, begin(problem, timed, 1))
+    whole = conclude(problem, timed, replace(state, seconds=1.0))
+    monkeypatch.setattr("sysid.conclusion._LATE", 30 * problem.n_steps)
+    late = conclude(problem, timed, replace(state, seconds=100.0))
+    soon = conclude(problem, timed, replace(state, seconds=99.0))  # time for a hundredth more
+    said = "not estimated to its end"
+    assert [any(said in one for one in found.warnings) for found in (whole, soon, late)] == [
+        False, True, True,
+    ]  # fmt: skip
+    assert late.evaluations <= whole.evaluations - 50
+    assert conclude(problem, timed, replace(state, seconds=1.0)).estimates == whole.estimates
 
 
 def test_what_a_noise_model_cannot_do_is_refused() -> None:

@@ -8,14 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import sysid.conclusion
 import workers.tasks
 from sysid.identify import identify
 from sysid.models.library import document
 from sysid.models.spec import parse_model
 from sysid.noise import Noise
 from sysid.problem import Problem
-from sysid.settings import GeneticAlgorithm
+from sysid.settings import GeneticAlgorithm, Loss
 from tests.polynomials import frols, lagged
 from tests.runs import RECORDS, bits, carry_out, spec
 from workers.inline import InlineCrew
@@ -150,21 +149,31 @@ def test_terms_are_selected_anew_for_other_noise() -> None:
     assert beside.model.selection == alone.model.selection
 
 
-@pytest.mark.parametrize("part", ["refine", "analyse", "residual_tests", "onset_delays"])
+@pytest.mark.parametrize(
+    "part",
+    ["conclusion.refine", "conclusion.analyse", "conclusion.residual_tests",
+     "conclusion.onset_delays", "noise_model._correlation_times", "noise_model._proposals"],
+)  # fmt: skip
 def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_later_one(
     part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pack = [Advance("r", spec(generations=5), None, 100.0)]
-    (whole,) = workers.tasks.advance(pack, ["short"], RECORDS["short"])
+    (short,) = RECORDS["short"]
+    slow = np.cumsum(np.random.default_rng(1).normal(0.0, 0.02, short.outputs[0].values.size))
+    drifting = replace(short.outputs[0], values=short.outputs[0].values + slow)
+    records = (replace(short, outputs=(drifting,)),)
+    run = spec(generations=5, records="drifting")
+    problem = replace(run.problem, loss=Loss(noise_model="ar1"))
+    pack = [Advance("r", replace(run, problem=problem), None, 100.0)]
+    (whole,) = workers.tasks.advance(pack, ["drifting"], records)
 
     def cancelled(*arguments: object, **_: object) -> None:
         os.kill(os.getpid(), signal.SIGINT)  # as Ray does to a worker
 
     with monkeypatch.context() as patched:
-        patched.setattr(sysid.conclusion, part, cancelled)
+        patched.setattr(f"sysid.{part}", cancelled)
         with pytest.raises(KeyboardInterrupt):
-            workers.tasks.advance(pack, ["short"], RECORDS["short"])
-    (again,) = workers.tasks.advance(pack, ["short"], RECORDS["short"])
+            workers.tasks.advance(pack, ["drifting"], records)
+    (again,) = workers.tasks.advance(pack, ["drifting"], records)
     assert isinstance(whole.outcome, Concluded)
     assert isinstance(again.outcome, Concluded)
     assert bits(again.outcome.identification) == bits(whole.outcome.identification)
