@@ -12,7 +12,7 @@ it (going on as it went there, it would not have come half way to its threshold)
 is not above 5 % of its excursion, and if no other input moves in between.
 The input's own onset is taken the same way, so that a ramp is not counted as delay; an input that
 is held moves at its samples. Both read the measurement: no model enters. Of very many events some,
-spread evenly over the record, are enough for a median.
+spread evenly over the record and in step with no pattern in it, are enough for a median.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,6 +38,7 @@ _LAST = 0.25  # of a rest: the part from which the level is taken
 _CREEP = 0.5  # of the threshold: what still moves so far by itself is not at rest
 _STAYS = 3  # samples beyond the threshold that make an onset
 _MOST = 500  # events that are looked at
+_GOLDEN = 0.5 * (sqrt(5.0) - 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +127,15 @@ def _pair(number: int, first: Channel, then: Channel, others: Sequence[Channel])
 
 
 def _spread(events: Sequence[_Event]) -> Sequence[_Event]:
-    """All events, or of more than are needed as many as are, from the first to the last."""
+    """All events, or of more than are needed as many as are, from the first on.
+
+    Their places times the golden ratio are as even as can be, and in step with no pattern: every
+    second event of a square wave would be a rising edge.
+    """
     if len(events) <= _MOST:
         return events
-    return [events[i] for i in np.linspace(0, len(events) - 1, _MOST).round().astype(int)]
+    turns = (_GOLDEN * np.arange(len(events))) % 1.0
+    return [events[i] for i in np.sort(np.argsort(turns, kind="stable")[:_MOST])]
 
 
 def _at_event(

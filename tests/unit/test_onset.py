@@ -166,3 +166,17 @@ def test_of_many_events_an_even_part_gives_the_same_delay(monkeypatch: pytest.Mo
     assert every.events > 150
     assert 20 < some.events <= 40
     assert some.delay == pytest.approx(every.delay, abs=1e-9)
+
+
+def test_of_a_square_wave_both_edges_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(onset, "_MOST", 40)
+    times, falls = 0.1 * np.arange(79 * 30 + 20), np.arange(79) % 2 == 1
+    u, y = np.zeros(times.size), np.zeros(times.size)
+    for event, does_fall in enumerate(falls):
+        at, late = 20 + 30 * event, 8 if does_fall else 3  # samples: it opens faster than it shuts
+        u[at:], y[at + late :] = not does_fall, not does_fall
+    record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
+    (found,) = onset_delays(load_model("fopdt"), (record,))
+    assert found.events == 40
+    assert found.delay is not None
+    assert found.spread == pytest.approx(0.25, abs=0.01)  # half the delays' difference
