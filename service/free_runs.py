@@ -30,7 +30,7 @@ from service.storage.tables import Dataset, Run
 from service.sweeps import body_of
 from sysid.errors import InvalidRecord, RecordTooShort, nearest
 from sysid.metrics import Metrics
-from sysid.models.initial import initial_parameters
+from sysid.models.initial import initial_name, initial_parameters
 from sysid.models.model import Model
 from sysid.records import Channel, Record
 from sysid.signal_units import SignalUnits
@@ -40,6 +40,12 @@ if TYPE_CHECKING:
     from sysid.problem import Problem
 
 MOST_SAMPLES = 1_000_000
+MOST_RECORDS = 2000
+MOST_STEPS = 1_000_000_000
+"""Of integration or recursion, in a search for starts: some ten seconds."""
+LEAST_SIMULATIONS = 100
+MOST_WORK = 30_000_000
+"""Measured values times starts that are searched together: their derivatives are in memory."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,9 +174,16 @@ def _records(
     holds = {channels.get(name, name): hold for name, hold in request.get("hold", {}).items()}
     try:
         recording = recording_of(store, row.sha256).held(holds)
-        return recording.records(inputs, outputs, row.name)
+        found = recording.records(inputs, outputs, row.name)
     except InvalidRecord as error:
         raise InvalidRequest.at("/dataset", str(error)) from None
+    if len(found) > MOST_RECORDS:
+        raise InvalidRequest.at(
+            "/dataset",
+            f"{row.name!r} has {len(found)} segments; at most {MOST_RECORDS} are simulated for a "
+            "request: derive a recording of some of them with 'select' or 'trim'",
+        )
+    return found
 
 
 def _problem(
@@ -203,15 +216,53 @@ def _fixed(estimate: Mapping[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _judged(problem: "Problem", run: Run, row: Dataset) -> FreeRun:
-    from sysid.problem import metrics_of
+def _starts(problem: "Problem") -> FloatArray:
+    """The starts (D,) that fit best.
+
+    Those of a record touch no other, so each record is searched alone: all at once the effort
+    would grow with the cube of their number.
+    """
+    most = max(LEAST_SIMULATIONS, MOST_STEPS // problem.n_steps)
+    changes = problem.arguments[2]
+    if len(problem.records) == 1 or any("tied" in fields for fields in changes.values()):
+        return _searched(problem, most)
+    return np.concatenate([_searched(one, most) for one in _alone(problem)])
+
+
+def _alone(problem: "Problem") -> "Iterator[Problem]":
+    """Each record of a problem by itself, its starts by the names of the first."""
+    model, records, changes, *_ = problem.arguments
+    fixed = {one.name: changes[one.name] for one in model.parameters if one.name in changes}
+    for number, record in enumerate(records):
+        names = {initial_name(one.name, 0): initial_name(one.name, number) for one in model.states}
+        starts = {own: changes[name] for own, name in names.items() if name in changes}
+        yield problem.build(
+            model, [record], parameters=fixed | starts, weights=problem.output_weights,
+            skip=problem.arguments[6],
+        )  # fmt: skip
+
+
+def _searched(problem: "Problem", simulations: int) -> FloatArray:
     from sysid.refinement import refine
 
-    theta = np.zeros(0)
-    if problem.space:
-        middle = 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
-        found = refine(problem, [middle])[0]
-        theta = middle if found is None else found.theta
+    if not problem.space:
+        return np.zeros(0)
+    work = problem.evaluator.n_measured * len(problem.space)
+    if work > MOST_WORK:
+        raise InvalidRequest.at(
+            "/dataset",
+            f"{len(problem.space)} starts are to be found on {problem.evaluator.n_measured} "
+            f"measured values: their product may be {MOST_WORK:.3g}; derive a shorter recording",
+        )
+    middle: FloatArray = 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
+    found = refine(problem, [middle], simulations)[0]
+    return middle if found is None else found.theta
+
+
+def _judged(problem: "Problem", run: Run, row: Dataset) -> FreeRun:
+    from sysid.problem import metrics_of
+
+    theta = _starts(problem)
     predicted = problem.predictions(theta[None])[0]
     metrics = _in_units(metrics_of(problem, predicted), problem.records)
     if not isfinite(metrics.rms):

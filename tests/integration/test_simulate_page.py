@@ -10,6 +10,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
+from sysid import refinement
+from sysid.problem import Problem
+from sysid.refinement import refine
 from tests.identified import identified
 from tests.rest import refused, settings_of
 
@@ -70,6 +73,30 @@ def test_over_a_recording_of_the_same_system_the_model_is_right_wherever_it_star
     assert experiment["measured"][0]["values"][:3] == pytest.approx(
         experiment["simulated"][0]["values"][:3], abs=1e-5
     )
+
+
+def test_the_start_of_each_record_is_searched_on_it_alone(
+    place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = ["series,t,u,y"]
+    rows += [f"{n},{0.1 * k:.1f},{(k // 9) % 2},{n * 0.9**k}" for n in range(5) for k in range(60)]
+    answer = place.client.post(
+        "/v1/datasets?name=five&segments=series", content="\n".join(rows).encode(),
+        headers={"content-type": "text/csv"},
+    )  # fmt: skip
+    searched = []
+
+    def noted(problem: Problem, *arguments: Any) -> Any:
+        searched.append([one.name for one in problem.space])
+        return refine(problem, *arguments)
+
+    monkeypatch.setattr(refinement, "refine", noted)
+    found = validated(place, dataset=answer.json()["id"]).json()
+    assert searched == 5 * [["x(0)"]]
+    assert list(found["starts"]) == ["x(0)", *(f"x(0)[{n}]" for n in range(2, 6))]
+    starts = list(found["starts"].values())
+    assert starts == sorted(starts)
+    assert starts[4] - starts[0] > 1
 
 
 def test_over_a_recording_of_another_system_it_is_not(place: Place) -> None:
