@@ -10,6 +10,7 @@
     - InvalidRequest         422  the body or a query value cannot be used, with every fault
     - TooMuchUnfinished      429  the project has as much queued and running as it may
     - Unavailable            503  a part the service needs is down
+        - Busy                    too many requests of a heavy kind
     - Misconfigured               the settings cannot be used (command line only)
     - ServiceDidNotStart          `lagid serve` ended or did not get ready (command line only)
 
@@ -153,6 +154,17 @@ class Unavailable(ServiceError):
     """A part that the service needs is down."""
 
     status, kind, title = 503, "unavailable", "A part of the service is down"
+
+
+class Busy(Unavailable):
+    """Too many requests of a heavy kind at once."""
+
+    title = "The service has too much to do"
+
+    @property
+    def headers(self) -> Mapping[str, str]:
+        """When to ask again."""
+        return {"Retry-After": "2"}
 
 
 class Misconfigured(ServiceError):

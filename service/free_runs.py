@@ -28,6 +28,7 @@ from service.storage.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Dataset, Run
 from service.sweeps import body_of
+from service.turns import simulating
 from sysid.errors import InvalidRecord, RecordTooShort, nearest
 from sysid.metrics import Metrics
 from sysid.models.initial import initial_name, initial_parameters
@@ -89,6 +90,7 @@ def free_run(
     )  # fmt: skip
 
 
+@simulating.one()
 def judged(database: Database, store: ObjectStore, run_id: str, body: FreeRunIn) -> FreeRun:
     """The same as arrays; raises as `free_run` does."""
     with database.read() as session:

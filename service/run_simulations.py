@@ -28,6 +28,7 @@ from service.storage.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Run
 from service.sweeps import body_of
+from service.turns import simulating
 from sysid.errors import InvalidSettings, nearest
 from sysid.models.model import FixedInitial, Model
 from sysid.records import Channel, Recording
@@ -57,6 +58,7 @@ class _Simulated:
     notes: list[str]
 
 
+@simulating.one()
 def simulate(
     database: Database, store: ObjectStore, run_id: str, body: RunSimulateIn, max_points: int
 ) -> RunSimulationOut:

@@ -17,6 +17,7 @@ from service.storage.datasets import DatasetRepository, Stored, row_of
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
+from service.turns import simulating
 from sysid.errors import InvalidSettings, nearest
 from sysid.models.lags import check_lags
 from sysid.models.model import FixedInitial, Model
@@ -51,6 +52,7 @@ class Simulated:
         )  # fmt: skip
 
 
+@simulating.one()
 def simulate(database: Database, store: ObjectStore, body: SimulateIn) -> Stored:
     """Make a dataset of a model's or plant's signals; the same body gives the same dataset.
 

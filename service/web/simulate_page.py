@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from service import free_runs, run_simulations
 from service.conversion import faults_of
-from service.errors import FieldError, InvalidRequest, ServiceError
+from service.errors import FieldError, InvalidRequest, ServiceError, Unavailable
 from service.free_runs import FreeRun
 from service.models import model_of_run
 from service.pointers import explained
@@ -107,6 +107,7 @@ def simulate_page(
     kind: Kind = "loop"
     context: dict[str, Any] = {}
     faults: list[FieldError] = []
+    status = 200
     try:
         kind = kind_of(query)
         if is_asked(query):
@@ -117,13 +118,14 @@ def simulate_page(
             context |= _figure_context(figure) | _request(known.run, wanted, base_url)
     except (ServiceError, StorageError, SysidError) as error:
         faults = [at_home(one) for one in _faults(error)]
+        status = error.status if isinstance(error, Unavailable) else 422
     page = render(
         "simulate.html", known=known, kind=kind, kinds=KINDS,
         values={**known.defaults, **query}, faults={f.pointer[1:]: f.detail for f in faults},
         lines=[_line(one) for one in faults], query=_address(query), label_of=label_of,
         **{"result": None, "free": None, "figure": None, **context},
     )  # fmt: skip
-    return Shown(page, is_csv=False, status=422 if faults else 200)
+    return Shown(page, is_csv=False, status=status)
 
 
 def _known(session: Session, run_id: str, query: Mapping[str, str]) -> _Known:

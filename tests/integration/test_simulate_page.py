@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
+from service.turns import AT_ONCE, WAITING, simulating
 from sysid import refinement
 from sysid.problem import Problem
 from sysid.refinement import refine
@@ -240,3 +242,38 @@ def test_a_run_without_estimates_says_so(tmp_path: Path) -> None:
     assert answer.status_code == 200
     assert "has no estimates" in answer.text
     assert "<form" not in answer.text
+
+
+def test_while_too_many_simulate_the_others_are_asked_to_come_again_and_nothing_else_waits(
+    place: Place,
+) -> None:
+    step = {"inputs": {"u": {"kind": "step"}}, "samples": 50, "sample_time": 0.1}
+    query = {"kind": "loop", "gain": "1", "duration": "5", "sample_time": "0.1"}
+    made = {**NOISELESS, "parameters": TRUE}
+    with ExitStack() as others:
+        for _ in range(AT_ONCE):
+            others.enter_context(simulating.one())
+        others.enter_context(_all_places())
+        for answer in (
+            place.client.post(f"/v1/runs/{place.run}:simulate", json=step),
+            place.client.post("/v1/datasets:simulate", json=made),
+            validated(place, dataset=place.other),
+        ):
+            refused(answer, 503, "unavailable")
+            assert answer.headers["retry-after"] == "2"
+        page = place.client.get(place.page, params=query)
+        assert (page.status_code, "ask again" in page.text) == (503, True)
+        assert place.client.get(place.page).status_code == 200
+    assert place.client.get(place.page, params=query).status_code == 200
+
+
+@contextmanager
+def _all_places() -> Iterator[None]:
+    """All that may wait are there."""
+    here = simulating._here
+    for _ in range(WAITING):
+        assert here.acquire(blocking=False)
+    try:
+        yield
+    finally:
+        here.release(WAITING)

@@ -1,0 +1,53 @@
+"""Turns at what is heavy: so many at once, some wait, the others are refused at once."""
+
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+
+import pytest
+
+from service.errors import Busy
+from service.turns import Turns
+
+
+def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused() -> None:
+    turns, begun, ended = Turns(at_once=2, waiting=1), [Event(), Event(), Event()], Event()
+
+    def work(number: int) -> int:
+        with turns.one():
+            begun[number].set()
+            assert ended.wait(30)
+        return number
+
+    with ThreadPoolExecutor(3) as pool:
+        first = [pool.submit(work, number) for number in range(2)]
+        assert all(one.wait(30) for one in begun[:2])
+        third = pool.submit(work, 2)
+        assert not begun[2].wait(0.05)
+        with pytest.raises(Busy, match="too many"), turns.one():
+            pass
+        ended.set()
+        assert [one.result() for one in (*first, third)] == [0, 1, 2]
+    with turns.one():
+        pass
+
+
+def test_who_waits_too_long_is_told_and_leaves_its_place() -> None:
+    turns = Turns(at_once=1, waiting=1, seconds=0.01)
+    with turns.one():
+        for _ in range(3):
+            with pytest.raises(Busy, match=r"0\.01 s"), turns.one():
+                pass
+    with turns.one():
+        pass
+
+
+def test_a_fault_gives_the_turn_back() -> None:
+    turns = Turns(at_once=1, waiting=0)
+
+    @turns.one()
+    def fails() -> None:
+        raise KeyError
+
+    for _ in range(3):
+        with pytest.raises(KeyError):
+            fails()
