@@ -85,8 +85,9 @@ class StopIn(Body):
     """End conditions besides the generations.
 
     `settled`: `improved` ends when searches from random places and from beside the best individual
-    found it again two times more than that, a third of all of them; where the fitness jumps
-    nearby, that many of either kind, and nearly all; null: never.
+    found it again two times more than that, a third of all of them, the more of them the less those
+    from random places agree; where the fitness jumps nearby, that many of either kind, and nearly
+    all; null: never.
     """
 
     evaluations: Evaluations | None = None

@@ -61,7 +61,8 @@ class Stop:
     """End conditions besides the generations; whichever comes first. None: not used.
 
     `settled`: the best individual was found again by two searches more than that, half of that
-    at least from new random places and half from beside it, and by a third of all searches.
+    at least from new random places and half from beside it, and by a third of all searches; where
+    fewer than half of those from random places agree, only after two and a half times as many.
     Where the fitness jumps nearby, by that many of either kind, by two thirds of those from random
     places and nine of ten from beside it. Only the adaptive sequence search makes these, so that
     the paper's methods never end by it.
