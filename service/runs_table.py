@@ -3,7 +3,8 @@
 import csv
 import io
 import json
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from service.storage.jobs import JobRepository
@@ -12,6 +13,9 @@ from service.storage.sessions import Database
 from service.storage.tables import Run
 
 AT_ONCE = 500
+FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""What a formula begins with, in one spreadsheet or another."""
+_NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
 COLUMNS = ("number", "id", "state", "valid", "best_rms", "fit_estimation", "fit_validation",
            "evaluations", "generations", "seconds", "error")  # fmt: skip
 
@@ -20,7 +24,8 @@ def table(database: Database, job_id: str) -> Iterator[str]:
     """Lines of the table, some hundred runs at a time, each part read in a session of its own.
 
     One row a run in the order of the sweep: its columns, the values of the axes by their paths,
-    its labels, and estimate and standard error of every parameter that the job tells.
+    its labels, and estimate and standard error of every parameter that a run has. A text that a
+    spreadsheet would take for a formula begins with an apostrophe, which it hides.
 
     Raises
     ------
@@ -30,9 +35,9 @@ def table(database: Database, job_id: str) -> Iterator[str]:
     with database.read() as session:
         spec = JobRepository(session).get(job_id).spec
         runs = RunRepository(session)
-        some = [*runs.page(job_id, limit=1, order="best_rms").items,
-                *runs.page(job_id, limit=AT_ONCE).items]  # fmt: skip
-        parameters = list(dict.fromkeys(name for run in some for name in run.estimates or {}))
+        best = runs.page(job_id, limit=1, order="best_rms").items
+        names = [*((best[0].estimates or {}) if best else ()), *runs.estimated(job_id)]
+    parameters = list(dict.fromkeys(names))
     axes = (spec.get("sweep") or {}).get("axes") or []
     paths = [axis["path"] for axis in axes]
     labels = list(dict.fromkeys(
@@ -75,7 +80,15 @@ def _plain(value: object) -> object:
     return json.dumps(value) if isinstance(value, dict | list) else value
 
 
-def _lines(rows: Sequence[Sequence[Any]]) -> str:
+def _lines(rows: Iterable[Sequence[Any]]) -> str:
     sink = io.StringIO()
-    csv.writer(sink, lineterminator="\n").writerows(rows)
+    csv.writer(sink, lineterminator="\n").writerows(map(_inert, row) for row in rows)
     return sink.getvalue()
+
+
+def _inert(value: object) -> object:
+    """A value that no spreadsheet carries out, and no reader takes for two lines."""
+    if not isinstance(value, str):
+        return value
+    is_formula = value.startswith(FORMULA) and not _NUMBER.fullmatch(value)
+    return ("'" if is_formula else "") + value.replace("\r", " ")

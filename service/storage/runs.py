@@ -4,7 +4,18 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
-from sqlalchemy import ColumnElement, Select, cast, exists, func, literal, or_, select, type_coerce
+from sqlalchemy import (
+    ColumnElement,
+    Select,
+    cast,
+    exists,
+    func,
+    literal,
+    or_,
+    select,
+    true,
+    type_coerce,
+)
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
@@ -101,6 +112,16 @@ class RunRepository:
         columns = [getattr(Run, name) for name in RunRow._fields]
         query = select(*columns).where(*self._of(job_id)).order_by(Run.number)
         return [RunRow(*row) for row in self._session.execute(query)]
+
+    def estimated(self, job_id: str) -> list[str]:
+        """Names of all parameters that runs of a job have estimates of, the earliest first."""
+        if self._session.get_bind().dialect.name == "postgresql":
+            each = func.jsonb_object_keys(Run.estimates).table_valued("key").render_derived()
+        else:
+            each = func.json_each(Run.estimates).table_valued("key")
+        found = select(each.c.key, func.min(Run.number)).select_from(Run).join(each, true())
+        query = found.where(*self._of(job_id), Run.estimates.is_not(None)).group_by(each.c.key)
+        return [name for name, _ in sorted(self._session.execute(query), key=lambda one: one[1])]
 
     def history(self, run_id: str) -> list[HistoryPoint]:
         """Better champions of a run, island by island, in the order they were found."""

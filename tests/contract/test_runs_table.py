@@ -1,0 +1,68 @@
+"""The table of all runs of a job: complete, and nothing in it is carried out by a spreadsheet."""
+
+import csv
+import io
+
+from service import runs_table
+from service.storage.ledger import Cell, RunLedger, RunOutcome, add_runs
+from service.storage.queue import Queue
+from service.storage.runs import RunRepository
+from service.storage.sessions import Database
+from service.storage.tables import State
+from tests.stored import claim, submit
+
+EVIL = '=HYPERLINK("http://x","y")'
+
+
+def ended(
+    database: Database, cells: list[Cell], outcomes: dict[int, dict[str, float] | str]
+) -> str:
+    """A job whose runs of these numbers have estimates, or failed for a reason."""
+    job = submit(database, n_runs=len(cells))
+    got = claim(database)
+    assert got is not None
+    with database.write() as session:
+        add_runs(session, got.job, cells)
+        runs = RunRepository(session).page(job, limit=10_000).items
+        RunLedger(session, got.lease).record([
+            _outcome(run.id, outcomes[run.number]) for run in runs if run.number in outcomes
+        ])  # fmt: skip
+        Queue(session).finish(got.lease, State.FAILED, "stopped")
+    return job
+
+
+def _outcome(run: str, told: dict[str, float] | str) -> RunOutcome:
+    if isinstance(told, str):
+        return RunOutcome(run_id=run, state=State.FAILED, error=told)
+    parameters = [{"name": name, "value": value, "stderr": None} for name, value in told.items()]
+    return RunOutcome(
+        run_id=run, state=State.SUCCEEDED, result={"parameters": parameters}, best_rms=1.0
+    )
+
+
+def rows(database: Database, job: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO("".join(runs_table.table(database, job)))))
+
+
+def test_parameters_that_only_late_runs_have_are_in_the_table(database: Database) -> None:
+    cells = [Cell(number=number) for number in range(1200)]
+    job = ended(database, cells, {0: {"K": 2.0}, 3: "no", 1199: {"K": 3.0, "late": 0.1}})
+    found = rows(database, job)
+    assert len(found) == 1200
+    assert (found[1199]["K"], found[1199]["late"], found[0]["late"]) == ("3.0", "0.1", "")
+    assert (found[3]["error"], found[3]["K"]) == ("no", "")
+
+
+def test_a_table_of_runs_without_estimates_has_no_columns_of_parameters(database: Database) -> None:
+    found = rows(database, ended(database, [Cell(number=0)], {}))
+    assert [one["state"] for one in found] == ["failed"]
+    assert list(found[0])[-1] == "error"
+
+
+def test_no_text_of_a_user_is_a_formula_in_a_spreadsheet(database: Database) -> None:
+    cells = [Cell(number=0), Cell(number=1)]
+    job = ended(database, cells, {0: EVIL, 1: "-2"})
+    assert [one["error"] for one in rows(database, job)] == [f"'{EVIL}", "-2"]
+    for text in ("+1+cmd|' /C calc'!A0", "-2*K", "@SUM(1)", "\t=1", "\r=1"):
+        [row] = rows(database, ended(database, [Cell(number=0)], {0: text}))
+        assert row["error"] == f"'{text}".replace("\r", " ")
