@@ -11,7 +11,7 @@ from threading import BoundedSemaphore
 from service.errors import Busy
 
 AT_ONCE = 2
-WAITING = 6
+WAITING = 16
 LONGEST_SECONDS = 20.0
 
 
