@@ -122,9 +122,10 @@ def _worse_than_a_line(problem: Problem, simulated: FloatArray) -> list[str]:
             rms = _rms(y - model)
             if rms > line:
                 where = f" of experiment {e + 1}" if len(problem.experiments) > 1 else ""
+                unit = "" if output.unit == "1" else f" {output.unit}"
                 found.append(
                     f"the model fits {output.name}{where} worse than a straight line "
-                    f"(RMS {rms:.4g} against {line:.4g} {output.unit})"
+                    f"(RMS {rms:.4g} against {line:.4g}{unit})"
                 )
     return found
 

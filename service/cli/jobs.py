@@ -140,7 +140,9 @@ def resume(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
 
 def report(
     job: JobName,
-    file: Annotated[Path, typer.Option("--out", help="File to write.")] = Path("report.html"),
+    file: Annotated[Path, typer.Option("--output", "--out", "-o", help="File to write.")] = Path(
+        "report.html"
+    ),
     url: Url = DEFAULT_URL,
     key: Key = None,
 ) -> None:

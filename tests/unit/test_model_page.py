@@ -1,0 +1,31 @@
+"""docs/model.md: every field and function is there, and its example holds."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from sysid.language.scope import FUNCTIONS
+from sysid.models.documents import read_yaml
+from sysid.models.spec import parse_model
+
+PAGE = (Path(__file__).parents[2] / "docs/model.md").read_text(encoding="utf-8")
+SOLVER = ("method", "step", "substeps", "history", "interpolation")
+FIELDS = ("name", "title", "description", "source", "form", "inputs", "states", "parameters",
+          "constants", "equations", "outputs", "initial")  # fmt: skip
+
+
+def test_the_example_of_the_page_is_a_model() -> None:
+    [text] = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)
+    assert parse_model(read_yaml(text)).name == "valve-and-oven"
+
+
+@pytest.mark.parametrize("field", [*FIELDS, *(f"solver.{name}" for name in SOLVER)])
+def test_every_field_of_a_model_is_on_the_page(field: str) -> None:
+    assert re.search(rf"^\|.*`{re.escape(field)}`.*\|.*\|.+\|$", PAGE, re.M)
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_every_function_of_the_language_is_on_the_page(function: str) -> None:
+    [row] = re.findall(r"^\| functions \|(.*)\|$", PAGE, re.M)
+    assert re.search(rf"\b{function}\b", row)
