@@ -7,7 +7,7 @@ what was written before reads an object as the signals of one run. All numbers s
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from hashlib import blake2b
-from itertools import groupby
+from itertools import groupby, islice
 from typing import Any
 
 import sqlalchemy as sa
@@ -80,10 +80,10 @@ def _rebuild(name: str, was: Any, now: Any, keys: tuple[str, ...], convert: Any)
     )  # fmt: skip
     old, new = _table(old_name, was), _table(name, now)
     for rows in _of_runs(old):
-        made = [one for run, mine in groupby(rows, lambda row: row.run_id)
-                for one in convert(run, list(mine))]  # fmt: skip
-        if made:
-            op.get_bind().execute(sa.insert(new), made)
+        made = (one for run, mine in groupby(rows, lambda row: row.run_id)
+                for one in convert(run, list(mine)))  # fmt: skip
+        while some := list(islice(made, ROWS_AT_A_TIME)):
+            op.get_bind().execute(sa.insert(new), some)
     op.drop_table(old_name)
 
 
