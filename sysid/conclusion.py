@@ -10,7 +10,7 @@ from sysid.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.islands.archipelago import analysis_budget, of_island
 from sysid.islands.run_state import RunState
 from sysid.metrics import Metrics
-from sysid.neighbours import affordable, neighbourhood, widened
+from sysid.neighbours import Neighbourhood, affordable, neighbourhood, widened
 from sysid.noise_model import Generalised, generalised, whitening
 from sysid.onset import onset_delays
 from sysid.problem import Problem, metrics_of
@@ -154,7 +154,8 @@ def _with_neighbours(
     if most == 0 and is_late:
         return unchanged, replace(analysis, is_cut_short=True)
     if left is not None:
-        most = min(most, max(0, left - kept))
+        shared = 1 if problem.loss.noise_model == "white" else 2  # with the noise model
+        most = min(most, max(0, left - kept) // shared)
     found = neighbourhood(problem, theta, rms, analysis.linear, state.seed, most)
     spent = before + found.evaluations
     if found.best is not None:
@@ -162,12 +163,16 @@ def _with_neighbours(
         theta, rms = found.best.theta, found.best.rms
         left = None if left is None else left - analysis.evaluations - found.evaluations
         analysis = analyse(problem, theta, left)
-    if analysis.linear is not None:
-        names = tuple(p.name for p in problem.space)
-        share = analysis.linear.share
-        estimates = widened(analysis.estimates, names, problem.n_scored, found, share)
-        analysis = replace(analysis, estimates=estimates)
-    return Refined(theta, rms, spent), analysis
+    return Refined(theta, rms, spent), _widened(problem, analysis, found)
+
+
+def _widened(problem: Problem, analysis: Analysis, found: Neighbourhood) -> Analysis:
+    """The analysis with intervals that hold those of all minima found."""
+    if analysis.linear is None:
+        return analysis
+    names, share = tuple(p.name for p in problem.space), analysis.linear.share
+    estimates = widened(analysis.estimates, names, problem.n_scored, found, share)
+    return replace(analysis, estimates=estimates)
 
 
 def _under_noise(
@@ -195,6 +200,7 @@ def _under_noise(
         white = whitening(problem, found.correlation_times)
         analysis = analyse(problem, found.theta, None if left is None else left - spent, white)
         spent += analysis.evaluations
+        analysis = _widened(problem, analysis, Neighbourhood(None, found.minima, found.rms, 0))
     return found, replace(analysis, evaluations=spent, is_cut_short=is_cut_short)
 
 

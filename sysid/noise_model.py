@@ -62,12 +62,18 @@ class Generalised(NamedTuple):
     evaluations : int
     is_complete : bool
         False where the simulations that were left did not suffice.
+    minima : FloatArray, shape (m, D)
+        Where least squares ended from all starts, the estimate among them.
+    rms : FloatArray, shape (m,)
+        Of the whitened residuals there.
     """
 
     theta: FloatArray
     correlation_times: Mapping[str, float]
     evaluations: int
     is_complete: bool
+    minima: FloatArray = np.zeros((0, 0))
+    rms: FloatArray = np.zeros(0)
 
 
 def whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
@@ -125,7 +131,8 @@ def _told(
     """The estimates at a place, those there were where no correlation was found."""
     if any(known.values()):
         theta = located(problem.evaluator, place[None])[0]
-    return Generalised(theta, known, search.evaluations, is_complete)
+    minima = located(problem.evaluator, search.ends)
+    return Generalised(theta, known, search.evaluations, is_complete, minima, search.rms)
 
 
 def _starts(
@@ -219,6 +226,7 @@ class _Search:
     def __init__(self, problem: Problem, budget: int) -> None:
         self.problem, self._budget, self.evaluations = problem, budget, 0
         self.is_cut = False  # whether a minimum was left before its end for want of simulations
+        self.ends, self.rms = np.zeros((0, len(problem.space))), np.zeros(0)  # of the last round
         self._rows = np.flatnonzero(problem.evaluator.weight > 0)
         self._weight = problem.evaluator.weight[self._rows]
         self._measured = problem.evaluator.measured[self._rows]
@@ -249,7 +257,9 @@ class _Search:
     ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
         """The lowest minimum from a place with its residuals and from other such starts."""
         ends = [self.minimum(*start, white) for start in (here, *starts)]
-        return ends[int(np.argmin(_sums(white.of(np.array([error for _, error in ends])))))]
+        totals = _sums(white.of(np.array([error for _, error in ends])))
+        self.ends, self.rms = np.array([place for place, _ in ends]), np.sqrt(totals)
+        return ends[int(np.argmin(totals))]
 
     def minimum(
         self, place: FloatArray, error: FloatArray, white: Whitening
