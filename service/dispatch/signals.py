@@ -4,6 +4,7 @@ import io
 import time
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
+from weakref import WeakSet
 
 from service.signals.writer import FittedOutput, write_fit
 from service.storage.errors import ObjectStoreFailed
@@ -17,6 +18,8 @@ PARCEL_BYTES = 4 << 20
 PATIENCE_SECONDS = 15.0
 """How long a store that takes nothing, such as a full disk, is waited for."""
 PAUSE_SECONDS = 0.3
+_lost: "WeakSet[ObjectStore]" = WeakSet()
+"""Stores that have not come back in time."""
 
 
 class Place(NamedTuple):
@@ -30,12 +33,12 @@ class Place(NamedTuple):
 class _PatientStore:
     """Puts objects into a store that may be full or away for a while.
 
-    A store that has not come back in time is not waited for again until it has taken something.
+    A store that has not come back in time is not waited for again until it has taken something,
+    by none of the jobs that a dispatcher holds: all of them wait meanwhile.
     """
 
     def __init__(self, store: ObjectStore) -> None:
         self._store = store
-        self._is_lost = False
 
     def put(self, blocks: Sequence[bytes]) -> str:
         begun = time.monotonic()
@@ -43,12 +46,12 @@ class _PatientStore:
             try:
                 sha256 = self._store.put_stream(blocks).sha256
             except ObjectStoreFailed:
-                if self._is_lost or time.monotonic() - begun > PATIENCE_SECONDS:
-                    self._is_lost = True
+                if self._store in _lost or time.monotonic() - begun > PATIENCE_SECONDS:
+                    _lost.add(self._store)
                     raise
                 time.sleep(PAUSE_SECONDS)
             else:
-                self._is_lost = False
+                _lost.discard(self._store)
                 return sha256
 
 

@@ -144,3 +144,12 @@ def test_a_store_that_stays_full_is_waited_for_once_until_it_takes_something(
     assert store.left == before - 1
     store.left = 0
     assert read(store, shelf.add(b"kept").place()) == b"kept"
+
+
+def test_a_store_that_stays_full_is_waited_for_by_one_job_of_many(monkeypatch):
+    full = FullStore()
+    for place in range(1, 5):
+        monkeypatch.setattr(signals, "PATIENCE_SECONDS", -1.0 if place == 1 else 0.2)
+        with pytest.raises(ObjectStoreFailed):
+            Shelf(full).add(b"of another job").place()
+        assert full.asked == place
