@@ -54,6 +54,8 @@ def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, pa
     expect(page.locator("#check")).to_contain_text("can be used")
     page.get_by_label("upper of L").fill("0.3")
     page.get_by_label("output y").select_option("P2")
+    page.get_by_label("u between samples").select_option("zero")
+    page.get_by_label("noise").select_option("ar1")
     page.get_by_label("population").fill("24")
     page.get_by_label("name of the job").fill("by hand")
     page.get_by_role("button", name="Identify").click()
@@ -65,6 +67,8 @@ def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, pa
     assert spec["datasets"] == [own_site.filled.dataset]
     assert spec["channels"] == {"u": "P1", "y": "P2"}
     assert spec["parameters"] == {"L": {"upper": 0.3}}
+    assert spec["hold"] == {"u": "zero"}
+    assert spec["loss"]["noise_model"] == "ar1"
     assert spec["algorithm"]["population"] == 24
 
 

@@ -27,6 +27,18 @@ def opened_sweep(site: Site, page: Page, model: str = "fopdt") -> None:
 def test_a_sweep_tells_its_runs_before_it_is_submitted_and_makes_as_many(
     own_site: Site, page: Page
 ) -> None:
+    simulated = httpx.post(
+        f"{own_site.url}/v1/datasets:simulate",
+        json={
+            "model": "fopdt",
+            "name": "whose truth is known",
+            "parameters": {"K": 2, "T": 1, "L": 0.5, "y0": 0},
+            "inputs": {"u": {"kind": "binary", "period": 2}},
+            "samples": 50,
+            "sample_time": 0.1,
+        },
+    )
+    assert simulated.status_code == 201
     opened_sweep(own_site, page)
     for name, value in {"K": "2", "T": "1", "L": "0.5", "y0": "0"}.items():
         page.get_by_label(re.compile(rf"^true {name}\b")).fill(value)

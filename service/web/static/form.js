@@ -8,12 +8,16 @@ const form = document.getElementById('job-form');
 const field = (name) => form.elements.namedItem(name);
 const state = { dataset: null, model: null, cloned: null, extra: {}, started: false };
 const query = new URLSearchParams(location.search);
+const HOLDS = [['', 'as the recording says'], ['zero', 'held (zero)'], ['first', 'straight line (first)'], ['band-limited', 'band-limited']];
 
 async function start() {
   if (state.started) return;
   state.started = true;
   const [datasets, models] = await Promise.all([ask('/v1/datasets?limit=200'), ask('/v1/models')]);
-  for (const one of datasets.items) field('dataset').append(new Option(one.name, one.id));
+  for (const one of datasets.items) {
+    field('dataset').append(new Option(one.name, one.id));
+    field('validation').append(new Option(`recording ${one.name}`, one.id));
+  }
   for (const one of models.items) field('model').append(new Option(one.title ? `${one.name} – ${one.title}` : one.name, one.name));
   if (query.get('clone')) await fillFrom(query.get('clone'));
   else {
@@ -34,6 +38,7 @@ async function fillFrom(job) {
   set('evaluations', algorithm.stop?.evaluations);
   for (const key of ['seed', 'prediction']) set(key, request[key]);
   set('loss', request.loss?.kind);
+  set('noise_model', request.loss?.noise_model);
   const fraction = request.validation?.fraction;
   if (fraction) {
     const known = [...field('validation').options].some((one) => one.value === String(fraction));
@@ -53,7 +58,7 @@ async function fillFrom(job) {
     state.cloned = { text, model: request.model };
     await own(text, request.parameters);
   }
-  mapChannels(request.channels);
+  mapChannels(request.channels, request.hold);
 }
 
 async function choose(id) {
@@ -144,7 +149,7 @@ function take(document, changes) {
 }
 
 /** One choice per signal of the model; an equal name is taken, else the one at the same place. */
-function mapChannels(wanted = {}) {
+function mapChannels(wanted = {}, held = holds()) {
   if (!state.model || !state.dataset) return;
   const recorded = state.dataset.channels.map((one) => one.name);
   const inputs = Object.keys(state.model.inputs ?? {});
@@ -161,8 +166,24 @@ function mapChannels(wanted = {}) {
     label.append(select);
     return label;
   });
-  document.getElementById('channels').replaceChildren(...choices);
+  document.getElementById('channels').replaceChildren(...choices, ...inputs.map((signal) => betweenSamples(signal, held[signal])));
 }
+
+/** What an input does between its samples; read wrongly, it moves a lag by half a sample. */
+function betweenSamples(signal, hold) {
+  const label = element('label', `${signal} between samples`);
+  const select = document.createElement('select');
+  select.dataset.hold = signal;
+  select.dataset.pointer = `/hold/${signal}`;
+  for (const [value, text] of HOLDS) select.append(new Option(text, value));
+  select.value = hold ?? '';
+  label.append(select);
+  return label;
+}
+
+/** The inputs for which something else is chosen than what the recording says. */
+const holds = () =>
+  Object.fromEntries([...form.querySelectorAll('[data-hold]')].filter((one) => one.value).map((one) => [one.dataset.hold, one.value]));
 
 const channels = () =>
   Object.fromEntries([...form.querySelectorAll('[data-signal]')].map((one) => [one.dataset.signal, one.value]));
@@ -192,13 +213,20 @@ function body() {
     model: isOwn() ? ownModel() : field('model').value,
     datasets: datasets.filter(Boolean),
     channels: channels(),
-    validation: validation === 'clone' ? kept.validation : validation ? { fraction: Number(validation) } : null,
+    hold: holds(),
+    validation: validation === 'clone' ? kept.validation : chosenValidation(validation),
     parameters: overrides(),
     prediction: field('prediction').value,
-    loss: { ...kept.loss, kind: field('loss').value },
+    loss: { ...kept.loss, kind: field('loss').value, noise_model: field('noise_model').value },
     algorithm,
     seed: number('seed') ?? 1,
   };
+}
+
+/** None, the last part of the recording, or another recording. */
+function chosenValidation(value) {
+  if (!value) return null;
+  return value.startsWith('ds_') ? { datasets: [value] } : { fraction: Number(value) };
 }
 
 async function submit(event) {

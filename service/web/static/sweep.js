@@ -63,7 +63,7 @@ function count() {
 
 function truth() {
   const found = { parameters: {}, inputs: {}, samples: number(field('samples').value), sample_time: number(field('sample_time').value) };
-  for (const one of form.querySelectorAll('[data-truth]')) {
+  for (const one of form.querySelectorAll('input[data-truth]')) {
     const value = number(one.value);
     if (value !== null) found.parameters[one.dataset.truth] = value;
   }
