@@ -178,6 +178,37 @@ def test_a_job_of_many_runs_shows_a_table_and_the_best_of_them(site: Site, page:
     assert page.locator(f"{figure(page, 'history')} {LINES}").count() >= 4
 
 
+def test_when_another_run_becomes_the_best_all_that_is_shown_is_of_that_run(
+    site: Site, page: Page
+) -> None:
+    page.goto(f"{site.url}/jobs/{site.filled.sweep}")
+    figure(page, "history")
+    shown = page.locator("#run")
+    first = shown.get_attribute("data-run")
+    other = page.locator("table.runs tbody tr").nth(6).get_by_role("link").get_attribute("href")
+    assert other is not None
+    page.evaluate(
+        """async (other) => {
+          history.replaceState(null, '', other);
+          const job = document.querySelector('script[type=module][src*="job.js"]').src;
+          const [live, figures] = await Promise.all(['live.js', 'figures.js']
+            .map((name) => import(new URL(name, job))));
+          await live.refresh();
+          figures.watch();
+        }""",
+        other,
+    )
+    run = other.rpartition("/")[2]
+    assert run != first
+    expect(shown).to_have_attribute("data-run", run)
+    expect(shown.get_by_role("heading", name="run 7", exact=True)).to_be_visible()
+    plots = shown.locator("[data-figure]")
+    urls = [one.get_attribute("data-url") or "" for one in plots.all()]
+    assert urls
+    assert all(run in url for url in urls)
+    assert page.locator(f"{figure(page, 'history')} {LINES}").count() >= 4
+
+
 def test_the_page_of_a_dataset_draws_its_channels_and_a_zoom_brings_more_samples(
     site: Site, page: Page
 ) -> None:

@@ -116,7 +116,10 @@ const watcher = new IntersectionObserver(
   { rootMargin: '300px' },
 );
 
+/** Draw every plot once it is on the screen, those too that have come to the page since. */
+export const watch = () => plots().filter((plot) => !seen.has(plot)).forEach((plot) => watcher.observe(plot));
+
 export function begin() {
-  plots().forEach((plot) => watcher.observe(plot));
+  watch();
   dark.addEventListener('change', () => redraw());
 }

@@ -1,6 +1,6 @@
 // A job's page: plots, live regions while the job is open, and its actions.
 
-import { begin, choose, plots, profile, redraw } from './figures.js';
+import { begin, choose, plots, profile, redraw, watch } from './figures.js';
 import { Problem, element, post, put, refresh, throttled } from './live.js';
 
 const { job, runs } = document.getElementById('job').dataset;
@@ -11,6 +11,7 @@ let stream = null;
 const renew = throttled(async () => {
   const wasOpen = isOpen();
   await refresh();
+  watch();
   await redraw(isOpen() ? ['history', 'convergence'] : undefined);
   if (wasOpen && !isOpen()) close();
 }, 1000 + Number(runs) / 10); // the database looks at all runs of a sweep for its page
@@ -48,6 +49,7 @@ async function act(button) {
   try {
     await post(`/v1/jobs/${encodeURIComponent(job)}:${button.dataset.act}`);
     await refresh();
+    watch();
     listen();
   } catch (error) {
     if (!(error instanceof Problem)) throw error;

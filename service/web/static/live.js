@@ -2,11 +2,18 @@
 
 const PROBLEM = 'application/problem+json';
 
+/** The best run of a sweep has become another one: all that is shown of a run is taken from it. */
+function takeRun(fresh) {
+  const [shown, next] = [document, fresh].map((one) => one.getElementById('run'));
+  if (shown && next && shown.dataset.run !== next.dataset.run) shown.replaceWith(document.adoptNode(next.cloneNode(true)));
+}
+
 /** Replace every live region whose content has changed; nothing else of the page moves. */
 export async function refresh() {
   const answer = await fetch(location.href, { headers: { Accept: 'text/html' } });
   if (!answer.ok) return null;
   const fresh = new DOMParser().parseFromString(await answer.text(), 'text/html');
+  takeRun(fresh);
   for (const region of document.querySelectorAll('[data-live]')) {
     const next = fresh.querySelector(`[data-live="${region.dataset.live}"]`);
     if (!next) continue;
