@@ -8,6 +8,7 @@ from sysid.pulls import AT_BOUND
 from sysid.types import BoolArray, FloatArray
 
 RANK = 1e-7  # of the largest singular value: below, the differences are rounding
+_STREAM = 2**63
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +55,14 @@ def drawn_along(covariance: FloatArray) -> FloatArray:
     deviation = np.sqrt(np.where(variance > 0, variance, 1.0))
     size, rows = np.linalg.eigh(covariance / np.outer(deviation, deviation))
     return np.asarray(deviation[:, None] * rows * np.sqrt(np.maximum(size, 0.0)))
+
+
+def moves_of(seed: int) -> np.random.Generator:
+    """Numbers for moves around an estimate: others than those that noise of that seed is made of.
+
+    `sysid.noise` numbers its streams by channels.
+    """
+    return np.random.Generator(np.random.Philox(key=[seed, _STREAM]))
 
 
 def linear_model(

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.linear import Linear, drawn_along
+from sysid.linear import Linear, drawn_along, moves_of
 from sysid.problem import Problem
 from sysid.refinement import Refined, refine_one
 from sysid.result import Estimate
@@ -90,10 +90,9 @@ def neighbourhood(
             ends = look.minima(best)
             found += ends
             reached = min((best, *ends), key=lambda one: one.rms)
-            if not reached.rms < best.rms * (1.0 - _BETTER):
-                break
-            best = reached
-            if best.rms == 0:
+            gains = reached.rms < best.rms * (1.0 - _BETTER)
+            best = reached  # also where it is lower by rounding only: what follows ends the lowest
+            if not gains or best.rms == 0:
                 break
         found.append(look.followed(best) if best.rms > 0 else best)
         best = found[-1]
@@ -110,7 +109,7 @@ class _Look:
     def __init__(self, problem: Problem, linear: Linear, seed: int, budget: int) -> None:
         self._problem, self._budget, self.spent = problem, budget, 0
         self._linear = linear
-        self._random = np.random.Generator(np.random.Philox(key=seed))
+        self._random = moves_of(seed)
         self.root = drawn_along(linear.covariance)
 
     def is_rough(self, centre: Refined) -> bool:

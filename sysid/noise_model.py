@@ -31,7 +31,7 @@ from numpy.fft import irfft, rfft
 from sysid.ga.chromosome import located, placed
 from sysid.ga.gauss_newton import damped_step
 from sysid.lagged_sums import laid_out
-from sysid.linear import drawn_along
+from sysid.linear import drawn_along, moves_of
 from sysid.problem import Problem
 from sysid.serial import Part, is_coloured, parts
 from sysid.types import FloatArray
@@ -107,7 +107,7 @@ def generalised(
     error = search.errors(place[None])[0]
     coloured = {one.output for one in parts(problem) if is_coloured(one, error[one.rows])}
     known: Mapping[str, float] = {}
-    random = np.random.Generator(np.random.Philox(key=seed))
+    random = moves_of(seed)
     for i in range(_ROUNDS if coloured else 0):
         found = _correlation_times(problem, coloured, error, None)
         is_last = i == _ROUNDS - 1 or _are_alike(found, known)

@@ -8,9 +8,10 @@ import pytest
 from scipy.signal import lfilter
 
 from sysid.identify import identify
-from sysid.linear import drawn_along, linear_model
+from sysid.linear import drawn_along, linear_model, moves_of
 from sysid.models.library import load_model
 from sysid.neighbours import Neighbourhood, affordable, neighbourhood, widened
+from sysid.noise import Noise, noise_samples
 from sysid.problem import Problem
 from sysid.refinement import refine
 from sysid.result import Estimate
@@ -165,6 +166,13 @@ def test_moves_have_the_covariance_they_are_drawn_along_whatever_the_units() -> 
     assert root @ root.T == pytest.approx(correlation, abs=1e-14)
     held = drawn_along(np.diag([4.0, 0.0]))  # a parameter on a plateau stays
     assert held @ held.T == pytest.approx(np.diag([4.0, 0.0]), abs=1e-14)
+
+
+def test_moves_are_not_made_of_the_noise_that_was_added_with_the_same_seed() -> None:
+    moves = moves_of(1).standard_normal(50)
+    for stream in (0, 1, 1000):
+        assert not np.isin(moves, noise_samples(Noise(1.0, 1), 50, stream)).any()
+    assert moves.tobytes() == moves_of(1).standard_normal(50).tobytes()
 
 
 def test_without_a_budget_nothing_is_simulated() -> None:
