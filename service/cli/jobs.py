@@ -27,6 +27,7 @@ from service.cli.one_run import place_of, show_run
 from service.cli.places import in_file, told_at
 from service.cli.watching import follow
 from service.documents import read_yaml
+from service.errors import InvalidRequest
 
 if TYPE_CHECKING:
     from service.client import Client
@@ -158,17 +159,24 @@ def report(
 
 def job_of(file: Path) -> dict[str, Any]:
     """The body of a job file; a model named as a file is read, beside the job file."""
-    body = read_yaml(read_file(file))
+    body = _yaml_of(file)
     if not isinstance(body, dict):
         fail(f"{file} does not hold a job (model: …, datasets: […])")
     model = body.get("model")
     if isinstance(model, str) and model.endswith(FILE_SUFFIXES):
-        body["model"] = read_yaml(read_file(file.parent / model))
+        body["model"] = _yaml_of(file.parent / model)
     for one in body.get("datasets") or []:
         if isinstance(one, str) and one.endswith(DATA_SUFFIXES):
             fail(f"{file}: datasets are ids or names on the server, and {one!r} is a file; "
                  f"add it first: lagid dataset add {one}")  # fmt: skip
     return body
+
+
+def _yaml_of(file: Path) -> Any:
+    try:
+        return read_yaml(read_file(file))
+    except InvalidRequest as error:
+        fail(f"{file}: {error}")
 
 
 def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
