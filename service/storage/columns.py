@@ -16,6 +16,8 @@ Document: TypeAlias = dict[str, Any]
 
 DocumentType = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql")
 """JSON text on SQLite, JSONB on PostgreSQL; None is NULL."""
+WrittenType = JSON(none_as_null=True)
+"""JSON as it was written: JSONB sorts keys, and a search draws parameters in their order."""
 
 _ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=False, separators=(",", ":"))
 _SURROGATE = re.compile("[\ud800-\udfff]")

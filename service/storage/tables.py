@@ -13,6 +13,7 @@ from service.storage.columns import (
     LargeInteger,
     Text,
     UtcDateTime,
+    WrittenType,
     state_type,
     utc_now,
 )
@@ -140,7 +141,7 @@ class Model(Base):
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
     name: Mapped[str]
     version: Mapped[int]
-    document: Mapped[Document]
+    document: Mapped[Document] = mapped_column(WrittenType)
     document_hash: Mapped[str]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     deleted_at: Mapped[datetime | None]
@@ -168,7 +169,7 @@ class Job(Base):
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
     name: Mapped[str]
     state: Mapped[State] = mapped_column(default=State.QUEUED)
-    spec: Mapped[Document]
+    spec: Mapped[Document] = mapped_column(WrittenType)
     priority: Mapped[int] = mapped_column(default=0)
     max_attempts: Mapped[int] = mapped_column(default=3)
     attempt: Mapped[int] = mapped_column(default=0)

@@ -34,6 +34,16 @@ def test_a_submitted_job_is_queued_and_kept_whole(database):
     assert job.created_at.tzinfo is UTC
 
 
+def test_a_specification_keeps_the_order_of_its_keys(database):
+    parameters = {name: {"lower": 0, "upper": 1} for name in ("zeta", "T", "L", "gain")}
+    with database.write() as session:
+        job = JobRepository(session).submit(
+            NewJob(name="order", spec={"model": {"parameters": parameters}}, n_runs=1)
+        )
+    found = job_of(database, job.job.id).spec["model"]["parameters"]
+    assert list(found) == ["zeta", "T", "L", "gain"]
+
+
 def test_the_same_request_under_the_same_key_is_one_job(database):
     found = []
     for _ in range(2):
