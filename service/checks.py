@@ -13,6 +13,7 @@ from service.named_datasets import dataset_of
 from service.pointers import explained
 from service.record_checks import (
     channel_faults,
+    given_both_ways,
     length_faults,
     pieces_of,
     unit_faults,
@@ -186,6 +187,7 @@ class JobChecker:
         self, body: Body, model: Model, parameters: tuple[Parameter, ...]
     ) -> Iterator[FieldError]:
         kept: float | None = (body["validation"] or {}).get("fraction")
+        yield from given_both_ways(body["channels"], model)
         for pointer, reference in _references(body):
             dataset = self.dataset(reference)
             if isinstance(dataset, str):

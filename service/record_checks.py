@@ -10,6 +10,7 @@ from sysid.models.lags import check_length, longest_lag, past_signals
 from sysid.models.model import Model
 from sysid.models.sections import interval
 from sysid.parameters import Parameter
+from sysid.records import both_ways
 from sysid.signal_units import SignalUnits
 
 
@@ -51,6 +52,13 @@ def channel_faults(
                 f"dataset {dataset.id} ({dataset.name}) has no channel {channel!r} for signal "
                 f"{signal!r} of the model{nearest(channel, known)}",
             )
+
+
+def given_both_ways(channels: Mapping[str, str], model: Model) -> Iterator[FieldError]:
+    """Inputs to which the channel of an output is given."""
+    given = [{one: channels.get(one, one) for one in group} for group in signals_of(model)]
+    for signal, fault in both_ways(*given).items():
+        yield FieldError(f"/channels/{signal}" if signal in channels else "/channels", fault)
 
 
 def unit_faults(

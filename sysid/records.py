@@ -196,9 +196,11 @@ class Recording:
         Raises
         ------
         InvalidRecord
-            If a channel is not there, an input has missing values, an output has no value, or
-            the recording consists of several segments.
+            If a channel is not there or both an input and an output, an input has missing
+            values, an output has no value, or the recording consists of several segments.
         """
+        for fault in both_ways(inputs, outputs).values():
+            raise InvalidRecord(fault)
         if len(self.segments) > 1:
             raise InvalidRecord(
                 f"the recording has {len(self.segments)} segments, each measured on its own; "
@@ -225,6 +227,23 @@ class Recording:
     def _piece(self, segment: Segment) -> "Recording":
         cut = [channel.between(segment.start, segment.stop) for channel in self.channels]
         return Recording(tuple(replace(one, times=own_times(one.times, segment)) for one in cut))
+
+
+def both_ways(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> dict[str, str]:
+    """Inputs whose channel is that of an output as well, and what is wrong with that.
+
+    Parameters
+    ----------
+    inputs, outputs : mapping of str to str
+        Model's name → channel's name.
+    """
+    measured = {channel: name for name, channel in outputs.items()}
+    return {
+        name: f"channel {channel!r} is given to input {name!r} and to output "
+        f"{measured[channel]!r}: an output that is its own input tells nothing"
+        for name, channel in inputs.items()
+        if channel in measured
+    }
 
 
 def own_times(times: FloatArray, segment: Segment) -> FloatArray:

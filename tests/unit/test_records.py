@@ -23,6 +23,12 @@ def test_an_unknown_channel_is_told_with_the_nearest() -> None:
         Recording((ramp("P1"),)).record({"u": "P11"}, {"y": "P1"})
 
 
+def test_an_output_that_is_its_own_input_is_refused() -> None:
+    recording = Recording((ramp("P1"), ramp("P2")))
+    with pytest.raises(InvalidRecord, match="'P2' is given to input 'u' and to output 'y'"):
+        recording.record({"u": "P2"}, {"y": "P2"})
+
+
 def test_missing_values_are_an_error_in_an_input_and_none_in_an_output() -> None:
     holes = Channel("x", np.arange(3.0), np.array([1.0, np.nan, 2.0]))
     recording = Recording((holes,))

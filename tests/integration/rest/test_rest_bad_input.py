@@ -362,6 +362,14 @@ def test_an_unknown_channel_names_those_that_are_there(own: TestClient) -> None:
     assert "P1, P2" in faults[0]["detail"]
 
 
+def test_an_output_that_is_its_own_input_is_refused(own: TestClient) -> None:
+    answer = own.post("/v1/datasets?name=p", content=recording(columns=("P1", "P2")), headers=CSV)
+    body = {"model": "fopdt", "datasets": [answer.json()["id"]], "channels": {"u": "P2", "y": "P2"}}
+    [fault] = refused(own.post("/v1/jobs", json=body), 422, "invalid")
+    assert fault["pointer"] == "/channels/u"
+    assert "to input 'u' and to output 'y'" in fault["detail"]
+
+
 def test_validation_data_in_other_units_or_with_other_channels_are_refused(own: TestClient) -> None:
     def stored(columns: str) -> str:
         text = recording().decode().replace("t,u,y", columns)
