@@ -17,7 +17,7 @@ spread evenly over the record and in step with no pattern in it, are enough for 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from math import sqrt
+from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -95,6 +95,44 @@ def onset_delays(model: Model, records: Sequence[Record]) -> tuple[OnsetDelay, .
         for then in record.outputs
         if then.name in outputs
     )
+
+
+def moves_alone(record: Record) -> tuple[str, float] | None:
+    """The first output that leaves a rest before any input does, and when (s); None if none does.
+
+    So a record looks that begins with the step itself: the step is then before all samples. The
+    output goes a tenth of its range before an input has gone a hundredth of its own: where both
+    grow slowly from nothing, either may be the first to leave its rest.
+    """
+    inputs = min((_moved(one) for one in record.inputs), default=-inf)
+    found = []
+    for output in record.outputs:
+        there = np.isfinite(output.values)
+        times, values = output.times[there], output.values[there]
+        leaves = _leaves(times, values)
+        if not leaves < inputs:
+            continue
+        rest = times <= leaves
+        way = np.abs(values[times <= inputs] - np.mean(values[rest]))
+        if float(np.max(way)) < _NOTABLE * float(np.ptp(values)):
+            continue
+        if _creep(times[rest], values[rest], leaves) <= _CREEP * _tolerance(values):
+            found.append((leaves, output.name))
+    return None if not found else (min(found)[1], min(found)[0])
+
+
+def _moved(channel: Channel) -> float:
+    """When an input has gone 1 % of its range, its noise included: s; inf if it is constant."""
+    away = np.abs(channel.values - channel.values[0]) > _TOLERANCE * float(np.ptp(channel.values))
+    return float(channel.times[np.argmax(away)]) if np.any(away) else inf
+
+
+def _leaves(times: FloatArray, values: FloatArray) -> float:
+    """The last time of the rest that a signal begins with: inf without one or if all is rest."""
+    first = next(iter(_rests(values)), None)
+    if first is None or first[0] > 0:
+        return inf
+    return inf if first[1] >= values.size else float(times[first[1] - 1])
 
 
 def _pair(number: int, first: Channel, then: Channel, others: Sequence[Channel]) -> OnsetDelay:

@@ -6,6 +6,7 @@ import numpy as np
 
 from sysid.islands.archipelago import of_island
 from sysid.kernels.demand import is_difference, lags
+from sysid.onset import moves_alone
 from sysid.problem import Problem
 from sysid.residuals import ResidualTests
 from sysid.result import Estimate, Group, NoiseColour, Uncertainty
@@ -52,6 +53,7 @@ def warnings_of(
     found += _worse_than_a_line(problem, simulated)
     found += _without_excitation(problem, analysis.estimates)
     found += _steps_read_as_ramps(problem)
+    found += _begun_before(problem)
     found += [text for e in analysis.estimates if (text := _of_estimate(e))]
     lagged = lag_parameters(problem)
     if analysis.uncertainty is not None:
@@ -104,6 +106,23 @@ def _steps_read_as_ramps(problem: Problem) -> list[str]:
         f"{{{name}: zero}}"
         for name in sorted(names)
     ]
+
+
+def _begun_before(problem: Problem) -> list[str]:
+    """Records of a lagged input whose output leaves its rest while no input has moved."""
+    if not lags(problem.model, "input"):
+        return []
+    found = []
+    for number, record in enumerate(problem.records, 1):
+        if alone := moves_alone(record):
+            where = f" in experiment {number}" if len(problem.records) > 1 else ""
+            found.append(
+                f"output {alone[0]!r} begins to move at t = {alone[1]:.4g} s{where} although no "
+                "input has moved yet: if the record begins with the step itself, the lag comes out "
+                "wrong, since an input is taken to have stood at its first value all the time "
+                "before; put some rows of the input at rest before the record"
+            )
+    return found
 
 
 def _worse_than_a_line(problem: Problem, simulated: FloatArray) -> list[str]:

@@ -9,7 +9,7 @@ import pytest
 from service.signals.csv_reader import read_csv
 from sysid import onset
 from sysid.models.library import load_model
-from sysid.onset import OnsetDelay, onset_delays
+from sysid.onset import OnsetDelay, moves_alone, onset_delays
 from sysid.records import Channel, Hold, Record
 from sysid.types import FloatArray
 
@@ -180,3 +180,48 @@ def test_of_a_square_wave_both_edges_are_looked_at(monkeypatch: pytest.MonkeyPat
     assert found.events == 40
     assert found.delay is not None
     assert found.spread == pytest.approx(0.25, abs=0.01)  # half the delays' difference
+
+
+def _step_test(rest: float, noise: float = 0.0, creep: float = 0.0) -> Record:
+    """A first-order lag with a dead time of 2 s; the input steps after `rest` s, and at 25 s."""
+    times = np.arange(400) * 0.1
+    command = np.where(times >= rest, 1.0, 0.0) - np.where(times > 25.0, 0.7, 0.0)
+    late = np.interp(times - 2.0, times, command, left=0.0)
+    response = np.zeros_like(times)
+    for k in range(1, times.size):
+        response[k] = response[k - 1] + 0.1 * (late[k - 1] - response[k - 1]) / 3.0
+    response += creep * np.exp(-times / 3.0)
+    response += np.random.default_rng(5).normal(0.0, noise, times.size)
+    return Record((Channel("u", times, command, hold="zero"),), (Channel("y", times, response),))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_record_that_begins_with_its_step_is_told_apart(noise: float) -> None:
+    alone = moves_alone(_step_test(0.0, noise))
+    assert alone is not None
+    assert alone[0] == "y"
+    assert alone[1] == pytest.approx(2.0, abs=0.4)
+    assert moves_alone(_step_test(5.0, noise)) is None
+
+
+def test_where_both_grow_from_nothing_the_output_does_not_move_alone() -> None:
+    times = np.arange(4000) * 0.01
+    grown = (times / 40.0) ** 2 * np.sin(5.0 * times)
+    before = Channel("u", times, grown)
+    earlier = Channel("y", times, np.interp(times + 0.5, times, grown) * 3.0)
+    assert moves_alone(Record((before,), (earlier,))) is None
+
+
+def test_what_is_not_at_rest_in_the_beginning_does_not_move_alone() -> None:
+    assert moves_alone(_step_test(0.0, creep=1.0)) is None
+    assert moves_alone(_step_test(5.0, creep=1.0)) is None
+
+
+def test_missing_samples_hide_no_rest_and_no_rest_is_found_without_samples() -> None:
+    record = _step_test(0.0)
+    [output] = record.outputs
+    values = output.values.copy()
+    values[3:6] = np.nan
+    assert moves_alone(Record(record.inputs, (Channel("y", output.times, values),))) is not None
+    short = Channel("y", output.times[:5], output.values[:5])
+    assert moves_alone(Record(record.inputs, (short,))) is None
