@@ -35,7 +35,7 @@ def test_a_killed_database_costs_nothing_but_time(tmp_path: Path, server: Any) -
         stream.measure()
         stream.start()
         (before,) = stand.family.dispatchers()
-        bench = Bench(stand, stream.jobs, server)
+        bench = Bench(stand, stream, server)
         faults.kill_postgres(bench)
         faults.kill_postgres(bench)
         assert stand.family.dispatchers() == [before]  # it waited

@@ -157,7 +157,7 @@ def test_what_identify_cannot_do_in_this_process_is_refused(
 def test_a_file_that_is_not_utf8_is_said_without_an_empty_place(tmp_path: Path) -> None:
     job = tmp_path / "job.yaml"
     job.write_bytes(b"model: \xff")
-    assert refused(lagid("submit", job)).startswith("lagid: not UTF-8")
+    assert refused(lagid("submit", job)).startswith(f"lagid: {job}: not UTF-8")
 
 
 def test_no_server_is_said_with_what_to_do() -> None:

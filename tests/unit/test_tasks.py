@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -149,6 +149,16 @@ def test_terms_are_selected_anew_for_other_noise() -> None:
     assert beside.model.selection == alone.model.selection
 
 
+@pytest.fixture
+def interrupts() -> Iterator[None]:
+    """SIGINT is Python's own here, whatever a dispatcher or Ray of another test has made of it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    if before is not None:  # one that was not set from Python cannot be set again
+        signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interrupts")
 @pytest.mark.parametrize(
     "part",
     ["conclusion.refine", "conclusion.analyse", "conclusion.residual_tests",
