@@ -1,8 +1,10 @@
 """Units: which are the same, by what they differ, and that a record in another one is told."""
 
+from ast import literal_eval
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sysid.derivations import derive
@@ -166,11 +168,12 @@ def test_for_a_unit_that_nobody_knows_the_one_written_most_alike_is_suggested(
 
 
 @given(st.text(max_size=90))
+@example("1\rM")
 def test_what_is_suggested_can_be_read_and_nothing_is_for_what_can_be(unit: str) -> None:
     told = suggestion(unit)
     if told:
         assert not is_read(unit)
-        assert is_read(told.removeprefix("; did you mean '").removesuffix("'?"))
+        assert is_read(literal_eval(told.removeprefix("; did you mean ").removesuffix("?")))
 
 
 def test_channels_in_units_that_nobody_knows_are_told_and_others_are_not() -> None:

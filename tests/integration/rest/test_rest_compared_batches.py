@@ -81,7 +81,7 @@ def test_what_the_reference_was_made_with_otherwise_is_told(served: Served) -> N
     assert against(served)["notes"] == []
     other = against(
         served, hold={"u": "zero"}, parameters={"K": {"fixed": 1.0}},
-        loss={"kind": "soft-l1", "scale": 0.05}, channels={"u": "y"},
+        loss={"kind": "soft-l1", "scale": 0.05}, channels={"u": "y", "y": "u"},
     )  # fmt: skip
     (note,) = other["notes"]
     assert note.startswith("the reference was made with ")
