@@ -4,10 +4,11 @@ import asyncio
 import json
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypedDict
+from uuid import uuid4
 
 if TYPE_CHECKING:
     import httpx
@@ -19,7 +20,7 @@ TERMINAL = frozenset({"succeeded", "failed", "cancelled"})
 PIECE = 1 << 20
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 MEDIA_TYPES = {".csv": "text/csv", ".txt": "text/csv", ".mcap": "application/x-mcap"}
-
+IDEMPOTENCY = "Idempotency-Key"
 
 POLL_S = 0.3
 TIMEOUT_S = 60.0
@@ -147,14 +148,18 @@ def create(what: str, body: Any, headers: Mapping[str, str] | None = None) -> Ca
     return Call("POST", f"/v1/{what}", json=body, headers=headers or {})
 
 
-def noise_sweep(body: Mapping[str, Any], key: str | None) -> Call:
-    """POST of a noise sweep; the same idempotency key again gives the same job."""
-    return create("recipes/noise-sweep", body, {"Idempotency-Key": key} if key else {})
+def queue(what: str, body: Mapping[str, Any], key: str | None) -> Call:
+    """POST that queues a job; the same idempotency key again gives the same job.
+
+    Without a key it has one of its own, so that it can be sent again where no answer came.
+    """
+    return create(what, body, {IDEMPOTENCY: key or uuid4().hex})
 
 
-def reidentify(body: Mapping[str, Any], key: str | None) -> Call:
-    """POST of a batch re-identification; the same idempotency key again gives the same job."""
-    return create("recipes/reidentify", body, {"Idempotency-Key": key} if key else {})
+def events(job: str, after: str | None) -> Call:
+    """GET of a job's events, those after a known one."""
+    call = read("jobs", job, "events")
+    return replace(call, headers={"Last-Event-ID": after}) if after else call
 
 
 def accept(name: str, run: str, by: str | None, note: str | None) -> Call:
@@ -192,6 +197,51 @@ def opened(content: bytes | Path | None) -> Iterator[bytes | BinaryIO | None]:
 def pieces(content: bytes | Path | None) -> bytes | AsyncIterator[bytes] | None:
     """Content to send from an asynchronous client."""
     return _read_pieces(content) if isinstance(content, Path) else content
+
+
+@contextmanager
+def unreachable_told(url: str) -> Iterator[None]:
+    """Raise `ServerUnreachable` where no answer comes."""
+    import httpx  # whoever sends has a client; a command without one starts sooner
+
+    try:
+        yield
+    except httpx.TransportError as error:
+        raise ServerUnreachable(url, str(error) or type(error).__name__) from error
+
+
+def request(call: Call, content: Any, *, stream: bool) -> dict[str, Any]:
+    """A call as httpx builds a request of it; a stream stays open as long as it has to."""
+    given = {"params": dict(call.params), "json": call.json, "headers": dict(call.headers)}
+    limit = {"timeout": None} if stream else {}
+    return {"method": call.method, "url": call.path, "content": content, **given, **limit}
+
+
+class Pages:
+    """What is listed under a path, page by page: `at_most` items, or all."""
+
+    def __init__(
+        self, parts: Sequence[str], at_most: int | None, filters: Mapping[str, Any]
+    ) -> None:
+        self._parts, self._filters = parts, filters
+        self._left, self._limit = at_most, min(at_most or PAGE, PAGE)
+        self._cursor: str | None = None
+        self._is_over = False
+
+    def next(self) -> Call | None:
+        """The call of the next page, until there is none."""
+        if self._is_over:
+            return None
+        return read(*self._parts, cursor=self._cursor, limit=self._limit, **self._filters)
+
+    def take(self, page: Document) -> list[Document]:
+        """The items of a page that answers the call."""
+        found: list[Document] = page["items"][: self._left]
+        if self._left is not None:
+            self._left -= len(found)
+        self._cursor = page["next"]
+        self._is_over = self._cursor is None or self._left == 0
+        return found
 
 
 def checked(answer: "httpx.Response") -> "httpx.Response":

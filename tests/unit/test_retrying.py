@@ -1,0 +1,182 @@
+"""The clients send a call again that a server could not serve just then, and only such a call."""
+
+import asyncio
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime, timedelta
+from email.utils import format_datetime
+from typing import Any
+
+import httpx
+import pytest
+
+from service import client as synchronous
+from service.client import AsyncClient, Client, ProblemError, ServerUnreachable
+
+JOB = {"id": "job_1", "state": "queued"}
+AWAY = httpx.codes.SERVICE_UNAVAILABLE
+
+
+class Server:
+    """Answers with these statuses, one after the other, and keeps what it was asked."""
+
+    def __init__(self, *statuses: int, headers: dict[str, str] | None = None) -> None:
+        self._statuses, self._headers = list(statuses), headers or {}
+        self.asked: list[httpx.Request] = []
+
+    def __call__(self, request: httpx.Request) -> httpx.Response:
+        self.asked.append(request)
+        status = self._statuses.pop(0)
+        if status == AWAY:
+            problem = {"title": "A part of the service is down", "detail": "try again"}
+            return httpx.Response(AWAY, headers=self._headers, json=problem)
+        return httpx.Response(status, json=JOB)
+
+
+@pytest.fixture
+def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Pauses that would have been made."""
+    pauses: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+
+    monkeypatch.setattr(synchronous.time, "sleep", pauses.append)
+    monkeypatch.setattr(asyncio, "sleep", sleep)
+    return pauses
+
+
+def synchronously(server: Server, name: str, *given: Any, **settings: Any) -> Any:
+    with Client("http://here", transport=httpx.MockTransport(server), **settings) as client:
+        return getattr(client, name)(*given)
+
+
+def asynchronously(server: Server, name: str, *given: Any, **settings: Any) -> Any:
+    async def work() -> Any:
+        transport = httpx.MockTransport(server)
+        async with AsyncClient("http://here", transport=transport, **settings) as client:
+            return await getattr(client, name)(*given)
+
+    return asyncio.run(work())
+
+
+Asked = Callable[..., Any]
+both = pytest.mark.parametrize("asked", [synchronously, asynchronously])
+
+
+@both
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [("job", ["job_1"]), ("accept_reference", ["tube", "run_1"]), ("submit", [{}]),
+     ("noise_sweep", [{}]), ("reidentify", [{}])],
+)  # fmt: skip
+def test_a_call_that_may_be_sent_twice_is_sent_until_it_is_served(
+    slept: list[float], asked: Asked, name: str, given: Sequence[Any]
+) -> None:
+    server = Server(AWAY, AWAY, 200)
+    assert asked(server, name, *given) == JOB
+    assert slept == [0.5, 1.0]
+    assert len({request.headers.get("Idempotency-Key") for request in server.asked}) == 1
+
+
+@both
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [("clone", ["job_1"]), ("simulate_dataset", [{}]), ("add_dataset", [b"t,u,y\n"])],
+)
+def test_a_call_that_might_be_carried_out_twice_is_sent_once(
+    slept: list[float], asked: Asked, name: str, given: Sequence[Any]
+) -> None:
+    server = Server(AWAY, 200)
+    with pytest.raises(ProblemError, match="try again"):
+        asked(server, name, *given)
+    assert (len(server.asked), slept) == (1, [])
+
+
+@both
+def test_a_job_has_a_key_of_its_own_if_none_is_given(slept: list[float], asked: Asked) -> None:
+    server = Server(200, 200)
+    asked(server, "submit", {})
+    asked(server, "submit", {})
+    keys = {request.headers["Idempotency-Key"] for request in server.asked}
+    assert len(keys) == 2
+    assert all(len(key) >= 32 for key in keys)
+
+
+@both
+@pytest.mark.parametrize(("retries", "pauses"), [(4, [0.5, 1.0, 2.0, 4.0]), (1, [0.5]), (0, [])])
+def test_in_the_end_the_refusal_is_raised(
+    slept: list[float], asked: Asked, retries: int, pauses: list[float]
+) -> None:
+    server = Server(*[AWAY] * 9)
+    with pytest.raises(ProblemError) as refused:
+        asked(server, "job", "job_1", retries=retries)
+    assert refused.value.status == AWAY
+    assert slept == pauses
+    assert len(server.asked) == retries + 1
+
+
+@pytest.mark.parametrize(
+    ("header", "pause"), [("2", 2.0), ("0", 0.0), (" 7 ", 7.0), ("soon", 0.5), ("-3", 0.5)]
+)
+def test_what_the_server_asks_for_is_waited(slept: list[float], header: str, pause: float) -> None:
+    server = Server(AWAY, 200, headers={"Retry-After": header})
+    assert synchronously(server, "job", "job_1") == JOB
+    assert slept == [pause]
+
+
+def test_a_date_is_waited_for(slept: list[float]) -> None:
+    for ahead, least, most in ((20, 15, 20), (-60, 0, 0)):
+        slept.clear()
+        until = format_datetime(datetime.now(UTC) + timedelta(seconds=ahead), usegmt=True)
+        synchronously(Server(AWAY, 200, headers={"Retry-After": until}), "job", "job_1")
+        assert least <= slept[0] <= most
+
+
+def test_nobody_waits_for_a_server_that_is_away_for_long(slept: list[float]) -> None:
+    server = Server(AWAY, 200, headers={"Retry-After": "3600"})
+    with pytest.raises(ProblemError):
+        synchronously(server, "job", "job_1")
+    assert (slept, len(server.asked)) == ([], 1)
+
+
+@pytest.mark.parametrize("status", [404, 409, 422, 429, 500, 502])
+def test_other_refusals_stand(slept: list[float], status: int) -> None:
+    server = Server(status, 200)
+    with pytest.raises(ProblemError):
+        synchronously(server, "job", "job_1")
+    assert slept == []
+
+
+def test_events_are_asked_for_again_and_told_from_where_they_broke_off(
+    slept: list[float],
+) -> None:
+    server = Server(AWAY, 200)
+
+    def stream(request: httpx.Request) -> httpx.Response:
+        answer = server(request)
+        text = 'id: 8\nevent: end\ndata: {"state": "failed"}\n\n'
+        return answer if answer.is_error else httpx.Response(200, text=text)
+
+    with Client("http://here", transport=httpx.MockTransport(stream)) as client:
+        [event] = client.events("job_1", after="7")
+    assert event == {"id": "8", "event": "end", "data": {"state": "failed"}}
+    assert [one.headers["Last-Event-ID"] for one in server.asked] == ["7", "7"]
+
+    async def work() -> list[Any]:
+        transport = httpx.MockTransport(stream)
+        async with AsyncClient("http://here", transport=transport) as client:
+            return [event async for event in client.events("job_1")]
+
+    server = Server(AWAY, 200)
+    assert asyncio.run(work()) == [event]
+
+
+def test_events_of_a_server_that_is_not_there() -> None:
+    with pytest.raises(ServerUnreachable), Client("http://127.0.0.1:1") as client:
+        list(client.events("job_1"))
+
+
+def test_both_clients_have_the_same_methods() -> None:
+    public = [{name for name in dir(one) if not name.startswith("_")}
+              for one in (Client, AsyncClient)]  # fmt: skip
+    assert public[0] == public[1]
