@@ -5,18 +5,25 @@ from dataclasses import replace
 import numpy as np
 
 from sysid.arguments import Arguments
+from sysid.kernels.inputs import mean_of_held
 from sysid.records import Channel, Recording, Segment
 from sysid.types import FloatArray
 
 MOST_SAMPLES = 50_000_000
+
+_ON_BORDER = 1e-6  # of a period: nearer to the border of two, a sample belongs to both
+_ROUNDING = 1e-9
 
 
 def resample(recording: Recording, given: Arguments) -> Recording:
     """Put every channel on a common grid with the period `sample_time` (s).
 
     The grid spans what all channels cover; each segment has its own. Method ``linear`` reads
-    between the samples (a channel with zero-order hold: the last sample); ``mean`` averages the
-    samples of each period, which keeps faster components from being folded into the slow ones.
+    between the samples (a channel with zero-order hold: the last sample, so that its jumps wait
+    for the next grid point); ``mean`` averages the samples from half a period before a grid point
+    to half a period behind it, which keeps faster components from being folded into the slow ones.
+    Of a channel with zero-order hold it is the mean over the period for which it is then held:
+    the jumps stay, on average, where they are, and so does a lag behind them.
     """
     given.only("sample_time", "method")
     period = given.positive("sample_time")
@@ -64,12 +71,30 @@ def _between(channel: Channel, grid: FloatArray, period: float) -> FloatArray:
 
 
 def _mean(channel: Channel, grid: FloatArray, period: float) -> FloatArray:
-    here = np.floor((channel.times - grid[0]) / period + 0.5).astype(np.int64)
-    inside = (here >= 0) & (here < grid.size)
-    counts = np.bincount(here[inside], minlength=grid.size)
-    sums = np.bincount(here[inside], weights=channel.values[inside], minlength=grid.size)
+    if channel.hold == "zero":
+        return _mean_while_held(channel, grid, period)
+    places = (channel.times - grid[0]) / period + 0.5
+    counts, sums = np.zeros(grid.size), np.zeros(grid.size)
+    # A sample on the border of two periods is half of either: else the mean would lie too early.
+    for border in (-_ON_BORDER, _ON_BORDER):
+        here = np.floor(places + border).astype(np.int64)
+        inside = (here >= 0) & (here < grid.size)
+        counts += np.bincount(here[inside], minlength=grid.size)
+        sums += np.bincount(here[inside], weights=channel.values[inside], minlength=grid.size)
     alone = _between(channel, grid, period)  # where a period has no sample of its own
     return np.where(counts > 0, sums / np.maximum(counts, 1), alone)
+
+
+def _mean_while_held(channel: Channel, grid: FloatArray, period: float) -> FloatArray:
+    """Mean from each grid point to the next; unknown where any of it is."""
+    missing = ~np.isfinite(channel.values)
+    known = replace(channel, values=np.where(missing, 0.0, channel.values))
+    means = mean_of_held(known, grid, period)
+    last = _between(known, grid, period)
+    # Where nothing jumps it is the value itself, to its last digit.
+    means = np.where(np.abs(means - last) <= _ROUNDING * np.ptp(known.values), last, means)
+    gaps = mean_of_held(replace(channel, values=missing.astype(np.float64)), grid, period)
+    return np.where(gaps > _ROUNDING, np.nan, means)
 
 
 def _moved(segment: Segment, grid: FloatArray) -> Segment:

@@ -76,7 +76,7 @@ def fine_input(
     times: FloatArray = start + (np.arange(count, dtype=np.float64) - cap) * (step / points)
     if mean is not None and channel.hold == "zero" and channel.times.size > 1:
         early = 0.5 * step if mean == "around" else 0.0
-        values = _mean_of_held(channel, times - early, step)
+        values = mean_of_held(channel, times - early, step)
         return FineInput(values, cap, points, 0, points, max(cap - 2, 0))
     jump = 1 if channel.hold == "zero" else 0
     return FineInput(
@@ -128,7 +128,7 @@ def _held(channel: Channel, times: FloatArray) -> FloatArray:
     return found
 
 
-def _mean_of_held(channel: Channel, times: FloatArray, width: float) -> FloatArray:
+def mean_of_held(channel: Channel, times: FloatArray, width: float) -> FloatArray:
     """Mean of a held channel over [t, t + width]: the difference of its integral, by `width`."""
     values, far = channel.values, width + float(np.ptp(times)) + float(np.ptp(channel.times))
     knots = np.concatenate([[channel.times[0] - far], channel.times, [channel.times[-1] + far]])

@@ -7,8 +7,12 @@ import pytest
 
 from sysid.derivations import derive
 from sysid.errors import InvalidSettings
+from sysid.models.library import load_model
 from sysid.noise import Noise, with_noise
-from sysid.records import Channel, Recording, Segment
+from sysid.problem import Problem
+from sysid.records import Channel, Hold, Recording, Segment
+from sysid.refinement import refine
+from sysid.simulation import simulate
 
 
 def recording(samples: int = 100) -> Recording:
@@ -110,6 +114,47 @@ def test_the_mean_of_each_period_is_taken() -> None:
     start = recording(101)
     made = derive(start, [{"resample": {"sample_time": 0.5, "method": "mean"}}])
     assert values(made, "u")[2] == pytest.approx(np.mean(values(start, "u")[8:13]))
+
+
+def test_a_held_input_is_averaged_over_the_period_for_which_it_is_then_held() -> None:
+    # Jumps between the points of the new grid must not move, or every lag behind them would.
+    held = Channel(
+        "u", np.array([0.0, 0.26, 0.75, 1.7]), np.array([1.0, 3.0, -1.0, 2.0]), "V", "zero"
+    )
+    made = derive(Recording((held,)), [{"resample": {"sample_time": 0.5, "method": "mean"}}])
+    expected = [
+        (0.26 * 1 + 0.24 * 3) / 0.5,
+        (0.25 * 3 - 0.25 * 1) / 0.5,
+        -1,
+        (-0.2 + 0.3 * 2) / 0.5,
+    ]
+    np.testing.assert_allclose(values(made, "u"), expected, rtol=1e-12)
+
+
+def test_a_gap_of_a_held_input_stays_one() -> None:
+    times = 0.1 * np.arange(20)
+    held = Channel("u", times, np.where(np.arange(20) == 6, np.nan, 0.1 * 3), "V", "zero")
+    made = derive(Recording((held,)), [{"resample": {"sample_time": 0.5, "method": "mean"}}])
+    np.testing.assert_array_equal(values(made, "u"), [0.1 * 3, np.nan, 0.1 * 3, 0.1 * 3])
+
+
+@pytest.mark.parametrize("hold", ["zero", "first"])
+def test_a_lag_survives_resampling_by_means(hold: Hold) -> None:
+    times = 0.01 * np.arange(4000)
+    draw = np.random.default_rng(1)
+    levels = draw.uniform(-1, 1, 41)[np.searchsorted(np.cumsum(draw.uniform(0.7, 1.5, 40)), times)]
+    if hold == "first":
+        levels = np.convolve(np.pad(levels, (60, 0), mode="edge"), np.full(61, 1 / 61), "valid")
+    model, truth = load_model("fopdt"), {"K": 2.0, "T": 1.0, "L": 0.53, "y0": 0.7, "x(0)": 0.0}
+    measured = simulate(model, [Channel("u", times, levels, "V", hold)], truth, times=times)
+    whole = Recording((Channel("u", times, levels, "V", hold), measured.channel("y")))
+    made = derive(whole, [{"resample": {"sample_time": 0.2, "method": "mean"}}])
+    problem = Problem.build(model, [made.record({"u": "u"}, {"y": "y"})])
+    start = np.array([truth[p.name] for p in problem.space])
+    (end,) = refine(problem, [start])
+    assert end is not None
+    found = dict(zip((p.name for p in problem.space), end.theta, strict=True))
+    assert found["L"] == pytest.approx(0.53, abs=0.01)
 
 
 def test_the_two_parts_of_a_split_are_the_whole() -> None:
