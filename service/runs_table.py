@@ -4,9 +4,11 @@ import csv
 import io
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+from service.rms_units import unit_of
 from service.storage.jobs import JobRepository
 from service.storage.runs import RunRepository
 from service.storage.sessions import Database
@@ -18,13 +20,31 @@ FORMULA = ("=", "+", "-", "@", "\t", "\r")
 _NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
 COLUMNS = ("number", "id", "state", "valid", "best_rms", "fit_estimation", "fit_validation",
            "evaluations", "generations", "seconds", "error")  # fmt: skip
+UNITS = {"fit_estimation": "%", "fit_validation": "%"}
+"""Of columns that do not have it in their name, and not from the job."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """What the columns of a job's table are; `parameters` are names with their units."""
+
+    paths: tuple[str, ...]
+    labels: tuple[str, ...]
+    parameters: tuple[tuple[str, str], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters, those of several units once."""
+        return tuple(dict.fromkeys(name for name, _ in self.parameters))
 
 
 def table(database: Database, job_id: str) -> Iterator[str]:
     """Lines of the table, some hundred runs at a time, each part read in a session of its own.
 
     One row a run in the order of the sweep: its columns, the values of the axes by their paths,
-    its labels, and estimate and standard error of every parameter that a run has. A text that a
+    its labels, and estimate, standard error and status of every parameter that a run has. A
+    heading has the unit behind the name, ``L [s]``, and none where there is no dimension; a
+    parameter that has several units, with several models, has columns for each. A text that a
     spreadsheet would take for a formula begins with an apostrophe, which it hides.
 
     Raises
@@ -36,44 +56,60 @@ def table(database: Database, job_id: str) -> Iterator[str]:
         spec = JobRepository(session).get(job_id).spec
         runs = RunRepository(session)
         best = runs.page(job_id, limit=1, order="best_rms").items
-        names = [*((best[0].estimates or {}) if best else ()), *runs.estimated(job_id)]
-    parameters = list(dict.fromkeys(names))
+        first = [(one["name"], one["unit"]) for run in best for one in _told(run)]
+        parameters = tuple(dict.fromkeys([*first, *runs.estimated(job_id)]))
+        units = {**UNITS, "best_rms": unit_of(session, spec)}
     axes = (spec.get("sweep") or {}).get("axes") or []
-    paths = [axis["path"] for axis in axes]
-    labels = list(dict.fromkeys(
+    labels = dict.fromkeys(
         name for axis in axes for one in axis.get("labels") or [] for name in one
-    ))  # fmt: skip
-    return _parts(database, job_id, paths, labels, parameters)
+    )
+    layout = _Layout(tuple(axis["path"] for axis in axes), tuple(labels), parameters)
+    return _parts(database, job_id, layout, units)
 
 
 def _parts(
-    database: Database, job_id: str, paths: Sequence[str], labels: Sequence[str],
-    parameters: Sequence[str],
-) -> Iterator[str]:  # fmt: skip
-    errors = [f"stderr of {name}" for name in parameters]
-    yield _lines([[*COLUMNS, *paths, *labels, *parameters, *errors]])
+    database: Database, job_id: str, layout: _Layout, units: Mapping[str, str]
+) -> Iterator[str]:
+    fixed = [_heading(name, units.get(name, "1")) for name in COLUMNS]
+    estimates = [
+        _heading(what + name, unit)
+        for name, unit in layout.parameters
+        for what in ("", "stderr of ")
+    ]
+    statuses = [f"status of {name}" for name in layout.names]
+    yield _lines([[*fixed, *layout.paths, *layout.labels, *estimates, *statuses]])
     cursor: str | None = None
     while True:
         with database.read() as session:
             page = RunRepository(session).page(job_id, cursor=cursor, limit=AT_ONCE)
-            rows = [_row(run, paths, labels, parameters) for run in page.items]
+            rows = [_row(run, layout) for run in page.items]
         yield _lines(rows)
         cursor = page.next
         if cursor is None:
             return
 
 
-def _row(
-    run: Run, paths: Sequence[str], labels: Sequence[str], parameters: Sequence[str]
-) -> list[Any]:
-    known = run.estimates or {}
-    found = [known.get(name) or {} for name in parameters]
+def _row(run: Run, layout: _Layout) -> list[Any]:
+    told = {(one["name"], one["unit"]): one for one in _told(run)}
+    statuses = {one["name"]: one["status"] for one in _told(run)}
+    found = [told.get(key) or {} for key in layout.parameters]
     return [
         run.number, run.id, run.state.value, *(getattr(run, name) for name in COLUMNS[3:]),
-        *(_plain(run.cell.get(path)) for path in paths),
-        *(_plain(run.labels.get(name)) for name in labels),
-        *(one.get("value") for one in found), *(one.get("stderr") for one in found),
+        *(_plain(run.cell.get(path)) for path in layout.paths),
+        *(_plain(run.labels.get(name)) for name in layout.labels),
+        *(one.get(what) for one in found for what in ("value", "stderr")),
+        *(statuses.get(name) for name in layout.names),
     ]  # fmt: skip
+
+
+def _told(run: Run) -> list[dict[str, Any]]:
+    """The estimates of a run's result."""
+    found: list[dict[str, Any]] = (run.result or {}).get("parameters", [])
+    return found
+
+
+def _heading(name: str, unit: str) -> str:
+    return name if unit == "1" else f"{name} [{unit}]"
 
 
 def _plain(value: object) -> object:

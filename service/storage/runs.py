@@ -113,15 +113,19 @@ class RunRepository:
         query = select(*columns).where(*self._of(job_id)).order_by(Run.number)
         return [RunRow(*row) for row in self._session.execute(query)]
 
-    def estimated(self, job_id: str) -> list[str]:
-        """Names of all parameters that runs of a job have estimates of, the earliest first."""
+    def estimated(self, job_id: str) -> list[tuple[str, str]]:
+        """Names and units of all parameters in the results of a job's runs, the earliest first."""
         if self._session.get_bind().dialect.name == "postgresql":
-            each = func.jsonb_object_keys(Run.estimates).table_valued("key").render_derived()
+            told = func.jsonb_array_elements(Run.result["parameters"]).table_valued("value")
+            each, entry = told.render_derived(), func.jsonb_extract_path_text
+            name, unit = (entry(each.c.value, key) for key in ("name", "unit"))
         else:
-            each = func.json_each(Run.estimates).table_valued("key")
-        found = select(each.c.key, func.min(Run.number)).select_from(Run).join(each, true())
-        query = found.where(*self._of(job_id), Run.estimates.is_not(None)).group_by(each.c.key)
-        return [name for name, _ in sorted(self._session.execute(query), key=lambda one: one[1])]
+            each = func.json_each(Run.result, "$.parameters").table_valued("value")
+            name, unit = (func.json_extract(each.c.value, f"$.{key}") for key in ("name", "unit"))
+        found = select(name, unit, func.min(Run.number)).select_from(Run).join(each, true())
+        query = found.where(*self._of(job_id), Run.result.is_not(None)).group_by(name, unit)
+        rows = sorted(self._session.execute(query), key=lambda row: row[2])
+        return [(row[0], row[1]) for row in rows]
 
     def history(self, run_id: str) -> list[HistoryPoint]:
         """Better champions of a run, island by island, in the order they were found."""

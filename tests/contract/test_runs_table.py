@@ -2,16 +2,24 @@
 
 import csv
 import io
+from collections.abc import Sequence
 
 from service import runs_table
+from service.storage.jobs import JobRepository, NewJob
 from service.storage.ledger import Cell, RunLedger, RunOutcome, add_runs
 from service.storage.queue import Queue
 from service.storage.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import State
-from tests.stored import claim, submit
+from tests.stored import claim
 
 EVIL = '=HYPERLINK("http://x","y")'
+
+
+def submit(database: Database, n_runs: int) -> str:
+    with database.write() as session:
+        new = NewJob(name="many", spec={"model": "silverbox"}, n_runs=n_runs)
+        return JobRepository(session).submit(new).job.id
 
 
 def ended(
@@ -34,7 +42,10 @@ def ended(
 def _outcome(run: str, told: dict[str, float] | str) -> RunOutcome:
     if isinstance(told, str):
         return RunOutcome(run_id=run, state=State.FAILED, error=told)
-    parameters = [{"name": name, "value": value, "stderr": None} for name, value in told.items()]
+    parameters = [
+        {"name": name, "unit": "1", "value": value, "stderr": None, "status": "fixed"}
+        for name, value in told.items()
+    ]
     return RunOutcome(
         run_id=run, state=State.SUCCEEDED, result={"parameters": parameters}, best_rms=1.0
     )
@@ -66,3 +77,45 @@ def test_no_text_of_a_user_is_a_formula_in_a_spreadsheet(database: Database) -> 
     for text in ("+1+cmd|' /C calc'!A0", "-2*K", "@SUM(1)", "\t=1", "\r=1"):
         [row] = rows(database, ended(database, [Cell(number=0)], {0: text}))
         assert row["error"] == f"'{text}".replace("\r", " ")
+
+
+def estimated(database: Database, job: str, told: Sequence[tuple[str, str, str]]) -> None:
+    """One run after the other, each with one estimate: name, unit and status."""
+    got = claim(database)
+    assert got is not None
+    with database.write() as session:
+        add_runs(session, got.job, [Cell(number=number) for number in range(len(told))])
+        runs = RunRepository(session).page(job).items
+        RunLedger(session, got.lease).record([
+            RunOutcome(
+                run_id=run.id, state=State.SUCCEEDED, best_rms=1.0 + run.number,
+                result={"parameters": [
+                    {"name": name, "unit": unit, "value": 0.5, "stderr": 0.25, "status": status}
+                ]},
+            )
+            for run, (name, unit, status) in zip(runs, told, strict=True)
+        ])  # fmt: skip
+        Queue(session).finish(got.lease, State.FAILED, "stopped")
+
+
+def test_headings_have_units_and_estimates_their_status(database: Database) -> None:
+    job = submit(database, n_runs=2)
+    estimated(database, job, [("L", "s", "identified"), ("K", "1", "at bound")])
+    first, second = rows(database, job)
+    assert (first["L [s]"], first["stderr of L [s]"]) == ("0.5", "0.25")
+    assert (first["status of L"], second["status of L"]) == ("identified", "")
+    assert (second["K"], second["stderr of K"], second["status of K"]) == (
+        "0.5",
+        "0.25",
+        "at bound",
+    )
+    assert (first["best_rms [V]"], first["fit_estimation [%]"]) == ("1.0", "")
+
+
+def test_a_parameter_of_two_units_has_columns_for_each(database: Database) -> None:
+    job = submit(database, n_runs=2)
+    estimated(database, job, [("T", "s", "identified"), ("T", "min", "fixed")])
+    first, second = rows(database, job)
+    assert (first["T [s]"], first["T [min]"]) == ("0.5", "")
+    assert (second["T [s]"], second["T [min]"]) == ("", "0.5")
+    assert [one["status of T"] for one in (first, second)] == ["identified", "fixed"]
