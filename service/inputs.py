@@ -19,8 +19,9 @@ from service.schemas_datasets import (
 from service.schemas_simulations import RunInputIn, SeriesInput
 from service.storage.datasets import DatasetRepository
 from service.storage.objects import ObjectStore
-from sysid.errors import InvalidRecord, SysidError
+from sysid.errors import InvalidRecord
 from sysid.language.checker import check
+from sysid.language.evaluation import values_at
 from sysid.language.scope import Scope
 from sysid.records import Channel, Hold
 from sysid.types import FloatArray
@@ -172,21 +173,10 @@ def _binary(pointer: str, signal: BinaryInput, times: FloatArray) -> FloatArray:
 
 
 def _evaluated(pointer: str, expression: str, times: FloatArray) -> FloatArray:
-    """An expression of t, computed as the output of a model that has nothing else."""
-    from sysid.models.spec import parse_model
-    from sysid.simulation import simulate as simulated
-
-    faults = check(expression, Scope("difference")).faults
-    if faults:
+    """An expression of t, k and h, as in a difference equation, at regular times (N,)."""
+    tree, faults, _ = check(expression, Scope("difference"))
+    if tree is None:
         raise InvalidRequest(
             FieldError(f"{pointer}/expression", one.detail, one.column) for one in faults
         )
-    document = {
-        "name": "input", "form": "difference", "states": {"unused": "1"},
-        "equations": {"unused": "0"}, "initial": {"unused": 0}, "outputs": {"value": expression},
-    }  # fmt: skip
-    try:
-        return simulated(parse_model(document), [], {}, times=times).channel("value").values
-    except SysidError as error:
-        detail = str(error).replace("/outputs/value, ", "").replace("/outputs/value: ", "")
-        raise InvalidRequest.at(f"{pointer}/expression", detail) from None
+    return values_at(tree, times)

@@ -123,8 +123,7 @@ def _simulated(
         for state, start in zip(model.states, model.initial, strict=True)
         if not isinstance(start, FixedInitial)
     }
-    known = {p.name: p.fixed for p in model.parameters if p.fixed is not None}
-    values = {**rest, **known, **body.parameters}
+    values = {**rest, **body.parameters}
     outputs = outputs_of(model, inputs, values, times=times).channels
     check_finite(outputs, times)
     recording = Recording((*inputs, *outputs))

@@ -1,7 +1,8 @@
 """Closing the loop: a model whose input is proportional control of one of its outputs.
 
 The result is a model like any other, whose input is the reference; `sysid.simulation.simulate`
-runs it. The plant's input becomes
+runs it. Gain, limit and transport are parameters of that model, fixed at their values: its kernel
+is compiled once, whatever their numbers. The plant's input becomes
 
     u = ± limit at most of gain · (reference - output),
 
@@ -17,9 +18,9 @@ from typing import Any
 from sysid.errors import InvalidSettings, nearest
 from sysid.language.intervals import bounds
 from sysid.language.lags import past_values
-from sysid.language.printer import number, text
+from sysid.language.printer import text
 from sysid.language.substitution import substitute
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol
+from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
 from sysid.models.model import EstimatedInitial, FixedInitial, Initial, Model
 from sysid.models.sections import interval
 from sysid.models.spec import parse_model
@@ -156,15 +157,33 @@ class _Loop:
         taken |= {p.name for p in model.parameters}
         self.reference = _free("reference", taken)
         self.command = _free("command", taken)
-        self.steps_late = 0
-        self.steps, self.delay = 0, self._delay()
+        self.taken = taken
+        self.own: dict[str, dict[str, Any]] = {}
+        self.gain = self._fixed("gain", control.gain)
+        self.limit = None if control.limit is None else self._fixed("limit", control.limit)
+        self.transport_gain = (
+            None
+            if control.transport is None
+            else self._fixed("transport_gain", self.transport.gain)
+        )
+        self.delay = self._delay()
+        self.steps = self.steps_late = 0
+
+    def _fixed(self, name: str, value: float, unit: str = "1") -> Symbol:
+        """A number of the controller or the transport as a parameter of the closed loop."""
+        name = _free(name, self.taken)
+        self.taken.add(name)
+        self.own[name] = {
+            "lower": min(value, 0.0), "upper": max(value, 0.0) or 1.0, "unit": unit, "fixed": value,
+        }  # fmt: skip
+        return Symbol(name, "parameter")
 
     def differential(self) -> dict[str, Any]:
         """Document of a closed loop in the differential form."""
-        delayed = self._given(0, Number(self.transport.delay))
         if self.transport.time_constant > 0:
+            delayed = self._given(0, self.delay)
             entered = f"{text(delayed, self.clock)} - {self.input.name}"
-            return self._document(f"({entered})/{number(self.transport.time_constant)}", None)
+            return self._document(f"({entered})/{self._time_constant()}", None)
         if any(past.name == self.input.name for past in past_values(self.output.expression)):
             raise InvalidSettings(
                 "/output",
@@ -177,9 +196,8 @@ class _Loop:
     def difference(self) -> dict[str, Any]:
         """Document of a closed loop in the difference form (a polynomial becomes one)."""
         if self.transport.time_constant > 0:
-            lag = Binary("/", Number(self.transport.delay), _PERIOD)
-            kept = f"exp(-h/{number(self.transport.time_constant)})"
-            drive = text(self._given(1, lag))
+            kept = f"exp(-h/{self._time_constant()})"
+            drive = text(self._given(1, self.delay))
             before = f"{self.input.name}(k-1)"
             return self._document(f"{drive} + {kept}*({before} - ({drive}))", None)
         if self._is_circular():
@@ -187,13 +205,18 @@ class _Loop:
             self.steps_late = int(self.steps == 0)
         return self._document(None, self._fed_back)
 
-    def _delay(self) -> Expression:
+    def _time_constant(self) -> str:
+        return self._fixed("transport_time_constant", self.transport.time_constant, "s").name
+
+    def _delay(self) -> Expression | None:
         """The transport's delay as a lag: in seconds, or in steps in the difference form."""
-        delay = Number(self.transport.delay)
+        if self.transport.delay == 0:
+            return None
+        delay = self._fixed("transport_delay", self.transport.delay, "s")
         return Binary("/", delay, _PERIOD) if self.clock == "k" else delay
 
-    def _whole_steps(self) -> tuple[int, Expression]:
-        """The transport's delay as whole steps and a rest, if a step or more is known to be in it.
+    def _whole_steps(self) -> tuple[int, Expression | None]:
+        """The transport's delay as a whole step and a rest in steps, if a step or more is in it.
 
         Such a delay cuts the circle: the plant's input is one of an earlier sample.
         """
@@ -201,32 +224,32 @@ class _Loop:
             return 0, self.delay
         steps = self.transport.delay / self.period
         whole = floor(steps + _ROUNDING)
-        return (whole, Number(max(steps - whole, 0.0))) if whole else (0, self.delay)
+        if not whole:
+            return 0, self.delay
+        return 1, self._fixed("transport_steps", whole - 1 + max(steps - whole, 0.0))
 
     def _given(self, steps: int, lag: Expression | None) -> Expression:
         """What leaves the transport but for its time constant, some steps and a lag ago."""
-        gain = self.transport.gain
-        command = self._command(steps, None if lag is None or _is_zero(lag) else lag)
-        return command if gain == 1.0 else Binary("*", Number(gain), command)
+        command = self._command(steps, lag)
+        gain = self.transport_gain
+        return command if gain is None else Binary("*", gain, command)
 
     def _command(self, steps: int, lag: Expression | None) -> Expression:
         """Gain times (reference - output), limited, some steps and a lag ago."""
         reference = Past(self.reference, "input", steps, lag)
         output = _shifted(self.output.expression, steps, lag, self.clock == "k")
         error = Binary("-", reference, output)
-        command: Expression = Binary("*", Number(self.control.gain), error)
-        if self.control.limit is not None:
-            limit = self.control.limit
-            least = Call("min", (Number(limit), command))
-            command = Call("max", (Number(-limit), least))
+        command: Expression = Binary("*", self.gain, error)
+        if self.limit is not None:
+            least = Call("min", (self.limit, command))
+            command = Call("max", (Unary("-", self.limit), least))
         return command
 
     def _fed_back(self, node: Expression) -> Expression | None:
         """The controller's signal where the plant reads its input."""
         match node:
             case Past(self.input.name, "input", offset, own):
-                delay = self.delay
-                lag = own if _is_zero(delay) else delay if own is None else Binary("+", delay, own)
+                lag = _together(self.delay, own)
                 return self._given(offset + self.steps + self.steps_late, lag)
             case _:
                 return None
@@ -275,7 +298,7 @@ class _Loop:
             "form": "differential" if model.form == "differential" else "difference",
             "inputs": {self.reference: self.output.unit, **inputs},
             "states": states,
-            "parameters": {p.name: _declared(p) for p in model.parameters},
+            "parameters": {p.name: _declared(p) for p in model.parameters} | self.own,
             "equations": equations,
             "outputs": {k: {"expression": e, "unit": unit} for k, (e, unit) in outputs.items()},
             "initial": initial,
@@ -308,13 +331,11 @@ def _called(model: Model, renamed: Mapping[str, str]) -> Model:
     return replace(model, parameters=parameters, equations=trees)
 
 
-def _is_zero(lag: Expression) -> bool:
-    """Whether a lag is the number 0, or that many seconds in samples."""
-    match lag:
-        case Number(0.0) | Binary("/", Number(0.0), _):
-            return True
-        case _:
-            return False
+def _together(lag: Expression | None, other: Expression | None) -> Expression | None:
+    """Two lags, one after the other."""
+    if lag is None or other is None:
+        return other if lag is None else lag
+    return Binary("+", lag, other)
 
 
 def _shifted(tree: Expression, steps: int, lag: Expression | None, counts: bool) -> Expression:
@@ -323,8 +344,7 @@ def _shifted(tree: Expression, steps: int, lag: Expression | None, counts: bool)
     def earlier(node: Expression) -> Expression | None:
         match node:
             case Past(name, kind, offset, own):
-                both = own if lag is None else lag if own is None else Binary("+", own, lag)
-                return Past(name, kind, offset + steps, both)
+                return Past(name, kind, offset + steps, _together(own, lag))
             case Symbol(_, "index"):
                 return Binary("-", node, back)
             case Symbol(_, "time"):

@@ -29,8 +29,8 @@ def simulate(
         One for each input of the model, of the same name; others are ignored.
     values : mapping of str to float
         Every parameter, inside or outside its bounds, and initial values such as ``x(0)`` where
-        the model does not fix them (where it does, they replace its own). One that is tied to
-        others may be left out.
+        the model does not fix them (where it does, they replace its own). One that the model fixes
+        or ties to others may be left out.
     times : FloatArray, shape (N,)
         Seconds, not decreasing; regular for a difference equation, whose period they give.
 
@@ -47,7 +47,8 @@ def simulate(
         If an input is missing or the times are too short for the model's lags.
     """
     _check(model, values)
-    values = _with_ties(model, values)
+    fixed = {one.name: one.fixed for one in model.parameters if one.fixed is not None}
+    values = _with_ties(model, {**fixed, **values})
     known = tuple(_known(parameter, values[parameter.name]) for parameter in model.parameters)
     initial = tuple(
         _start(start, state.name, values)
@@ -73,7 +74,7 @@ def _with_ties(model: Model, values: Mapping[str, float]) -> dict[str, float]:
 
 def _check(model: Model, values: Mapping[str, float]) -> None:
     names = [parameter.name for parameter in model.parameters]
-    tied = [parameter.name for parameter in model.parameters if parameter.tied is not None]
+    free = [parameter.name for parameter in model.parameters if parameter.is_free]
     starts = [initial_name(state.name, 0) for state in model.states]
     for name, value in values.items():
         if name not in names and name not in starts:
@@ -83,8 +84,8 @@ def _check(model: Model, values: Mapping[str, float]) -> None:
             )
         if not isfinite(value):
             raise InvalidSettings(f"/parameters/{name}", f"{value!r} is not a finite number")
-    for name in names:
-        if name not in values and name not in tied:
+    for name in free:
+        if name not in values:
             raise InvalidSettings(f"/parameters/{name}", "a value is missing")
 
 

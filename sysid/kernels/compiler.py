@@ -5,10 +5,11 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from sysid.kernels.apart import object_code_bounded
 from sysid.kernels.emission import KERNEL, kernel_code
 from sysid.kernels.keeping import store, stored
 from sysid.kernels.layout import Variant
-from sysid.kernels.machine import loaded, machine_name, object_code
+from sysid.kernels.machine import loaded, machine_name
 from sysid.models.model import EstimatedInitial, Model
 
 _KEPT = 64
@@ -22,7 +23,7 @@ def kernel_address(model: Model, variant: Variant) -> int:
     if key not in _addresses:
         code = stored(key)
         if code is None:
-            code = object_code(kernel_code(model, variant))
+            code = object_code_bounded(kernel_code(model, variant))
             store(key, code)
         _addresses[key] = loaded(code, KERNEL)
     return _addresses[key]

@@ -1,12 +1,16 @@
-"""The value of an expression that has no signals in it: of a tie between parameters."""
+"""The value of an expression that has no signals in it: a tie between parameters, a wave of t.
 
-import math
+By NumPy as it stands: what is worth a number or a few samples is not worth a kernel.
+"""
+
 from collections.abc import Callable, Mapping
+from math import nan
 from typing import Any
 
 import numpy as np
 
 from sysid.language.tree import Binary, Call, Expression, Number, Symbol, Unary
+from sysid.types import FloatArray
 
 _OPERATORS: Mapping[str, Callable[..., Any]] = {
     "+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide, "**": np.power,
@@ -16,7 +20,7 @@ _OPERATORS: Mapping[str, Callable[..., Any]] = {
 _FUNCTIONS: Mapping[str, Callable[..., Any]] = {
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
     "abs": np.abs, "sign": np.sign, "min": np.minimum, "max": np.maximum, "tanh": np.tanh,
-    "atan": np.arctan,
+    "atan": np.arctan, "where": np.where,
 }  # fmt: skip
 
 
@@ -26,25 +30,32 @@ def value(expression: Expression, parameters: Mapping[str, float]) -> float:
     Past values, time and the sampling period have no place in it.
     """
     with np.errstate(all="ignore"):
-        return float(_value(expression, parameters))
+        return float(_value(expression, {k: np.float64(v) for k, v in parameters.items()}))
 
 
-def _value(expression: Expression, parameters: Mapping[str, float]) -> np.float64:
+def values_at(expression: Expression, times: FloatArray) -> FloatArray:
+    """Values (N,) of an expression of ``t``, ``k`` and ``h`` at regular times (N,) in s.
+
+    Past values and parameters have no place in it.
+    """
+    period = times[1] - times[0]
+    named = {"t": times, "k": np.arange(float(times.size)), "h": period}
+    with np.errstate(all="ignore"):
+        return np.array(np.broadcast_to(_value(expression, named), times.shape), dtype=np.float64)
+
+
+def _value(expression: Expression, named: Mapping[str, Any]) -> Any:
     match expression:
         case Number(number):
             return np.float64(number)
-        case Symbol(name, "parameter"):
-            return np.float64(parameters[name])
+        case Symbol(name, kind) if kind == "parameter" or name in named:
+            return named[name]
         case Unary(operator, operand):
-            inside = _value(operand, parameters)
-            return np.float64(-inside if operator == "-" else not inside)
+            inside = _value(operand, named)
+            return -inside if operator == "-" else np.logical_not(inside)
         case Binary(operator, left, right):
-            ends = _value(left, parameters), _value(right, parameters)
-            return np.float64(_OPERATORS[operator](*ends))
-        case Call("where", (condition, first, second)):
-            return _value(first if _value(condition, parameters) else second, parameters)
+            return _OPERATORS[operator](_value(left, named), _value(right, named))
         case Call(function, arguments):
-            values = (_value(one, parameters) for one in arguments)
-            return np.float64(_FUNCTIONS[function](*values))
+            return _FUNCTIONS[function](*(_value(one, named) for one in arguments))
         case _:
-            return np.float64(math.nan)
+            return np.float64(nan)

@@ -8,6 +8,8 @@ import pytest
 
 from sysid.closed_loop import ProportionalControl, Transport, close_loop
 from sysid.errors import InvalidRecord, InvalidSettings
+from sysid.kernels.compiler import kernel_key
+from sysid.kernels.layout import Variant
 from sysid.models.library import load_model
 from sysid.models.model import Model
 from sysid.models.spec import parse_model
@@ -144,6 +146,31 @@ def test_a_delay_of_a_step_or_more_is_no_circle(delay: float, steps_late: int, b
         entered = np.interp(k - back, grid, command) if k >= back else 0.0
         x[k] = 0.5 * x[k - 1] + 0.4 * entered
     np.testing.assert_allclose(found[5:], x[5:], rtol=0.02, atol=2e-3)
+
+
+def test_during_a_dead_time_of_whole_steps_the_plant_goes_on() -> None:
+    """Ten steps of delay are no ten samples that a recursion is given."""
+    plant = parse_model({**DIRECT, "inputs": {"u": "V", "v": "V"},
+                         "equations": {"x": "0.5*x(k-1) + 0.4*u + v"}})  # fmt: skip
+    control = ProportionalControl("u", "y", 0.9, None, Transport(1.0, 0.0, 0.1))
+    loop = close_loop(plant, control, 0.01)
+    steady = Channel("v", TIMES, np.ones(TIMES.size), "V")
+    found = simulate(loop.model, [stepped(0.0, "m"), steady], {}, times=TIMES).channel("y").values
+    np.testing.assert_allclose(found[:10], 2.0 * (1.0 - 0.5 ** np.arange(10.0)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("plant", [lag(), parse_model(DIRECT)], ids=["differential", "difference"])
+@pytest.mark.parametrize("time_constant", [0.0, 1.0])
+def test_other_numbers_of_controller_and_transport_need_no_other_kernel(
+    plant: Model, time_constant: float
+) -> None:
+    variant = Variant(one_step=False, soft=False, on_grid=True, weighted=False)
+    keys = set()
+    for size in (1.0, 1.7, -2.0):
+        transport = Transport(size, abs(size) * time_constant, 0.05 * abs(size))
+        control = ProportionalControl("u", "y", 3.0 * size, 2.0 * abs(size), transport)
+        keys.add(kernel_key(close_loop(plant, control, 0.01).model, variant))
+    assert len(keys) == 1
 
 
 def test_a_delay_whose_step_is_not_known_is_taken_for_less_than_one() -> None:

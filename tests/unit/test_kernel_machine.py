@@ -37,7 +37,7 @@ def test_a_kernel_is_compiled_once_and_found_again(
     first = fitness()
     assert len(list(folder.glob("*.o"))) == 1
     monkeypatch.setattr(compiler, "_addresses", {})
-    monkeypatch.setattr(compiler, "object_code", refuse)
+    monkeypatch.setattr(compiler, "object_code_bounded", refuse)
     np.testing.assert_array_equal(fitness(), first)
 
 

@@ -1,0 +1,41 @@
+"""Expressions of time by NumPy: what the same expression gives as a model's output."""
+
+import numpy as np
+import pytest
+
+from sysid.language.checker import check
+from sysid.language.evaluation import values_at
+from sysid.language.scope import Scope
+from sysid.models.spec import parse_model
+from sysid.simulation import simulate
+
+TIMES = np.arange(400) / 16  # exact, so that comparisons with them are
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        "12e3*(0.55*sin(2.2*t) + 0.6*cos(5.65*t + 1))", "3", "-t**2 + pi", "k*h",
+        "exp(-t/2)*log(t + 1)",
+        "where(t < 2 or not (t <= 4 and t != 3), 1, min(t, 5, k/7))", "sqrt(t - 3)", "1/(t - 3)",
+        "abs(tan(t)) + sign(t - 4)*tanh(t) - atan(t)", "max(log(t - 1), 0)", "t**0.5 + 2**(-t)",
+        "log(t - 3)",
+        "where(t > 5, sqrt(t - 5), -1)", "(t - 3)**3",
+    ],
+)  # fmt: skip
+def test_values_are_those_of_a_kernel(expression: str) -> None:
+    tree = check(expression, Scope("difference")).tree
+    assert tree is not None
+    model = parse_model({
+        "name": "wave", "form": "difference", "states": {"unused": "1"},
+        "equations": {"unused": "0"}, "initial": {"unused": 0}, "outputs": {"y": expression},
+    })  # fmt: skip
+    expected = simulate(model, [], {}, times=TIMES).channel("y").values
+    small = 1e-12 * np.max(np.abs(expected[np.isfinite(expected)]))
+    np.testing.assert_allclose(values_at(tree, TIMES), expected, rtol=1e-12, atol=small)
+
+
+def test_what_it_has_no_value_for_is_nan() -> None:
+    tree = check("x(k-1) + 1", Scope("difference", states=("x",))).tree
+    assert tree is not None
+    assert np.all(np.isnan(values_at(tree, TIMES)))

@@ -1,0 +1,56 @@
+"""Kernels that are compiled in a process of their own: the same code, and no fault of that process
+is one of ours."""
+
+import subprocess
+from typing import Any
+
+import pytest
+
+from sysid.kernels import apart
+from sysid.kernels.emission import kernel_code
+from sysid.kernels.layout import Variant
+from sysid.kernels.machine import object_code
+from tests.models import duffing
+
+VARIANT = Variant(one_step=False, soft=False, on_grid=True, weighted=False)
+
+
+@pytest.fixture
+def code(monkeypatch: pytest.MonkeyPatch) -> str:
+    """Assembly of a kernel, in a process that has compiled as many as it may itself."""
+    monkeypatch.setattr(apart, "_made", [None] * apart.OWN)
+    return kernel_code(duffing(), VARIANT)
+
+
+def refuse(assembly: str) -> bytes:
+    raise AssertionError("compiled in this process")
+
+
+def test_after_many_kernels_another_process_makes_the_same_code(
+    code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = object_code(code)
+    monkeypatch.setattr(apart, "object_code", refuse)
+    assert apart.object_code_bounded(code) == expected
+    assert len(apart._made) == apart.OWN
+
+
+@pytest.mark.parametrize(
+    "fault", [OSError("no more processes"), subprocess.CalledProcessError(-9, "child")]
+)
+def test_without_another_process_it_is_compiled_here(
+    code: str, fault: Exception, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fails(*_: Any, **__: Any) -> Any:
+        raise fault
+
+    monkeypatch.setattr(subprocess, "run", fails)
+    assert apart.object_code_bounded(code) == object_code(code)
+    assert "compiled in this process" in caplog.text
+
+
+def test_the_first_kernels_are_compiled_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(apart, "_made", [])
+    monkeypatch.setattr(apart, "object_code", lambda assembly: assembly.encode())
+    found = [apart.object_code_bounded(str(i)) for i in range(apart.OWN)]
+    assert found == [str(i).encode() for i in range(apart.OWN)]
