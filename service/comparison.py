@@ -244,7 +244,10 @@ def _notes(ordered: Sequence[_Candidate]) -> Iterator[str]:
         yield "the runs were fitted with different losses, which favour each its own measure"
     counts = {(one.result.get("criteria") or {}).get("samples") for one in ordered}
     if len(counts - {None}) > 1:
-        yield "the runs scored different numbers of samples: AIC and BIC do not compare"
+        yield (
+            "the runs scored different numbers of samples: AIC and BIC do not compare "
+            "(recursions do not score the samples they start from; the same skip for all helps)"
+        )
     if None in counts:
         yield "some runs were identified by an older version, which told no AIC and BIC"
 

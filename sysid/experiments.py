@@ -13,7 +13,7 @@ from sysid.kernels.inputs import FineInput
 from sysid.kernels.plan import Samples, Start, fine_inputs, largest_lags
 from sysid.language.tree import Past
 from sysid.models.initial import initial_name
-from sysid.models.model import EstimatedInitial, FixedInitial, Model
+from sysid.models.model import EstimatedInitial, FixedInitial, MeasuredInitial, Model
 from sysid.parameters import Parameter
 from sysid.records import Channel, Record
 from sysid.types import BoolArray, FloatArray
@@ -104,6 +104,10 @@ def lay_out(
     if is_difference(model) and grid.last < model.memory:
         needed = model.memory * grid.integration_step
         raise RecordTooShort(grid.duration, needed, "the model's memory")
+    since = _scored_since(model, grid, scored_from)
+    if not simulates_only:
+        for channel in outputs:
+            _check_scored(channel, skip, since[channel.name])
     spans = {
         p.name: (p.lower, p.upper) if p.fixed is None else (p.fixed, p.fixed) for p in parameters
     }
@@ -111,7 +115,7 @@ def lay_out(
     return Experiment(
         grid,
         tuple(fine_inputs(model, inputs, spans, grid)),
-        tuple(_samples(model, grid, c, weights[c.name], skip, scored_from) for c in outputs),
+        tuple(_samples(model, grid, c, weights[c.name], skip, since[c.name]) for c in outputs),
         tuple(_starts(model, grid, outputs, experiment, rows)),
         max([0.0, *largest_lags(model, "state", spans, grid).values()]),
     )
@@ -123,11 +127,12 @@ def measured_anew(
 ) -> Experiment:  # fmt: skip
     """What `lay_out` makes of a record whose inputs and times are those of one laid out before."""
     outputs, grid = _outputs(model, record, (skip, scored_from)), laid.grid
+    since = _scored_since(model, grid, scored_from)
     rows = {p.name: i for i, p in enumerate(parameters)}
     return replace(
         laid,
         outputs=tuple(
-            _samples(model, grid, c, weights[c.name], skip, scored_from) for c in outputs
+            _samples(model, grid, c, weights[c.name], skip, since[c.name]) for c in outputs
         ),
         starts=tuple(_starts(model, grid, outputs, experiment, rows)),
     )
@@ -168,6 +173,23 @@ def _check_scored(channel: Channel, skip: int, scored_from: float) -> None:
             f"output {channel.name!r} has {channel.values.size} samples and none with a value "
             f"after the first {skip}{later}; nothing is left to compare with"
         )
+
+
+def _scored_since(model: Model, grid: Grid, scored_from: float) -> dict[str, float]:
+    """For each output the time (s) from which on its samples are scored.
+
+    A recursion that starts at measured values repeats them: they say nothing about the model.
+    """
+    if not is_difference(model):
+        return {output.name: scored_from for output in model.outputs}
+    initial = {state.name: how for state, how in zip(model.states, model.initial, strict=True)}
+    computed = grid.start + (max(model.memory, 1) - 0.5) * grid.integration_step
+    return {
+        output.name: max(scored_from, computed)
+        if isinstance(initial.get(measured_state(output) or ""), MeasuredInitial)
+        else scored_from
+        for output in model.outputs
+    }
 
 
 def _is_scored(channel: Channel, skip: int, scored_from: float) -> BoolArray:

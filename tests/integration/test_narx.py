@@ -208,3 +208,27 @@ def test_a_start_that_is_the_optimum_already_is_found_and_told(seed: int, island
     assert all(history and history[0].phase == "start" for history in found.history)
     values = [one.value for one in found.estimates[:3]]
     np.testing.assert_allclose(values, [0.6, -0.2, 0.5], atol=0.02)
+
+
+@pytest.mark.parametrize("longest", [2, 25])
+def test_one_step_ahead_it_is_least_squares_behind_the_samples_it_starts_from(longest: int) -> None:
+    # The first samples are given: counted as agreement they make every error too small.
+    n, draw = 90, np.random.default_rng(5)
+    u, y = draw.uniform(-1, 1, n), np.zeros(n)
+    for k in range(longest, n):
+        y[k] = 0.5 * y[k - 1] - 0.2 * y[k - longest] + 0.8 * u[k - 1]
+    y += draw.normal(0, 0.05, n)
+    terms = ["y(k-1)", f"y(k-{longest})", "u(k-1)"]
+    model = parse_model(document(lags={"y": [1, longest], "u": [1]}, terms=terms))
+    times = 0.1 * np.arange(n)
+    record = Record((Channel("u", times, u, "V"),), (Channel("y", times, y, "V"),))
+    found = identify(model, record, SMALL, prediction="one-step")
+    late = np.arange(longest, n)
+    rows = np.column_stack([y[late - 1], y[late - longest], u[late - 1]])
+    solution, (squares,), *_ = np.linalg.lstsq(rows, y[late])
+    errors = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows)) * squares / (n - longest - 3))
+    assert [one.value for one in found.estimates] == pytest.approx(solution, abs=1e-6)
+    assert [one.stderr for one in found.estimates] == pytest.approx(errors, rel=1e-4)
+    assert found.rms == pytest.approx(np.sqrt(squares / (n - longest)), rel=1e-6)
+    assert found.criteria is not None
+    assert found.criteria.samples == n - longest
