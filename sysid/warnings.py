@@ -80,11 +80,8 @@ def _held_back(analysis: Analysis) -> list[str]:
         return []
     first, *others = analysis.pulls
     more = f", and {', '.join(map(str, others))}" if others else ""
-    cure = "lower" if first.side == "lower" else "raise"
-    return [
-        f"the data pull {first}{more}: {cure} the bound of {first.name}"
-        f"{' first' if others else ''}, unless nature sets it there"
-    ]
+    cures = " and ".join(one.cure for one in analysis.pulls)
+    return [f"the data pull {first}{more}: {cures}, unless nature sets it there"]
 
 
 def _steps_read_as_ramps(problem: Problem) -> list[str]:
@@ -102,7 +99,7 @@ def _steps_read_as_ramps(problem: Problem) -> list[str]:
     }
     return [
         f"input {name!r} stays constant between jumps, but is read as straight between its "
-        f"samples, which moves a lag by about half a sample; if it was held, set hold: "
+        f"samples, which moves a lag by about half a sample; if it was held, use hold: "
         f"{{{name}: zero}}"
         for name in sorted(names)
     ]

@@ -6,6 +6,9 @@ from typing import Annotated, Literal
 import typer
 
 from service.cli.common import DEFAULT_URL, Key, Url, connected, fail, out
+from service.cli.places import Places, told_at
+
+PLACES = Places({"?format": "--format", "?pade_order": "--pade-order"})
 
 
 def export(
@@ -24,7 +27,7 @@ def export(
     key: Key = None,
 ) -> None:
     """Write the identified model of a run for another program."""
-    with connected(url, key) as client:
+    with connected(url, key) as client, told_at(PLACES):
         text = client.export(run, format, pade_order)
     if output is None:
         typer.echo(text, nl=False)

@@ -44,7 +44,10 @@ ELSEWHERE = {
     "model": "use --model",
     "validation.datasets": "use --validation FILE",
 }
-PLACES = Places({"/model": "--model …", "/datasets": "DATA", "/channels": "--channels {}"})
+PLACES = Places({
+    "/model": "--model …", "/datasets": "DATA", "/channels": "--channels {}",
+    "/loss/noise_model": "--noise-model",
+})  # fmt: skip
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 
 
@@ -232,7 +235,7 @@ def tell(model: "Model", found: "Identification", seconds: float, json_file: str
         out.print(f", validation {_percent(found.fit_percent_validation)}", markup=False, end="")
     out.print(f"; {found.evaluations} simulations in {seconds:.2f} s", markup=False)
     for warning in found.warnings:
-        err.print(f"note: {warning}", markup=False)
+        err.print(f"note: {PLACES.in_note(warning)}", markup=False)
 
 
 def _percent(fit: float) -> str:

@@ -13,6 +13,9 @@ INVALID = 422
 INSIDE = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: where a field of a name is, and what in a value of an axis is wrong."""
 
+SETTING = re.compile(r"\b(\w+): \{([^{}:]+): ([^{}:,]+)\}")
+"""A field of a job in a note, as a job file has it: ``loss: {noise_model: ar1}``."""
+
 
 @dataclass(frozen=True, slots=True)
 class Places:
@@ -41,6 +44,15 @@ class Places:
     def told(self, faults: Iterable[FieldError]) -> str:
         """Faults as one line."""
         return "; ".join(self._one(fault) for fault in faults)
+
+    def in_note(self, note: str) -> str:
+        """A note of a result, with the options in it that set the fields which it advises."""
+        return SETTING.sub(self._typed, note)
+
+    def _typed(self, found: re.Match[str]) -> str:
+        part, name, value = found.groups()
+        place = self.of(f"/{part}/{name.replace('~', '~0').replace('/', '~1')}")
+        return f"{place}{'=' if place.startswith('--set ') else ' '}{value}"
 
     def _one(self, fault: FieldError) -> str:
         place = self.of(fault.pointer) if fault.pointer else ""

@@ -131,7 +131,7 @@ def _tell(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
     if json_file == "-":
         print_json(trend)
     else:
-        print_trend(trend)
+        print_trend(trend, Places())
     if json_file not in (None, "-"):
         try:
             Path(str(json_file)).write_text(json.dumps(trend, indent=2, ensure_ascii=False))

@@ -3,11 +3,12 @@
 from typing import Any
 
 from service.cli.common import estimate, out, print_table
+from service.cli.places import Places
 from service.trend_text import Quantity, flags, law_text, notes, reference_text, span_text
 
 
-def print_trend(trend: dict[str, Any]) -> None:
-    """Print what `GET /v1/jobs/{id}/trend` tells."""
+def print_trend(trend: dict[str, Any], places: Places) -> None:
+    """Print what `GET /v1/jobs/{id}/trend` tells, with notes that name the user's `places`."""
     shown = [
         one for one in trend["quantities"] if any(p["value"] is not None for p in one["points"])
     ]
@@ -32,7 +33,7 @@ def print_trend(trend: dict[str, Any]) -> None:
         text = f"compared with {trend['reference']}{named and ', '}{named}"
         out.print(text, markup=False, soft_wrap=True)
     for note in notes(trend):
-        out.print(f"note: {note}", markup=False, soft_wrap=True)
+        out.print(f"note: {places.in_note(note)}", markup=False, soft_wrap=True)
 
 
 def _row(place: dict[str, Any], quantities: list[Quantity]) -> list[object]:

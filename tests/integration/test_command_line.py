@@ -226,6 +226,7 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
                  "--set", "validation.fraction=0.4", "--json", result)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "±" in done.stdout
+    assert "if it was held, use --set hold.u=zero" in " ".join(done.stderr.split())
     found = {one["name"]: one for one in json.loads(result.read_text())["parameters"]}
     truth = {"K": 2.0, "T": 1.0, "L": 0.5}
     for name, value in truth.items():
@@ -251,7 +252,7 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
         ),
         (
             ["--model", "fopdt", "--noise-model", "ar1", "--set", "prediction=one-step"],
-            "--set loss.noise_model: ar1 is for free runs",
+            "--noise-model: ar1 is for free runs",
         ),
     ],
 )

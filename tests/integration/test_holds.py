@@ -41,7 +41,7 @@ def test_a_held_input_gives_the_true_lag_of_a_step_test() -> None:
 def test_a_step_that_is_read_as_a_ramp_is_asked_about() -> None:
     found = fitted(step_test())
     assert abs(lag(found) - LAG) > 0.1
-    assert any("set hold: {u: zero}" in one for one in found.warnings)
+    assert any("use hold: {u: zero}" in one for one in found.warnings)
 
 
 def test_a_held_input_is_not_asked_about() -> None:

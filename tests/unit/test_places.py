@@ -2,12 +2,14 @@
 
 from typing import Any
 
+import httpx
 import pytest
 import typer
 
 from service.calls import NotFinite, ProblemError
-from service.cli import sweeps
+from service.cli import exporting, identify, sweeps
 from service.cli.places import Places, in_file, told_at
+from service.client import Client
 from service.errors import FieldError
 
 
@@ -79,3 +81,32 @@ def test_a_number_that_is_none_is_wrong_usage_at_its_option(
         raise NotFinite("/truth/parameters/K", float("inf"))
     assert ended.value.exit_code == 2
     assert capsys.readouterr().err == "lagid: --true K: found inf; need a finite number\n"
+
+
+WHITE = "if it is the noise that is coloured, use loss: {noise_model: ar1}"
+HELD = "if it was held, use hold: {u: zero}"
+
+
+@pytest.mark.parametrize(
+    ("places", "note", "end"),
+    [
+        (identify.PLACES, WHITE, ", use --noise-model ar1"),
+        (identify.PLACES, HELD, ", use --set hold.u=zero"),
+        (Places(), WHITE, ", use --set loss.noise_model=ar1"),
+        (Places(), "a set {1: 2} of pairs: {a, b}", "a set {1: 2} of pairs: {a, b}"),
+    ],
+)
+def test_a_note_names_the_option_that_can_be_typed(places: Places, note: str, end: str) -> None:
+    assert places.in_note(note).endswith(end)
+
+
+def test_a_refused_export_is_told_at_its_option(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fault = {"pointer": "?format", "detail": "'control' is not possible: a**3"}
+    answer = httpx.Response(422, json={"title": "refused", "errors": [fault]})
+    client = Client(transport=httpx.MockTransport(lambda _: answer))
+    monkeypatch.setattr(exporting, "connected", lambda *_: client)
+    with pytest.raises(typer.Exit):
+        exporting.export("run_1", "control")
+    assert capsys.readouterr().err == "lagid: --format: 'control' is not possible: a**3\n"

@@ -12,6 +12,7 @@ from typer.testing import CliRunner, Result
 
 from service.app import create_app
 from service.cli.main import app as program
+from service.cli.places import Places
 from service.cli.trends import print_trend
 from service.client import Client, ProblemError
 from tests.identified import identified
@@ -132,8 +133,11 @@ def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) ->
            "reason": "", "predictions": [], "notes": []}  # fmt: skip
     place = {"x": 5.0, "runs": [], "evaluations": 1, "spans": [], "warnings": []}
     print_trend({"x": "length_m", "reference": None, "reference_x": None, "reference_names": [],
-                 "places": [place], "quantities": [one], "missing": 0, "notes": []})  # fmt: skip
-    assert "T [s]" in capsys.readouterr().out
+                 "places": [place], "quantities": [one], "missing": 0,
+                 "notes": ["use loss: {noise_model: ar1}"]}, Places())  # fmt: skip
+    told = capsys.readouterr().out
+    assert "T [s]" in told
+    assert "note: use --set loss.noise_model=ar1" in told
 
 
 def test_a_job_that_is_watched_from_a_pipe_tells_its_state(served: Served) -> None:
