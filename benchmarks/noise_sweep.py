@@ -21,8 +21,8 @@ from benchmarks.table import Row, parser, report
 from service.client import Client
 from service.embedded import embedded_service
 from sysid import least_squares, problem, sensitivities
-from sysid.ga import island
 from sysid.identify import identify
+from sysid.islands import voyage
 from sysid.models.library import load_model
 from sysid.noise import Noise, with_noise
 from sysid.settings import GeneticAlgorithm
@@ -30,7 +30,7 @@ from sysid.settings import GeneticAlgorithm
 SIGMAS = [round(0.05 * i, 2) for i in range(21)]
 METHODS = ["simple", "improved"]
 COMPILED: Sequence[tuple[Any, str]] = (
-    (island, "generations"),
+    (voyage, "_sail"),
     (least_squares, "_descend"),
     (problem, "population_fitness"),
     (problem, "population_predictions"),

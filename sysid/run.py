@@ -10,14 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from time import perf_counter
 
-import numpy as np
-
 from sysid.conclusion import conclude
 from sysid.ga.island import Island, evolve
 from sysid.ga.state import WARMED, Plan
 from sysid.islands.archipelago import found, of_island, plans
 from sysid.islands.migration import migrate
 from sysid.islands.run_state import RunState
+from sysid.islands.settling import has_ended
+from sysid.islands.voyage import course, ends_of, evolve_all, next_border, rests, step_of
 from sysid.problem import Problem
 from sysid.selection import equation_error_starts
 from sysid.settings import GeneticAlgorithm
@@ -30,13 +30,7 @@ __all__ = [
 CALL_SECONDS = 0.1
 """Aimed at for one compiled call, by measured cost, so that a cancel is heard in time."""
 
-_TARGET_ROUND = 5  # generations between two looks at the target RMS, or at a warm start
-_OF_EACH, _MORE = 2, 2
-_SHARE = 1 / 3  # of all searches
-_HALF, _MANY = 0.5, 2.5  # of those from random places agree, or there are so many times enough
-_AGREE = 2 / 3  # of the searches from random places, where the fitness jumps
-_RETURN = 0.9  # of those from beside the best individual
-_WARM_SETTLED = 3  # of the searches that agree, a warm start needs one in three
+UNMEASURED_STEPS = 1_000_000  # steps of integration or recursion in a first call: some 10 ms
 
 
 def begin(
@@ -63,21 +57,13 @@ def begin(
 
 def border(algorithm: GeneticAlgorithm, state: RunState) -> int:
     """The generation up to which every island evolves alone."""
-    every = algorithm.migration.every
-    looks_often = algorithm.stop.rms is not None or state.is_warm
-    step = min(every, _TARGET_ROUND) if looks_often else every
-    at, done = state.generation, state.generation % every
-    return min(at + min(step, every - done), algorithm.generations)
+    step = step_of(algorithm, is_warm=state.is_warm)
+    return next_border(state.generation, step, algorithm.migration.every, algorithm.generations)
 
 
 def is_resting(plan: Plan, island: Island) -> bool:
-    """Whether an island has used up its evaluations or reached the target RMS.
-
-    Not before its population is evaluated: finding the starts of a polynomial counts, too.
-    """
-    if np.isnan(island.fitness).all():
-        return False
-    return island.evaluations >= plan.evaluations or island.champion_rms <= plan.rms
+    """Whether an island has used up its evaluations or reached the target RMS."""
+    return rests(plan, island.fitness, island.counters, island.champion_rms)
 
 
 def advance_island(
@@ -102,48 +88,9 @@ def exchange(algorithm: GeneticAlgorithm, state: RunState, islands: Sequence[Isl
 
 
 def _has_ended(algorithm: GeneticAlgorithm, state: RunState) -> bool:
-    if state.generation >= algorithm.generations:
-        return True
-    if algorithm.stop.rms is not None and state.rms <= algorithm.stop.rms:
-        return True
-    if algorithm.stop.settled is not None and _is_settled(algorithm.stop.settled, state):
-        return True
-    # Below the border only those islands stay that have used up their evaluations.
-    return all(island.generation < state.generation for island in state.islands)
-
-
-def _is_settled(settled: int, state: RunState) -> bool:
-    """Whether searches keep finding the best individual, from random places and from beside it.
-
-    Had a better one as many ways that lead to it, all of k searches that found the best again and
-    those that found others would have missed it with a probability below exp(-k). So where the
-    fitness around is smooth, those that led to worse ones say nothing against the best, unless
-    they are the most. Where it jumps, a better one nearby may draw few searches beside a wide one
-    that draws many: then nearly all must agree.
-    But what was found from beside the best says little of minima far away. So where fewer than
-    half of those from random places agree, these must be many: at 5 of 14 one search in a hundred
-    ended at twice the least RMS.
-    Behind a warm start stands an earlier result. So a third of them is enough, and so it is that
-    as many from random places, one from beside it (where the fitness jumps, as many) and the
-    second half of the generations have found nothing better. Those from beside it alone would not
-    do: around a false optimum they find nothing better.
-    """
-    hops, returned = state.hops
-    if state.is_warm:
-        tried = state.independent >= settled and hops >= (settled if state.has_cliffs else 1)
-        if tried and state.is_the_best_since(state.generation // 2):
-            return True
-        settled = -(-settled // _WARM_SETTLED)
-    if state.has_cliffs:
-        every = returned >= max(settled, _RETURN * hops)
-        return every and state.confirmed >= max(settled, _AGREE * state.independent)
-    again, enough = state.confirmed + returned, settled + _MORE
-    if min(state.confirmed, returned) < -(-settled // _OF_EACH):
-        return False
-    agree = state.confirmed >= max(enough, _HALF * state.independent)
-    if not (state.is_warm or agree or state.independent >= _MANY * enough):
-        return False
-    return again >= max(enough, _SHARE * (state.independent + hops))
+    is_old = state.is_warm and state.is_the_best_since(state.generation // 2)
+    ends = ends_of(algorithm, is_warm=state.is_warm)
+    return has_ended(ends, state.generation, *state.tally, is_old)
 
 
 def is_finished(algorithm: GeneticAlgorithm, state: RunState) -> bool:
@@ -163,24 +110,38 @@ def advance(
 
     `should_stop` is asked between compiled calls, about every 0.1 s.
     """
-    pace = _Pace(seconds, algorithm.stop.seconds, state.seconds, should_stop)
-    planned = plans(problem, algorithm, state.seed)
-    while not is_finished(algorithm, state):
-        target = border(algorithm, state)
-        islands = list(state.islands)
-        for i, plan in enumerate(planned):
-            while islands[i].generation < target and not is_resting(plan, islands[i]):
-                if pace.is_over():
-                    return replace(state, islands=tuple(islands), seconds=pace.used())
-                count = pace.affordable(target - islands[i].generation)
-                islands[i] = evolve(problem.evaluator, plan, islands[i], count)
-                pace.measure(count)
-        state = replace(exchange(algorithm, state, islands), seconds=pace.used())
+    way = course(problem, algorithm, state.seed, is_warm=state.is_warm)
+    size = algorithm.population // algorithm.n_islands
+    pace = _Pace(
+        seconds, algorithm.stop.seconds, state.seconds, should_stop,
+        UNMEASURED_STEPS // (size * max(problem.n_steps, 1)),
+    )  # fmt: skip
+    while not is_finished(algorithm, state) and not pace.is_over():
+        before, left = _done(state), algorithm.generations - state.generation
+        stand = evolve_all(
+            problem.evaluator, way, state.islands, state.generation, state.epoch,
+            pace.affordable(left * algorithm.n_islands),
+        )  # fmt: skip
+        state = replace(
+            state, islands=stand.islands, generation=stand.generation, epoch=stand.epoch,
+            migrations=state.migrations + stand.migrants,
+        )  # fmt: skip
+        pace.measure(_done(state) - before)
+        ended = stand.has_crossed and _has_ended(algorithm, state)
+        state = replace(state, ended=ended, seconds=pace.used())
     return state
 
 
+def _done(state: RunState) -> int:
+    """Generations of all islands together."""
+    return sum(island.generation for island in state.islands)
+
+
 class _Pace:
-    """How many generations one compiled call may run, and when to stop, by the clock."""
+    """How many generations one compiled call may run, and when to stop, by the clock.
+
+    `first`: those of the first call, before anything is measured.
+    """
 
     def __init__(
         self,
@@ -188,6 +149,7 @@ class _Pace:
         limit: float | None,
         before: float,
         should_stop: Callable[[], bool] | None,
+        first: int,
     ) -> None:
         self._start = self._last = perf_counter()
         self._before, self._should_stop, self._calls = before, should_stop, 0
@@ -195,7 +157,8 @@ class _Pace:
             end for end in (seconds, None if limit is None else limit - before) if end is not None
         ]
         self._end = min(ends, default=float("inf"))
-        self._cost = CALL_SECONDS  # of one generation, until it is measured
+        self._first = first
+        self._cost = 0.0  # of one generation of one island, as measured
 
     def used(self) -> float:
         return self._before + perf_counter() - self._start
@@ -206,9 +169,12 @@ class _Pace:
         return stopped or (self._calls > 0 and self._last - self._start >= self._end)
 
     def affordable(self, wanted: int) -> int:
-        return max(1, min(wanted, int(CALL_SECONDS / self._cost)))
+        """Generations for the next call: as many as are left, or as the time allows."""
+        left = min(CALL_SECONDS, self._start + self._end - self._last)
+        count = int(left / self._cost) if self._calls else self._first
+        return max(1, min(wanted, count))
 
     def measure(self, count: int) -> None:
         now = perf_counter()
-        self._cost = max((now - self._last) / count, 1e-9)
+        self._cost = max((now - self._last) / max(count, 1), 1e-9)
         self._last, self._calls = now, self._calls + 1

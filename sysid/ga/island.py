@@ -1,5 +1,6 @@
 """An island: one population between two generations, and its evolution as a pure function."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,12 +77,13 @@ def evolve(evaluator: Evaluator, plan: Plan, island: Island, count: int) -> Isla
     counters, memory = island.counters.copy(), island.memory.copy()
     rows = np.empty((count + 1, VALUES + words.shape[1]))
     written = generations(evaluator, plan, count, words, fitness, counters, memory, rows)
-    better = tuple(_improvement(row) for row in rows[:written].tolist())
+    better = tuple(improvement(row) for row in rows[:written].tolist())
     history = island.history + better
     return Island(island.index, island.seed, words, fitness, counters, memory, history)
 
 
-def _improvement(row: list[float]) -> Improvement:
+def improvement(row: Sequence[float]) -> Improvement:
+    """An improvement, of the row that compiled code wrote of it."""
     return Improvement(
         int(row[AT_GENERATION]),
         int(row[AT_EVALUATIONS]),

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from sysid.settings import GeneticAlgorithm, Loss
 from sysid.types import FloatArray
 
 _UNLIMITED = 2**62
-_NEVER = -1.0
+NEVER = -1.0
 _WARM_SHARE = 4  # one individual in four of a warm start comes from the given values
 _WARM_SPREAD = 0.1  # of the range
 
@@ -112,13 +113,20 @@ def budget_before(algorithm: GeneticAlgorithm, n: int) -> int:
 def plans(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> tuple[Plan, ...]:
     """How each island searches."""
     progress = record_progress(problem)
+    alike = shared_plans(algorithm, len(problem.space), loss_scale(problem))
+    return tuple(plan._replace(seed=seed, progress=progress) for plan in alike)
+
+
+@lru_cache(maxsize=64)
+def shared_plans(algorithm: GeneticAlgorithm, n: int, scale: float) -> tuple[Plan, ...]:
+    """What the plans of all runs of n parameters share; their arrays are not to be written to."""
     dealt = sizes(algorithm)
     made = []
     for index, size in enumerate(dealt):
         own = of_island(algorithm, index)
         made.append(
             Plan(
-                seed=seed,
+                seed=0,
                 island=index,
                 first=sum(dealt[:index]),
                 total=algorithm.population,
@@ -127,13 +135,13 @@ def plans(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> tuple[Pla
                 survivors=min(max(2, round(own.selection_rate * size)), size - 1),
                 stagnation=own.stagnation,
                 relative=int(own.sequence.relative),
-                evaluations=_island_budget(own, len(problem.space), size),
+                evaluations=_island_budget(own, n, size),
                 beta=float(own.sequence.beta),
-                rms=_NEVER if own.stop.rms is None else float(own.stop.rms),
-                loss_scale=loss_scale(problem),
+                rms=NEVER if own.stop.rms is None else float(own.stop.rms),
+                loss_scale=scale,
                 starts=np.array([start for start, _ in own.mutation], dtype=np.int64),
                 rates=np.array([rate for _, rate in own.mutation], dtype=np.float64),
-                progress=progress,
+                progress=np.zeros(0),
             )
         )
     return tuple(made)

@@ -1,18 +1,67 @@
 """Migration: copies of the best of one island replace the worst of another, all at once."""
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 
 from sysid.ga.chromosome import coded, decoded
 from sysid.ga.island import Island
-from sysid.ga.state import CLIFFS, CONFIRMED, HOPS, RETURNED, SAME, SETTLED, STAGNATION
+from sysid.ga.operators import rank
+from sysid.ga.state import (
+    AT_EVALUATIONS,
+    AT_GENERATION,
+    CLIFFS,
+    CONFIRMED,
+    EVALUATIONS,
+    GENERATION,
+    HOPS,
+    MIGRATION,
+    PHASE,
+    RETURNED,
+    RMS,
+    SAME,
+    SETTLED,
+    STAGNATION,
+    VALUES,
+)  # fmt: skip
+from sysid.islands.fleet import Fleet, News, dealt, empty_news, gathered, migrations
 from sysid.islands.topology import edges
-from sysid.result import Improvement, Migrant
+from sysid.kernels.caching import compiled
+from sysid.result import Migrant
 from sysid.settings import Migration
-from sysid.types import IntArray, WordArray
+from sysid.types import FloatArray, IntArray, WordArray
+
+
+class Routes(NamedTuple):
+    """Who sends how many to whom, as compiled code reads it.
+
+    Attributes
+    ----------
+    edges : IntArray, shape (E, 2)
+        Source and destination.
+    bits : IntArray, shape (I,)
+        Of each island's chromosomes.
+    migrants : int
+        Of each edge, at most.
+    """
+
+    edges: IntArray
+    bits: IntArray
+    migrants: int
+
+
+def routes(bits: Sequence[int], migration: Migration, largest: int) -> Routes:
+    """The routes between islands, the largest of which has so many individuals."""
+    pairs = edges(migration.topology, len(bits))
+    return Routes(
+        np.array(pairs, dtype=np.int64).reshape(len(pairs), 2),
+        np.array(bits, dtype=np.int64), min(migration.migrants, largest),
+    )  # fmt: skip
 
 
 def migrate(
-    islands: tuple[Island, ...], bits: tuple[int, ...], migration: Migration, epoch: int
+    islands: Sequence[Island], bits: Sequence[int], migration: Migration, epoch: int
 ) -> tuple[tuple[Island, ...], tuple[Migrant, ...]]:
     """The islands after one exchange, and its log.
 
@@ -21,53 +70,70 @@ def migrate(
     worse. `bits` are those of each island; between islands that differ the nearest chromosome
     arrives, to be evaluated at its destination.
     """
-    received = list(islands)
-    log: list[Migrant] = []
-    for source, destination in edges(migration.topology, len(islands)):
-        giver = islands[source]
-        for p in range(min(migration.migrants, giver.fitness.size)):
-            word, fitness = giver.words[p], float(giver.fitness[p])
-            exact = bits[source] == bits[destination]
+    ways = routes(bits, migration, max(island.fitness.size for island in islands))
+    fleet, count = gathered(islands), len(ways.edges)
+    news = empty_news(count, count * ways.migrants, fleet.champions.shape[1])
+    send(ways, fleet, epoch, news)
+    return dealt(fleet, news, islands), migrations(news)
+
+
+@compiled
+def send(ways: Routes, fleet: Fleet, epoch: int, news: News) -> None:
+    """One exchange in place: see `migrate`. An edge writes one improvement at most."""
+    words, fitness = fleet.words.copy(), fleet.fitness.copy()
+    champions = fleet.champions.copy()
+    for e in range(ways.edges.shape[0]):
+        source, destination = ways.edges[e, 0], ways.edges[e, 1]
+        begin, end = fleet.first[source], fleet.first[source + 1]
+        exact = ways.bits[source] == ways.bits[destination]
+        for p in range(begin, min(end, begin + ways.migrants)):
+            word = words[p : p + 1]
             if not exact:
-                word = coded(decoded(word[None], bits[source]), bits[destination])[0]
-            if _arrives(received[destination], word, fitness):
-                values = giver.history[-1].parameters if exact and p == 0 else None
-                received[destination] = _with(
-                    received[destination], word, fitness if exact else np.nan, values
-                )
-                log.append(Migrant(epoch, source, destination, fitness))
-    return tuple(received), tuple(log)
+                word = coded(decoded(word, ways.bits[source]), ways.bits[destination])
+            if not _arrives(fleet, destination, word[0], fitness[p]):
+                continue
+            _settle(fleet, destination, word[0], fitness[p] if exact else np.nan)
+            line = news.migrants[news.written[1]]
+            line[0], line[1], line[2], line[3] = epoch, source, destination, fitness[p]
+            news.written[1] += 1
+            if exact and p == begin and fitness[p] < fleet.rms[destination]:
+                _lead(fleet, destination, fitness[p], champions[source], news)
 
 
-def _arrives(island: Island, word: WordArray, fitness: float) -> bool:
+@compiled
+def _arrives(fleet: Fleet, island: int, word: WordArray, fitness: float) -> bool:
     """Whether a migrant is fitter than the worst, and new here."""
-    if not fitness < island.fitness[-1]:  # nan, not evaluated yet, comes last and is kept
+    begin, end = fleet.first[island], fleet.first[island + 1]
+    if not fitness < fleet.fitness[end - 1]:  # nan, not evaluated yet, comes last and is kept
         return False
-    sought, there = word.tobytes(), island.words.tobytes()
-    return all(there[i : i + len(sought)] != sought for i in range(0, len(there), len(sought)))
+    is_new = True
+    for p in range(begin, end):
+        is_new &= not np.all(fleet.words[p] == word)
+    return is_new
 
 
-def _with(
-    island: Island, word: WordArray, fitness: float, values: tuple[float, ...] | None
-) -> Island:
-    """The island with a migrant in the place of its worst individual."""
-    words, reached = island.words.copy(), island.fitness.copy()
-    words[-1], reached[-1] = word, fitness
-    order = np.argsort(reached, kind="stable")
-    counters, history = island.counters, island.history
-    if values is not None and fitness < island.champion_rms:
-        better = Improvement(island.generation, island.evaluations, fitness, "migration", values)
-        history, counters = (*history, better), _of_another(island, fitness)
-    return Island(
-        island.index, island.seed, words[order], reached[order], counters, island.memory, history
-    )
+@compiled
+def _settle(fleet: Fleet, island: int, word: WordArray, fitness: float) -> None:
+    """Put a migrant in the place of the worst individual."""
+    begin, end = fleet.first[island], fleet.first[island + 1]
+    for d in range(word.size):
+        fleet.words[end - 1, d] = word[d]
+    fleet.fitness[end - 1] = fitness
+    rank(fleet.words[begin:end], fleet.fitness[begin:end])
 
 
-def _of_another(island: Island, fitness: float) -> IntArray:
-    """The counters of an island whose champion has come from another."""
-    counters = island.counters.copy()
+@compiled
+def _lead(fleet: Fleet, island: int, fitness: float, values: FloatArray, news: News) -> None:
+    """Note that an island's champion has come from another."""
+    counters, row = fleet.counters[island], news.improvements[news.written[0]]
+    news.owners[news.written[0]] = island
+    news.written[0] += 1
+    row[AT_GENERATION], row[AT_EVALUATIONS] = counters[GENERATION], counters[EVALUATIONS]
+    row[RMS], row[PHASE] = fitness, MIGRATION
     counters[STAGNATION], counters[SETTLED] = 0, 0
-    if fitness < island.champion_rms * (1.0 - SAME):
+    if fitness < fleet.rms[island] * (1.0 - SAME):
         counters[CONFIRMED], counters[CLIFFS] = 0, 0
         counters[HOPS], counters[RETURNED] = 0, 0
-    return counters
+    fleet.rms[island] = fitness
+    for d in range(values.size):
+        fleet.champions[island, d] = row[VALUES + d] = values[d]

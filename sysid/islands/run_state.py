@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from sysid.ga.island import Island
-from sysid.ga.state import CLIFFS, CONFIRMED, HOPS, RETURNED, SAME, TRIED
+from sysid.ga.state import SAME
+from sysid.islands.settling import Searches, searches
 from sysid.result import Improvement, Migrant
+from sysid.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,28 +53,15 @@ class RunState:
         return min(island.champion_rms for island in self.islands)
 
     @property
-    def independent(self) -> int:
-        """How many searches began at new random places."""
-        return sum(int(island.counters[TRIED]) for island in self.islands)
+    def searches(self) -> Searches:
+        """What the searches of all islands found, as far as it is the best champion."""
+        return searches(*self.tally)
 
     @property
-    def confirmed(self) -> int:
-        """How many searches from new random places led to the best champion's fitness."""
-        most = self.rms * (1.0 + SAME)
-        return sum(int(i.counters[CONFIRMED]) for i in self.islands if i.champion_rms <= most)
-
-    @property
-    def hops(self) -> tuple[int, int]:
-        """Searches from beside the best champion, and how many of them led back to it."""
-        most = self.rms * (1.0 + SAME)
-        best = [i.counters for i in self.islands if i.champion_rms <= most]
-        return sum(int(c[HOPS]) for c in best), sum(int(c[RETURNED]) for c in best)
-
-    @property
-    def has_cliffs(self) -> bool:
-        """Whether a search from beside the best champion has met jumps of the fitness."""
-        most = self.rms * (1.0 + SAME)
-        return any(i.counters[CLIFFS] > 0 for i in self.islands if i.champion_rms <= most)
+    def tally(self) -> tuple[FloatArray, IntArray]:
+        """RMS of the champions (I,) and counters (I, N) of the islands."""
+        rms = np.array([island.champion_rms for island in self.islands])
+        return rms, np.array([island.counters for island in self.islands])
 
     def is_the_best_since(self, generation: int) -> bool:
         """Whether the best fitness was found by then, and nothing better after."""

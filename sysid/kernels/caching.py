@@ -24,8 +24,8 @@ import numpy as np
 from sysid.kernels.keeping import store, stored, tell
 
 _SOURCES = (
-    "ga/*.py", "kernels/*.py", "plants/*.py", "least_squares.py", "pulls.py", "refinement.py",
-    "sensitivities.py",
+    "ga/*.py", "islands/*.py", "kernels/*.py", "plants/*.py", "least_squares.py", "pulls.py",
+    "refinement.py", "sensitivities.py",
 )  # fmt: skip
 _VERSIONS = (numba.__version__, llvmlite.__version__, np.__version__, sys.version)
 _PARTS = 9  # of a compiled function; the last are environments

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sysid import run
 from sysid.ga.chromosome import decoded, located
 from sysid.ga.island import Island, evolve
 from sysid.islands.archipelago import found, plans
@@ -100,18 +101,44 @@ def test_fitness_is_that_of_the_chromosome_and_ascends(
     assert after.history[-1].parameters == tuple(theta[0])
 
 
+@pytest.mark.parametrize("steps", [1, 80 * 8 * 7], ids=["1-generation", "7-generations"])
 @pytest.mark.parametrize("method", METHODS)
-def test_a_run_cut_after_every_call_gives_the_same_bits(method: SearchMethod) -> None:
+def test_a_run_cut_after_every_call_gives_the_same_bits(
+    method: SearchMethod, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     algorithm = small(method)
     whole = advance(problem(), algorithm, begin(problem(), algorithm, 3))
-    cut = begin(problem(), algorithm, 3)
+    monkeypatch.setattr(run, "UNMEASURED_STEPS", steps)
+    cut, calls = begin(problem(), algorithm, 3), 0
     while not is_finished(algorithm, cut):
         cut = pickle.loads(pickle.dumps(advance(problem(), algorithm, cut, 0.0)))
+        calls += 1
     assert bits(cut) == bits(whole)
+    done = sum(island.generation for island in cut.islands)
+    assert calls >= done / (1 if steps == 1 else 7)
 
 
-def test_islands_evolved_apart_and_exchanged_are_the_plain_loop() -> None:
-    algorithm = small(stop=Stop(evaluations=900))
+DIFFERENT = (
+    IslandChange(mutation=((0, 0.9), (3, 0.1), (20, 0.5))),
+    IslandChange(method="simple", bits=12),
+    IslandChange(bits=20, mutation=((0, 0.3),)),
+)
+
+
+@pytest.mark.parametrize(
+    "algorithm",
+    [
+        small(stop=Stop(evaluations=900)),
+        small(stop=Stop(rms=0.03)),
+        small(population=26, migration=Migration(every=10, topology="fully-connected")),
+        small("simple", generations=230, migration=Migration(every=1)),  # many borders in a call
+        small(islands=DIFFERENT, migration=Migration(every=5, topology="ring", migrants=50)),
+    ],
+    ids=["evaluations", "target", "uneven", "borders", "different"],
+)
+def test_islands_evolved_apart_and_exchanged_are_the_plain_loop(
+    algorithm: GeneticAlgorithm,
+) -> None:
     whole = advance(problem(), algorithm, begin(problem(), algorithm, 9))
     state = begin(problem(), algorithm, 9)
     while not is_finished(algorithm, state):
@@ -125,11 +152,11 @@ def test_islands_evolved_apart_and_exchanged_are_the_plain_loop() -> None:
 
 
 def test_the_same_seed_repeats_and_another_does_not() -> None:
-    def run(seed: int) -> RunState:
+    def searched(seed: int) -> RunState:
         return advance(problem(), small(), begin(problem(), small(), seed))
 
-    assert bits(run(1)) == bits(run(1))
-    assert run(1).islands[0].words.tobytes() != run(2).islands[0].words.tobytes()
+    assert bits(searched(1)) == bits(searched(1))
+    assert searched(1).islands[0].words.tobytes() != searched(2).islands[0].words.tobytes()
 
 
 def test_islands_of_one_seed_begin_apart() -> None:
@@ -205,10 +232,10 @@ def test_islands_may_differ_in_method_and_bits() -> None:
 def test_a_run_settles_where_searches_from_anywhere_agree() -> None:
     once = GeneticAlgorithm(stop=Stop(settled=3))
     settled = advance(example(), once, begin(example(), once, 1))
-    assert settled.confirmed >= 3
-    assert 3 * settled.confirmed >= 2 * settled.independent
+    assert settled.searches.confirmed >= 3
+    assert 3 * settled.searches.confirmed >= 2 * settled.searches.independent
     assert settled.generation < once.generations
-    twice = GeneticAlgorithm(stop=Stop(settled=2 * settled.confirmed))
+    twice = GeneticAlgorithm(stop=Stop(settled=2 * settled.searches.confirmed))
     longer = advance(example(), twice, begin(example(), twice, 1))
     assert longer.generation > settled.generation
     assert longer.rms == pytest.approx(settled.rms, rel=1e-4)
@@ -218,6 +245,6 @@ def test_a_run_settles_where_searches_from_anywhere_agree() -> None:
 def test_the_papers_methods_and_those_told_so_never_settle(method: SearchMethod) -> None:
     algorithm = small(method, generations=60, stop=Stop(settled=1))
     state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
-    assert (state.generation, state.independent) == (60, 0)
+    assert (state.generation, state.searches.independent) == (60, 0)
     never = small(generations=60, stop=Stop(settled=None))
     assert advance(problem(), never, begin(problem(), never, 1)).generation == 60

@@ -29,5 +29,5 @@ def test_the_fitness_jumps_where_friction_switches_and_only_there(
 ) -> None:
     problem = example(model, sd=sd)
     state = advance(problem, GeneticAlgorithm(), begin(problem, GeneticAlgorithm(), 1))
-    assert state.hops[0] > 0
-    assert state.has_cliffs is jumps
+    assert state.searches.hops > 0
+    assert state.searches.has_cliffs is jumps
