@@ -18,7 +18,6 @@ What no data tell follows from the form of the equations (`sysid.symmetries`) an
 exactly; what these data do not tell, from its singular values. Both give groups (`sysid.groups`).
 """
 
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +29,8 @@ from sysid.groups import Block, blocks, written
 from sysid.islands.archipelago import loss_scale
 from sysid.linear import RANK, Linear, linear_model
 from sysid.problem import Problem
-from sysid.pulls import AT_BOUND, Pull, pulls
+from sysid.pulls import AT_BOUND, Pull, is_pulled, pulls
+from sysid.reaches import reach
 from sysid.result import Criteria, Estimate, EstimateStatus, NoiseColour, Uncertainty
 from sysid.sensitivities import BudgetSpentError, Sensitivities, sensitivities
 from sysid.serial import Coloured, coloured
@@ -67,7 +67,7 @@ class Analysis:
     evaluations: int
     criteria: Criteria
     pulls: tuple[Pull, ...] = ()
-    """Bounds that hold parameters back, the costliest first."""
+    """Bounds to widen together, the costliest first."""
     linear: Linear | None = None
     """None where there is no uncertainty or the loss is not that of squares."""
     is_cut_short: bool = False
@@ -139,7 +139,7 @@ def _analysed(
     sloping = np.where(plateau > 0, 0.0, columns)
     influence = _influence(error, loss_scale(problem))
     gain = _possible_gain(influence, sloping, place)
-    pulled = pulls(problem.space, influence, sloping, place)
+    pulled = is_pulled(influence, sloping, place)
     scale = physical_scale(problem, theta)
     powers = scalings(problem.model, problem.all_parameters)
     shifts, more = translations(
@@ -171,7 +171,7 @@ def _analysed(
         noise_colour=_named(colour, white),
         groups=tuple(g for one in found for g in written(one, names, theta, scale, physical)),
     )
-    statuses = _statuses(place, found, [p.name for p in pulled], problem)
+    statuses = _statuses(place, found, pulled)
     told = Known(
         theta, statuses, physical, float(stdtrit(_told_by(n, d, colour, white), 0.975)), member,
         uncertainty.groups, rows[~kept], scale,
@@ -182,7 +182,19 @@ def _analysed(
         stated = np.diag(covariance)
         root = singular[:, None] * rows
         linear = linear_model(error, columns, plateau > 0, place, stated, scale, inverse, root)
-    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, pulled, linear)
+    held = _held_back(problem, influence, sloping, place) if pulled.any() else ()
+    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, held, linear)
+
+
+def _held_back(
+    problem: Problem, influence: FloatArray, columns: FloatArray, place: FloatArray
+) -> tuple[Pull, ...]:
+    at_end = (place < AT_BOUND) | (place > 1.0 - AT_BOUND)
+    reaches = tuple(
+        reach(problem, one) if asked else (one.lower, one.upper)
+        for one, asked in zip(problem.space, at_end, strict=True)
+    )
+    return pulls(problem.space, reaches, influence, columns, place)
 
 
 def criteria_of(error: FloatArray, parameters: int, white: Whitening | None = None) -> Criteria:
@@ -316,7 +328,7 @@ def _named(colour: Coloured | None, white: Whitening | None) -> NoiseColour:
 
 
 def _statuses(
-    place: FloatArray, found: tuple[Block, ...], pulled: Collection[str], problem: Problem
+    place: FloatArray, found: tuple[Block, ...], pulled: BoolArray
 ) -> tuple[EstimateStatus, ...]:
     """What the data say of each parameter: see `EstimateStatus`.
 
@@ -328,7 +340,7 @@ def _statuses(
         statuses[d] = "at bound"
     for block in found:
         for d in block.members:
-            if problem.space[d].name not in pulled:
+            if not pulled[d]:
                 statuses[d] = "unidentifiable" if block.tells_nothing else "group"
     return tuple(statuses)
 

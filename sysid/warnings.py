@@ -50,6 +50,7 @@ def warnings_of(
         found.append(f"the RMS error {rms:.4g} is above the safe limit {limit:g}: not valid")
     found += mixed_units(problem.model, problem.records)
     found += _held_back(analysis)
+    found += _constant_outputs(problem)
     found += _worse_than_a_line(problem, simulated)
     found += _without_excitation(problem, analysis.estimates)
     found += _steps_read_as_ramps(problem)
@@ -118,6 +119,24 @@ def _begun_before(problem: Problem) -> list[str]:
                 "input has moved yet: if the record begins with the step itself, the lag comes out "
                 "wrong, since an input is taken to have stood at its first value all the time "
                 "before; put some rows of the input at rest before the record"
+            )
+    return found
+
+
+def _constant_outputs(problem: Problem) -> list[str]:
+    """Outputs whose scored samples are all the same, in every experiment."""
+    measured = problem.split(problem.evaluator.measured)
+    weights = problem.split(problem.evaluator.weight)
+    found = []
+    for output in problem.model.outputs:
+        values = np.concatenate(
+            [y[output.name][w[output.name] > 0] for y, w in zip(measured, weights, strict=True)]
+        )
+        if np.ptp(values) == 0.0:
+            unit = "" if output.unit == "1" else f" {output.unit}"
+            found.append(
+                f"output {output.name!r} is constant ({values[0]:.4g}{unit}): it tells nothing of "
+                "the dynamics, and no fit % can be given"
             )
     return found
 

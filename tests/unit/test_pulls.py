@@ -1,0 +1,139 @@
+"""Which bounds to widen: advice that holds for all parameters together, and is possible."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.models.model import Model
+from sysid.models.spec import parse_model
+from sysid.parameters import Parameter
+from sysid.problem import Problem
+from sysid.pulls import Pull, is_pulled, pulls
+from sysid.reaches import reach
+from sysid.records import Channel, Record
+from sysid.simulation import simulate
+from sysid.types import FloatArray
+from sysid.uncertainty import analyse
+
+TIMES = 0.05 * np.arange(400.0)
+ANYWHERE = (-np.inf, np.inf)
+U = Channel("u", TIMES, np.where((TIMES // 3) % 2 < 1, 0.0, 1.0), hold="zero")
+A, B, C = np.random.default_rng(5).standard_normal((3, 500))
+
+
+def space(number: int) -> tuple[Parameter, ...]:
+    return tuple(Parameter(name, 0.0, 1.0) for name in "abcd"[:number])
+
+
+def advised(
+    columns: FloatArray, truth: FloatArray, place: FloatArray, reaches: Any = None
+) -> tuple[tuple[Pull, ...], list[str]]:
+    """Advice at the best place inside the bounds for data of a linear model, and who is pulled."""
+    one = space(place.size)
+    influence = columns @ (place - truth) + 1e-3 * C
+    found = pulls(one, reaches or (ANYWHERE,) * place.size, influence, columns, place)
+    alone = is_pulled(influence, columns, place)
+    return found, [p.name for p, is_out in zip(one, alone, strict=True) if is_out]
+
+
+def test_a_bound_that_only_stands_in_for_another_is_not_to_be_widened() -> None:
+    """b lies at its upper bound because a is held: once a is free, b belongs inside."""
+    columns = np.column_stack([A, 0.9 * A + 0.4 * B])
+    found, alone = advised(columns, np.array([3.0, 0.5]), np.array([1.0, 1.0]))
+    assert alone == ["a", "b"]
+    assert [(one.name, one.side) for one in found] == [("a", "upper")]
+
+
+def test_of_two_with_one_effect_one_is_widened() -> None:
+    columns = np.column_stack([A, A])
+    found, alone = advised(columns, np.array([2.0, 2.0]), np.array([1.0, 1.0]))
+    assert alone == ["a", "b"]
+    assert [one.name for one in found] == ["a"]
+
+
+def test_bounds_that_hold_back_both_are_both_told_the_costliest_first() -> None:
+    columns = np.column_stack([A, B])
+    found, _ = advised(columns, np.array([-1.0, 4.0]), np.array([0.0, 1.0]))
+    assert [(one.name, one.side) for one in found] == [("b", "upper"), ("a", "lower")]
+    assert found[0].share + found[1].share == pytest.approx(1.0, abs=1e-4)
+
+
+def test_what_cannot_move_outwards_leaves_it_to_those_that_can() -> None:
+    """a is wanted below what is possible: b, of nearly the same effect, takes its part."""
+    columns = np.column_stack([A, A + 0.3 * B])
+    reaches = ((0.0, np.inf), ANYWHERE)
+    found, alone = advised(columns, np.array([-2.0, -1.0]), np.array([0.0, 0.0]), reaches)
+    assert alone == ["a", "b"]
+    assert [one.name for one in found] == ["b"]
+
+
+def test_the_step_goes_no_farther_than_is_possible() -> None:
+    columns = np.column_stack([A, B])
+    reaches = ((-0.5, 2.0), ANYWHERE)
+    [only], _ = advised(columns, np.array([-4.0, 0.5]), np.array([0.0, 0.5]), reaches)
+    assert (only.name, only.limit) == ("a", -0.5)
+    assert only.share == pytest.approx(1 - (3.5 / 4) ** 2, abs=0.01)
+    assert only.cure == "lower the bound of a, to -0.5 at the least"
+
+
+def lag(**bounds: Any) -> Model:
+    """First-order lag behind a dead time."""
+    parameters = {"K": {"lower": 0.1, "upper": 5}, "T": {"lower": 0.1, "upper": 2, "unit": "s"},
+                  "L": {"lower": 0, "upper": 1, "unit": "s"}}  # fmt: skip
+    return parse_model({
+        "name": "lag", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
+        "parameters": {name: {**one, **bounds.get(name, {})} for name, one in parameters.items()},
+        "equations": {"x": "(K*u(t-L) - x)/T"}, "outputs": {"y": "x"}, "initial": {"x": 0},
+    })  # fmt: skip
+
+
+def problem(model: Model, ahead: float = 0.0, **truth: float) -> Problem:
+    """Data of a lag; `ahead`: the output is recorded so much too early."""
+    values = {"K": 2.0, "T": 0.6, "L": 0.3} | truth
+    y = simulate(model, [U], values, times=TIMES).channel("y").values
+    noise = np.random.default_rng(1).normal(0, 0.01, y.size)
+    shifted = np.interp(TIMES + ahead, TIMES, y) + noise
+    return Problem.build(model, [Record((U,), (Channel("y", TIMES, shifted, "m"),))])
+
+
+def test_a_lag_at_zero_is_not_to_be_negative() -> None:
+    found = analyse(problem(lag(), ahead=0.25, L=0.0, T=1.0), np.array([2.0, 1.0, 0.0]))
+    assert found.estimates[2].status == "at bound"
+    assert "L" not in [one.name for one in found.pulls]
+
+
+def test_a_lag_that_is_held_above_zero_may_go_down_to_it() -> None:
+    model = lag(L={"lower": 0.5, "upper": 1.0})
+    found = analyse(problem(model, L=0.1), np.array([2.0, 0.6, 0.5]))
+    [only] = [one for one in found.pulls if one.name == "L"]
+    assert (only.side, only.limit) == ("lower", 0.0)
+    assert only.cure == "lower the bound of L, to 0 s at the least"
+
+
+def test_a_time_constant_is_not_to_be_negative_nor_zero_to_be_passed() -> None:
+    changed = problem(lag(T={"lower": 0.5}))
+    assert reach(changed, changed.space[1]) == (0.0, np.inf)
+    logarithmic = problem(lag(K={"scale": "log"}))
+    assert reach(logarithmic, logarithmic.space[0]) == (0.0, np.inf)
+    assert reach(changed, changed.space[0]) == (-np.inf, np.inf)
+
+
+def test_a_lag_is_not_to_reach_as_far_back_as_the_record() -> None:
+    short = problem(lag())
+    low, high = reach(short, short.space[2])
+    assert low == 0.0
+    assert high == pytest.approx(TIMES[-1], rel=1e-6)
+
+
+def test_of_two_lags_in_a_row_each_may_take_what_the_other_leaves() -> None:
+    parameters = {"a": {"lower": 0.2, "upper": 1}, "b": {"lower": -0.1, "upper": 1}}
+    model = parse_model({
+        "name": "two", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
+        "parameters": parameters, "equations": {"x": "u(t-a-b) - x"}, "outputs": {"y": "x"},
+        "initial": {"x": 0},
+    })  # fmt: skip
+    made = Problem.build(model, [Record((U,), (Channel("y", TIMES, np.sin(TIMES), "m"),))])
+    first, second = (reach(made, one) for one in made.space)
+    assert first[0] == pytest.approx(0.1, abs=1e-6)
+    assert second[0] == pytest.approx(-0.2, abs=1e-6)
