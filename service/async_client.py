@@ -113,9 +113,11 @@ class AsyncClient(
                 for event in parser.feed(line):
                     yield event
 
-    async def runs(self, job: str, **filters: Any) -> AsyncIterator[Document]:
+    async def runs(
+        self, job: str, *, at_most: int | None = None, **filters: Any
+    ) -> AsyncIterator[Document]:
         """Runs of a job, page by page."""
-        pages = calls.Pages(("jobs", job, "runs"), None, filters)
+        pages = calls.Pages(("jobs", job, "runs"), at_most, filters)
         while (call := pages.next()) is not None:
             for run in pages.take(await self._one(call)):
                 yield run

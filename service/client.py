@@ -142,6 +142,6 @@ class Client(Methods[Document, list[Document], str, bytes]):
             for line in stream.iter_lines():
                 yield from parser.feed(line)
 
-    def runs(self, job: str, **filters: Any) -> list[Document]:
-        """All runs of a job."""
-        return self._all("jobs", job, "runs", **filters)
+    def runs(self, job: str, *, at_most: int | None = None, **filters: Any) -> list[Document]:
+        """All runs of a job, or the first `at_most` that the filters leave."""
+        return self._all("jobs", job, "runs", at_most=at_most, **filters)

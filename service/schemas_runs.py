@@ -36,6 +36,9 @@ class RunOut(Answer):
     seconds: float | None = None
     progress: float
     error: str | None = None
+    reused_from: str | None = Field(
+        default=None, description="the run that was computed before with the same specification"
+    )
     created_at: datetime
     started_at: datetime | None = None
     finished_at: datetime | None = None

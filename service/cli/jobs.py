@@ -23,7 +23,7 @@ from service.cli.common import (
     with_unit,
 )
 from service.cli.many_runs import MOST, print_many
-from service.cli.one_run import place_of, show_run
+from service.cli.one_run import place_of, show_run, tell_reused
 from service.cli.places import in_file, told_at
 from service.cli.watching import follow
 from service.documents import read_yaml
@@ -208,6 +208,8 @@ def _finish(client: "Client", job: dict[str, Any], as_json: bool) -> None:
         print_runs(found, job["rms_unit"])
         for warning in dict.fromkeys(w for run in found for w in run.get("warnings", [])):
             out.print(f"note: {warning}", markup=False, soft_wrap=True)
+    if not as_json:
+        tell_reused(job, found, "reuse: false in the job")
     if job["state"] != "succeeded":
         reason = f": {job['error']}" if job["error"] else ""
         err.print(f"lagid: {job['id']} {job['state']}{reason}", markup=False)

@@ -1,10 +1,12 @@
 """One run in a terminal: what distinguishes it, its estimates, its fit, its warnings."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from service.cli.common import estimate, out, print_json, print_table, status_of
 
 DATA = "/datasets"
+REUSED = "the same run was computed before: the result of {} is shown"
 
 
 def place_of(run: dict[str, Any]) -> dict[str, object]:
@@ -37,8 +39,22 @@ def show_run(run: dict[str, Any], as_json: bool) -> None:
         _line(_fit(run))
     if run["error"]:
         _line(run["error"])
+    if run.get("reused_from"):
+        _line(f"note: {REUSED.format(run['reused_from'])}")
     for warning in run.get("warnings", []):
         _line(f"note: {warning}")
+
+
+def tell_reused(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: str) -> None:
+    """Say which results of a job were computed for others before, and how to have them anew."""
+    reused, n_runs = job["progress"]["reused"], job["progress"]["runs"]
+    if not reused:
+        return
+    if n_runs == 1 and runs:
+        text = REUSED.format(runs[0]["reused_from"])
+    else:
+        text = f"{reused} of {n_runs} runs were computed before: their results are shown"
+    _line(f"note: {text}; to compute anew: {cure}")
 
 
 def _fit(run: dict[str, Any]) -> str:

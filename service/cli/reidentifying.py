@@ -19,6 +19,7 @@ from service.cli.common import (
     read_file,
     usage,
 )
+from service.cli.one_run import tell_reused
 from service.cli.places import Places, told_at
 from service.cli.trends import print_trend
 from service.cli.watching import follow
@@ -132,6 +133,7 @@ def _tell(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
         print_json(trend)
     else:
         print_trend(trend, Places())
+        tell_reused(job, (), "--set reuse=false")
     if json_file not in (None, "-"):
         try:
             Path(str(json_file)).write_text(json.dumps(trend, indent=2, ensure_ascii=False))

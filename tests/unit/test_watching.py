@@ -2,40 +2,114 @@
 
 from typing import Any
 
+import pytest
+
 from service.cli.many_runs import MOST_KINDS, print_many
-from service.cli.watching import EVERY_S, Lines
+from service.cli.one_run import tell_reused
+from service.cli.watching import EVERY_S, Lines, Many
 
 
 def job(state: str, finished: int = 0, **progress: Any) -> dict[str, Any]:
-    known = {"runs": 40, "finished": finished, "generation": 0, "best_rms": None, **progress}
-    return {"id": "job_1", "state": state, "progress": known}
+    known = {"runs": 40, "finished": finished, "generation": 0, "best_rms": None, "failed": 0,
+             "reused": 0, "seconds_left": None, **progress}  # fmt: skip
+    return {"id": "job_1", "name": "many", "state": state, "progress": known}
+
+
+def run(number: int, state: str = "succeeded", rms: float | None = 0.25) -> dict[str, Any]:
+    return {"number": number, "state": state, "rms": rms, "labels": {"length_m": 5},
+            "cell": {"/noise/sigma": 0.1, "/datasets": ["ds_1"]}}  # fmt: skip
+
+
+class Log:
+    """Lines of a job at times that the test sets; `asked` counts looks at the last run."""
+
+    def __init__(self, unit: str | None = None, newest: dict[str, Any] | None = None) -> None:
+        self.told: list[str] = []
+        self.now = 0.0
+        self.asked = 0
+        self._run = newest
+        self._lines = Lines(self.told.append, Many(self._newest, unit, lambda: self.now))
+
+    def _newest(self) -> dict[str, Any] | None:
+        self.asked += 1
+        return self._run
+
+    def show(self, now: float, seen: dict[str, Any]) -> None:
+        self.now = now
+        self._lines.show(seen)
 
 
 def test_a_line_is_told_at_a_change_of_state_and_every_ten_seconds_at_most():
-    told: list[str] = []
-    now = [0.0]
-    lines = Lines(told.append, "m", lambda: now[0])
-    lines.show(job("queued"))
-    lines.show(job("queued"))
-    lines.show(job("running"))
+    log = Log("m")
+    log.show(0, job("queued"))
+    log.show(0, job("queued"))
+    log.show(0, job("running"))
     for tick in range(1, 300):  # 30 s, a look every 0.1 s, something new at each
-        now[0] = tick / 10
-        lines.show(job("running", tick // 10, best_rms=1 / tick))
-    lines.show(job("succeeded", 40, best_rms=0.25))
-    assert [text.split(",")[0].split()[1] for text in told] == [
+        log.show(tick / 10, job("running", tick // 10, best_rms=1 / tick))
+    log.show(30, job("succeeded", 40, best_rms=0.25))
+    assert [text.split(",")[0].split()[1] for text in log.told] == [
         "queued", "running", "running", "running", "succeeded",
     ]  # fmt: skip
-    assert told[-1] == "job_1 succeeded, 40/40 runs, best RMS 0.25 m"
+    assert log.told[-1] == "job_1 succeeded, 40/40 runs"
+
+
+def test_a_line_about_many_runs_has_counts_pace_what_is_left_and_the_last_run():
+    log = Log("m", run(11))
+    log.show(0, job("queued"))
+    log.show(100, job("running"))
+    log.show(110, job("running", 12, failed=2, reused=3, seconds_left=23.4, best_rms=1e-9))
+    assert log.told[-1] == (
+        "job_1 running, 12/40 runs, 2 failed, 3 reused, 1.2 runs/s, 23.4 s left, "
+        "last run 12 (5, 0.1): RMS 0.25 m"
+    )
+    log.show(115, job("succeeded", 40, failed=2, best_rms=1e-9))
+    assert log.told[-1] == "job_1 succeeded, 40/40 runs, 2 failed"
+
+
+def test_a_last_run_that_failed_has_no_rms():
+    log = Log("m", run(4, "failed", None))
+    log.show(0, job("running", 5, failed=1))
+    assert log.told == ["job_1 running, 5/40 runs, 1 failed, last run 5 (5, 0.1): failed"]
+
+
+def test_the_last_run_is_not_asked_for_at_every_look():
+    log = Log(None, run(0))
+    many = Many(log._newest, None, lambda: log.now)
+    for tick in range(100):  # 10 s, ten runs a second
+        log.now = tick / 10
+        many.told(job("running", tick))
+    assert log.asked <= 11
+    many.told(job("running", 99))
+    assert log.asked <= 11
+
+
+def test_one_run_is_told_with_its_rms():
+    log = Log("m")
+    log.show(0, job("running", 0, runs=1, generation=12, best_rms=0.5))
+    assert log.told == ["job_1 running, 0/1 runs, generation 12, RMS 0.5 m"]
 
 
 def test_nothing_new_is_not_told_again():
-    told: list[str] = []
-    now = [0.0]
-    lines = Lines(told.append, None, lambda: now[0])
+    log = Log()
     for tick in range(10):
-        now[0] = tick * EVERY_S
-        lines.show(job("queued"))
-    assert told == ["job_1 queued, 0/40 runs"]
+        log.show(tick * EVERY_S, job("queued"))
+    assert log.told == ["job_1 queued, 0/40 runs"]
+
+
+@pytest.mark.parametrize(
+    ("runs", "reused", "said"),
+    [
+        (1, 1, "note: the same run was computed before: the result of run_0 is shown; to compute "
+               "anew: reuse: false in the job"),
+        (40, 3, "note: 3 of 40 runs were computed before: their results are shown; to compute "
+                "anew: reuse: false in the job"),
+        (40, 0, ""),
+    ],
+)  # fmt: skip
+def test_a_result_that_was_taken_over_is_said_to_be(capsys, runs: int, reused: int, said: str):
+    ended = job("succeeded", runs, runs=runs, reused=reused)
+    tell_reused(ended, [{"reused_from": "run_0"}], "reuse: false in the job")
+    assert capsys.readouterr().out.strip() == said
 
 
 class Summarised:

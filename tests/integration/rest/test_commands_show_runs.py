@@ -143,7 +143,19 @@ def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) ->
 def test_a_job_that_is_watched_from_a_pipe_tells_its_state(served: Served) -> None:
     told = lagid("watch", served.job)
     assert told.exit_code == 0, told.output
-    assert f"{served.job} succeeded, 2/2 runs, best RMS" in told.stderr
+    assert f"{served.job} succeeded, 2/2 runs\n" in told.stderr
+
+
+def test_a_result_that_was_computed_before_is_said_to_be(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = served.runs[0]
+    taken = {**served.client.run(before), "reused_from": "run_before"}
+    monkeypatch.setattr(served.client, "run", lambda _: taken)
+    assert (
+        "note: the same run was computed before: the result of run_before"
+        in lagid("runs", before).stdout
+    )
 
 
 def test_a_dataset_is_derived_by_its_name(served: Served, tmp_path: Path) -> None:
