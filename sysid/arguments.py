@@ -37,6 +37,10 @@ class Arguments:
         """Whether the argument is given and not null."""
         return self._given.get(name) is not None
 
+    def value(self, name: str) -> object:
+        """Return the argument as it is, None if it is not given."""
+        return self._given.get(name)
+
     def items(self) -> list[tuple[str, Any]]:
         """All arguments; at least one."""
         if not self._given:

@@ -79,21 +79,36 @@ def pool(recording: Recording, given: Arguments) -> Recording:
     The input becomes the median of its samples over bins of time, at the mean time of each bin's
     samples; each output keeps every sample at its own time. This resolves a lag that is shorter
     than the sampling period when every repeat has another phase.
+
+    With ``outputs_from``, conditions as in `select`, outputs are those of some segments only: where
+    every repeat has the same input, those kept for validation may help to tell it.
     """
-    given.only("input", "outputs", "bin", "start", "stop")
+    given.only("input", "outputs", "outputs_from", "bin", "start", "stop")
     start, width = given.number("start", 0.0), given.positive("bin")
     source = recording.channel(given.text("input"))
-    outputs = [recording.channel(name) for name in given.texts("outputs")]
-    last = max(float(own_times_of(one, recording.segments).max()) for one in (source, *outputs))
+    kept = _outputs_from(recording, given)
+    outputs = [kept.channel(name) for name in given.texts("outputs")]
+    last = max(
+        float(own_times_of(one, whole.segments).max())
+        for one, whole in [(source, recording), *((output, kept) for output in outputs)]
+    )
     stop = given.number("stop", float(np.nextafter(last, np.inf)))
     if stop <= start:
         given.fail("stop", f"found {stop!r}; need more than the start, {start!r}")
     pooled = [_medians(source, recording.segments, start, stop, width)]
-    pooled += [_gathered(one, recording.segments, start, stop) for one in outputs]
+    pooled += [_gathered(one, kept.segments, start, stop) for one in outputs]
     for channel in pooled:
         if channel is None:
             given.fail("", f"a channel has no sample from {start:g} to {stop:g} s")
     return Recording(tuple(channel for channel in pooled if channel is not None))
+
+
+def _outputs_from(recording: Recording, given: Arguments) -> Recording:
+    if not given.has("outputs_from"):
+        return recording
+    return select(
+        recording, Arguments(f"{given.pointer}/outputs_from", given.value("outputs_from"))
+    )
 
 
 def own_times_of(channel: Channel, segments: tuple[Segment, ...]) -> FloatArray:

@@ -71,12 +71,12 @@ def _job(client: Client, raw: str, length: float, several: list[float]) -> dict[
 def pooled(
     client: Client, raw: str, length: float, pressure: float, remainder: int
 ) -> dict[str, Any]:
-    """The pooled record of the even (0) or odd (1) repeats."""
-    chosen = {
-        "length_m": length, "p_nom_bar": pressure, "phase": "fill",
-        "repeat": {"modulus": 2, "remainder": remainder},
+    """The outlet of the even (0) or odd (1) repeats over the inlet curve of all (data's README)."""
+    chosen = {"length_m": length, "p_nom_bar": pressure, "phase": "fill"}
+    pooling = {
+        "input": "p_in_bar", "outputs": ["p_out_bar"], "bin": 0.003, "start": 0, "stop": 1,
+        "outputs_from": {"repeat": {"modulus": 2, "remainder": remainder}},
     }  # fmt: skip
-    pooling = {"input": "p_in_bar", "outputs": ["p_out_bar"], "bin": 0.003, "start": 0, "stop": 1}
     name = f"{length:g} m, {pressure:g} bar, fill, {'odd' if remainder else 'even'} repeats"
     return client.derive(raw, [{"select": chosen}, {"pool": pooling}], name=name)
 

@@ -210,6 +210,30 @@ def test_a_pooled_input_is_the_median_of_each_bin() -> None:
     assert made.channel("y").times[-1] == 0.6
 
 
+def test_a_pooled_input_is_that_of_all_repeats_where_outputs_are_those_of_some() -> None:
+    pooling = {"input": "u", "outputs": ["y"], "bin": 0.3, "start": 0}
+    some = {"n": {"modulus": 2, "remainder": 0}}
+    whole = derive(repeats(), [{"pool": pooling}])
+    made = derive(repeats(), [{"pool": pooling | {"outputs_from": some}}])
+    alone = derive(repeats(), [{"select": some}, {"pool": pooling}])
+    for name, same in (("u", whole), ("y", alone)):
+        np.testing.assert_array_equal(made.channel(name).times, same.channel(name).times)
+        np.testing.assert_array_equal(values(made, name), values(same, name))
+    assert alone.channel("u").times.size < made.channel("u").times.size
+    assert made.channel("y").times.size < whole.channel("y").times.size
+
+
+def test_pooled_outputs_are_of_segments_that_exist() -> None:
+    pooling = {"input": "u", "outputs": ["y"], "bin": 0.3}
+    for wrong, pointer in (
+        ({"m": 1}, "/steps/0/pool/outputs_from/m"), (3, "/steps/0/pool/outputs_from"),
+        ({"n": 99}, "/steps/0/pool/outputs_from"), ({}, "/steps/0/pool/outputs_from"),
+    ):  # fmt: skip
+        with pytest.raises(InvalidSettings) as caught:
+            derive(repeats(), [{"pool": pooling | {"outputs_from": wrong}}])
+        assert caught.value.pointer == pointer
+
+
 @pytest.mark.parametrize(
     ("steps", "pointer"),
     [
