@@ -14,10 +14,12 @@ from sysid.neighbours import Neighbourhood, affordable, neighbourhood, widened
 from sysid.noise_model import Generalised, generalised, whitening
 from sysid.onset import onset_delays
 from sysid.problem import Problem, metrics_of
+from sysid.records import common_sample_time
 from sysid.refinement import Refined, refine
 from sysid.residuals import ResidualTests, residual_tests
 from sysid.result import Estimate, Identification, Improvement, IslandSummary
 from sysid.settings import GeneticAlgorithm
+from sysid.step_check import step_notes
 from sysid.threads import one_thread
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis, analyse
@@ -100,6 +102,7 @@ def _concluded(
         agreement_validation=() if kept is None else kept.metrics.channels,
         warnings=(
             *warnings_of(problem, algorithm, analysis, simulated, metrics.rms, tests),
+            *step_notes(problem, theta, analysis.estimates, simulated),
             *noise_notes(problem, times, noise.is_complete),
         ),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
@@ -107,6 +110,8 @@ def _concluded(
         residual_tests=tests,
         onset_delays=onset_delays(problem.model, problem.records),
         correlation_times=times,
+        holds={one.name: one.hold for one in problem.records[0].inputs},
+        sample_time=common_sample_time(problem.records),
     )
 
 

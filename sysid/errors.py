@@ -18,6 +18,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
 
+_MOST_NAMES = 30
+"""Known names that a message lists at most: of datasets there may be thousands."""
+
 
 class SysidError(Exception):
     """Base class of the errors that the numerical core raises on purpose."""
@@ -119,9 +122,11 @@ class NothingIdentifiable(SysidError, ValueError):
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """Suggestion to add to a message about an unknown name: the nearest known one, or all."""
+    """Suggestion to add to a message about an unknown name: the nearest known one, or the first."""
     names = sorted(known)
     close = get_close_matches(name, names, n=1)
     if close:
         return f"; did you mean {close[0]!r}?"
-    return f"; known are {', '.join(names)}" if names else ""
+    left = len(names) - _MOST_NAMES
+    more = f", and {left} more" if left > 0 else ""
+    return f"; known are {', '.join(names[:_MOST_NAMES])}{more}" if names else ""

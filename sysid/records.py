@@ -1,6 +1,6 @@
 """Recordings: channels on their own times, segments, and the record a model is compared with."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
@@ -17,6 +17,9 @@ REGULAR_WITHIN = 1e-2
 
 Files print times with few digits: 610.35 Hz to 10 µs is off by 0.3 % of a period.
 """
+
+
+_SAME_PERIOD = 1e-6  # of a period: how far those of one clock may differ
 
 
 class Sampling(NamedTuple):
@@ -295,6 +298,15 @@ class Record:
     def duration(self) -> float:
         """Seconds from the first to the last sample of any channel."""
         return self.stop - self.start
+
+
+def common_sample_time(records: Sequence[Record]) -> float | None:
+    """Period (s) with which all outputs of all records are sampled; None if there is none."""
+    found = [channel.sampling for record in records for channel in record.outputs]
+    periods = [one.period for one in found]
+    if not all(one.is_regular for one in found) or np.ptp(periods) > _SAME_PERIOD * min(periods):
+        return None
+    return periods[0]
 
 
 def split_record(record: Record, fraction: float) -> tuple[Record, Record]:

@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple
 from sysid.metrics import ChannelMetrics
 from sysid.models.terms import SelectedTerm
 from sysid.onset import OnsetDelay
+from sysid.records import Hold
 from sysid.residuals import ResidualTests
 from sysid.types import FloatArray
 
@@ -148,7 +149,9 @@ class Identification:
     times. `fit_percent_validation` and `rms_validation` are None without validation data.
     `agreement` and `agreement_validation` tell each output of each experiment on its own.
     `selection` has the terms that were selected, if the model asked for it. `correlation_times`
-    (s) are those of each output's noise, where the noise model found any.
+    (s) are those of each output's noise, where the noise model found any. `holds` tells what the
+    inputs of the first experiment did between their samples, `sample_time` (s) how all outputs
+    were sampled; None where that was not regular, or not the same.
     """
 
     estimates: tuple[Estimate, ...]
@@ -173,3 +176,5 @@ class Identification:
     residual_tests: ResidualTests | None = None
     onset_delays: tuple[OnsetDelay, ...] = ()
     correlation_times: Mapping[str, float] = field(default_factory=dict)
+    holds: Mapping[str, Hold] = field(default_factory=dict)
+    sample_time: float | None = None

@@ -49,9 +49,10 @@ def export(
         model estimates them. One that is tied to others may be left out.
     format : {"json", "python", "c", "control"}
     sample_time : float, optional
-        Sampling period of the data in s; a transfer function in z needs it.
+        Sampling period of the data in s; a transfer function in z needs it. A result knows its.
     hold : mapping of str to {"zero", "first", "band-limited"}, optional
-        How inputs are held between their samples; ``first`` where nothing is said.
+        How inputs are held between their samples; where nothing is said as in the data of the
+        result, ``first`` without one.
     version, provenance : optional
         Told in the text: version of the program, run, data sets.
     pade_order : int
@@ -65,9 +66,14 @@ def export(
         If the format is ``control`` and the model has no transfer function.
     """
     values, covariance = _values(model, found)
-    _check(model, values, sample_time, hold or {})
+    holds = dict(hold or {})
+    if isinstance(found, Identification):
+        known = {one.name for one in model.inputs}
+        holds = {**{k: v for k, v in found.holds.items() if k in known}, **holds}
+        sample_time = found.sample_time if sample_time is None else sample_time
+    _check(model, values, sample_time, holds)
     identified = Identified(
-        model, values, covariance, sample_time, dict(hold or {}), version, dict(provenance or {})
+        model, values, covariance, sample_time, holds, version, dict(provenance or {})
     )
     return written(identified, format, pade_order)
 

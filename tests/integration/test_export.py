@@ -215,7 +215,8 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
     for name, variance in variances.items():
         assert stderr[name] ** 2 == pytest.approx(variance)
     assert document["provenance"] == {"made": "here"}
-    text = sysid.export(model, found, "python", hold={"u": "zero"})
+    assert document["data"] == {"sample_time": pytest.approx(0.05), "hold": {"u": "zero"}}
+    text = sysid.export(model, found, "python")  # held as the data of the result were
     assert f"standard error {stderr['T']:.3g}" in text
     # The tube starts where it was measured, so that is to be given.
     expected = simulated(

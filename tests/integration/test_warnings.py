@@ -1,10 +1,13 @@
 """What a result says of itself: each warning where it belongs, and not where it does not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sysid.errors import NothingIdentifiable
 from sysid.identify import identify
+from sysid.models.library import load_model
 from sysid.models.model import Model
 from sysid.models.spec import parse_model
 from sysid.records import Channel, Record
@@ -91,3 +94,29 @@ def test_where_nothing_has_an_effect_the_run_fails_and_says_so() -> None:
     model = parse_model(SECOND)
     with pytest.raises(NothingIdentifiable, match="none of L has an effect on the output"):
         identify(model, record(np.zeros(N), np.sin(np.arange(N))), QUICK)
+
+
+@pytest.mark.parametrize(("substeps", "too_long"), [(1, True), (8, False)])
+def test_an_estimate_that_the_integration_step_has_made_is_told(
+    substeps: int, too_long: bool
+) -> None:
+    # A time constant of a third of the step: the method of Runge and Kutta is at its limit there.
+    tube = load_model("tube")
+    exact, coarse = (replace(tube, solver=replace(tube.solver, substeps=n)) for n in (16, substeps))
+    times = 0.01 * np.arange(600)
+    inlet = Channel("u", times, np.interp(times, 0.3 * np.arange(21), steps()[:21]))
+    truth = {"K": 1.0, "T": 0.0033, "L": 0.024, "y(0)": float(inlet.values[0])}
+    outlet = simulate(exact, [inlet], truth, times=times).channel("y")
+    noisy = replace(outlet, values=outlet.values + np.random.default_rng(1).normal(0, 1e-3, 600))
+    found = identify(coarse, Record((inlet,), (noisy,)))
+    assert told(found, "the integration step is too long for these estimates") == too_long
+    if too_long:
+        assert told(found, "give the model solver: {substeps: 4}")
+
+
+@pytest.mark.parametrize("level", [0.0, 3.0])
+def test_a_constant_output_is_told(level: float) -> None:
+    found = identify(parse_model(FIRST), record(steps(), np.full(N, level)), QUICK)
+    assert told(found, f"output 'y' is constant ({level:g}): it tells nothing of the dynamics")
+    moving = np.where(np.arange(N) == 7, level + 0.1, level)
+    assert not told(identify(parse_model(FIRST), record(steps(), moving), QUICK), "is constant")

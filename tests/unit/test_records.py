@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidRecord, InvalidSettings
+from sysid.errors import InvalidRecord, InvalidSettings, nearest
 from sysid.records import Channel, Record, Recording, Segment, sampling_of, split_record
 
 
@@ -21,6 +21,13 @@ def test_a_record_carries_the_models_names() -> None:
 def test_an_unknown_channel_is_told_with_the_nearest() -> None:
     with pytest.raises(InvalidRecord, match="did you mean 'P1'"):
         Recording((ramp("P1"),)).record({"u": "P11"}, {"y": "P1"})
+
+
+def test_of_very_many_names_a_message_lists_some() -> None:
+    told = nearest("zzz", (f"dataset {n:03}" for n in range(150)))
+    assert told.startswith("; known are dataset 000, ")
+    assert told.endswith("dataset 029, and 120 more")
+    assert nearest("zzz", ["b", "a"]) == "; known are a, b"
 
 
 def test_an_output_that_is_its_own_input_is_refused() -> None:
