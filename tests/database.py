@@ -71,19 +71,29 @@ def empty_postgres(name: str = "", template: str = "template0", *, keep: bool = 
 @contextmanager
 def empty_sqlite(folder: Path):
     """A SQLite database without tables."""
-    database = Database(sqlite_url(folder / "lagid.db"), pool_size=10)
+    database = _sqlite(folder)
     try:
         yield database
     finally:
         database.dispose()
 
 
+def migrated_sqlite(folder: Path) -> Database:
+    """A new SQLite database with the tables of today, which the caller disposes of."""
+    shutil.copy(_sqlite_template(), folder / "lagid.db")
+    return _sqlite(folder)
+
+
+def _sqlite(folder: Path) -> Database:
+    return Database(sqlite_url(folder / "lagid.db"), pool_size=10)
+
+
 @pytest.fixture
 def sqlite_database(tmp_path: Path) -> Iterator[Database]:
     """A migrated SQLite database."""
-    shutil.copy(_sqlite_template(), tmp_path / "lagid.db")
-    with empty_sqlite(tmp_path) as database:
-        yield database
+    database = migrated_sqlite(tmp_path)
+    yield database
+    database.dispose()
 
 
 @pytest.fixture

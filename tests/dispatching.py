@@ -18,13 +18,13 @@ from service.jobs import submit
 from service.schemas_jobs import JobIn
 from service.settings import Settings
 from service.storage.jobs import JobRepository
-from service.storage.migrate import upgrade
 from service.storage.objects import ObjectStore, open_store
 from service.storage.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import OPEN, Job, Run, State
 from service.supervision import clear_family, environment_of
 from sysid.records import Recording
+from tests.database import migrated_sqlite
 from tests.runs import step_record
 from workers.ports import Crew
 
@@ -37,8 +37,7 @@ class Place:
     def __init__(self, folder: Path, database: Database | None = None) -> None:
         self.settings = Settings(data_dir=folder, cpus=2, lease_seconds=3.0)
         self.settings.prepare_folder()
-        self.database = database or Database(self.settings.database)
-        upgrade(self.database)
+        self.database = database or migrated_sqlite(folder)
         self.store: ObjectStore = open_store(self.settings.store)
         self.dataset = self._dataset()
 

@@ -84,7 +84,7 @@ def test_a_file_cut_off_anywhere_is_refused_at_a_byte_of_it(content: bytes) -> N
 
 @pytest.mark.parametrize("content", FILES)
 @given(data=st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_flipped_bits_are_found_or_change_nothing(content: bytes, data: st.DataObject) -> None:
     whole, _ = read_mcap(content, DEFAULT_LIMITS)
     damaged = bytearray(content)
@@ -111,7 +111,7 @@ def is_read_whole_or_refused(content: bytes) -> bool:
 
 
 @given(st.binary(max_size=400), st.sampled_from(FILES), st.data())
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_any_bytes_put_anywhere_are_refused_with_a_reason_or_read_whole(
     junk: bytes, content: bytes, data: st.DataObject
 ) -> None:
@@ -121,7 +121,7 @@ def test_any_bytes_put_anywhere_are_refused_with_a_reason_or_read_whole(
 
 
 @given(st.lists(st.tuples(st.integers(0, 20), st.binary(max_size=80)), max_size=8))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_records_of_any_content_are_read_or_refused(records: list[tuple[int, bytes]]) -> None:
     raw = [struct.pack("<BQ", opcode, len(body)) + body for opcode, body in records]
     for content in (

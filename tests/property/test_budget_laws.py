@@ -35,7 +35,7 @@ def record() -> Record:
 
 
 @pytest.mark.parametrize("model", [LAG, polynomial()], ids=["lag", "polynomial"])
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     budget=st.integers(24, 900), method=st.sampled_from(METHODS), refine=st.booleans(),
     population=st.sampled_from([24, 50, 130]), islands=st.sampled_from([None, 1, 6]),

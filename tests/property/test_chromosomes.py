@@ -1,7 +1,7 @@
 """Laws of the code and of the operators on it, and of the derived random numbers."""
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid.ga import random
@@ -13,14 +13,12 @@ BITS = st.integers(1, 32)
 WORD = st.integers(0, 2**32 - 1)
 
 
-@settings(deadline=None)
 @given(BITS, st.lists(WORD, min_size=1, max_size=8))
 def test_coding_is_the_inverse_of_decoding(bits: int, values: list[int]) -> None:
     words = np.array([[v % 2**bits for v in values]], dtype=np.uint32)
     assert np.array_equal(coded(decoded(words, bits), bits), words)
 
 
-@settings(deadline=None)
 @given(st.booleans(), st.lists(st.floats(0, 1), min_size=4, max_size=4))
 def test_placing_is_the_inverse_of_locating(log: bool, values: list[float]) -> None:
     evaluator = example(n=80).evaluator
@@ -43,7 +41,6 @@ def string(word: np.ndarray, bits: int) -> str:
     return "".join(format(int(w), f"0{bits}b") for w in word)
 
 
-@settings(deadline=None)
 @given(BITS, WORD, WORD, WORD, WORD, st.data())
 def test_a_child_has_the_first_parents_bits_up_to_the_cut(
     bits: int, a: int, b: int, c: int, d: int, data: st.DataObject
@@ -58,7 +55,6 @@ def test_a_child_has_the_first_parents_bits_up_to_the_cut(
     assert string(child, bits) == string(first, bits)[:cut] + string(second, bits)[cut:]
 
 
-@settings(deadline=None)
 @given(BITS, WORD, WORD, st.data())
 def test_a_mutation_changes_exactly_the_chosen_bit(
     bits: int, a: int, b: int, data: st.DataObject
@@ -71,7 +67,6 @@ def test_a_mutation_changes_exactly_the_chosen_bit(
     assert changed == [position]
 
 
-@settings(deadline=None)
 @given(st.lists(st.sampled_from([0.0, 1.0, 2.0, np.inf]), min_size=1, max_size=12))
 def test_ranking_is_stable_and_ascends(values: list[float]) -> None:
     words = np.arange(len(values), dtype=np.uint32)[:, None]
@@ -82,7 +77,6 @@ def test_ranking_is_stable_and_ascends(values: list[float]) -> None:
     assert np.array_equal(fitness, np.sort(values))
 
 
-@settings(deadline=None)
 @given(st.floats(0, 1), WORD, WORD, BITS)
 def test_a_scale_free_step_stays_in_the_box_and_moves(
     place: float, size: int, sign: int, bits: int
@@ -91,7 +85,6 @@ def test_a_scale_free_step_stays_in_the_box_and_moves(
     assert 0 <= reflected(2 * place - 0.5) <= 1
 
 
-@settings(deadline=None)
 @given(WORD, WORD, st.integers(2, 1000))
 def test_two_parents_differ(a: int, b: int, n: int) -> None:
     first, second = two_of(a, b, n)

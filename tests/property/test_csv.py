@@ -13,7 +13,6 @@ VALUES = st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, 
 
 
 @given(VALUES, st.sampled_from([",", ";", "\t"]), st.sampled_from(["\n", "\r\n"]))
-@settings(deadline=None)
 def test_printed_numbers_come_back_bit_for_bit(
     values: list[float], separator: str, end: str
 ) -> None:
@@ -23,7 +22,6 @@ def test_printed_numbers_come_back_bit_for_bit(
 
 
 @given(VALUES)
-@settings(deadline=None)
 def test_decimal_commas_and_points_give_the_same(values: list[float]) -> None:
     rows = [f"{k};{value!r}" for k, value in enumerate(values)]
     points, _ = read_csv("\n".join(["t;u", *rows]).encode())
@@ -43,7 +41,7 @@ def test_decimal_commas_and_points_give_the_same(values: list[float]) -> None:
 @example(b't,u\n0,"' + b"x" * 200_000, None, ())
 @example(b'"' + b"x" * 200_000, None, ())
 @example(b'"t","u"x\n0,1\n', None, ())
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 def test_any_bytes_are_read_or_refused(
     content: bytes, sample_time: float | None, segments: tuple[str, ...]
 ) -> None:

@@ -119,7 +119,7 @@ def _grown(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
     )
 
 
-@settings(max_examples=15, deadline=None, derandomize=True)
+@settings(max_examples=15, derandomize=True)
 @given(st.recursive(_leaves, _grown, max_leaves=6))
 def test_any_expression_equals_its_twin(text: str) -> None:
     model: Model = difference({"x": f"0.5*x(k-1) + 0.3*tanh({text})"}, "x")

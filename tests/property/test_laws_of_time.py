@@ -38,7 +38,7 @@ def quiet_first(seed: int) -> FloatArray:
     return np.where(np.arange(SAMPLES) < QUIET, 0.0, walk)
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=12)
 @given(
     st.sampled_from(sorted(SYSTEMS)), st.sampled_from(["zero", "first"]),
     st.integers(1, 30), st.integers(0, 1000),

@@ -41,7 +41,7 @@ def candidates(problem: Problem, seed: int) -> FloatArray:
     return np.asarray(located(problem.evaluator, places))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.sampled_from(sorted(POSED)), st.floats(0.01, 1.0), st.integers(0, 99))
 def test_a_part_of_the_simulation_is_the_beginning_of_the_whole(
     name: str, horizon: float, seed: int

@@ -53,7 +53,7 @@ def alone(method: SearchMethod, seed: int, **changes: object) -> tuple[Island, o
     return found(problem(), algorithm, seed)[1], plans(problem(), algorithm, seed)[1]
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(METHOD, st.integers(0, 2**63 - 1), st.integers(0, 30), st.integers(0, 30))
 def test_evolving_twice_is_evolving_the_sum(
     method: SearchMethod, seed: int, first: int, second: int
@@ -76,7 +76,7 @@ def test_a_sequence_search_can_be_cut_anywhere(kind: str) -> None:
     assert "sequence" in {step.phase for step in stepwise.history}
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(METHOD, st.integers(0, 1000), st.integers(0, 60))
 def test_the_fittest_survives_a_step(method: SearchMethod, seed: int, age: int) -> None:
     island, plan = alone(method, seed)
@@ -87,7 +87,7 @@ def test_the_fittest_survives_a_step(method: SearchMethod, seed: int, age: int) 
     assert after.fitness[0] <= before.fitness[0]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(METHOD, st.integers(0, 1000), st.integers(0, 60))
 def test_fitness_is_that_of_the_chromosome_and_ascends(
     method: SearchMethod, seed: int, age: int

@@ -38,7 +38,7 @@ def noisy(seed: int, n: int = 9) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return x, 3.0 * x**0.8 + stderr * draw.normal(size=n), stderr
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(NUMBER, NUMBER)
 def test_an_exact_line_is_recovered_and_chosen(a: float, b: float) -> None:
     found = fit_trend(X, a + b * X, np.full(5, 0.1), [30.0])
@@ -51,7 +51,7 @@ def test_an_exact_line_is_recovered_and_chosen(a: float, b: float) -> None:
     assert not any(one.is_outlier for one in found.influences)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(NUMBER.filter(bool), st.floats(-3, 3).filter(lambda b: min(abs(b), abs(b - 1)) > 0.05))
 def test_an_exact_power_law_is_recovered_and_chosen(a: float, b: float) -> None:
     y = a * X**b
@@ -62,7 +62,7 @@ def test_an_exact_power_law_is_recovered_and_chosen(a: float, b: float) -> None:
     assert (told["a"][0], told["b"][0]) == (pytest.approx(a, rel=1e-7), pytest.approx(b, rel=1e-7))
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 10_000), SCALE, SCALE)
 def test_units_of_x_and_y_change_only_the_units_of_the_result(
     seed: int, metre: float, second: float
@@ -335,7 +335,7 @@ def test_looking_up_the_errors_of_a_batch_is_done_once_not_for_every_estimate(
 SIZES = st.floats(1e-300, 1e300) | st.floats(-1e300, -1e-300) | st.floats(-10, 10)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(st.tuples(SIZES, SIZES, st.floats(1e-300, 1e300)), min_size=3, max_size=6))
 def test_points_of_any_size_give_finite_laws_or_a_reason(
     points: list[tuple[float, float, float]],

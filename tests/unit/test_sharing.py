@@ -1,7 +1,7 @@
 """Who goes next: laws of fair sharing, with workers whose time is simulated."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.simulated_crew import Theatre
@@ -216,7 +216,6 @@ jobs = st.lists(
 )
 
 
-@settings(deadline=None)
 @given(jobs, st.integers(1, 5))
 def test_no_core_is_idle_while_work_waits_and_every_job_ends(
     sizes: list[tuple[int, str, int, float]], slots: int
