@@ -6,7 +6,7 @@ READY  := $(VENV)/.ready
 FAST   := not slow and not ray and not postgres and not browser and not data
 
 .DEFAULT_GOAL := help
-.PHONY: help demo paper serve test check format bench bench-full real-data clean
+.PHONY: help demo paper serve test check check-code check-unit check-laws format bench bench-full real-data clean
 
 help:
 	@echo "make demo        set up, run the paper's Example 1 through the service, print the table"
@@ -35,19 +35,29 @@ paper: $(READY)
 serve: $(READY)
 	@exec $(BIN)/lagid serve
 
-test: $(READY)
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/lint-imports
+# Bytecode is kept for the next run, also where the shell says otherwise: modules of tests are
+# compiled twice, and every process that a test starts compiles its modules again.
+test check: export PYTHONDONTWRITEBYTECODE =
+
+test: $(READY) check-code
 	$(BIN)/python -m pytest
 
+# Side by side, each with its output in one piece where this make can do that.
 check: $(READY)
+	@$(MAKE) --no-print-directory -j3 $(if $(filter output-sync,$(.FEATURES)),--output-sync) \
+	  check-code check-unit check-laws
+
+check-code: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -q -m "$(FAST)" tests/unit tests/property tests/contract
+
+check-unit: $(READY)
+	$(BIN)/python -m pytest -q -m "$(FAST)" tests/unit
+
+check-laws: $(READY)
+	$(BIN)/python -m pytest -q -m "$(FAST)" tests/property tests/contract
 
 format: $(READY)
 	$(BIN)/ruff check --fix .
