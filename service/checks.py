@@ -1,6 +1,6 @@
 """What can be known of a job before it runs: every fault is found here, and found now."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from typing import Any
 
 from pydantic import ValidationError
@@ -9,6 +9,7 @@ from sqlalchemy.orm import Session
 from service import models, warm_starts
 from service.conversion import faults_of
 from service.errors import FieldError
+from service.experiments import experiments_in
 from service.named_datasets import dataset_of
 from service.pointers import explained
 from service.record_checks import (
@@ -22,7 +23,6 @@ from service.schemas_jobs import JobIn
 from service.setting_checks import (
     conversion_faults,
     overridden,
-    setting_faults,
     signal_faults,
     tried,
 )
@@ -37,6 +37,7 @@ from sysid.ties import tied_model, ties_of
 from sysid.unused import unused
 
 Body = dict[str, Any]
+NOTHING: Set[str] = frozenset()
 MOST_GENES = 10_000_000  # individuals times parameters: 80 MB for each copy of a population
 
 
@@ -53,41 +54,40 @@ class JobChecker:
         self._models: dict[str, tuple[Model, Any] | list[FieldError]] = {}
         self._datasets: dict[str, Dataset | str] = {one.id: one for one in unstored}
 
-    def names(self, body: Body) -> list[FieldError]:
-        """Faults of single fields: names that nothing has, values that are none.
+    def errors(self, body: Body, unread: Set[str] = NOTHING) -> list[FieldError]:
+        """Every fault of a body in its normal form.
 
-        They stand, whatever else of the body is changed.
+        `unread` are fields that could not be read, for which their defaults stand: nothing is told
+        that depends on them.
         """
-        found = list(self._missing_datasets(body))
-        model = self.model(body["model"])
-        if isinstance(model, list):
-            return [*conversion_faults(body), *found, *model]
-        found += setting_faults(body, model[0], self._all_parameters(body, model[0]))
-        return found + warm_starts.faults(self._session, body["warm_start"], model[0])
-
-    def errors(self, body: Body) -> list[FieldError]:
-        """Every fault of a body in its normal form."""
-        found = conversion_faults(body)
-        model = self.model(body["model"])
-        if isinstance(model, list):
-            return found + model + list(self._missing_datasets(body))
-        parameters = overridden(found, self._all_parameters(body, model[0]), body["parameters"])
-        found += _freedom_faults(parameters, body["algorithm"]["population"])
-        own = parameters[: len(model[0].parameters)]
-        ties = tried(ties_of, found, model[0], parameters)
-        tied = tied_model(model[0], ties or {})
-        tried(check_lags, found, tied, own)
-        if model[0].rule is not None:
-            tried(check_samples, found, len(model[0].terms), self._samples(body))
-        found += [FieldError(one.pointer, one.detail)
-                  for one in unused(tied, own, body["weights"])]  # fmt: skip
-        found += self._repeated(body)
-        found += self._data(body, tied, own)
-        if model[0].rule is None:  # of candidates not all are kept; `check_samples` looks at them
-            found += _sample_faults(parameters, self._scored(body, model[0]))
-        found += self._units(body, model[0])
-        found += warm_starts.faults(self._session, body["warm_start"], model[0])
-        return found + list(signal_faults(body, model[0]))
+        found = [*conversion_faults(body), *self._missing_datasets(body)]
+        known = self.model(body["model"])
+        if isinstance(known, list):
+            return found + known
+        model = known[0]
+        parameters = overridden(found, self._all_parameters(body, model), body["parameters"])
+        own = parameters[: len(model.parameters)]
+        tied = model
+        if "parameters" not in unread:
+            tied = tied_model(model, tried(ties_of, found, model, parameters) or {})
+            tried(check_lags, found, tied, own)
+        for read, check in (
+            (("parameters", "algorithm"),
+             lambda: _freedom_faults(parameters, body["algorithm"]["population"])),
+            (("datasets",), lambda: self._too_few_for_terms(body, model)),
+            (("parameters", "weights"), lambda: _unused_faults(tied, own, body["weights"])),
+            (("datasets", "validation"), lambda: self._repeated(body)),
+            (("datasets", "channels"), lambda: self._channels(body, model)),
+            (("datasets", "validation", "parameters", "skip"),
+             lambda: self._lengths(body, tied, own)),
+            (("datasets", "validation", "parameters", "skip"),
+             lambda: self._too_few_samples(body, model, parameters)),
+            (("datasets", "channels"), lambda: self._units(body, model)),
+        ):  # fmt: skip
+            if unread.isdisjoint(read):
+                found += check()
+        found += warm_starts.faults(self._session, body["warm_start"], model)
+        return found + list(signal_faults(body, model))
 
     def resolved(self, body: Body) -> Body:
         """The body with identifiers of datasets, and an own model as its document."""
@@ -138,10 +138,7 @@ class JobChecker:
     def _all_parameters(self, body: Body, model: Model) -> tuple[Parameter, ...]:
         """The model's parameters, and the initial states to be estimated in each experiment."""
         found = [self.dataset(reference) for reference in body["datasets"]]
-        pieces = sum(
-            max(1, len(one.details.get("segments") or ())) for one in found
-            if isinstance(one, Dataset)
-        )  # fmt: skip
+        pieces = sum(experiments_in(one) for one in found if isinstance(one, Dataset))
         return (*model.parameters, *initial_parameters(model, pieces))
 
     def _samples(self, body: Body) -> int:
@@ -179,21 +176,18 @@ class JobChecker:
                 )  # fmt: skip
 
     def _units(self, body: Body, model: Model) -> Iterator[FieldError]:
-        found = ((pointer, self.dataset(reference)) for pointer, reference in _references(body))
-        known = [(pointer, one) for pointer, one in found if isinstance(one, Dataset)]
-        return unit_faults(model, body["channels"], known)
+        return unit_faults(model, body["channels"], self._there(body))
 
-    def _data(
+    def _channels(self, body: Body, model: Model) -> Iterator[FieldError]:
+        yield from given_both_ways(body["channels"], model)
+        for _, dataset in self._there(body):
+            yield from channel_faults(body["channels"], model, dataset)
+
+    def _lengths(
         self, body: Body, model: Model, parameters: tuple[Parameter, ...]
     ) -> Iterator[FieldError]:
         kept: float | None = (body["validation"] or {}).get("fraction")
-        yield from given_both_ways(body["channels"], model)
-        for pointer, reference in _references(body):
-            dataset = self.dataset(reference)
-            if isinstance(dataset, str):
-                yield FieldError(pointer, dataset)
-                continue
-            yield from channel_faults(body["channels"], model, dataset)
+        for pointer, dataset in self._there(body):
             for piece in pieces_of(dataset):
                 estimated = piece if kept is None else piece.without(kept)
                 if estimated is not None:
@@ -205,6 +199,23 @@ class JobChecker:
                         "be empty",
                     )
 
+    def _too_few_for_terms(self, body: Body, model: Model) -> list[FieldError]:
+        found: list[FieldError] = []
+        if model.rule is not None:
+            tried(check_samples, found, len(model.terms), self._samples(body))
+        return found
+
+    def _too_few_samples(
+        self, body: Body, model: Model, parameters: tuple[Parameter, ...]
+    ) -> Iterator[FieldError]:
+        if model.rule is None:  # of candidates not all are kept; `check_samples` looks at them
+            yield from _sample_faults(parameters, self._scored(body, model))
+
+    def _there(self, body: Body) -> list[tuple[str, Dataset]]:
+        """The datasets of a body that there are, with their places."""
+        found = ((pointer, self.dataset(reference)) for pointer, reference in _references(body))
+        return [(pointer, one) for pointer, one in found if isinstance(one, Dataset)]
+
 
 def value_faults(pointer: str, body: Body) -> list[FieldError]:
     """What the wire type says against a body into which a sweep put a value."""
@@ -214,6 +225,13 @@ def value_faults(pointer: str, body: Body) -> list[FieldError]:
         faults = explained(error.errors(), body, JobIn)
         return [FieldError(pointer, str(one)) for one in faults]
     return []
+
+
+def _unused_faults(
+    model: Model, parameters: tuple[Parameter, ...], weights: Mapping[str, float] | None
+) -> list[FieldError]:
+    """Parameters that no output depends on, and the like."""
+    return [FieldError(one.pointer, one.detail) for one in unused(model, parameters, weights)]
 
 
 def _references(body: Body) -> Iterator[tuple[str, str]]:

@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.errors import InvalidRequest
+from service.experiments import parameters_of_job
 from service.models import model_of_run
 from service.rms_units import unit_of
 from service.schemas import Page
@@ -23,7 +24,6 @@ from service.storage.lookups import Reached, reached
 from service.storage.runs import RunOrder, RunRepository
 from service.storage.tables import Job, Run, State
 from service.sweeps import body_of
-from sysid.models.initial import initial_parameters
 from sysid.parameters import Parameter, override
 
 ALMOST = 0.99  # what a run that is not over shows at most: refinement is still to come
@@ -150,7 +150,7 @@ def _sought(session: Session, run: Run, job: Job) -> list[Parameter]:
     model = model_of_run(session, run, job)
     if model.rule is not None:  # which of its candidates are sought is told with the result
         return []
-    everything = (*model.parameters, *initial_parameters(model, len(body["datasets"])))
+    everything = parameters_of_job(session, model, body)
     return [one for one in override(everything, body["parameters"]) if one.is_free]
 
 

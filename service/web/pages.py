@@ -86,7 +86,7 @@ def job_page(
         next_runs=_query({"cell": cell, "cursor": page.next}) if page.next else "",
         grid=grid, is_listed=is_listed,
         cell_title=cell_text(chosen_cell, {}),
-        noise_height=_noise_height(job, chosen), trend=_trend(session, job),
+        noise_height=_noise_height(session, job, chosen), trend=_trend(session, job),
         comparable=_comparable(page.items),
         datasets=dataset_links(session, job), more_datasets=unnamed(job),
         commands=_commands(view, base_url),
@@ -165,7 +165,7 @@ def run_summary(session: Session, job: Job, run: Run) -> RunView:
 def run_in_full(session: Session, job: Job, run: Run) -> RunView:
     """A run with what its plots need to be laid out before they are drawn."""
     body = run_body(job, run)
-    sought = sought_parameters(run, body)
+    sought = sought_parameters(session, run, body)
     result = run.result or {}
     # What comes with the end of the run lies below the live plots and takes its room then.
     heights = {
@@ -198,12 +198,12 @@ def _comparable(runs: Sequence[Run]) -> str:
     return urlencode([("run", one) for one in chosen]) if len(chosen) > 1 else ""
 
 
-def _noise_height(job: Job, run: Run | None) -> int:
+def _noise_height(session: Session, job: Job, run: Run | None) -> int:
     """Height (px) of the figure of a sweep over σ; 0 where it is none."""
     if job.n_runs == 1 or noise_keys(job.spec.get("sweep", {}).get("axes", [])) is None:
         return 0
     body = job.spec if run is None else run_body(job, run)
-    sought = sought_parameters(run, body) if run is not None else []
+    sought = sought_parameters(session, run, body) if run is not None else []
     return noise_height(1 + len(sought), columns=2)
 
 

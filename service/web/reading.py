@@ -7,12 +7,12 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from service.experiments import parameters_of_job
 from service.rms_units import Body, model_of, unit_of
 from service.storage.runs import RunRepository
 from service.storage.tables import Job, Run
 from service.sweeps import body_of
 from service.web.evidence import Improvement, RunEvidence, SoughtParameter
-from sysid.models.initial import initial_parameters
 from sysid.parameters import Parameter, Scale, override
 
 __all__ = ["Body", "evidence_of", "fitness_of", "model_of", "run_body", "sought_parameters",
@@ -30,15 +30,13 @@ def fitness_of(body: Body) -> str:
     return "soft-l1 loss, as RMS" if robust else "RMS"
 
 
-def sought_parameters(run: Run, body: Body) -> list[SoughtParameter]:
+def sought_parameters(session: Session, run: Run, body: Body) -> list[SoughtParameter]:
     """The free parameters in the order of the history's columns.
 
     The result names them once the run has ended; until then the model and the request do.
     """
     model = model_of(body)
-    everything = (
-        (*model.parameters, *initial_parameters(model, len(body["datasets"]))) if model else ()
-    )
+    everything = parameters_of_job(session, model, body) if model else ()
     known = override(everything, body.get("parameters", {}))
     result = (run.result or {}).get("parameters")
     if result:
@@ -62,7 +60,7 @@ def evidence_of(session: Session, job: Job, run: Run) -> RunEvidence:
         id=run.id, unit=unit_of(session, body), fitness=fitness_of(body),
         generations=run.generations or (job.generation if job.n_runs == 1 else 0),
         evaluations=run.evaluations, history=history,
-        parameters=_covering(sought_parameters(run, body), history),
+        parameters=_covering(sought_parameters(session, run, body), history),
         epoch=int((algorithm.get("migration") or {}).get("every", 0)),
         migrations=sorted({one.epoch for one in runs.migrations(run.id)}),
         islands=[(_or(one.get("champion_rms"), inf), one.get("refined_rms"))

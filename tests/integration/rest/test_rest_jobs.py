@@ -212,3 +212,23 @@ def test_a_summary_over_an_axis_that_is_not_there_names_those_that_are(
     assert fault["pointer"] == "?by"
     assert "no axis or label '/sed'" in fault["detail"]
     assert "/seed" in fault["detail"]
+
+
+def test_the_start_of_a_later_segment_is_a_parameter_wherever_the_run_is_shown(
+    server: TestClient,
+) -> None:
+    rows = [
+        f"{0.1 * k:.1f},{repeat},{k // 7 % 2},{k % 7}" for repeat in (1, 2, 3) for k in range(80)
+    ]
+    text = "\n".join(["t,repeat,u,y", *rows])
+    stored = server.post("/v1/datasets?segments=repeat", content=text, headers=CSV).json()
+    starts = {"L": {"upper": 2}, "x(0)[3]": {"fixed": 0.9}}
+    job = submit(server, stored["id"], parameters=starts)
+    (run,) = server.get(f"/v1/jobs/{job['id']}/runs").json()["items"]
+    for path in (f"/jobs/{job['id']}", f"/v1/jobs/{job['id']}/report", f"/runs/{run['id']}"):
+        assert server.get(path).status_code == 200, path
+    drawn = server.get(f"/v1/runs/{run['id']}/figures/convergence")
+    assert drawn.status_code == 200
+    told = drawn.text
+    assert "x(0)[2]" in told
+    assert "x(0)[3]" not in told  # it is fixed
