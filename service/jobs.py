@@ -81,7 +81,7 @@ def check(
     document = body.normal_form()
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
     checker = JobChecker(session, unstored)
-    faults = faults_of_job(session, checker, body, document, settings.max_runs_per_job)
+    faults = faults_of_job(session, checker, body, settings.max_runs_per_job)
     if faults:
         raise InvalidRequest(faults)
     numbers = grouped(body.sweep.axes)

@@ -1,6 +1,6 @@
 """What can be told of a body of which some fields cannot be read: the faults of all the others."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from copy import deepcopy
 from itertools import accumulate
 from typing import Any, TypeVar
@@ -21,7 +21,7 @@ def beside(
     kind: type[Whole],
     body: Any,
     faults: Sequence[FieldError],
-    meant: Callable[[Whole], Iterable[FieldError]],
+    meant: Callable[[Whole, Set[str]], Iterable[FieldError]],
 ) -> list[FieldError]:
     """Faults of what a body means, where other fields of it have faults that keep it from its type.
 
@@ -32,7 +32,8 @@ def beside(
     faults : sequence of FieldError
         Of the fields that cannot be read; nothing more is told of these.
     meant : callable
-        Faults of a body of that type that do not depend on the fields left out.
+        Faults of a body of that type that do not depend on the fields named besides, which are
+        those that were left out, wholly or in part.
     """
     left_out = [one.pointer for one in faults]
     if not isinstance(body, dict) or "" in left_out:
@@ -45,9 +46,19 @@ def beside(
     silent = {*left_out, *(f"/{name}" for name in stand_ins)}
     above = {place for one in silent for place in _places_down_to(one)}
     return [
-        one for one in meant(whole)
+        one for one in meant(whole, _unread(kind, body, silent))
         if one.pointer not in above and silent.isdisjoint(_places_down_to(one.pointer))
     ]  # fmt: skip
+
+
+def _unread(kind: type[BaseModel], body: dict[str, Any], silent: Iterable[str]) -> frozenset[str]:
+    """The fields that are not known, of which something was left out or could not be read.
+
+    A name that no field has may be meant for any of those that are not given.
+    """
+    known = kind.model_fields.keys()
+    tops = {one.split("/")[1] for one in silent}
+    return frozenset(tops & known if tops <= known else tops & known | known - body.keys())
 
 
 def _without(body: dict[str, Any], pointers: Iterable[str]) -> dict[str, Any]:

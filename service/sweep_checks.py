@@ -6,7 +6,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.orm import Session
 
-from service.checks import JobChecker, value_faults
+from service.checks import NOTHING, JobChecker, value_faults
 from service.errors import FieldError
 from service.schemas_jobs import JobIn, Seed, Sigma
 from service.sweeps import (
@@ -33,15 +33,18 @@ SINGLE = ("/trend/parameters", "/trend/reference")
 
 
 def faults_of_job(
-    session: Session, checker: JobChecker, body: JobIn, document: dict[str, Any], most_runs: int
+    session: Session, checker: JobChecker, body: JobIn, most_runs: int, unread: Set[str] = NOTHING
 ) -> list[FieldError]:
     """Every fault that can be known before the job runs.
 
     Values of axes are looked at where the axes are sound, and no more than `most_runs` of them.
+    `unread` are fields that could not be read, for which their defaults stand: nothing is told
+    that depends on them.
     """
+    document = body.normal_form()
     found = list(axis_faults(body))
-    known = checker.errors(body_of(document, {}))
-    if not found:
+    known = checker.errors(body_of(document, {}), unread)
+    if not found and "sweep" not in unread:
         groups = grouped(body.sweep.axes)
         n_runs = count(body, groups)
         if n_runs > most_runs:
@@ -50,22 +53,20 @@ def faults_of_job(
             ))  # fmt: skip
         else:
             steps = steps_of(body.sweep.axes, groups)
-            found += _sweep_faults(checker, document, steps, frozenset(known))
+            found += _sweep_faults(checker, document, steps, frozenset(known), unread)
             found += _repeated_recordings(checker, body)
     model = checker.model(body.model)
-    found += trend_faults(session, body, None if isinstance(model, list) else model[0])
+    trend = trend_faults(session, body, None if isinstance(model, list) else model[0])
+    are_axes_known = unread.isdisjoint({"sweep", "trend"})
+    found += [one for one in trend if are_axes_known or one.pointer.startswith(SINGLE)]
     return list(dict.fromkeys([*known, *found]))
 
 
-def faults_of_names(session: Session, body: JobIn) -> list[FieldError]:
-    """Faults of a body of which fields are left out: those that stand without them as well."""
-    checker = JobChecker(session)
-    found = checker.names(body_of(body.normal_form(), {})) + list(axis_faults(body))
-    model = checker.model(body.model)
-    if not isinstance(model, list):
-        trend = trend_faults(session, body, model[0])
-        found += [one for one in trend if one.pointer.startswith(SINGLE)]
-    return list(dict.fromkeys(found))
+def faults_of_rest(
+    session: Session, body: JobIn, most_runs: int, unread: Set[str]
+) -> list[FieldError]:
+    """Faults of a body of which fields are `unread`: those that stand whatever these say."""
+    return faults_of_job(session, JobChecker(session), body, most_runs, unread)
 
 
 def _repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldError]:
@@ -95,16 +96,18 @@ def _sweep_faults(
     document: dict[str, Any],
     groups: Sequence[Sequence[Step]],
     known: Set[FieldError],
+    unread: Set[str],
 ) -> Iterator[FieldError]:
     """Faults of the values; of a range or a logarithmic axis, those of its first bad value.
 
-    What the job has without its axes is `known`, and not told of every value again.
+    What the job has without its axes is `known`, and not told of every value again; nor is what a
+    value makes of a field of which a part is `unread`.
     """
     told: set[str] = set()
     for step in (step for group in groups for step in group):
         if step.pointer in told or _is_good_alone(step.cell):
             continue
-        found = list(_step_faults(checker, document, step, known))
+        found = list(_step_faults(checker, document, step, known, unread))
         if found:
             told.add(step.pointer)
         yield from found
@@ -133,7 +136,11 @@ def _fits(kind: TypeAdapter[Any], value: Any) -> bool:
 
 
 def _step_faults(
-    checker: JobChecker, document: dict[str, Any], step: Step, known: Set[FieldError]
+    checker: JobChecker,
+    document: dict[str, Any],
+    step: Step,
+    known: Set[FieldError],
+    unread: Set[str],
 ) -> Iterator[FieldError]:
     body = body_of(document, step.cell.values)
     wrong = value_faults(step.pointer, body)
@@ -142,6 +149,6 @@ def _step_faults(
         return
     whole = JobIn.model_validate(body).normal_form()
     yield from _of_another_type(step, whole)
-    for fault in checker.errors(whole):
-        if fault not in known:
+    for fault in checker.errors(whole, unread):
+        if fault not in known and fault.pointer.split("/")[1:2] not in ([one] for one in unread):
             yield FieldError(step.pointer, str(fault), fault.column)

@@ -1,6 +1,6 @@
 """What can be told of a body that its type refuses, so that one answer has every fault."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Any
 
 from pydantic import BaseModel
@@ -13,12 +13,13 @@ from service.recipes import noise, reidentify
 from service.schemas_jobs import JobIn
 from service.schemas_noise import NoiseSweepIn
 from service.schemas_reidentify import ReidentifyIn
-from service.sweep_checks import faults_of_names
+from service.sweep_checks import faults_of_rest
 
-MEANINGS: Mapping[type[BaseModel], Callable[[Session, Any], list[FieldError]]] = {
-    JobIn: faults_of_names,
-    NoiseSweepIn: noise.faults_of_names,
-    ReidentifyIn: reidentify.faults_of_names,
+Meaning = Callable[[Session, Any, int, Set[str]], list[FieldError]]
+MEANINGS: Mapping[type[BaseModel], Meaning] = {
+    JobIn: faults_of_rest,
+    NoiseSweepIn: noise.faults_of_rest,
+    ReidentifyIn: reidentify.faults_of_rest,
 }
 
 
@@ -29,5 +30,6 @@ def faults_beside(
     meant = MEANINGS.get(kind) if isinstance(kind, type) else None
     if meant is None:
         return []
+    most = parts.settings.max_runs_per_job
     with parts.database.read() as session:
-        return beside(kind, body, faults, lambda whole: meant(session, whole))
+        return beside(kind, body, faults, lambda whole, unread: meant(session, whole, most, unread))

@@ -145,7 +145,7 @@ def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
         usage(f"--set validation: {ELSEWHERE['validation.datasets']}")
     if model is not None:
         loaded = model
-        found += beside(JobIn, body, unread, lambda whole: _meant(whole, loaded, pieces))
+        found += beside(JobIn, body, unread, lambda whole, _: _meant(whole, loaded, pieces))
     if unread or found or job is None or model is None:
         fail(PLACES.told((*unread, *found)), 2 if unread else 1)
     return job, model

@@ -4,7 +4,7 @@ Draws depend on the sweep's seed and the replicate alone. So a run keeps its spe
 grid of σ or the number of replicates grows, and is taken over then (`service.storage.reuse`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from typing import Any, NamedTuple
 
 from sqlalchemy.orm import Session
@@ -68,8 +68,10 @@ def submit(
     """
     own = list(_own_faults(body, settings.max_runs_per_job))
     if own:
+        most, unread = settings.max_runs_per_job, {one.pointer.split("/")[1] for one in own}
         with database.read() as session:
-            raise InvalidRequest(dict.fromkeys([*own, *faults_of_names(session, body)]))
+            more = faults_of_rest(session, body, most, unread)
+        raise InvalidRequest(dict.fromkeys([*own, *more]))
     source = _source(database, store, body)
     try:
         with database.read() as session:
@@ -87,10 +89,12 @@ def submit(
         raise InvalidRequest(_at_home(one, body) for one in error.errors) from None
 
 
-def faults_of_names(session: Session, body: NoiseSweepIn) -> list[FieldError]:
-    """Faults of a body of which fields are left out: those that stand without them as well."""
+def faults_of_rest(
+    session: Session, body: NoiseSweepIn, most_runs: int, unread: Set[str]
+) -> list[FieldError]:
+    """Faults of a body of which fields are `unread`: those that stand whatever these say."""
     job = JobIn.model_validate({**body.shared, "datasets": body.datasets or [UNSTORED]})
-    found = sweep_checks.faults_of_names(session, job)
+    found = sweep_checks.faults_of_rest(session, job, most_runs, unread)
     return [one for one in found if body.datasets or not one.pointer.startswith("/datasets")]
 
 

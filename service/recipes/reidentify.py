@@ -1,7 +1,7 @@
 """Batch re-identification: one run for each value of a label, warm-started, with a trend."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -16,6 +16,9 @@ from service.storage.sessions import Database
 FIRST_AXIS = "/sweep/axes/0"
 IN_DATASETS = re.compile(r"/datasets(?P<place>/\d+): ")
 """How the fault of a value of the axis begins that is one of its recordings'."""
+MADE_OF = {"batch": ("datasets", "sweep"), "label": ("sweep", "trend"), "look_at": ("trend",),
+           "predict": ("trend",), "reference": ("trend", "warm_start")}  # fmt: skip
+"""Fields of the job that each field of this body makes; the others have the same name."""
 
 
 def submit(
@@ -44,10 +47,13 @@ def submit(
     raise InvalidRequest(dict.fromkeys(own))
 
 
-def faults_of_names(session: Session, body: ReidentifyIn) -> list[FieldError]:
-    """Faults of a body of which fields are left out: those that stand without them as well."""
+def faults_of_rest(
+    session: Session, body: ReidentifyIn, most_runs: int, unread: Set[str]
+) -> list[FieldError]:
+    """Faults of a body of which fields are `unread`: those that stand whatever these say."""
     order = order_of(body)
-    found = sweep_checks.faults_of_names(session, job_of(body, order))
+    theirs = {name for ours in unread for name in MADE_OF.get(ours, (ours,))}
+    found = sweep_checks.faults_of_rest(session, job_of(body, order), most_runs, theirs)
     return [*_own_faults(body), *(_at_home(one, order) for one in found)]
 
 

@@ -1,5 +1,6 @@
 """One answer has every fault: of fields that cannot be read, and of what the others mean."""
 
+from collections.abc import Set
 from typing import Any
 
 import pytest
@@ -42,6 +43,19 @@ def faults(answer: Any) -> dict[str, str]:
         ({"sweep": {"axes": [{"values": [1]}]}, "trend": {"x": "n", "parameters": ["LL"]}},
          {"/sweep/axes/0/path", "/trend/parameters/0"}),
         ({"validation": {"fraction": 2}, "skip": 10_000}, {"/validation/fraction"}),
+        ({"seed": "x", "skip": 10_000}, {"/seed", "/datasets/0"}),
+        ({"seed": "x", "channels": {"u": "volts"}, "parameters": {"L": {"lower": 9}}},
+         {"/seed", "/channels/u", "/parameters/L"}),
+        ({"priority": "high", "sweep": {"axes": [{"path": "/noise/sigma", "values": [0, -1]}]}},
+         {"/priority", "/sweep/axes/0/values/1"}),
+        ({"priority": "high", "parameters": {"K": {"upper": "x"}}, "sweep": {"axes": [
+            {"path": "/parameters/K/fixed", "values": [1, 7]},
+            {"path": "/algorithm/population", "values": [50, 2]}]}},
+         {"/priority", "/parameters/K/upper", "/sweep/axes/1/values/1"}),
+        ({"channels": {"u": 3}, "hold": {"y": "zero"}}, {"/channels/u", "/hold/y"}),
+        ({"seed": [], "sweep": {"axes": [{"path": "/seed", "range": [0, 900_000]}]}},
+         {"/seed", "/sweep/axes"}),
+        ({"chanels": {"u": "volts"}, "skip": 10_000}, {"/chanels"}),
     ],
 )  # fmt: skip
 def test_a_job_is_told_all_its_faults_and_none_that_follows_from_another(
@@ -65,6 +79,22 @@ def test_a_noise_sweep_is_told_all_its_faults(server: TestClient, dataset: str) 
     assert set(found) == {"/algorithm/method", "/hold/y"}
 
 
+def test_units_and_missing_channels_are_told_beside_what_cannot_be_read(server: TestClient) -> None:
+    text = b"t,u [V],x [K]\n" + b"".join(b"%d,%d,%d\n" % (n, n % 3, n % 5) for n in range(60))
+    stored = server.post("/v1/datasets", content=text, headers={"content-type": "text/csv"})
+    name = stored.json()["id"]
+    own = {"name": "own", "form": "differential", "inputs": {"u": "Pa"}, "states": {"x": "m"},
+           "parameters": {"T": {"lower": 1, "upper": 9}}, "equations": {"x": "(u - x)/T"},
+           "outputs": {"y": "x"}}  # fmt: skip
+    body = {"model": own, "datasets": [name], "seed": "x"}
+    found = faults(server.post("/v1/jobs", json=body))
+    assert set(found) == {"/seed", "/channels", "/datasets/0"}
+    assert "no channel 'y'" in found["/channels"]
+    assert "'u' is in V" in found["/datasets/0"]
+    batch = {"model": own, "label": "n", "batch": [{"x": 1, "datasets": [name]}], "seed": "x"}
+    assert set(faults(server.post("/v1/recipes/reidentify", json=batch))) >= {"/seed", "/channels"}
+
+
 def test_a_batch_is_told_all_its_faults(server: TestClient, dataset: str) -> None:
     batch = [{"x": 5, "datasets": [dataset]}]
     body = {"model": "fopdt", "label": "n", "batch": batch, "look_at": ["LL"], "seed": "x"}
@@ -82,7 +112,7 @@ def test_a_batch_is_told_all_its_faults(server: TestClient, dataset: str) -> Non
     "body", [[], 3, None, {"model": "m"}, {"model": "m", "datasets": ["d"], "seed": []}]
 )
 def test_of_what_is_no_body_nothing_more_is_told(body: Any) -> None:
-    def everything(job: JobIn) -> list[FieldError]:
+    def everything(job: JobIn, unread: Set[str]) -> list[FieldError]:
         return [FieldError("", "of the whole"), FieldError("/seed", "of the seed")]
 
     told = beside(JobIn, body, [FieldError("/seed", "x")], everything)
@@ -119,7 +149,7 @@ def test_what_follows_from_a_fault_is_not_told_above_or_below_it() -> None:
     told = ["", "/a", "/a/b", "/a/b/c", "/a/bc", "/b", "/seed/0", "/seeds"]
     body = {"model": "m", "datasets": ["d"]}
 
-    def everything(_job: JobIn) -> list[FieldError]:
+    def everything(_job: JobIn, _unread: Set[str]) -> list[FieldError]:
         return [FieldError(one, "of it") for one in told]
 
     found = beside(JobIn, body, [FieldError(one, "x") for one in silent], everything)
