@@ -1,6 +1,7 @@
 """A quantity to identify and the interval in which it is sought."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any, Literal
@@ -8,6 +9,8 @@ from typing import Any, Literal
 from sysid.errors import InvalidBounds, InvalidSettings, nearest
 
 Scale = Literal["linear", "log"]
+
+_START = re.compile(r"(\w+)\(0\)(?:\[\d+\])?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +85,7 @@ def override(
     for name, fields in changes.items():
         if name not in known:
             raise InvalidSettings(
-                f"/parameters/{name}", f"the model has no parameter {name!r}{nearest(name, known)}"
+                f"/parameters/{name}", f"the model has no parameter {name!r}{_known(name, known)}"
             )
         for field, value in fields.items():
             _check_field(f"/parameters/{name}/{field}", field, value)
@@ -92,6 +95,21 @@ def override(
                 f"/parameters/{name}", f"a tied parameter is not searched; leave out {others}"
             )
     return tuple(_changed(p, changes.get(p.name, {})) for p in parameters)
+
+
+def _known(name: str, known: Set[str]) -> str:
+    """What there is instead of an unknown name."""
+    start = _START.fullmatch(name)
+    if start is None:
+        return nearest(name, known)
+    state, first = start[1], f"{start[1]}(0)"
+    if first in known:
+        starts = sum(other == first or other.startswith(f"{first}[") for other in known)
+        return f": the records hold {starts} start(s) of {state!r}, {first} and so on"
+    return (
+        f": a start is one where the model's document has bounds for it, "
+        f"initial: {{{state}: {{lower: …, upper: …}}}}"
+    )
 
 
 def _check_field(pointer: str, field: str, value: object) -> None:

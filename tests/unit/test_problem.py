@@ -1,7 +1,9 @@
 """Problems: which channel is which, what is scored, what cannot be used and how that is said."""
 
 import pickle
+import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -213,3 +215,22 @@ def test_the_weight_of_a_single_output_changes_nothing(loss: Loss) -> None:
 def test_weights_that_no_number_can_square_are_refused(weight: float) -> None:
     with pytest.raises(InvalidSettings, match=r"/weights/y: .*need a number from"):
         Problem.build(duffing(), [record()], weights={"y": weight})
+
+
+@pytest.mark.parametrize(
+    ("initial", "name", "told"),
+    [
+        (0, "x(0)", "a start is one where the model's document has bounds for it, initial: {x: {"),
+        (
+            {"lower": -1, "upper": 1},
+            "x(0)[2]",
+            "the records hold 1 start(s) of 'x', x(0) and so on",
+        ),
+    ],
+)
+def test_a_start_that_is_no_parameter_is_told_how_to_become_one(
+    initial: Any, name: str, told: str
+) -> None:
+    model = differential({"x": "-b*x"}, "x", initial={"x": initial})
+    with pytest.raises(InvalidSettings, match=re.escape(told)):
+        Problem.build(model, [record()], parameters={name: {"fixed": 0.5}})
