@@ -1,12 +1,13 @@
 """Residuals laid out evenly, and their sums with lagged inputs, with the covariance of those."""
 
+from functools import lru_cache
 from math import ceil
 from typing import NamedTuple
 
 import numpy as np
 from numpy.fft import irfft, rfft
 
-from sysid.records import Channel, sampling_of
+from sysid.records import Channel, Hold, sampling_of
 from sysid.types import BoolArray, FloatArray
 
 MAX_LAG = 25
@@ -98,9 +99,38 @@ def lagged_sums(
     laid: Laid, residual: FloatArray, colour: FloatArray, channel: Channel, lags: FloatArray
 ) -> LaggedSums | str:
     """The sums over these lags, or why there are none."""
-    shifted = _shifted(laid, channel, lags * laid.period)
+    floats = (laid.times, channel.times, channel.values, lags)
+    shifted = _columns(
+        laid.present.tobytes(), laid.period, channel.hold,
+        *(np.asarray(one, dtype=np.float64).tobytes() for one in floats),
+    )  # fmt: skip
+    if isinstance(shifted, str):
+        return shifted
+    columns, sizes, known = shifted
+    seen = (rfft(columns, 2 * (colour.size - 1), axis=1) * colour).view(np.float64)
+    covariance = seen @ seen.T  # real part of the product with the conjugate
+    norm = sizes * np.sqrt(float(residual[known] @ residual[known]))
+    tiny = np.finfo(float).tiny
+    deviation = np.sqrt(np.maximum(np.diag(covariance), tiny))
+    return LaggedSums(lags, columns @ residual, np.maximum(norm, tiny), covariance, deviation)
+
+
+@lru_cache(maxsize=2)
+def _columns(
+    present: bytes, period: float, hold: Hold, times: bytes, moments: bytes, values: bytes,
+    lags: bytes,
+) -> tuple[FloatArray, FloatArray, BoolArray] | str:  # fmt: skip
+    """The lagged input without its mean (n, N), the lengths (n,), and which samples are known.
+
+    Or why there is none. Kept for the runs of a sweep, whose residuals alone differ. The bytes are
+    of arrays: `Laid.times` and `Laid.present`, times and values of the input, lags in periods.
+    """
+    there = np.frombuffer(present, dtype=np.bool_)
+    laid = Laid(np.frombuffer(times), np.zeros(0), there, period, is_regular=True)
+    channel = Channel("", np.frombuffer(moments), np.frombuffer(values), hold=hold)
+    shifted = _shifted(laid, channel, np.frombuffer(lags) * period)
     # Of every lag the same samples, so that no lag is judged by more than another.
-    known = laid.present & np.isfinite(shifted.sum(axis=0))
+    known = there & np.isfinite(shifted.sum(axis=0))
     if np.count_nonzero(known) < FEWEST:
         return "it overlaps the output too little"
     columns = np.where(known, shifted, 0.0)
@@ -108,12 +138,9 @@ def lagged_sums(
     sizes = np.sqrt(np.einsum("kn,kn->k", columns, columns))
     if not np.min(sizes) > ROUNDING * np.max(np.abs(channel.values)):
         return "the input is constant there"
-    seen = (rfft(columns, 2 * (colour.size - 1), axis=1) * colour).view(np.float64)
-    covariance = seen @ seen.T  # real part of the product with the conjugate
-    norm = sizes * np.sqrt(float(residual[known] @ residual[known]))
-    tiny = np.finfo(float).tiny
-    deviation = np.sqrt(np.maximum(np.diag(covariance), tiny))
-    return LaggedSums(lags, columns @ residual, np.maximum(norm, tiny), covariance, deviation)
+    for array in (columns, sizes, known):
+        array.flags.writeable = False
+    return columns, sizes, known
 
 
 def _shifted(laid: Laid, channel: Channel, lags: FloatArray) -> FloatArray:

@@ -163,7 +163,8 @@ class _Look:
         """Places that many standard errors away, inside the bounds, and their RMS."""
         moves = sizes[:, None] * self._random.standard_normal((sizes.size, theta.size))
         evaluator = self._problem.evaluator
-        starts = np.clip(theta + moves @ self.root.T, evaluator.lower, evaluator.upper)
+        starts = np.maximum(theta + moves @ self.root.T, evaluator.lower)
+        starts = np.minimum(starts, evaluator.upper)  # quicker than clip for so few
         self.spent += sizes.size
         return starts, self._problem.fitness(starts)
 

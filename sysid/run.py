@@ -169,10 +169,14 @@ class _Pace:
         return stopped or (self._calls > 0 and self._last - self._start >= self._end)
 
     def affordable(self, wanted: int) -> int:
-        """Generations for the next call: as many as are left, or as the time allows."""
+        """Generations for the next call: as many as are left, or as the time allows; one at least.
+
+        No time at all stands for the least that can be done.
+        """
         left = min(CALL_SECONDS, self._start + self._end - self._last)
-        count = int(left / self._cost) if self._calls else self._first
-        return max(1, min(wanted, count))
+        if left <= 0:
+            return 1
+        return max(1, min(wanted, int(left / self._cost) if self._calls else self._first))
 
     def measure(self, count: int) -> None:
         now = perf_counter()

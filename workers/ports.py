@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
@@ -13,7 +13,7 @@ from sysid.islands.run_state import RunState
 from sysid.noise import Noise
 from sysid.program import program
 from sysid.records import Record
-from sysid.result import Identification
+from sysid.result import Identification, Improvement, Migrant
 from sysid.settings import GeneticAlgorithm, Loss, Prediction
 
 Records: TypeAlias = tuple[Record, ...]
@@ -142,6 +142,23 @@ class Concluded:
 
     identification: Identification
     rms_noise_free: float | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Improvements and migrants as plain tuples: named ones cost several times as much."""
+        found = self.identification
+        histories = [[tuple(one) for one in island] for island in found.history]
+        migrants = [tuple(one) for one in found.migrations]
+        rest = replace(found, history=(), migrations=())
+        return _concluded, (rest, histories, migrants, self.rms_noise_free)
+
+
+def _concluded(
+    rest: Identification, histories: list[list[Any]], migrants: list[Any],
+    rms_noise_free: float | None,
+) -> Concluded:  # fmt: skip
+    history = tuple(tuple(map(Improvement._make, island)) for island in histories)
+    found = replace(rest, history=history, migrations=tuple(map(Migrant._make, migrants)))
+    return Concluded(found, rms_noise_free)
 
 
 @dataclass(frozen=True, slots=True)

@@ -323,3 +323,13 @@ def test_only_predictions_one_step_ahead_of_the_estimation_data_lose_degrees() -
         one = Problem.build(load_model("fopdt"), (record,), prediction=prediction)  # type: ignore[arg-type]
         tests = residual_tests(one, np.zeros(N), data).tests  # type: ignore[arg-type]
         assert tests[0].degrees == degrees
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.float32, np.float64])
+def test_one_input_after_another_is_told_apart_whatever_its_numbers_are(kind: type) -> None:
+    draw = draws(7)
+    residual, inputs = draw.normal(size=N), [held(draw), held(draw)]
+    first, second = (found(residual, u)[1].values for u in inputs)
+    assert not np.array_equal(first, second)
+    again = [found(residual, u.astype(kind))[1].values for u in inputs]
+    assert np.array_equal(again, [first, second])
