@@ -10,7 +10,7 @@ if TYPE_CHECKING:  # most tests need no Ray, and its import takes its time
     from workers.cluster import RayCrew
 
 CPUS = 2
-FREE_SECONDS = 15.0
+FREE_SECONDS = 60.0
 
 
 @pytest.fixture(scope="session")

@@ -83,7 +83,7 @@ class Place:
         try:
             yield child
             child.send_signal(signal.SIGTERM)
-            child.wait(20.0)
+            child.wait(LIMIT_SECONDS)
         finally:
             clear_family(child.pid)
             child.wait()

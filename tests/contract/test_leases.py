@@ -201,7 +201,7 @@ def test_a_heartbeat_waits_for_the_database_no_longer_than_a_third_of_the_lease(
     database, clock: Clock
 ) -> None:
     job = submit(database)
-    leases = Leases(database, 0.6)  # by the true clock
+    leases = Leases(database, 3.0)  # by the true clock
     lease = leases.claim().lease
     with database.write() as other:
         other.execute(update(Job).where(Job.id == job).values(name="held"))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import uvicorn
-from playwright.sync_api import Browser, ConsoleMessage, Page, sync_playwright
+from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
 from service.api.deps import Parts
 from service.app import create_app
@@ -23,6 +23,9 @@ ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
+
+LIMIT_MILLISECONDS = 60_000
+"""How long a page may take to show something: its own 5 s are too few beside other work."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,7 @@ def browser() -> Iterator[Browser]:
         if os.environ.get(REQUIRED) == "1":
             pytest.fail(f"{reason}, and {REQUIRED} is 1")
         pytest.skip(f"{reason}; install it, or set {REQUIRED}=1 to make its absence an error")
+    expect.set_options(timeout=LIMIT_MILLISECONDS)
     with sync_playwright() as playwright:
         opened = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         yield opened
@@ -90,6 +94,7 @@ def browser() -> Iterator[Browser]:
 def page(browser: Browser) -> Iterator[Page]:
     """A tab in which nothing may go wrong: an error on its console fails the test."""
     context = browser.new_context(viewport={"width": 1280, "height": 900})
+    context.set_default_timeout(LIMIT_MILLISECONDS)
     tab = context.new_page()
     wrong: list[str] = []
 

@@ -42,7 +42,7 @@ def test_jobs_wait_for_ray_and_survive_an_upgrade_of_their_tables(tmp_path: Path
         log = folder / "logs" / "dispatcher.log"
         refusal = "Ray could not be started"
         until(lambda: log.exists() and log.read_text().count(refusal) > 1, "tries", LIMIT_SECONDS)
-        answer = httpx.get(f"{one.url}/readyz", timeout=10.0)
+        answer = httpx.get(f"{one.url}/readyz", timeout=60.0)
         assert answer.status_code == 503
         assert "no dispatcher is alive" in answer.json()["detail"]
         assert state_of(one, job) is State.QUEUED

@@ -5,13 +5,16 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
+from service.datasets import add_recording
 from service.settings import Settings
 from service.storage.tables import Job
 from service.web import assets
+from sysid.records import Channel, Recording
 from tests.e2e.filled import Filled, fill
 
 
@@ -171,12 +174,13 @@ def test_starts_are_told_apart_from_dispatchers_that_were_lost(
 def test_the_recordings_are_listed_page_by_page_with_what_can_be_done(tmp_path: Path) -> None:
     with TestClient(create_app(Settings(data_dir=tmp_path))) as client:
         assert "No recording is stored yet" in client.get("/datasets").text
+        parts = client.app.state.parts  # type: ignore[attr-defined]
         for number in range(52):
-            answer = client.post(
-                f"/v1/datasets?name=record+{number}", content=f"t,u\n0,1\n1,{number}\n".encode(),
-                headers={"content-type": "text/csv"},
+            channel = Channel("u", np.array([0.0, 1.0]), np.array([1.0, number]), "V")
+            add_recording(
+                parts.database, parts.store, Recording((channel,)), name=f"record {number}",
+                kind="upload", key=f"record {number}", details={},
             )  # fmt: skip
-            assert answer.status_code == 201
         first = client.get("/datasets").text
         [following] = re.findall(r'rel="next" href="([^"]*)"', first)
         rest = client.get(following).text

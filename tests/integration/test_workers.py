@@ -59,7 +59,7 @@ def test_a_cancelled_job_frees_the_workers_soon_and_they_go_on_working(ray_crew)
     notebook.is_stopped = True
     begun = time.monotonic()
     while not feeder.step(0.05):
-        assert time.monotonic() - begun < 10.0
+        assert time.monotonic() - begun < 60.0
     assert carry_out(ray_crew, {"r": spec()}).failures == {}
 
 
