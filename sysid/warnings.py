@@ -68,7 +68,7 @@ def warnings_of(
         )
     if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING * problem.output_scale:
         found.append(_not_an_optimum(algorithm, analysis.possible_gain))
-    elif tests is not None and lagged:
+    elif tests is not None:
         loss = problem.loss
         plain = loss.kind == "squares" and loss.noise_model == "white"
         found += _coloured(tests, lagged, analysis.uncertainty, may_be_noise=plain)
@@ -262,17 +262,39 @@ def _coloured(
     """Residuals that are clearly not white: the model lacks something, most often an order.
 
     A lag makes up for an order that is missing. Of whether the tests are passed the result tells
-    by itself; a true model fails them often enough that a warning asks for more.
+    by itself; a true model fails them often enough that a warning asks for more. Residuals that
+    depend on an input contain dynamics, which no noise model is for; those that do not may be slow
+    noise (Ljung, System Identification, 2nd ed., ch. 16.6).
     """
     if all(one.kind != "whiteness" or one.p is None or one.p > _CHANCE for one in tests.tests):
         return []
     colour = "white" if uncertainty is None else uncertainty.noise_colour
-    suggestion = _SUGGESTION if may_be_noise and colour in ("coloured", "drifting") else ""
+    depends = any(one.kind == "independence" and one.outcome == "failed" for one in tests.tests)
+    advises = may_be_noise and colour in ("coloured", "drifting") and not depends
+    if lagged:
+        suggestion = _SUGGESTION if advises else ""
+        return [
+            f"the residuals are not white (on the {tests.data} data): something of the dynamics is "
+            f"not in the model, the estimate of {', '.join(sorted(lagged))} depends on the order "
+            f"of the model, and {_ALLOWED[colour]}{suggestion}"
+        ]
+    if not advises:
+        return []
     return [
-        f"the residuals are not white (on the {tests.data} data): something of the dynamics is "
-        f"not in the model, the estimate of {', '.join(sorted(lagged))} depends on the order of "
-        f"the model, and {_ALLOWED[colour]}{suggestion}"
+        f"the residuals are not white (on the {tests.data} data), and no input tells them: squares "
+        f"give slow noise too much weight{_SUGGESTION}"
     ]
+
+
+def time_notes(is_cut_short: bool) -> tuple[str, ...]:
+    """What refinement left out because the time was over."""
+    if not is_cut_short:
+        return ()
+    return (
+        "the time was over before least squares had ended from the champions of all islands: the "
+        "estimate is the best found until then, and need not be the optimum; give more seconds, "
+        "or a shorter record",
+    )
 
 
 def noise_notes(

@@ -233,3 +233,25 @@ def test_every_output_has_a_noise_of_its_own_and_a_kept_part_is_judged() -> None
     assert found.rms_validation is not None
     assert found.residual_tests is not None
     assert {one.output for one in found.residual_tests.tests} == {"y", "z"}
+
+
+def advised(u: FloatArray, y: FloatArray) -> list[str]:
+    times = STEP * np.arange(u.size)
+    one = Record((Channel("u", times, u),), (Channel("y", times, y),))
+    told = identify(load_model(GAIN), one, SMALL, skip=1).warnings
+    return [text for text in told if "noise_model: ar1" in text]
+
+
+def test_slow_noise_is_told_with_its_remedy_also_without_a_lag() -> None:
+    u = np.random.default_rng([3, 1]).choice([-1.0, 1.0], N)
+    (text,) = advised(u, 2.0 * u + 1.0 + 0.2 * coloured(N, POLE, 3))
+    assert "no input tells them" in text
+    assert not advised(u, 2.0 * u + 1.0 + 0.2 * coloured(N, 0.0, 3))
+
+
+def test_no_noise_model_is_advised_where_the_residuals_are_dynamics() -> None:
+    u = np.repeat(np.random.default_rng([3, 2]).choice([-1.0, 1.0], N // 4), 4)
+    y, pole = np.zeros(N), 0.8
+    for k in range(1, N):
+        y[k] = pole * y[k - 1] + (1.0 - pole) * 2.0 * u[k - 1]
+    assert not advised(u, y + 0.01 * coloured(N, 0.0, 3))
