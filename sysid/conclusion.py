@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
 
+from sysid.deadline import Clock, Deadline
 from sysid.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.islands.archipelago import analysis_budget, of_island
 from sysid.islands.run_state import RunState
@@ -23,7 +25,7 @@ from sysid.step_check import step_notes
 from sysid.threads import one_thread
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis, analyse
-from sysid.warnings import noise_notes, warnings_of
+from sysid.warnings import noise_notes, time_notes, warnings_of
 
 _LATE = 20_000_000
 """Steps of integration or recursion that may follow where the run's time is over: about 0.2 s."""
@@ -35,11 +37,14 @@ def conclude(
     algorithm: GeneticAlgorithm,
     state: RunState,
     validation: Problem | None = None,
+    clock: Clock = perf_counter,
 ) -> Identification:
     """The identification that a run has led to.
 
     With ``refine`` the champions of an ``improved`` search are polished by least squares. Those
     of the paper's two methods are reported as found, so that a comparison is one of the methods.
+    Of a run whose time is limited all of that ends near the limit, and warnings tell what was left
+    out; standard errors, tests and validation are made in any case. `clock` gives seconds.
 
     Raises
     ------
@@ -51,27 +56,15 @@ def conclude(
     if not np.isfinite(state.rms):
         raise DivergedEverywhere(state.evaluations)
     with one_thread():  # so that the last bit does not depend on the number of cores
-        return _concluded(problem, algorithm, state, validation)
+        deadline = Deadline(algorithm.stop.seconds, state.seconds, clock)
+        return _concluded(problem, algorithm, state, validation, deadline)
 
 
 def _concluded(
-    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, validation: Problem | None
-) -> Identification:
-    champions = [_champion(problem, island.history) for island in state.islands]
-    refined = _polished(problem, algorithm, state, champions)
-    ends = [
-        (champion, island.champion_rms) if end is None else (end.theta, end.rms)
-        for champion, island, end in zip(champions, state.islands, refined, strict=True)
-    ]
-    best = min(range(len(ends)), key=lambda i: ends[i][1])
-    theta = ends[best][0]
-    analysis = analyse(problem, theta, _left(algorithm, state, refined))
-    if _polishes(algorithm, len(ends)):
-        end, analysis = _with_neighbours(problem, algorithm, state, refined, ends[best], analysis)
-        theta = end.theta
-        ends[best] = theta, end.rms
-        refined = (*refined[:best], end, *refined[best + 1 :])
-    noise, analysis = _under_noise(problem, algorithm, state, refined, theta, analysis)
+    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, validation: Problem | None,
+    deadline: Deadline,
+) -> Identification:  # fmt: skip
+    refined, ends, noise, analysis = _estimated(problem, algorithm, state, deadline)
     theta = noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
         raise NothingIdentifiable(p.name for p in problem.space)
@@ -102,7 +95,8 @@ def _concluded(
         agreement_validation=() if kept is None else kept.metrics.channels,
         warnings=(
             *warnings_of(problem, algorithm, analysis, simulated, metrics.rms, tests),
-            *step_notes(problem, theta, analysis.estimates, simulated),
+            *time_notes(any(end.is_cut_short for end in refined if end is not None)),
+            *step_notes(problem, theta, analysis.estimates, simulated, deadline.is_past_grace),
             *noise_notes(problem, times, noise.is_complete),
         ),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
@@ -115,6 +109,30 @@ def _concluded(
     )
 
 
+def _estimated(
+    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, deadline: Deadline
+) -> tuple[tuple[Refined | None, ...], list[tuple[FloatArray, float]], Generalised, Analysis]:
+    """What refinement made of the islands' champions, where each ended, and the best's analysis."""
+    champions = [_champion(problem, island.history) for island in state.islands]
+    refined = _polished(problem, algorithm, state, champions, deadline)
+    ends = [
+        (champion, island.champion_rms) if end is None else (end.theta, end.rms)
+        for champion, island, end in zip(champions, state.islands, refined, strict=True)
+    ]
+    best = min(range(len(ends)), key=lambda i: ends[i][1])
+    theta = ends[best][0]
+    analysis = analyse(problem, theta, _left(algorithm, state, refined))
+    if _polishes(algorithm, len(ends)):
+        end, analysis = _with_neighbours(
+            problem, algorithm, state, refined, ends[best], analysis, deadline
+        )
+        theta = end.theta
+        ends[best] = theta, end.rms
+        refined = (*refined[:best], end, *refined[best + 1 :])
+    noise, analysis = _under_noise(problem, algorithm, state, refined, theta, analysis, deadline)
+    return refined, ends, noise, analysis
+
+
 def _champion(problem: Problem, history: tuple[Improvement, ...]) -> FloatArray:
     if history:
         return np.array(history[-1].parameters)
@@ -122,13 +140,15 @@ def _champion(problem: Problem, history: tuple[Improvement, ...]) -> FloatArray:
 
 
 def _polished(
-    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, champions: list[FloatArray]
-) -> tuple[Refined | None, ...]:
+    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, champions: list[FloatArray],
+    deadline: Deadline,
+) -> tuple[Refined | None, ...]:  # fmt: skip
     if not _polishes(algorithm, len(champions)):
         return (None,) * len(champions)
     left = _left(algorithm, state, ())
     kept = analysis_budget(len(champions[0]))
-    return refine(problem, champions, None if left is None else max(0, left - kept))
+    most = None if left is None else max(0, left - kept)
+    return refine(problem, champions, most, deadline.is_past_grace)
 
 
 def _polishes(algorithm: GeneticAlgorithm, islands: int) -> bool:
@@ -140,6 +160,7 @@ def _polishes(algorithm: GeneticAlgorithm, islands: int) -> bool:
 def _with_neighbours(
     problem: Problem, algorithm: GeneticAlgorithm, state: RunState,
     refined: tuple[Refined | None, ...], end: tuple[FloatArray, float], analysis: Analysis,
+    deadline: Deadline,
 ) -> tuple[Refined, Analysis]:  # fmt: skip
     """The best of the minima beside an estimate, with intervals that allow for the others.
 
@@ -147,14 +168,13 @@ def _with_neighbours(
     """
     theta, rms = end
     known = next((one for one in refined if one is not None and one.theta is theta), None)
-    before = 0 if known is None else known.evaluations
-    unchanged = Refined(theta, rms, before)
+    before, is_cut = (0, False) if known is None else (known.evaluations, known.is_cut_short)
+    unchanged = Refined(theta, rms, before, is_cut)
     if analysis.linear is None:
         return unchanged, analysis
     left = _left(algorithm, state, refined)
     kept = analysis.evaluations + analysis_budget(theta.size)
-    seconds = algorithm.stop.seconds
-    is_late = seconds is not None and state.seconds >= seconds
+    is_late = deadline.is_over()
     most = affordable(problem, is_late)
     if most == 0 and is_late:
         return unchanged, replace(analysis, is_cut_short=True)
@@ -168,7 +188,7 @@ def _with_neighbours(
         theta, rms = found.best.theta, found.best.rms
         left = None if left is None else left - analysis.evaluations - found.evaluations
         analysis = analyse(problem, theta, left)
-    return Refined(theta, rms, spent), _widened(problem, analysis, found)
+    return Refined(theta, rms, spent, is_cut), _widened(problem, analysis, found)
 
 
 def _widened(problem: Problem, analysis: Analysis, found: Neighbourhood) -> Analysis:
@@ -182,7 +202,7 @@ def _widened(problem: Problem, analysis: Analysis, found: Neighbourhood) -> Anal
 
 def _under_noise(
     problem: Problem, algorithm: GeneticAlgorithm, state: RunState,
-    refined: tuple[Refined | None, ...], theta: FloatArray, analysis: Analysis,
+    refined: tuple[Refined | None, ...], theta: FloatArray, analysis: Analysis, deadline: Deadline,
 ) -> tuple[Generalised, Analysis]:  # fmt: skip
     """The estimates under the noise model that was asked for, and their analysis.
 
@@ -194,7 +214,10 @@ def _under_noise(
         return Generalised(theta, {}, 0, False), analysis
     left = _left(algorithm, state, refined)
     kept = analysis.evaluations + analysis_budget(theta.size)
-    limits = (None if left is None else max(0, left - kept), _in_time(problem, algorithm, state))
+    limits = (
+        None if left is None else max(0, left - kept),
+        _in_time(problem, algorithm, state, deadline),
+    )
     most = min((one for one in limits if one is not None), default=None)
     nothing = np.zeros((theta.size, theta.size))
     covariance = nothing if analysis.uncertainty is None else analysis.uncertainty.covariance
@@ -209,17 +232,17 @@ def _under_noise(
     return found, replace(analysis, evaluations=spent, is_cut_short=is_cut_short)
 
 
-def _in_time(problem: Problem, algorithm: GeneticAlgorithm, state: RunState) -> int | None:
+def _in_time(
+    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, deadline: Deadline
+) -> int | None:
     """Simulations that the run's time leaves, by what those of the search took; None: no limit.
 
     As many as are over at once are there always.
     """
-    limit = algorithm.stop.seconds
-    if limit is None:
+    if algorithm.stop.seconds is None:
         return None
-    left = max(0.0, limit - state.seconds)
     each = max(state.seconds, _CLOCK) / max(state.evaluations, 1)
-    return max(_LATE // max(problem.n_steps, 1), int(left / each))
+    return max(_LATE // max(problem.n_steps, 1), int(deadline.left / each))
 
 
 def _left(

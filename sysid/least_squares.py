@@ -11,6 +11,7 @@ cancel is heard. What it needs to go on lies in its arrays, so the cuts change n
    SIAM J. Appl. Math. 11 (1963) 431.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -54,19 +55,23 @@ class Solution:
     place : FloatArray
         (D,) in [0, 1].
     is_converged : bool
-        Whether the next step promises less than the tolerance; False after too many steps.
+        Whether the next step promises less than the tolerance; False after too many steps, or
+        too late.
     evaluations : int
         Simulations run.
+    is_cut_short : bool
+        Whether it was too late to go on.
     """
 
     place: FloatArray
     is_converged: bool
     evaluations: int
+    is_cut_short: bool = False
 
 
 def solve(
     scored: Scored, place: FloatArray, scale: float, *, steps: int, at_once: int,
-    tolerance: float = 1e-10,
+    tolerance: float = 1e-10, is_late: Callable[[], bool] | None = None,
 ) -> Solution:  # fmt: skip
     """The local minimum that Levenberg-Marquardt finds from a place (D,).
 
@@ -80,14 +85,18 @@ def solve(
         So many of them in one compiled call.
     tolerance : float
         Of the loss: the part that a step must promise to be worth taking.
+    is_late : callable or None
+        Asked after each call: whether to leave it at that.
     """
     place = np.array(place)
     error, columns = np.empty(scored.rows.size), np.empty((place.size, scored.rows.size))
-    memory = np.zeros(_N_MEMORY)
-    while steps > 0 and not memory[_END]:
+    memory, is_cut_short = np.zeros(_N_MEMORY), False
+    while steps > 0 and not memory[_END] and not is_cut_short:
         _descend(scored, place, error, columns, memory, scale, min(steps, at_once), tolerance)
         steps -= at_once
-    return Solution(place, bool(memory[_END]), int(memory[_SPENT]))
+        goes_on = steps > 0 and not memory[_END]
+        is_cut_short = goes_on and is_late is not None and is_late()
+    return Solution(place, bool(memory[_END]), int(memory[_SPENT]), is_cut_short)
 
 
 @compiled

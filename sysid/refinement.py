@@ -1,7 +1,7 @@
 """Refinement: bounded least squares from the champions of all islands."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,26 +24,35 @@ _AT_ONCE = 10_000_000  # steps of integration or recursion in one compiled call:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refined:
-    """A start and what least squares made of it; `theta` is the start if it gained nothing."""
+    """A start and what least squares made of it; `theta` is the start if it gained nothing.
+
+    `is_cut_short`: it was too late to go on to its end, or to begin with the start after it.
+    """
 
     theta: FloatArray
     rms: float
     evaluations: int
+    is_cut_short: bool = False
 
 
 def refine(
-    problem: Problem, starts: Sequence[FloatArray], evaluations: int | None = None
+    problem: Problem,
+    starts: Sequence[FloatArray],
+    evaluations: int | None = None,
+    is_late: Callable[[], bool] | None = None,
 ) -> tuple[Refined | None, ...]:
     """Refine each of the starts (D,), best first; None for one that was left out.
 
     Left out are starts that diverge, that lie beside a better one, or for which nothing of the
-    budget of `evaluations` is left. On long records only the two best are refined.
+    budget of `evaluations` is left. On long records only the two best are refined. `is_late` is
+    asked between compiled calls of about 0.1 s; of the best start there is one call always.
     """
     values = problem.fitness(np.array(starts))
     left = 2**62 if evaluations is None else evaluations
     most = 2 if problem.evaluator.n_measured * len(problem.space) > _LONG else len(starts)
     found: list[Refined | None] = [None] * len(starts)
     taken: list[FloatArray] = []
+    before: tuple[int, Refined] | None = None
     for i in np.argsort(values, kind="stable"):
         place = placed(problem.evaluator, np.array(starts[i])[None])[0]
         beside = any(np.max(np.abs(place - other)) < _SAME for other in taken)
@@ -51,9 +60,12 @@ def refine(
             continue
         if left < place.size + TRIED + _ENDS:
             break
+        if before is not None and is_late is not None and is_late():
+            found[before[0]] = replace(before[1], is_cut_short=True)
+            break
         taken.append(place)
-        refined = _refined(problem, starts[i], place, float(values[i]), left)
-        found[i], left = refined, left - refined.evaluations
+        refined = _refined(problem, starts[i], place, float(values[i]), left, is_late)
+        found[i], left, before = refined, left - refined.evaluations, (i, refined)
     return tuple(found)
 
 
@@ -68,8 +80,9 @@ def refine_one(
 
 
 def _refined(
-    problem: Problem, start: FloatArray, place: FloatArray, rms: float, left: int
-) -> Refined:
+    problem: Problem, start: FloatArray, place: FloatArray, rms: float, left: int,
+    is_late: Callable[[], bool] | None = None,
+) -> Refined:  # fmt: skip
     """Least squares from one start; the search may use `left` simulations.
 
     Residuals are in units of about the outputs' scale, so that the tolerances of the search and
@@ -79,15 +92,16 @@ def _refined(
     unit = float(np.ldexp(1.0, int(np.frexp(size)[1]))) if size > 0 else 1.0
     evaluator, rows = problem.evaluator, problem.scored
     batch = place.size + TRIED
+    steps = min(_STEPS, (left - _ENDS) // batch)
+    at_once = max(1, _AT_ONCE // (batch * problem.n_steps))
     solved = solve(
         Scored(evaluator, rows, evaluator.weight[rows] / unit), place, loss_scale(problem) / unit,
-        steps=min(_STEPS, (left - _ENDS) // batch),
-        at_once=max(1, _AT_ONCE // (batch * problem.n_steps)),
+        steps=steps, at_once=at_once, is_late=is_late,
     )  # fmt: skip
     theta, reached = _end(evaluator, solved.place)
     if reached > rms:
         theta, reached = start, rms
-    return Refined(np.array(theta), reached, solved.evaluations + 2)
+    return Refined(np.array(theta), reached, solved.evaluations + 2, solved.is_cut_short)
 
 
 @compiled

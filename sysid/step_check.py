@@ -6,6 +6,7 @@ more with half the step. Where that moves the output by as much as may move a pa
 standard error (a move d of the outputs moves none by more than |d|/s of those), it is fitted anew.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -24,8 +25,9 @@ _MOST_STEPS = 2_000_000
 
 
 def step_notes(
-    problem: Problem, theta: FloatArray, estimates: tuple[Estimate, ...], simulated: FloatArray
-) -> list[str]:
+    problem: Problem, theta: FloatArray, estimates: tuple[Estimate, ...], simulated: FloatArray,
+    is_late: Callable[[], bool] | None = None,
+) -> list[str]:  # fmt: skip
     """Estimates (D,) that would be others with half the integration step; simulated (M,)."""
     plain = problem.loss.noise_model == "white"
     if is_difference(problem.model) or not plain or _FINER * problem.n_steps > _MOST_STEPS:
@@ -39,7 +41,12 @@ def step_notes(
         is_near = np.sqrt(squares / n) <= _NOTABLE * problem.output_scale
     if squares <= float(error @ error) / n or is_near:
         return []
-    (end,) = refine(fine, [theta])
+    if is_late is not None and is_late():
+        return [
+            "with half the integration step the output moves by more than the noise lets the "
+            "estimates; the time was over, so what they would be was not looked for"
+        ]
+    (end,) = refine(fine, [theta], None, is_late)
     if end is None:
         return []
     names = [one.name for one in problem.space]

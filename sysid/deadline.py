@@ -1,0 +1,41 @@
+"""When the time that a run may take is over, for what follows its search."""
+
+from collections.abc import Callable
+from time import perf_counter
+
+Clock = Callable[[], float]
+"""Seconds from any moment on."""
+
+_GRACE, _LEAST, _MOST = 0.1, 0.2, 10.0  # of the limit; s
+
+
+class Deadline:
+    """The end of a run's time, and a grace behind it, within which least squares may end.
+
+    Parameters
+    ----------
+    limit : float or None
+        Seconds that the run may take; None: it has no limit.
+    used : float
+        Seconds of it that its search has taken.
+    clock : callable
+    """
+
+    def __init__(self, limit: float | None, used: float, clock: Clock = perf_counter) -> None:
+        self._clock = clock
+        limit = float("inf") if limit is None else limit
+        self._end = clock() + (limit - used)
+        self._grace = min(max(_GRACE * limit, _LEAST), _MOST)
+
+    @property
+    def left(self) -> float:
+        """Seconds until the end, 0 or more."""
+        return max(0.0, self._end - self._clock())
+
+    def is_over(self) -> bool:
+        """Whether the end is reached."""
+        return self._clock() >= self._end
+
+    def is_past_grace(self) -> bool:
+        """Whether the grace is over as well."""
+        return self._clock() >= self._end + self._grace
