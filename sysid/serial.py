@@ -1,4 +1,4 @@
-"""Covariance of estimates where the residuals of neighbouring samples are alike.
+"""Covariance of estimates where residuals are not those of one white noise.
 
 s²(SᵀS)⁻¹ takes the residuals for white. Those of measured records seldom are, and then it is too
 small by as much as they are alike over the time in which the sensitivities change. Where they are
@@ -11,9 +11,12 @@ Coloured samples say less than as many white ones: of first-order noise with pol
 mean count for n(1 - a)/(1 + a) (Bayley and Hammersley 1946). So many are taken for the degrees of
 freedom. Where a is too near 1 the record is short beside its drift, and the errors are a lower
 bound. Different outputs are taken for independent.
+
+Nor is s² that of every output of every experiment. Where they are clearly noisy by unequal amounts
+in the weighted residuals (Bartlett 1937), Ω has of each its own variance.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +28,9 @@ from sysid.problem import Problem
 from sysid.types import FloatArray
 
 _CHANCE = 1e-3
-"""That white residuals look as little white: below, they are taken for coloured."""
+"""That white residuals look as little white: below, they are taken for coloured.
+
+And that those of one variance look as uneven."""
 
 QUANTILE = 3.841458820694124
 """95 % of χ² with one degree of freedom."""
@@ -41,12 +46,14 @@ _EVEN = 1e-3  # of a period: steps that differ by less are equal
 class Coloured(NamedTuple):
     """Ω (D, D) of the sandwich, and how many white samples would say as much.
 
-    `drifts` where that number is not known: the residuals wander over the whole record.
+    `drifts` where that number is not known: the residuals wander over the whole record. `is_white`
+    where they are of unequal size only.
     """
 
     middle: FloatArray
     samples: float
     drifts: bool
+    is_white: bool = False
 
     @property
     def degrees(self) -> float:
@@ -78,7 +85,7 @@ class Part(NamedTuple):
 
 
 def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloured | None:
-    """The middle of the sandwich; None where the residuals may as well be white.
+    """The middle of the sandwich; None where the residuals may as well be one white noise.
 
     Parameters
     ----------
@@ -87,13 +94,13 @@ def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloure
     columns : FloatArray, shape (n, D)
         Their sensitivities.
     """
-    if problem.prediction == "one-step":
-        return None
     found = [(part, _in_order(part, seen[part.rows])) for part in parts(problem)]
-    told = [_is_coloured(laid, part.size) for part, laid in found]
-    if not any(told):
+    is_free = problem.prediction == "simulation"
+    told = [is_free and _is_coloured(laid, part.size) for part, laid in found]
+    if not any(told) and not _are_uneven([seen[part.rows] for part, _ in found]):
         return None
-    whole = Coloured(np.zeros((columns.shape[1], columns.shape[1])), 0.0, drifts=False)
+    nothing = np.zeros((columns.shape[1], columns.shape[1]))
+    whole = Coloured(nothing, 0.0, drifts=False, is_white=not any(told))
     for (part, _), has_colour in zip(found, told, strict=True):
         own, values = columns[part.rows], seen[part.rows]
         if has_colour:
@@ -102,9 +109,25 @@ def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloure
             mean = float(np.mean(np.square(values)))
             one = Coloured(mean * (own.T @ own), float(values.size), drifts=False)
         whole = Coloured(
-            whole.middle + one.middle, whole.samples + one.samples, whole.drifts or one.drifts
-        )
+            whole.middle + one.middle, whole.samples + one.samples, whole.drifts or one.drifts,
+            whole.is_white,
+        )  # fmt: skip
     return whole
+
+
+def _are_uneven(series: Sequence[FloatArray]) -> bool:
+    """Whether residuals are clearly of unequal variance, by the test of Bartlett."""
+    long = [one for one in series if one.size >= FEWEST]
+    variances = np.array([np.mean(np.square(one)) for one in long])
+    if len(long) < 2 or not np.min(variances) > 0:
+        return False
+    counts = np.array([one.size for one in long])
+    total = float(np.sum(counts))
+    pooled = float(counts @ variances) / total
+    statistic = total * np.log(pooled) - counts @ np.log(variances)
+    others = len(long) - 1
+    correction = 1.0 + (np.sum(1.0 / counts) - 1.0 / total) / (3.0 * others)
+    return float(chdtrc(others, statistic / correction)) < _CHANCE
 
 
 def is_coloured(part: Part, values: FloatArray) -> bool:

@@ -322,7 +322,7 @@ def _told_by(n: int, d: int, colour: Coloured | None, white: Whitening | None) -
 
 
 def _named(colour: Coloured | None, white: Whitening | None) -> NoiseColour:
-    if colour is None:
+    if colour is None or colour.is_white:
         return "white" if white is None else "first-order"
     return "drifting" if colour.drifts else "coloured"
 

@@ -46,6 +46,31 @@ def test_estimates_scatter_as_their_standard_errors_say() -> None:
     assert np.mean(np.square(scores)) == pytest.approx(1.0, abs=0.35)
 
 
+def test_records_of_unequal_noise_each_count_with_their_own() -> None:
+    # The sandwich of White (1980) for two series, each of its own variance.
+    exact, vague = record(noisy(seed=1)), record(noisy(n=80, sd=0.06, seed=2))
+    problem = Problem.build(load_model("duffing-eq16"), [exact, vague])
+    end = refine(problem, [truth(problem)])[0]
+    assert end is not None
+    found = analyse(problem, end.theta)
+    assert found.uncertainty is not None
+    assert found.uncertainty.noise_colour == "white"
+    step = 1e-5 * np.eye(end.theta.size)
+    slopes = (
+        problem.predictions(end.theta + step) - problem.predictions(end.theta - step)
+    ).T / 2e-5  # fmt: skip
+    error = problem.evaluator.measured - problem.predictions(end.theta[None])[0]
+    inner = sum(
+        np.mean(error[rows] ** 2) * slopes[rows].T @ slopes[rows]
+        for rows in (slice(0, 300), slice(300, 380))
+    )
+    bread = np.linalg.inv(slopes.T @ slopes)
+    expected = np.sqrt(np.diag(bread @ inner @ bread) * 380 / 376)
+    pooled = np.sqrt(np.diag(bread) * np.sum(error**2) / 376)
+    assert [one.stderr for one in found.estimates] == pytest.approx(expected, rel=1e-3)
+    assert np.max(np.abs(expected / pooled - 1)) > 0.1
+
+
 def test_standard_errors_beside_the_jumps_of_coulomb_friction_are_those_of_repetition() -> None:
     values, errors = [], []
     for seed in range(40):
