@@ -74,6 +74,9 @@ def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, pa
 
 def test_a_refused_request_is_told_at_the_field(site: Site, page: Page) -> None:
     opened(site, page, f"?dataset={site.filled.dataset}")
+    write_own(page, EQUATIONS)  # of the recording's units: nothing else is refused
+    expect(page.locator("#check")).to_contain_text("can be used")
+    page.get_by_label("output y").select_option("P2")
     page.get_by_label("population").fill("2")
     page.get_by_role("button", name="Identify").click()
     expect(page.get_by_label("population")).to_have_attribute("aria-invalid", "true")
