@@ -13,6 +13,7 @@ from workers.ports import (
     Concluded,
     Crew,
     Done,
+    Evolve,
     Evolved,
     Failure,
     Handle,
@@ -109,17 +110,22 @@ class JobWork:
             self._send([run.whole(self._cost) for run in self._take_fresh(size)])
 
     def absorb(self, handle: Handle, done: tuple[Done, ...]) -> None:
-        """Take in what a pack gave."""
-        del self.flying[handle]
-        for one in done:
+        """Take in what a pack gave; islands whose turn did not come are sent again."""
+        again: list[Item] = []
+        for item, one in zip(self.flying.pop(handle), done, strict=True):
             run = self._active.get(one.run)
             if run is None:
                 continue  # it failed while another of its islands was still out
             run.seconds += one.seconds
-            if one.outcome is None:
-                self._ready.appendleft(run)
-            else:
+            if one.outcome is not None:
                 self._take(run, one)
+            elif isinstance(item, Evolve):
+                again.append(item)
+            else:
+                self._ready.appendleft(run)
+        again = [item for item in again if item.run in self._active]
+        if again:
+            self._send(again)
 
     def tell(self) -> bool:
         """Tell the observer of the next result, which takes it a while; whether there was one."""

@@ -7,9 +7,10 @@ import pytest
 
 from sysid.errors import InvalidSettings
 from sysid.run import begin
-from tests.runs import RECORDS, ListedRuns, Notebook, spec
+from tests.runs import RECORDS, ListedRuns, Notebook, bits, carry_out, spec
 from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
 from workers.feeding import Feeder
+from workers.inline import InlineCrew
 from workers.packing import PACKS_PER_CPU
 from workers.ports import (
     Advance,
@@ -283,3 +284,13 @@ def test_a_run_is_told_to_begin_once_also_when_it_goes_on_from_a_checkpoint() ->
     feeder.add("a", ListedRuns([QueuedRun("a0", spec(), kept)]), notebook)
     finish(feeder)
     assert notebook.begun == ["a0"]
+
+
+def test_islands_whose_turn_did_not_come_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = spec(3, "long", generations=60, islands=8, population=64)
+    plain = carry_out(InlineCrew(), {"r": one})
+    monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
+    monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 0.001)
+    monkeypatch.setattr("workers.tasks.PACK_LIMIT_SECONDS", 0.0)  # one island of a pack at a time
+    spread = carry_out(InlineCrew(slots=2), {"r": one})
+    assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])
