@@ -7,6 +7,7 @@ from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, PlainTex
 
 from service.api.deps import Cursor, PartsDep, ReadSession
 from service.api.jobs import Filter
+from service.api.page import Page
 from service.errors import NotFound
 from service.storage.tables import State
 from service.web import assets, figures, pages, recipe_pages, report, results
@@ -15,26 +16,7 @@ from service.web.simulate_page import simulate_page as simulate
 
 router = APIRouter()
 
-# Scripts and data come from here only. Plotly styles its own elements, hence the inline styles;
-# it writes pictures for download through blob: and data: addresses.
-PAGE_HEADERS = {
-    "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
-        "img-src 'self' data: blob:; connect-src 'self'; form-action 'self'; base-uri 'none'; "
-        "frame-ancestors 'none'"
-    ),
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "same-origin",
-    "Cache-Control": "no-store",
-}
 FOREVER = "public, max-age=31536000, immutable"
-
-
-class _Page(HTMLResponse):
-    """A page, with what a browser may load for it."""
-
-    def __init__(self, content: str, status: int = 200) -> None:
-        super().__init__(content, status, headers=PAGE_HEADERS)
 
 
 Hidden: dict[str, Any] = {"include_in_schema": False, "response_class": HTMLResponse}
@@ -46,25 +28,25 @@ ComparedRuns = Annotated[list[str], Query(min_length=2, max_length=50)]
 @router.get("/docs", **Hidden)
 def reference_page(request: Request) -> Response:
     """The REST interface for people."""
-    return _Page(pages.reference_page(request.app.openapi()))
+    return Page(pages.reference_page(request.app.openapi()))
 
 
 @router.get("/", **Hidden)
 def jobs_page(session: ReadSession, state: StateFilter = None, cursor: Cursor = None) -> Response:
     """The list of jobs, and the form of a new identification."""
-    return _Page(pages.jobs_page(session, state, cursor))
+    return Page(pages.jobs_page(session, state, cursor))
 
 
 @router.get("/new/noise-sweep", **Hidden)
 def noise_sweep_page(session: ReadSession) -> Response:
     """The form of a noise sweep."""
-    return _Page(recipe_pages.noise_sweep_page(session))
+    return Page(recipe_pages.noise_sweep_page(session))
 
 
 @router.get("/new/reidentify", **Hidden)
 def reidentify_page(session: ReadSession) -> Response:
     """The form of a batch re-identification."""
-    return _Page(recipe_pages.reidentify_page(session))
+    return Page(recipe_pages.reidentify_page(session))
 
 
 @router.get("/jobs/{job_id}", **Hidden)
@@ -74,13 +56,13 @@ def job_page(
 ) -> Response:  # fmt: skip
     """One job with its runs, or the grid of its cells and the runs of the chosen one."""
     url = str(request.base_url)
-    return _Page(pages.job_page(session, job_id, url, cursor=cursor, cell=cell or []))
+    return Page(pages.job_page(session, job_id, url, cursor=cursor, cell=cell or []))
 
 
 @router.get("/runs/{run_id}", **Hidden)
 def run_page(run_id: str, request: Request, session: ReadSession) -> Response:
     """The job of one run, with this run in full."""
-    return _Page(pages.run_page(session, run_id, str(request.base_url)))
+    return Page(pages.run_page(session, run_id, str(request.base_url)))
 
 
 @router.get("/runs/{run_id}/simulate", **Hidden)
@@ -90,25 +72,25 @@ def simulate_page(run_id: str, request: Request, parts: PartsDep) -> Response:
     found = simulate(parts.database, parts.store, run_id, query, str(request.base_url))
     if found.is_csv:
         return _as_csv(found.text, "simulation")
-    return _Page(found.text, found.status)
+    return Page(found.text, found.status)
 
 
 @router.get("/compare", **Hidden)
 def compare_page(session: ReadSession, run: ComparedRuns) -> Response:
     """Runs of several models on the same data side by side."""
-    return _Page(pages.compare_page(session, run))
+    return Page(pages.compare_page(session, run))
 
 
 @router.get("/datasets", **Hidden)
 def datasets_page(session: ReadSession, cursor: Cursor = None) -> Response:
     """The stored recordings."""
-    return _Page(pages.datasets_page(session, cursor))
+    return Page(pages.datasets_page(session, cursor))
 
 
 @router.get("/datasets/{dataset_id}", **Hidden)
 def dataset_page(dataset_id: str, session: ReadSession) -> Response:
     """One dataset: signals, channels, lineage."""
-    return _Page(pages.dataset_page(session, dataset_id))
+    return Page(pages.dataset_page(session, dataset_id))
 
 
 @router.get("/pages/models/{name}.yaml", **Hidden)

@@ -13,6 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
 from service.api.beside import faults_beside
+from service.api.page import error_page, is_for_people
 from service.conversion import faults_of
 from service.errors import (
     Conflict,
@@ -58,7 +59,12 @@ def problem(
     errors: Sequence[FieldError] = (),
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """Answer with a problem document; its `type` is a path of this server, one per kind."""
+    """Answer with a problem document; its `type` is a path of this server, one per kind.
+
+    A browser that asked for a page gets one that says the same.
+    """
+    if is_for_people(request):
+        return error_page(status, title, detail, errors, headers or {})
     content: dict[str, Any] = {
         "type": f"/problems/{kind}",
         "title": title,

@@ -21,6 +21,8 @@ Abscissa = Literal["generations", "evaluations"]
 MARGIN = {"l": 64, "r": 16, "t": 28, "b": 44}
 WATERFALL_HEIGHT = 280
 _EPOCHS_MARKED = 80
+_CROWDED = 8.0
+"""Ratio of the largest to the smallest value from which on digits of a log axis stand too close."""
 _PHASES = {
     "sequence": ("sequence", "diamond-open"),
     "migration": ("migration", "triangle-up-open"),
@@ -59,13 +61,14 @@ def history(run: RunEvidence, abscissa: Abscissa = "generations") -> Figure:
         for number, points in enumerate(run.history)
         if points
     ]
+    data = [*lines, *_phase_markers(run, abscissa)]
     epochs = run.migrations if abscissa == "generations" and run.epoch else ()
     return {
-        "data": [*lines, *_phase_markers(run, abscissa)],
+        "data": data,
         "layout": layout(
             360,
             xaxis={"title": {"text": abscissa}, "rangemode": "tozero"},
-            yaxis=_fitness_axis(run),
+            yaxis=_fitness_axis(run, data),
             shapes=[_upright(epoch * run.epoch) for epoch in _some(epochs)],
             uirevision=abscissa,
         ),
@@ -154,7 +157,7 @@ def waterfall(run: RunEvidence) -> Figure:
             WATERFALL_HEIGHT,
             xaxis={"title": {"text": "islands, best first"}, "dtick": max(1, len(order) // 12),
                    "range": [0.5, len(order) + 0.5]},
-            yaxis=_fitness_axis(run),
+            yaxis=_fitness_axis(run, data),
         ),
     }  # fmt: skip
 
@@ -241,10 +244,15 @@ def _some(epochs: Sequence[int]) -> list[int]:
     return distinct if len(distinct) <= _EPOCHS_MARKED else []
 
 
-def _fitness_axis(run: RunEvidence) -> dict[str, Any]:
-    title = {"text": f"{run.fitness} [{run.unit}]"}
+def _fitness_axis(run: RunEvidence, data: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The axis of the fitness; `data` are the traces upon it."""
+    title = {"text": run.fitness + formats.bracketed(run.unit)}
     # Over less than a decade the digits between its powers would stand alone, without any power.
-    return {"title": title, "type": "log", "exponentformat": "e", "minorloglabels": "complete"}
+    axis = {"title": title, "type": "log", "exponentformat": "e", "minorloglabels": "complete"}
+    positive = [y for trace in data for y in trace["y"] if y is not None and y > 0]
+    if positive and _CROWDED <= max(positive) / min(positive) < 1000 * _CROWDED:
+        axis["dtick"] = "D2"  # 1, 2, 5: all nine digits of a decade lie upon each other
+    return axis
 
 
 def _upright(x: float) -> dict[str, Any]:

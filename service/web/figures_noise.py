@@ -7,6 +7,7 @@ from typing import Any
 from service.schemas_summaries import GroupOut, ParameterSummaryOut, SummaryOut
 from service.web import theme
 from service.web.figures import MARGIN, Figure, finite, layout
+from service.web.formats import bracketed
 
 SIGMA = "/noise/sigma"
 METHOD = "/algorithm/method"
@@ -91,7 +92,7 @@ def noise_height(n_panels: int, columns: int = 2) -> int:
 
 
 def _panels(summary: SummaryOut, unit: str) -> list[_Panel]:
-    suffix = "" if unit == "1" else f" [{unit}]"
+    suffix = bracketed(unit)
     response = _Panel("<b>RMS error</b> of the response", f"RMS error{suffix}", is_signed=False)
     panels = {"": response}
     for group in summary.groups:
@@ -115,7 +116,7 @@ def _add_error(panel: _Panel, name: str, sigma: float, one: ParameterSummaryOut)
 
 
 def _panel_of(one: ParameterSummaryOut) -> _Panel:
-    suffix = "" if one.unit == "1" else f" [{one.unit}]"
+    suffix = bracketed(one.unit)
     known = "" if one.reference is None else f" − {one.reference:.6g}".replace("−-", "+")
     return _Panel(f"<b>{one.name}</b>{known}", f"error of {one.name}{suffix}", is_signed=True)
 
@@ -163,7 +164,7 @@ def _add(
     figure["data"] += _floors(panel, at, told)
     figure["layout"][f"xaxis{axis}"] = {
         "domain": across, "anchor": f"y{axis}", "rangemode": "tozero", "nticks": 7,
-        "title": {"text": f"σ{'' if unit == '1' else f' [{unit}]'}", "font": {"size": 11},
+        "title": {"text": "σ" + bracketed(unit), "font": {"size": 11},
                   "standoff": 4},
         **({} if number == 0 else {"matches": "x"}),
     }  # fmt: skip

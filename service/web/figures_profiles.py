@@ -6,6 +6,7 @@ from typing import Any
 from service.schemas_profiles import ProfileOut
 from service.web import theme
 from service.web.figures import MARGIN, Figure, layout
+from service.web.formats import bracketed
 
 _ROW_PX, _GAP = 230, 0.08
 _MOST = 3.0  # thresholds that are drawn: the walls of a steep profile would hide its foot
@@ -26,7 +27,7 @@ def profile(profiles: Sequence[ProfileOut], threshold: float, columns: int = 2) 
         axis = "" if number == 0 else str(number + 1)
         figure["data"].append(_line(one, axis))
         figure["layout"]["shapes"] += _marks(one, axis, threshold)
-        title = one.name if one.unit == "1" else f"{one.name} [{one.unit}]"
+        title = one.name + bracketed(one.unit)
         figure["layout"][f"xaxis{axis}"] = {
             "domain": [left, left + wide], "anchor": f"y{axis}", "title": {"text": title},
             "nticks": 6,

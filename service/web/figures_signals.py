@@ -9,6 +9,7 @@ from service.web import theme
 from service.web.decimation import MAX_POINTS, thinned, window
 from service.web.evidence import Experiment, Floats, OutputTraces, Trace
 from service.web.figures import MARGIN, Figure, finite, layout
+from service.web.formats import bracketed
 
 _GAP_PX = 20
 _OUTPUT_PX, _RESIDUAL_PX, _INPUT_PX, _SIGNAL_PX = 240, 84, 110, 120
@@ -102,11 +103,6 @@ def name_axis(figure: Figure, number: int, text: str) -> None:
     figure["layout"][f"yaxis{number if number > 1 else ''}"]["title"] = {
         "text": text, "standoff": 6, "font": {"size": 11},
     }  # fmt: skip
-
-
-def bracketed(unit: str) -> str:
-    """A unit as it follows a name; nothing for a number without dimension."""
-    return "" if unit == "1" else f" [{unit}]"
 
 
 def axis_id(name: str) -> str:

@@ -10,7 +10,8 @@ from service.schemas_simulations import RunSimulationOut, StepMetricsOut
 from service.web import theme
 from service.web.evidence import Trace
 from service.web.figures import Figure
-from service.web.figures_signals import axis_id, bracketed, line, name_axis, stack
+from service.web.figures_signals import axis_id, line, name_axis, stack
+from service.web.formats import bracketed
 
 _OUTPUT_PX, _INPUT_PX = 260, 120
 _WHOLE = slice(None)

@@ -5,6 +5,7 @@ from typing import Any
 from service.schemas_trends import LawOut, PlaceOut, PointOut, QuantityOut, TrendOut
 from service.web import theme
 from service.web.figures import MARGIN, Figure, finite, layout
+from service.web.formats import bracketed
 
 _CAPTION_PX, _PLOT_PX, _AXIS_PX = 30, 250, 54
 _ROW_PX = _CAPTION_PX + _PLOT_PX + _AXIS_PX
@@ -60,7 +61,7 @@ def _axes(
 ) -> Axes:  # fmt: skip
     axis = "" if number == 0 else str(number + 1)
     across, upward = place
-    unit = "" if one.unit in ("", "1") else f" [{one.unit}]"
+    unit = bracketed(one.unit)
     figure["layout"][f"xaxis{axis}"] = {
         "domain": across, "anchor": f"y{axis}", "nticks": 7, "rangemode": "tozero",
         "title": {"text": x, "font": {"size": 11}, "standoff": 4},

@@ -43,6 +43,11 @@ def unit(symbol: str) -> str:
     return "" if symbol in ("1", "") else f"{_THIN}{symbol}"
 
 
+def bracketed(symbol: str) -> str:
+    """A unit as it follows a name; nothing for a number without dimension."""
+    return "" if symbol in ("1", "") else f" [{symbol}]"
+
+
 def count(value: float | None) -> str:
     """A whole number in groups of three digits."""
     return DASH if value is None else f"{value:,.0f}".replace(",", _THIN)

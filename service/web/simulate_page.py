@@ -25,7 +25,7 @@ from service.storage.jobs import JobRepository
 from service.storage.objects import ObjectStore
 from service.storage.runs import RunRepository
 from service.storage.sessions import Database
-from service.storage.tables import Dataset
+from service.storage.tables import Dataset, Run
 from service.sweeps import body_of
 from service.web.decimation import MAX_POINTS
 from service.web.embedding import as_json, bare, templates
@@ -51,6 +51,8 @@ from sysid.records import Record
 DATASETS_LISTED = 200
 RECORDS_LISTED = 50
 MOST_DEFAULT_SAMPLES = 5000
+TAKEN = {"amplitude": "1", "offset": "0"}
+"""What an address without them means; a form that is still empty suggests others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +123,8 @@ def simulate_page(
         status = error.status if isinstance(error, Unavailable) else 422
     page = render(
         "simulate.html", known=known, kind=kind, kinds=KINDS,
-        values={**known.defaults, **query}, faults={f.pointer[1:]: f.detail for f in faults},
+        values={**known.defaults, **(TAKEN if is_asked(query) else {}), **query},
+        faults={f.pointer[1:]: f.detail for f in faults},
         lines=[_line(one) for one in faults], query=_address(query), label_of=label_of,
         **{"result": None, "free": None, "figure": None, **context},
     )  # fmt: skip
@@ -141,7 +144,8 @@ def _known(session: Session, run_id: str, query: Mapping[str, str]) -> _Known:
     return _Known(
         run=run.id, title=f"run {run.number + 1}", job=job.id, job_name=job.name, model=model,
         datasets=datasets, has_estimates=bool((run.result or {}).get("parameters")),
-        units=_units(model, request, fitted), defaults=_defaults(model, request, fitted),
+        units=_units(model, request, fitted),
+        defaults=_defaults(model, request, fitted) | _step(model, run),
     )  # fmt: skip
 
 
@@ -173,6 +177,20 @@ def _defaults(model: Model, request: Mapping[str, Any], fitted: Dataset | None) 
         "duration": f"{duration:.6g}", "sample_time": f"{period:.6g}",
         **{f"channel.{name}": channels.get(name, name) for name in chain(*signals_of(model))},
     }  # fmt: skip
+
+
+def _step(model: Model, run: Run) -> dict[str, str]:
+    """A step of the reference within what was measured: half the span of the first output.
+
+    A step from 0 to 1 would lie outside it for most plants, with an output's offset or in Pa.
+    """
+    told = ((run.result or {}).get("agreement") or {}).get("estimation", [])
+    of_output = (one for one in told if one["output"] == model.outputs[0].name)
+    spans = [one["span"] for one in of_output if None not in one["span"]]
+    if not spans:
+        return {}
+    low, high = min(span[0] for span in spans), max(span[1] for span in spans)
+    return {"offset": f"{low + (high - low) / 4:.2g}", "amplitude": f"{(high - low) / 2:.2g}"}
 
 
 def _simulated(

@@ -189,3 +189,36 @@ def test_the_recordings_are_listed_page_by_page_with_what_can_be_done(tmp_path: 
     assert "record 51" in first
     assert "record 0" in rest
     assert re.search(r'href="/new/noise-sweep\?dataset=ds_', rest)
+
+
+@pytest.mark.parametrize(
+    ("path", "status", "told"),
+    [
+        ("/jobs/job_x", 404, "there is no job"), ("/nothing", 404, "/nothing"),
+        ("/compare?run=%3Cb%3E", 422, "run"),
+    ],
+)  # fmt: skip
+def test_a_browser_is_told_an_error_on_a_page(
+    client: TestClient, path: str, status: int, told: str
+) -> None:
+    answer = client.get(path, headers={"accept": "text/html,*/*;q=0.8"})
+    assert answer.status_code == status
+    assert answer.headers["content-type"].startswith("text/html")
+    assert "script-src 'self'" in answer.headers["content-security-policy"]
+    assert told in answer.text
+    assert 'href="/datasets"' in answer.text
+    assert "<b>" not in answer.text
+
+
+@pytest.mark.parametrize("path", ["/v1/jobs/job_x", "/static/x.js", "/pages/models/x.yaml"])
+def test_what_scripts_load_has_a_problem_document_also_in_a_browser(
+    client: TestClient, path: str
+) -> None:
+    answer = client.get(path, headers={"accept": "text/html,*/*;q=0.8"})
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_every_column_of_a_page_has_a_heading() -> None:
+    folder = Path(assets.__file__).parent / "templates"
+    for path in folder.glob("*.html"):
+        assert "<th></th>" not in path.read_text(encoding="utf-8"), path.name

@@ -143,6 +143,20 @@ def test_the_form_is_shown_with_the_values_of_the_run(place: Place) -> None:
     assert f'href="/runs/{place.run}/simulate"' in place.client.get(f"/runs/{place.run}").text
 
 
+def test_the_form_suggests_a_step_within_what_was_measured(place: Place) -> None:
+    result = place.client.get(f"/v1/runs/{place.run}").json()
+    low, high = result["agreement"]["estimation"][0]["span"]
+    form = place.client.get(place.page).text
+    before, height = (
+        float(re.search(rf'name="{name}" value="([^"]*)"', form)[1])  # type: ignore[index]
+        for name in ("offset", "amplitude")
+    )
+    assert low < before < before + height < high
+    asked = place.client.get(f"{place.page}?gain=0.5&duration=5&sample_time=0.1").text
+    assert 'name="offset" value="0"' in asked  # what was simulated, not what is suggested
+    assert 'name="amplitude" value="1"' in asked
+
+
 def test_a_loop_of_small_gain_settles_and_the_page_says_by_how_much(place: Place) -> None:
     query = "?kind=loop&gain=0.5&amplitude=1&duration=30&sample_time=0.05"
     answer = place.client.get(place.page + query)

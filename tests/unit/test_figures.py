@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,6 +66,19 @@ def test_a_history_has_a_line_per_island_on_a_log_axis_with_its_unit() -> None:
     assert [line["name"] for line in lines] == ["island 1", "island 2"]
     assert figure["layout"]["yaxis"]["type"] == "log"
     assert figure["layout"]["yaxis"]["title"]["text"] == "RMS [kPa]"
+
+
+def test_the_axis_of_a_number_without_dimension_names_no_unit() -> None:
+    for draw in (figures.history, figures.waterfall):
+        assert draw(replace(run(), unit="1"))["layout"]["yaxis"]["title"]["text"] == "RMS"
+
+
+@pytest.mark.parametrize(("smallest", "digits"), [(0.5, None), (0.05, "D2"), (1e-6, None)])
+def test_digits_of_a_log_axis_do_not_lie_upon_each_other(
+    smallest: float, digits: str | None
+) -> None:
+    axis = figures.waterfall(run(islands=((1.0, None), (1.0, smallest))))["layout"]["yaxis"]
+    assert axis.get("dtick") == digits
 
 
 def test_a_history_line_goes_on_to_the_last_generation_at_its_last_value() -> None:
