@@ -23,13 +23,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sysid.common_noise import coloured_jointly
 from sysid.errors import InvalidRecord, InvalidSettings, nearest
 from sysid.ga.chromosome import located, placed
 from sysid.islands.archipelago import loss_scale
 from sysid.problem import Problem
 from sysid.refinement import Refined, refine
 from sysid.sensitivities import sensitivities
-from sysid.serial import QUANTILE, coloured
+from sysid.serial import QUANTILE
 from sysid.types import FloatArray
 
 _SPAN = 1.5  # of the half width that the covariance promises: where the outermost value lies
@@ -217,7 +218,7 @@ class _Walk:
         """What makes n ln(R/R₀) a ratio of χ², also where the residuals are coloured."""
         scale = loss_scale(self._problem)
         seen = error if scale == 0.0 else error / np.sqrt(1.0 + (error / scale) ** 2)
-        colour = coloured(self._problem, seen, columns)
+        colour = coloured_jointly(self._problem, seen, columns)
         factor = _factor(error, scale)
         if colour is None or not norm > 0:
             return factor

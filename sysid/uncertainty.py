@@ -7,7 +7,8 @@ scale: of its logarithm).
 With squares the covariance is s²(SᵀS)⁻¹, s² = Σe²/(n − D). With the soft-l1 loss it is that of an
 M-estimator (sandwich): n/(n − D) · (SᵀKS)⁻¹ (SᵀΨ²S) (SᵀKS)⁻¹ with ψ = e/√(1 + (e/s)²) and
 K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals unduly. Where
-residuals of a free run are clearly not white, both are that of coloured ones (`sysid.serial`).
+residuals of a free run are clearly not white, both are that of coloured ones (`sysid.serial`),
+and where those of outputs are clearly correlated, that of a common noise (`sysid.common_noise`).
 Under a noise model e and S are whitened first (`sysid.noise_model`).
 
 Where the output does not change on a plateau of width w (a lag that is rounded to whole samples),
@@ -23,6 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
+from sysid.common_noise import coloured_jointly
 from sysid.estimates import Known, estimates_of
 from sysid.ga.chromosome import placed
 from sysid.groups import Block, blocks, written
@@ -33,7 +35,7 @@ from sysid.pulls import AT_BOUND, Pull, is_pulled, pulls
 from sysid.reaches import reach
 from sysid.result import Criteria, Estimate, EstimateStatus, NoiseColour, Uncertainty
 from sysid.sensitivities import BudgetSpentError, Sensitivities, sensitivities
-from sysid.serial import Coloured, coloured
+from sysid.serial import Coloured
 from sysid.symmetries import scalings
 from sysid.translations import translations
 from sysid.types import BoolArray, FloatArray
@@ -151,7 +153,7 @@ def _analysed(
     kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
     kept[d - known :] = False
     inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
-    colour = coloured(problem, influence, columns)
+    colour = coloured_jointly(problem, influence, columns)
     covariance, noise = _covariance(error, columns, inverse, loss_scale(problem), colour)
     member = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | np.any(powers != 0.0, axis=0)
     member |= np.any(shifts != 0.0, axis=0)

@@ -1,0 +1,93 @@
+"""Standard errors where two outputs are shaken by the same noise, against repetition."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from sysid.common_noise import coloured_jointly
+from sysid.models.spec import parse_model
+from sysid.problem import Problem
+from sysid.records import Channel, Record
+from sysid.refinement import refine
+from sysid.simulation import simulate
+from sysid.types import FloatArray
+from sysid.uncertainty import Analysis, analyse
+
+TIMES = 0.05 * np.arange(300.0)
+TRUTH = {"a": 2.0, "b": 1.5, "T": 0.6, "L": 0.3}
+MODEL = parse_model({
+    "name": "two", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
+    "parameters": {"a": {"lower": 0.1, "upper": 5}, "b": {"lower": 0.1, "upper": 5},
+                   "T": {"lower": 0.1, "upper": 3}, "L": {"lower": 0, "upper": 1}},
+    "equations": {"x": "(u(t-L) - x)/T"}, "outputs": {"y": "a*x", "z": "b*x"}, "initial": {"x": 0},
+})  # fmt: skip
+U = Channel("u", TIMES, np.repeat(np.random.default_rng(7).normal(size=30), 10), hold="zero")
+CLEAN = simulate(MODEL, [U], TRUTH, times=TIMES).channels
+
+
+def noise(seed: int, correlation: float, pole: float = 0.0) -> FloatArray:
+    """Noise of two outputs (2, N), of variance 0.01 each."""
+    white = np.random.default_rng(seed).standard_normal((2, TIMES.size + 100))
+    white[1] = correlation * white[0] + np.sqrt(1 - correlation**2) * white[1]
+    found = lfilter([0.1 * np.sqrt(1 - pole**2)], [1, -pole], white, axis=1)
+    return np.asarray(found[:, 100:])
+
+
+def analysed(both: FloatArray, late: int = 0) -> Analysis:
+    """The analysis at the estimate; the second output is measured from sample `late` on."""
+    data = [
+        Channel("y", TIMES, CLEAN[0].values + both[0], "m"),
+        Channel("z", TIMES[late:], (CLEAN[1].values + both[1])[late:], "m"),
+    ]
+    problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
+    end = refine(problem, [np.array(list(TRUTH.values()))])[0]
+    assert end is not None
+    return analyse(problem, end.theta)
+
+
+@pytest.mark.parametrize(("correlation", "pole"), [(0.9, 0.0), (-0.9, 0.0), (0.9, 0.7)])
+def test_intervals_cover_the_truth_whatever_outputs_have_in_common(
+    correlation: float, pole: float
+) -> None:
+    draws = 150
+    covered = dict.fromkeys(TRUTH, 0)
+    for seed in range(draws):
+        for one in analysed(noise(seed, correlation, pole)).estimates:
+            assert one.interval95 is not None
+            covered[one.name] += one.interval95[0] <= TRUTH[one.name] <= one.interval95[1]
+    # As independent outputs 84 % of T and L for a correlation of 0.9.
+    assert min(covered.values()) >= 0.89 * draws
+    assert sum(covered.values()) >= 0.92 * draws * len(covered)
+
+
+def test_of_independent_outputs_nothing_is_taken_for_common() -> None:
+    columns = np.random.default_rng(0).standard_normal((2 * TIMES.size, 4))
+    data = [Channel(one.name, TIMES, one.values, "m") for one in CLEAN]
+    problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
+    drawn = ([noise(seed, one).ravel() for seed in range(30)] for one in (0.0, 0.9))
+    free, common = ([coloured_jointly(problem, e, columns) is None for e in one] for one in drawn)
+    assert sum(free) >= 29
+    assert not any(common)
+
+
+def test_common_noise_makes_what_both_outputs_tell_less_sure() -> None:
+    alone, common = (analysed(noise(1, one)).estimates for one in (0.0, 0.9))
+    for name in ("T", "L"):
+        before, after = (next(e.stderr for e in one if e.name == name) for one in (alone, common))
+        assert before is not None
+        assert after is not None
+        assert after / before == pytest.approx(np.sqrt(1.9), rel=0.15)
+
+
+def test_only_samples_of_the_same_time_have_their_noise_in_common() -> None:
+    whole, part = (analysed(noise(1, 0.9), late).estimates for late in (0, 150))
+    assert [e.name for e in whole] == [e.name for e in part]
+    assert whole[3].stderr is not None
+    assert part[3].stderr is not None
+    assert part[3].stderr > 0.9 * whole[3].stderr
+
+
+def test_it_is_told_as_white_noise() -> None:
+    found = analysed(noise(1, 0.9)).uncertainty
+    assert found is not None
+    assert found.noise_colour == "white"
