@@ -23,6 +23,14 @@ class _Seen(NamedTuple):
     has_state: bool = False
 
 
+def reads_outputs(model: Model) -> bool:
+    """Whether a prediction one step ahead is other than the free run: some output is a state."""
+    return any(
+        isinstance(one, Past) and one.kind == "state" and one.offset == 0 and one.lag is None
+        for one in (output.expression for output in model.outputs)
+    )
+
+
 def coefficients_on_past_outputs(model: Model, parameters: Sequence[Parameter]) -> dict[str, int]:
     """Of each output, how many free parameters multiply a state in the equations behind it.
 

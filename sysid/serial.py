@@ -24,6 +24,7 @@ from numpy.fft import rfft
 from scipy.special import chdtrc, stdtrit
 
 from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, laid_out, whiteness
+from sysid.past_outputs import reads_outputs
 from sysid.problem import Problem
 from sysid.types import FloatArray
 
@@ -95,7 +96,7 @@ def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloure
         Their sensitivities.
     """
     found = [(part, _in_order(part, seen[part.rows])) for part in parts(problem)]
-    is_free = problem.prediction == "simulation"
+    is_free = problem.prediction == "simulation" or not reads_outputs(problem.model)
     told = [is_free and _is_coloured(laid, part.size) for part, laid in found]
     if not any(told) and not _are_uneven([seen[part.rows] for part, _ in found]):
         return None

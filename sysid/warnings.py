@@ -7,6 +7,7 @@ import numpy as np
 from sysid.islands.archipelago import of_island
 from sysid.kernels.demand import is_difference, lags
 from sysid.onset import moves_alone
+from sysid.past_outputs import reads_outputs
 from sysid.problem import Problem
 from sysid.residuals import ResidualTests
 from sysid.result import Estimate, Group, NoiseColour, Uncertainty
@@ -50,6 +51,7 @@ def warnings_of(
         found.append(f"the RMS error {rms:.4g} is above the safe limit {limit:g}: not valid")
     found += mixed_units(problem.model, problem.records)
     found += _held_back(analysis)
+    found += _no_prediction(problem)
     found += _constant_outputs(problem)
     found += _worse_than_a_line(problem, simulated)
     found += _without_excitation(problem, analysis.estimates)
@@ -121,6 +123,17 @@ def _begun_before(problem: Problem) -> list[str]:
                 "before; put some rows of the input at rest before the record"
             )
     return found
+
+
+def _no_prediction(problem: Problem) -> list[str]:
+    """Whether predictions one step ahead are asked for of a model that reads no measured output."""
+    if problem.prediction == "simulation" or reads_outputs(problem.model):
+        return []
+    names = ", ".join(output.name for output in problem.model.outputs)
+    return [
+        f"no output ({names}) is a state by itself, so predictions one step ahead are those of the "
+        "free run; for another start of every step write an output as a state, outputs: {y: x}"
+    ]
 
 
 def _constant_outputs(problem: Problem) -> list[str]:

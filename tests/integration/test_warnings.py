@@ -120,3 +120,14 @@ def test_a_constant_output_is_told(level: float) -> None:
     assert told(found, f"output 'y' is constant ({level:g}): it tells nothing of the dynamics")
     moving = np.where(np.arange(N) == 7, level + 0.1, level)
     assert not told(identify(parse_model(FIRST), record(steps(), moving), QUICK), "is constant")
+
+
+def test_one_step_ahead_without_an_output_that_is_a_state_is_told_to_be_the_free_run() -> None:
+    hidden, y = parse_model(FIRST), response(parse_model(SECOND), steps(), L=0.1)
+    free = identify(hidden, record(steps(), y), QUICK)
+    ahead = identify(hidden, record(steps(), y), QUICK, prediction="one-step")
+    assert told(ahead, "no output (y) is a state by itself")
+    assert [one.stderr for one in ahead.estimates] == [one.stderr for one in free.estimates]
+    tube, narrow = load_model("tube"), {"L": {"upper": 1.0}}
+    seen = identify(tube, record(steps(), y), QUICK, prediction="one-step", parameters=narrow)
+    assert not told(seen, "is a state by itself")
