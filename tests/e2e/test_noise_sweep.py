@@ -26,7 +26,7 @@ PLOT = '[data-figure="summary"]'
 @pytest.fixture
 def job(own_site: Site) -> str:
     """A sweep of 52 runs that has ended."""
-    answer = httpx.post(f"{own_site.url}/v1/recipes/noise-sweep", json=BODY)
+    answer = httpx.post(f"{own_site.url}/v1/recipes/noise-sweep", json=BODY, timeout=60)
     assert answer.status_code == 202, answer.text
     name: str = answer.json()["id"]
     carried_out(own_site.parts, name)

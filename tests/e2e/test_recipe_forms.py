@@ -37,6 +37,7 @@ def test_a_sweep_tells_its_runs_before_it_is_submitted_and_makes_as_many(
             "samples": 50,
             "sample_time": 0.1,
         },
+        timeout=60,
     )
     assert simulated.status_code == 201
     opened_sweep(own_site, page)

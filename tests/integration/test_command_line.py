@@ -371,7 +371,7 @@ def test_a_noise_sweep_is_submitted_with_the_settings_that_were_given(server: st
     assert done.returncode == 0, done.stderr
     job = json.loads(done.stdout)
     assert job["progress"]["runs"] == 6
-    request = httpx.get(f"{server}/v1/jobs/{job['id']}").json()["request"]
+    request = httpx.get(f"{server}/v1/jobs/{job['id']}", timeout=60).json()["request"]
     assert request["algorithm"]["population"] == 12
     assert request["parameters"] == {"L": {"upper": 1}}
     assert request["sweep"]["axes"][0]["values"] == [0, 0.1, 0.2]
