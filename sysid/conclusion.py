@@ -9,6 +9,7 @@ import numpy as np
 
 from sysid.deadline import Clock, Deadline
 from sysid.errors import DivergedEverywhere, NothingIdentifiable
+from sysid.exchanges import exchange_notes, exchanges, ordered
 from sysid.islands.archipelago import analysis_budget, of_island
 from sysid.islands.run_state import RunState
 from sysid.metrics import Metrics
@@ -95,6 +96,11 @@ def _concluded(
         agreement_validation=() if kept is None else kept.metrics.channels,
         warnings=(
             *warnings_of(problem, algorithm, analysis, simulated, metrics.rms, tests),
+            *exchange_notes(
+                problem,
+                analysis.exchanges,
+                {one.name for one in analysis.estimates if one.stderr is not None},
+            ),
             *time_notes(any(end.is_cut_short for end in refined if end is not None)),
             *step_notes(problem, theta, analysis.estimates, simulated, deadline.is_past_grace),
             *noise_notes(problem, times, noise.is_complete),
@@ -120,8 +126,17 @@ def _estimated(
         for champion, island, end in zip(champions, state.islands, refined, strict=True)
     ]
     best = min(range(len(ends)), key=lambda i: ends[i][1])
+    left = _left(algorithm, state, refined)
+    spare = None if left is None else max(0, left - analysis_budget(ends[best][0].size))
+    groups, spent = exchanges(problem, ends[best][0], spare)
+    ends = [(ordered(problem, theta, groups), rms) for theta, rms in ends]
+    refined = tuple(
+        None if one is None else replace(one, theta=end)
+        for one, (end, _) in zip(refined, ends, strict=True)
+    )
     theta = ends[best][0]
-    analysis = analyse(problem, theta, _left(algorithm, state, refined))
+    analysis = analyse(problem, theta, None if left is None else left - spent)
+    analysis = replace(analysis, evaluations=analysis.evaluations + spent, exchanges=groups)
     if _polishes(algorithm, len(ends)):
         end, analysis = _with_neighbours(
             problem, algorithm, state, refined, ends[best], analysis, deadline
@@ -185,9 +200,10 @@ def _with_neighbours(
     spent = before + found.evaluations
     if found.best is not None:
         spent += analysis.evaluations
-        theta, rms = found.best.theta, found.best.rms
+        groups = analysis.exchanges
+        theta, rms = ordered(problem, found.best.theta, groups), found.best.rms
         left = None if left is None else left - analysis.evaluations - found.evaluations
-        analysis = analyse(problem, theta, left)
+        analysis = replace(analyse(problem, theta, left), exchanges=groups)
     return Refined(theta, rms, spent, is_cut), _widened(problem, analysis, found)
 
 
@@ -196,6 +212,7 @@ def _widened(problem: Problem, analysis: Analysis, found: Neighbourhood) -> Anal
     if analysis.linear is None:
         return analysis
     names, share = tuple(p.name for p in problem.space), analysis.linear.share
+    found = replace(found, values=ordered(problem, found.values, analysis.exchanges))
     estimates = widened(analysis.estimates, names, problem.n_scored, found, share)
     return replace(analysis, estimates=estimates)
 
@@ -226,7 +243,10 @@ def _under_noise(
     spent = analysis.evaluations + found.evaluations
     if any(found.correlation_times.values()):
         white = whitening(problem, found.correlation_times)
-        analysis = analyse(problem, found.theta, None if left is None else left - spent, white)
+        groups, theta = analysis.exchanges, ordered(problem, found.theta, analysis.exchanges)
+        found = found._replace(theta=theta)
+        analysis = analyse(problem, theta, None if left is None else left - spent, white)
+        analysis = replace(analysis, exchanges=groups)
         spent += analysis.evaluations
         analysis = _widened(problem, analysis, Neighbourhood(None, found.minima, found.rms, 0))
     return found, replace(analysis, evaluations=spent, is_cut_short=is_cut_short)

@@ -25,6 +25,7 @@ import numpy as np
 
 from sysid.common_noise import coloured_jointly
 from sysid.errors import InvalidRecord, InvalidSettings, nearest
+from sysid.exchanges import Exchanges, exchanges, ordered
 from sysid.ga.chromosome import located, placed
 from sysid.islands.archipelago import loss_scale
 from sysid.problem import Problem
@@ -38,6 +39,7 @@ _BEYOND = 1.3  # growth of a step that does not reach the threshold, and how oft
 _MOST, _LEAST = 40, 3
 _EXACT = 1e-9  # of the outputs' size: residuals that are rounding
 _ALONE = 1e-14  # of the square of a slope: below, nothing of it is the parameter's own
+_SLIT = 1e-6  # of the range: what is left to a parameter that another one holds at its bound
 _ROOTS = 6  # halvings of the gap in which the ratio crosses the threshold
 
 
@@ -113,8 +115,10 @@ def profile(
     if points < _LEAST:
         raise InvalidSettings("/points", f"found {points}; need {_LEAST} or more")
     best = _best(problem, np.array(theta, dtype=np.float64))
-    walk = _Walk(problem, best.theta, names.index(name), should_stop)
-    walk.evaluations += best.evaluations
+    groups, spent = exchanges(problem, best.theta)
+    here = ordered(problem, best.theta, groups)
+    walk = _Walk(problem, here, names.index(name), groups, should_stop)
+    walk.evaluations += best.evaluations + spent
     step = _SPAN * walk.half_width / (points // 2)
     walk.go(-step, points // 2)
     walk.go(step, points // 2)
@@ -141,10 +145,12 @@ class _Walk:
     """Values of one parameter, as places in [0, 1], with the others estimated anew at each."""
 
     def __init__(
-        self, problem: Problem, theta: FloatArray, d: int,
+        self, problem: Problem, theta: FloatArray, d: int, groups: Exchanges,
         should_stop: Callable[[], bool] | None,
     ) -> None:  # fmt: skip
         self._problem, self._d, self._should_stop = problem, d, should_stop
+        self._larger = [i for group in groups if d in group for i in group if i < d]
+        self._smaller = [i for group in groups if d in group for i in group if i > d]
         self.stopped, self.evaluations = False, 1
         self._place = float(placed(problem.evaluator, theta[None])[0, d])
         rms = float(problem.fitness(theta[None])[0])
@@ -232,9 +238,9 @@ class _Walk:
         """Estimate the others at a place, beginning with what they were at a nearer one."""
         d, start = self._d, self._known[nearer][0].copy()
         start[d] = self._value(place)
-        held = _holding(self._problem, d, float(start[d]))
-        rest = np.delete(start, d)
-        rms = float(self._problem.fitness(start[None])[0])
+        held = _holding(self._in_order(float(start[d])), d, float(start[d]))
+        rest = np.clip(np.delete(start, d), held.evaluator.lower, held.evaluator.upper)
+        rms = float(held.fitness(rest[None])[0])
         self.evaluations += 1
         if rest.size:
             end = refine(held, [rest])[0]
@@ -242,6 +248,22 @@ class _Walk:
                 rest, rms = end.theta, end.rms
                 self.evaluations += end.evaluations
         self._known[place] = (np.insert(rest, d, start[d]), rms)
+
+    def _in_order(self, value: float) -> Problem:
+        """The problem with what can be exchanged with the parameter on its side of a value.
+
+        Beyond, the profile would be that of the other copy of the estimate.
+        """
+        if not self._larger and not self._smaller:
+            return self._problem
+        evaluator = self._problem.evaluator
+        lower, upper = evaluator.lower.copy(), evaluator.upper.copy()
+        least = _SLIT * (upper - lower)
+        for i in self._larger:
+            lower[i] = min(max(lower[i], value), upper[i] - least[i])
+        for i in self._smaller:
+            upper[i] = max(min(upper[i], value), lower[i] + least[i])
+        return replace(self._problem, evaluator=evaluator._replace(lower=lower, upper=upper))
 
     def _crossing(self, inside: float, outside: float) -> float:
         """Where the ratio, nearly a parabola, reaches the threshold."""

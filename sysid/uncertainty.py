@@ -26,6 +26,7 @@ from scipy.special import stdtrit
 
 from sysid.common_noise import coloured_jointly
 from sysid.estimates import Known, estimates_of
+from sysid.exchanges import Exchanges
 from sysid.ga.chromosome import placed
 from sysid.groups import Block, blocks, written
 from sysid.islands.archipelago import loss_scale
@@ -72,6 +73,8 @@ class Analysis:
     """Bounds to widen together, the costliest first."""
     linear: Linear | None = None
     """None where there is no uncertainty or the loss is not that of squares."""
+    exchanges: Exchanges = ()
+    """Parameters that can change places."""
     is_cut_short: bool = False
     """Whether minima beside the estimate were not looked for because the time was over."""
 

@@ -1,0 +1,110 @@
+"""Parameters that can change places, such as two time constants in series.
+
+No data tell which is the first. It need not show in the equations, whose inner states differ, so
+it is looked for as the sums of `sysid.translations` are: parameters of one unit are exchanged,
+apart from one another, and the model is simulated. Only what changes nothing then counts. One order
+is given, the largest first; bounds that do not hold the other order tell which is which, and leave
+nothing to be exchanged.
+"""
+
+from collections.abc import Iterator
+from itertools import combinations
+
+import numpy as np
+
+from sysid.models.lags import past_signals
+from sysid.problem import Problem
+from sysid.symmetries import scalings
+from sysid.ties import names_in
+from sysid.types import FloatArray
+
+Exchanges = tuple[tuple[int, ...], ...]
+"""Groups of places in the problem's space, rising, any two of which can be exchanged."""
+
+_APART = 0.05  # of the range that both may have: how far they are set apart at least
+_SAME = 1e-9  # of the output's size: rounding
+
+
+def exchanges(
+    problem: Problem, theta: FloatArray, most: int | None = None
+) -> tuple[Exchanges, int]:
+    """What can be exchanged around an estimate (D,), and the simulations this took.
+
+    Parameters
+    ----------
+    most : int or None
+        Simulations that may be run; pairs beyond are not looked at.
+    """
+    groups: list[set[int]] = []
+    spent = 0
+    for one, other in _candidates(problem, theta):
+        if any({one, other} <= group for group in groups):
+            continue
+        if most is not None and spent + 3 > most:
+            break
+        spent += 3
+        if _changes_nothing(problem, theta, one, other):
+            joined = [group for group in groups if group & {one, other}]
+            groups = [group for group in groups if not group & {one, other}]
+            groups.append(set().union({one, other}, *joined))
+    return tuple(sorted(tuple(sorted(group)) for group in groups)), spent
+
+
+def ordered(problem: Problem, theta: FloatArray, groups: Exchanges) -> FloatArray:
+    """Values (..., D) with those of each group falling, where the bounds hold them so."""
+    found = np.array(theta)
+    for group in groups:
+        members = list(group)
+        falling = -np.sort(-found[..., members], axis=-1)
+        lower, upper = problem.evaluator.lower[members], problem.evaluator.upper[members]
+        fits = np.all((lower <= falling) & (falling <= upper), axis=-1, keepdims=True)
+        found[..., members] = np.where(fits, falling, found[..., members])
+    return found
+
+
+def exchange_notes(problem: Problem, groups: Exchanges, told: set[str]) -> tuple[str, ...]:
+    """Notes of what can be exchanged among the names `told`: those with standard errors."""
+    named = [[problem.space[d].name for d in group] for group in groups]
+    return tuple(
+        f"{' and '.join(names)} can be exchanged without any effect on the output: which is which "
+        "no data tell; they are given from the largest to the smallest"
+        for names in named
+        if set(names) <= told
+    )
+
+
+def _candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[int, int]]:
+    """Pairs of one unit, both of them in lags or neither, whose bounds hold both orders.
+
+    Factors of a product that alone is known can do more than change places.
+    """
+    if problem.model.form == "polynomial":
+        return  # each coefficient has a term of its own
+    own = {one.name for one in problem.model.parameters}
+    lagged = set().union(*(names_in(p.lag) for p in past_signals(problem.model) if p.lag), set())
+    lower, upper = problem.evaluator.lower, problem.evaluator.upper
+    scaled = np.any(scalings(problem.model, problem.all_parameters) != 0.0, axis=0)
+    kinds = [(one.unit, one.name in lagged, one.name in own) for one in problem.space]
+    for i, j in combinations(range(theta.size), 2):
+        holds = lower[i] <= theta[j] <= upper[i] and lower[j] <= theta[i] <= upper[j]
+        if kinds[i] == kinds[j] and kinds[i][2] and holds and not (scaled[i] or scaled[j]):
+            yield i, j
+
+
+def _changes_nothing(problem: Problem, theta: FloatArray, one: int, other: int) -> bool:
+    """Whether the output is the same with two parameters exchanged, and not with their mean."""
+    evaluator = problem.evaluator
+    low, high = (
+        float(end)
+        for end in (max(evaluator.lower[[one, other]]), min(evaluator.upper[[one, other]]))
+    )
+    half = max(0.5 * abs(theta[one] - theta[other]), 0.5 * _APART * (high - low))
+    middle = min(max(0.5 * (theta[one] + theta[other]), low + half), high - half)
+    tried = np.repeat(theta[None], 3, axis=0)
+    tried[:, one] = middle + half, middle - half, middle
+    tried[:, other] = middle - half, middle + half, middle
+    here, there, equal = problem.predictions(tried)
+    with np.errstate(invalid="ignore"):
+        size = _SAME * float(np.max(np.abs(here)))
+        moves = bool(np.max(np.abs(equal - here)) > size)
+        return moves and bool(np.max(np.abs(there - here)) <= size)

@@ -1,0 +1,131 @@
+"""Parameters that can change places: found, told, given in one order, and never counted twice."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.exchanges import exchange_notes, exchanges, ordered
+from sysid.identify import identify
+from sysid.models.model import Model
+from sysid.models.spec import parse_model
+from sysid.problem import Problem
+from sysid.profiles import profile
+from sysid.records import Channel, Record
+from sysid.settings import GeneticAlgorithm
+from sysid.simulation import simulate
+
+TIMES = 0.1 * np.arange(300.0)
+U = Channel("u", TIMES, np.repeat(np.random.default_rng(3).normal(size=30), 10), hold="zero")
+SPAN = {"lower": 0.1, "upper": 5, "unit": "s"}
+FORMS: dict[str, dict[str, Any]] = {
+    "in series": {"states": {"x": "m", "y": "m"},
+                  "equations": {"x": "(K*u(t-L) - x)/T1", "y": "(x - y)/T2"},
+                  "outputs": {"z": "y"}, "initial": {"x": 0, "y": 0}},
+    "symmetric": {"states": {"x": "m", "v": "m/s"},
+                  "equations": {"x": "v", "v": "(K*u(t-L) - x - (T1 + T2)*v)/(T1*T2)"},
+                  "outputs": {"z": "x"}, "initial": {"x": 0, "v": 0}},
+    "unlike": {"states": {"x": "m", "y": "m"},
+               "equations": {"x": "(K*u(t-L) - x)/T1", "y": "(x + y*0.2 - y)/T2"},
+               "outputs": {"z": "y + 0.1*x"}, "initial": {"x": 0, "y": 0}},
+}  # fmt: skip
+TRUTH = {"K": 2.0, "L": 0.3, "T1": 1.5, "T2": 0.5}
+THETA = np.array(list(TRUTH.values()))
+
+
+def model(form: str, **bounds: dict[str, float]) -> Model:
+    parameters = {"K": {"lower": 0.1, "upper": 5, "unit": "m"}, "L": {**SPAN, "upper": 1},
+                  "T1": SPAN, "T2": SPAN}  # fmt: skip
+    changed = {name: {**one, **bounds.get(name, {})} for name, one in parameters.items()}
+    return parse_model({"name": "two", "form": "differential", "inputs": {"u": "V"},
+                        "parameters": changed, **FORMS[form]})  # fmt: skip
+
+
+def recorded(form: str) -> Record:
+    clean = simulate(model(form), [U], TRUTH, times=TIMES).channels[0]
+    noise = np.random.default_rng(4).normal(0, 0.05, TIMES.size)
+    return Record((U,), (Channel("z", TIMES, clean.values + noise, "m"),))
+
+
+def problem(form: str, **bounds: dict[str, float]) -> Problem:
+    return Problem.build(model(form, **bounds), [recorded(form)])
+
+
+@pytest.mark.parametrize(("form", "expected"), [
+    ("in series", ((2, 3),)), ("symmetric", ((2, 3),)), ("unlike", ()),
+])  # fmt: skip
+def test_an_exchange_is_found_whether_or_not_the_equations_show_it(
+    form: str, expected: tuple[tuple[int, int], ...]
+) -> None:
+    found, spent = exchanges(problem(form), THETA)
+    assert found == expected
+    assert spent == 3  # the lag is no candidate, and the gain has another unit
+
+
+@pytest.mark.parametrize("form", ["(K*u(t-L) - x)/(T1*T2)", "(K*u(t-L) - x)/(T1 + T2)"])
+def test_what_is_known_as_a_product_or_a_sum_only_is_no_exchange(form: str) -> None:
+    made = parse_model({
+        **(model("symmetric").document or {}), "states": {"x": "m"}, "equations": {"x": form},
+        "outputs": {"z": "x"}, "initial": {"x": 0},
+    })  # fmt: skip
+    assert exchanges(Problem.build(made, [recorded("symmetric")]), THETA)[0] == ()
+
+
+def test_it_is_found_at_a_double_pole_too() -> None:
+    assert exchanges(problem("in series"), np.array([2.0, 0.3, 1.0, 1.0]))[0] == ((2, 3),)
+
+
+def test_bounds_that_tell_which_is_which_leave_nothing_to_be_exchanged() -> None:
+    posed = problem("in series", T1={"lower": 1.0}, T2={"upper": 0.9})
+    assert exchanges(posed, THETA) == ((), 0)
+
+
+def test_a_budget_is_kept() -> None:
+    assert exchanges(problem("in series"), THETA, 2) == ((), 0)
+
+
+def test_three_in_a_row_are_one_group() -> None:
+    made = parse_model({
+        "name": "three", "form": "differential", "inputs": {"u": "V"},
+        "states": {"x": "V", "y": "V", "w": "V"},
+        "parameters": dict.fromkeys(("T1", "T2", "T3"), SPAN),
+        "equations": {"x": "(u - x)/T1", "y": "(x - y)/T2", "w": "(y - w)/T3"},
+        "outputs": {"z": "w"}, "initial": {"x": 0, "y": 0, "w": 0},
+    })  # fmt: skip
+    posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
+    groups, _ = exchanges(posed, np.array([0.4, 1.0, 2.0]))
+    assert groups == ((0, 1, 2),)
+    assert ordered(posed, np.array([[0.4, 2.0, 1.0]]), groups).tolist() == [[2.0, 1.0, 0.4]]
+    [note] = exchange_notes(posed, groups, {"T1", "T2", "T3"})
+    assert note.startswith("T1 and T2 and T3 can be exchanged")
+    assert exchange_notes(posed, groups, {"T1", "T2"}) == ()
+
+
+def test_whatever_the_seed_the_larger_comes_first_and_it_is_told() -> None:
+    found = [
+        identify(model("in series"), recorded("in series"), GeneticAlgorithm(islands=2), seed=seed)
+        for seed in range(4)
+    ]
+    for one in found:
+        values = {e.name: e.value for e in one.estimates}
+        assert values["T1"] == pytest.approx(1.5, abs=0.2)
+        assert values["T2"] == pytest.approx(0.5, abs=0.2)
+        assert any("T1 and T2 can be exchanged" in text for text in one.warnings)
+        assert all(island.parameters[2] >= island.parameters[3] for island in one.islands)
+        for e in one.estimates:
+            assert e.interval95 is not None
+            assert e.interval95[1] - e.interval95[0] < 0.8
+
+
+@pytest.mark.parametrize("name", ["T1", "T2"])
+def test_a_profile_stays_with_one_copy(name: str) -> None:
+    posed = problem("in series")
+    found = profile(posed, THETA, name, points=41)
+    own = found.others[:, 2]  # the other time constant
+    larger, smaller = (found.values, own) if name == "T1" else (own, found.values)
+    assert np.all(larger >= smaller - 1e-5)
+    low, high = found.interval
+    assert low is not None
+    assert high is not None
+    assert low < TRUTH[name] < high
+    assert high - low < 0.8
