@@ -80,6 +80,16 @@ class _Known:
         return [(one.name, one.name) for one in self.model.outputs]
 
     @property
+    def gain_unit(self) -> str:
+        """Unit of the gain, where there is one input and one output to choose."""
+        if len(self.model.inputs) != 1 or len(self.model.outputs) != 1:
+            return ""
+        above, below = (self.units[one[0].name] for one in (self.model.inputs, self.model.outputs))
+        if "1" in (above, below):
+            return above if below == "1" else f"1/{below}"
+        return "" if above == below else f"{above}/({below})"
+
+    @property
     def recordings(self) -> list[tuple[str, str]]:
         """Choices of a stored recording."""
         return [("", "choose one…"), *((one.id, one.name) for one in self.datasets)]
@@ -190,7 +200,12 @@ def _step(model: Model, run: Run) -> dict[str, str]:
     if not spans:
         return {}
     low, high = min(span[0] for span in spans), max(span[1] for span in spans)
-    return {"offset": f"{low + (high - low) / 4:.2g}", "amplitude": f"{(high - low) / 2:.2g}"}
+    return {"offset": _round(low + (high - low) / 4), "amplitude": _round((high - low) / 2)}
+
+
+def _round(value: float) -> str:
+    """Two significant digits, without a power of ten as long as that can be read."""
+    return f"{float(f'{value:.2g}'):.10g}"
 
 
 def _simulated(

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +13,9 @@ from fastapi.testclient import TestClient
 
 from service.app import create_app
 from service.turns import AT_ONCE, WAITING, simulating
+from service.web.simulate_page import _Known
 from sysid import refinement
+from sysid.models.library import load_model
 from sysid.problem import Problem
 from sysid.refinement import refine
 from tests.identified import identified
@@ -155,6 +158,23 @@ def test_the_form_suggests_a_step_within_what_was_measured(place: Place) -> None
     asked = place.client.get(f"{place.page}?gain=0.5&duration=5&sample_time=0.1").text
     assert 'name="offset" value="0"' in asked  # what was simulated, not what is suggested
     assert 'name="amplitude" value="1"' in asked
+
+
+@pytest.mark.parametrize(
+    ("above", "below", "unit"),
+    [
+        ("Pa", "Pa", ""),
+        ("V", "m/s", "V/(m/s)"),
+        ("1", "K", "1/K"),
+        ("V", "1", "V"),
+        ("1", "1", "1"),
+    ],
+)
+def test_the_gain_has_the_unit_that_makes_an_input_of_an_output(
+    above: str, below: str, unit: str
+) -> None:
+    known = SimpleNamespace(model=load_model("fopdt"), units={"u": above, "y": below})
+    assert _Known.gain_unit.fget(known) == unit  # type: ignore[attr-defined]
 
 
 def test_a_loop_of_small_gain_settles_and_the_page_says_by_how_much(place: Place) -> None:

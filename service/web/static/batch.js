@@ -1,7 +1,7 @@
 // The form of a re-identification: recordings with labels, and one POST to /v1/recipes/reidentify.
 
-import { overrides } from './fields.js';
-import { algorithmOf, channelsOf, chosenModel, drawChannels, number, numbers, shown, submits } from './recipes.js';
+import { overrides, shown, submits } from './fields.js';
+import { algorithmOf, channelsOf, chosenModel, drawChannels, number, numbers } from './recipes.js';
 
 const form = document.getElementById('batch-form');
 const field = (name) => form.elements.namedItem(name);

@@ -1,6 +1,6 @@
-// The table of bounds, and problem documents beside the fields they are about.
+// What all forms share: the table of bounds, submission, problem documents beside the fields they are about.
 
-import { element } from './live.js';
+import { Problem, element, post } from './live.js';
 
 const COLUMNS = ['lower', 'upper', 'fixed'];
 const rows = document.getElementById('parameters');
@@ -77,3 +77,40 @@ export function clearFaults(form) {
   form.querySelectorAll('[aria-invalid]').forEach((one) => one.removeAttribute('aria-invalid'));
   form.querySelector('#form-fault').hidden = true;
 }
+
+/** What the form is about to do, or why it does not. */
+export const say = (form, text) => (form.querySelector('#form-state').textContent = text);
+
+/** Send the body that `make` gives when a form that is ready is submitted; faults go to their fields. */
+export function submits(form, url, make, isReady = async () => true) {
+  form.addEventListener('submit', async (event) => {
+    event.preventDefault();
+    clearFaults(form);
+    const button = form.querySelector('[type="submit"]');
+    button.disabled = true;
+    say(form, 'submitting…');
+    try {
+      if (!(await isReady())) {
+        button.disabled = false;
+        return;
+      }
+      const job = await post(url, make());
+      location.assign(`/jobs/${encodeURIComponent(job.id)}`);
+    } catch (error) {
+      if (!(error instanceof Problem)) throw error;
+      say(form, '');
+      showFaults(form, error);
+      button.disabled = false;
+    }
+  });
+}
+
+/** What a choice sets going may be refused; the refusal is shown, never lost. */
+export const shown = (form, work) => async (...given) => {
+  try {
+    await work(...given);
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    showFaults(form, error);
+  }
+};

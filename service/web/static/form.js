@@ -1,7 +1,8 @@
 // New identification: choices from the REST interface, live checks, and one POST to /v1/jobs.
 
 import { Problem, ask, element, post } from './live.js';
-import { fillTable, overrides, showFaults, clearFaults } from './fields.js';
+import * as forms from './fields.js';
+import { clearFaults, fillTable, overrides, showFaults } from './fields.js';
 
 const panel = document.getElementById('new');
 const form = document.getElementById('job-form');
@@ -229,29 +230,16 @@ function chosenValidation(value) {
   return value.startsWith('ds_') ? { datasets: [value] } : { fraction: Number(value) };
 }
 
-async function submit(event) {
-  event.preventDefault();
-  clearFaults(form);
-  const button = form.querySelector('[type="submit"]');
-  button.disabled = true;
-  say('submitting…');
-  try {
-    if (isOwn() && !(await check())) {
-      say('the model cannot be used yet');
-      button.disabled = false;
-      return field('equations').focus();
-    }
-    const job = await post('/v1/jobs', body());
-    location.assign(`/jobs/${encodeURIComponent(job.id)}`);
-  } catch (error) {
-    if (!(error instanceof Problem)) throw error;
-    say('');
-    showFaults(form, error);
-    button.disabled = false;
-  }
+/** Own equations are checked before they are sent. */
+async function isReady() {
+  if (!isOwn() || (await check())) return true;
+  say('the model cannot be used yet');
+  field('equations').focus();
+  return false;
 }
 
-const say = (text) => (document.getElementById('form-state').textContent = text);
+const say = (text) => forms.say(form, text);
+const shown = (work) => forms.shown(form, work);
 
 function delayed(work, ms) {
   let timer = 0;
@@ -260,16 +248,6 @@ function delayed(work, ms) {
     timer = setTimeout(work, ms);
   };
 }
-
-/** What a choice sets going may be refused; the refusal is shown, never lost. */
-const shown = (work) => async (...given) => {
-  try {
-    await work(...given);
-  } catch (error) {
-    if (!(error instanceof Problem)) throw error;
-    showFaults(form, error);
-  }
-};
 
 function open() {
   if (location.hash === '#new') panel.open = true;
@@ -286,7 +264,7 @@ for (const one of field('source'))
 field('equations').addEventListener('input', () =>
   document.getElementById('check').replaceChildren(element('span', 'checking…', 'muted')));
 field('equations').addEventListener('input', delayed(shown(() => check()), 300));
-form.addEventListener('submit', submit);
+forms.submits(form, '/v1/jobs', body, isReady);
 panel.addEventListener('toggle', shown(() => panel.open && start()));
 addEventListener('hashchange', open);
 open();

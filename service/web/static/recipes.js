@@ -1,7 +1,7 @@
-// What the forms of recipes (noise sweep, re-identification) share: models, channels, submission.
+// What the forms of recipes (noise sweep, re-identification) share: models, channels, numbers.
 
-import { Problem, ask, element, post } from './live.js';
-import { clearFaults, fillTable, showFaults } from './fields.js';
+import { ask, element } from './live.js';
+import { fillTable } from './fields.js';
 
 /** The document of the chosen model, with its table of bounds drawn anew. */
 export async function chosenModel(form) {
@@ -60,34 +60,3 @@ export function algorithmOf(form) {
   const evaluations = number(form.elements.evaluations.value);
   return evaluations === null ? found : { ...found, stop: { evaluations } };
 }
-
-/** Send the body that `make` gives when the form is submitted; faults go to their fields. */
-export function submits(form, url, make) {
-  const say = (text) => (form.querySelector('#form-state').textContent = text);
-  form.addEventListener('submit', async (event) => {
-    event.preventDefault();
-    clearFaults(form);
-    const button = form.querySelector('[type="submit"]');
-    button.disabled = true;
-    say('submitting…');
-    try {
-      const job = await post(url, make());
-      location.assign(`/jobs/${encodeURIComponent(job.id)}`);
-    } catch (error) {
-      if (!(error instanceof Problem)) throw error;
-      say('');
-      showFaults(form, error);
-      button.disabled = false;
-    }
-  });
-}
-
-/** What a choice sets going may be refused; the refusal is shown, never lost. */
-export const shown = (form, work) => async () => {
-  try {
-    await work();
-  } catch (error) {
-    if (!(error instanceof Problem)) throw error;
-    showFaults(form, error);
-  }
-};

@@ -1,8 +1,8 @@
 // The form of a noise sweep: how many runs it makes, and one POST to /v1/recipes/noise-sweep.
 
 import { element } from './live.js';
-import { overrides } from './fields.js';
-import { algorithmOf, channelsOf, chosenModel, drawChannels, inputsOf, number, numbers, shown, submits } from './recipes.js';
+import { overrides, shown, submits } from './fields.js';
+import { algorithmOf, channelsOf, chosenModel, drawChannels, inputsOf, number, numbers } from './recipes.js';
 
 const form = document.getElementById('sweep-form');
 const field = (name) => form.elements.namedItem(name);
