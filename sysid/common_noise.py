@@ -42,7 +42,7 @@ def coloured_jointly(problem: Problem, seen: FloatArray, columns: FloatArray) ->
         Their sensitivities.
     """
     whole = coloured(problem, seen, columns)
-    pairs = list(_pairs(problem, seen))
+    pairs = list(_pairs(problem, seen)) if len(problem.model.outputs) > 1 else []
     if not pairs:
         return whole
     if whole is None:

@@ -81,13 +81,21 @@ def _candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[int, int]
     if problem.model.form == "polynomial":
         return  # each coefficient has a term of its own
     own = {one.name for one in problem.model.parameters}
-    lagged = set().union(*(names_in(p.lag) for p in past_signals(problem.model) if p.lag), set())
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
+    units = [one.unit if one.name in own else None for one in problem.space]
+    alike = [
+        (i, j)
+        for i, j in combinations(range(theta.size), 2)
+        if units[i] is not None and units[i] == units[j]
+        and lower[i] <= theta[j] <= upper[i] and lower[j] <= theta[i] <= upper[j]
+    ]  # fmt: skip
+    if not alike:
+        return
+    lagged = set().union(*(names_in(p.lag) for p in past_signals(problem.model) if p.lag), set())
     scaled = np.any(scalings(problem.model, problem.all_parameters) != 0.0, axis=0)
-    kinds = [(one.unit, one.name in lagged, one.name in own) for one in problem.space]
-    for i, j in combinations(range(theta.size), 2):
-        holds = lower[i] <= theta[j] <= upper[i] and lower[j] <= theta[i] <= upper[j]
-        if kinds[i] == kinds[j] and kinds[i][2] and holds and not (scaled[i] or scaled[j]):
+    for i, j in alike:
+        in_lags = [problem.space[d].name in lagged for d in (i, j)]
+        if in_lags[0] == in_lags[1] and not (scaled[i] or scaled[j]):
             yield i, j
 
 

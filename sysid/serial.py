@@ -10,7 +10,7 @@ For free runs only: one step ahead the sensitivities are made of measured output
 Coloured samples say less than as many white ones: of first-order noise with pole a > 0 those of a
 mean count for n(1 - a)/(1 + a) (Bayley and Hammersley 1946). So many are taken for the degrees of
 freedom. Where a is too near 1 the record is short beside its drift, and the errors are a lower
-bound. Different outputs are taken for independent.
+bound. Different outputs are taken for independent here; see `sysid.common_noise`.
 
 Nor is s² that of every output of every experiment. Where they are clearly noisy by unequal amounts
 in the weighted residuals (Bartlett 1937), Ω has of each its own variance.
