@@ -6,7 +6,6 @@ import numpy as np
 
 from sysid.ga.island import Island
 from sysid.ga.state import SAME
-from sysid.islands.settling import Searches, searches
 from sysid.result import Improvement, Migrant
 from sysid.types import FloatArray, IntArray
 
@@ -51,11 +50,6 @@ class RunState:
     def rms(self) -> float:
         """Fitness of the best champion."""
         return min(island.champion_rms for island in self.islands)
-
-    @property
-    def searches(self) -> Searches:
-        """What the searches of all islands found, as far as it is the best champion."""
-        return searches(*self.tally)
 
     @property
     def tally(self) -> tuple[FloatArray, IntArray]:

@@ -29,6 +29,11 @@ _BORDERS, _MIGRANTS = 100, 100_000
 """Borders that one call passes at most, and migrants that it has room for."""
 
 
+_OWN = (
+    "island", "first", "method", "bits", "survivors", "stagnation", "relative", "evaluations",
+)  # fmt: skip
+
+
 class Plans(NamedTuple):
     """The plans of all islands; `own` and `floats` have what differs (see `sysid.ga.state.Plan`).
 
@@ -38,7 +43,7 @@ class Plans(NamedTuple):
     loss_scale : float
     progress : FloatArray, shape (M,)
     own : IntArray, shape (I, 8)
-        Number, first individual, method, bits, survivors, stagnation, relative, evaluations.
+        Those of `_OWN`.
     floats : FloatArray, shape (I, 2)
         beta, rms.
     starts, rates : arrays, shape (I, S)
@@ -111,7 +116,7 @@ def _course(algorithm: GeneticAlgorithm, n: int, scale: float, is_warm: bool) ->
     longest = max(plan.starts.size for plan in planned)
     plans = Plans(
         0, algorithm.population, scale, np.zeros(0),
-        np.array([(*plan[1:3], *plan[4:10]) for plan in planned], dtype=np.int64),
+        np.array([[getattr(plan, name) for name in _OWN] for plan in planned], dtype=np.int64),
         np.array([(plan.beta, plan.rms) for plan in planned]),
         np.array([_filled(plan.starts, longest) for plan in planned]),
         np.array([_filled(plan.rates, longest) for plan in planned]),

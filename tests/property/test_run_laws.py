@@ -11,6 +11,7 @@ from sysid import run
 from sysid.ga.chromosome import decoded, located
 from sysid.ga.island import Island, evolve
 from sysid.islands.archipelago import found, plans
+from sysid.islands.settling import searches
 from sysid.problem import Problem
 from sysid.run import (
     RunState,
@@ -231,10 +232,10 @@ def test_islands_may_differ_in_method_and_bits() -> None:
 def test_a_run_settles_where_searches_from_anywhere_agree() -> None:
     once = GeneticAlgorithm(stop=Stop(settled=3))
     settled = advance(example(), once, begin(example(), once, 1))
-    assert settled.searches.confirmed >= 3
-    assert 3 * settled.searches.confirmed >= 2 * settled.searches.independent
+    assert searches(*settled.tally).confirmed >= 3
+    assert 3 * searches(*settled.tally).confirmed >= 2 * searches(*settled.tally).independent
     assert settled.generation < once.generations
-    twice = GeneticAlgorithm(stop=Stop(settled=2 * settled.searches.confirmed))
+    twice = GeneticAlgorithm(stop=Stop(settled=2 * searches(*settled.tally).confirmed))
     longer = advance(example(), twice, begin(example(), twice, 1))
     assert longer.generation > settled.generation
     assert longer.rms == pytest.approx(settled.rms, rel=1e-4)
@@ -244,6 +245,6 @@ def test_a_run_settles_where_searches_from_anywhere_agree() -> None:
 def test_the_papers_methods_and_those_told_so_never_settle(method: SearchMethod) -> None:
     algorithm = small(method, generations=60, stop=Stop(settled=1))
     state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
-    assert (state.generation, state.searches.independent) == (60, 0)
+    assert (state.generation, searches(*state.tally).independent) == (60, 0)
     never = small(generations=60, stop=Stop(settled=None))
     assert advance(problem(), never, begin(problem(), never, 1)).generation == 60

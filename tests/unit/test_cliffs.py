@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sysid.ga.cliffs import most_unlike
+from sysid.islands.settling import searches
 from sysid.run import advance, begin
 from sysid.settings import GeneticAlgorithm
 from tests.searching import example
@@ -29,5 +30,5 @@ def test_the_fitness_jumps_where_friction_switches_and_only_there(
 ) -> None:
     problem = example(model, sd=sd)
     state = advance(problem, GeneticAlgorithm(), begin(problem, GeneticAlgorithm(), 1))
-    assert state.searches.hops > 0
-    assert state.searches.has_cliffs is jumps
+    assert searches(*state.tally).hops > 0
+    assert searches(*state.tally).has_cliffs is jumps
