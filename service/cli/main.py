@@ -1,5 +1,6 @@
 """`lagid`: the command line. Commands import what they need when they run, so `--help` is quick."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -69,6 +70,9 @@ def demo(
 
 def main() -> None:
     """Run the command line; a user's mistake gives one line, never a traceback."""
+    # Its matrices are tiny: on several threads they take many times their own time beside other
+    # work. Told before NumPy is loaded, which asks once.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Errors of the core are imported late: the package may load compiled code.
     try:
         code = app(prog_name="lagid", standalone_mode=False)

@@ -1,5 +1,6 @@
 """A result does not depend on how many threads the linear algebra may use."""
 
+import json
 import os
 import subprocess
 import sys
@@ -47,8 +48,44 @@ def test_a_long_record_gives_the_same_bits_with_one_and_two_threads() -> None:
 
 def test_the_number_of_threads_comes_back_when_the_last_caller_is_done() -> None:
     before = [library.threads() for library in _libraries()]
-    with one_thread():
+    for library in _libraries():
+        library.limit(2)
+    try:
         with one_thread():
-            pass
-        assert all(library.threads() == 1 for library in _libraries())
-    assert [library.threads() for library in _libraries()] == before
+            with one_thread():
+                pass
+            assert all(library.threads() == 1 for library in _libraries())
+        assert all(library.threads() == 2 for library in _libraries())
+    finally:
+        for library, threads in zip(_libraries(), before, strict=True):
+            library.limit(threads)
+
+
+STARTED = """
+import sys
+from service.cli.main import main
+
+assert "numpy" not in sys.modules
+sys.argv = ["lagid", "--help"]
+try:
+    main()
+except SystemExit:
+    from sysid.threads import _libraries
+
+    print([library.threads() for library in _libraries()], file=sys.stderr)
+"""
+
+
+@pytest.mark.skipif(os.cpu_count() == 1, reason="one processor: one thread anyway")
+def test_a_process_of_the_command_line_has_one_thread_unless_told_otherwise() -> None:
+    free = {name: text for name, text in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    assert threads_of_a_command(free) == {1}
+    assert threads_of_a_command({**free, "OPENBLAS_NUM_THREADS": "2"}) == {2}
+
+
+def threads_of_a_command(environment: dict[str, str]) -> set[int]:
+    done = subprocess.run(
+        [sys.executable, "-c", STARTED], env=environment, capture_output=True, text=True,
+        check=True, cwd=Path(__file__).parents[2],
+    )  # fmt: skip
+    return set(json.loads(done.stderr))
