@@ -15,6 +15,7 @@ from sysid.export.python import python_source
 from sysid.language.evaluation import value as value_of
 from sysid.models.initial import initial_name
 from sysid.models.model import Model
+from sysid.models.spec import with_terms
 from sysid.records import HOLDS, Hold
 from sysid.result import Identification
 from sysid.ties import ties_of
@@ -44,6 +45,7 @@ def export(
     Parameters
     ----------
     model : Model
+        As it was identified; terms that were selected on the way are taken from the result.
     found : Identification or mapping of str to float
         A result, or every parameter's value; with initial values such as ``x(0)`` where the
         model estimates them. One that is tied to others may be left out.
@@ -65,12 +67,14 @@ def export(
     NotLinear
         If the format is ``control`` and the model has no transfer function.
     """
-    values, covariance = _values(model, found)
     holds = dict(hold or {})
     if isinstance(found, Identification):
+        if model.rule is not None and found.selection:
+            model = with_terms(model, [one.term for one in found.selection])
         known = {one.name for one in model.inputs}
         holds = {**{k: v for k, v in found.holds.items() if k in known}, **holds}
         sample_time = found.sample_time if sample_time is None else sample_time
+    values, covariance = _values(model, found)
     _check(model, values, sample_time, holds)
     identified = Identified(
         model, values, covariance, sample_time, holds, version, dict(provenance or {})

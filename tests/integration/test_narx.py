@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sysid.export.exporting import export
 from sysid.identify import identify
 from sysid.models.library import load_model
 from sysid.models.model import Model
@@ -232,3 +233,15 @@ def test_one_step_ahead_it_is_least_squares_behind_the_samples_it_starts_from(lo
     assert found.rms == pytest.approx(np.sqrt(squares / (n - longest)), rel=1e-6)
     assert found.criteria is not None
     assert found.criteria.samples == n - longest
+
+
+def test_selected_terms_are_exported_as_the_result_has_them() -> None:
+    record = record_of(TRUTH, noise=0.01)
+    model = parse_model(document(frols(5)))
+    found = identify(model, record, SMALL)
+    program: dict[str, Any] = {}
+    exec(compile(export(model, found, "python"), "exported", "exec"), program)
+    times, u = record.inputs[0].times, record.inputs[0].values
+    start = record.outputs[0].values[:2]
+    again = np.asarray(program["simulate"](times, u, y_0=start)).ravel()
+    np.testing.assert_allclose(again, found.simulated[0][0], rtol=1e-9, atol=1e-12)
