@@ -6,7 +6,7 @@ from importlib.metadata import version
 
 from sysid.islands.run_state import RunState
 
-_HEADER = f"lagid {version('lagid')} run state 3\n".encode()
+_HEADER = f"lagid {version('lagid')} run state 4\n".encode()
 
 
 def packed(state: RunState) -> bytes:

@@ -35,6 +35,7 @@ from sysid.ga.state import (
     HOP,
     HOPS,
     HORIZON,
+    JUMPS,
     OLD,
     POINT,
     PROBES,
@@ -69,6 +70,10 @@ ENOUGH_PART = 1e-2
 EARLY = 4  # developments that follow each other at once and are cheap, before the long ones
 FAR = 1.1  # of the champion's fitness: above, a search ends at the first small gain
 SHORTEST_HOP, LONGEST_HOP = 0.3, 50.0  # standard errors
+COUNTED, UNCOUNTED = 1, 2  # hops: as evidence for the champion, or not
+TURNS = 8  # developments after which the kinds repeat where the fitness jumps
+SCATTERS, GROWS_BESIDE = 2, 4  # of four the one that spreads, of eight that grows from beside
+SHORT_GROWTH = 1.5  # doublings: beside the champion the later signs of velocities are right
 LOOKS = 4  # hops that also look for jumps of the fitness, as long as there is none
 LINES = 2  # on which each does
 
@@ -120,7 +125,8 @@ def _hop(evaluator: Evaluator, plan: Plan, counters: IntArray, memory: FloatArra
     word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
     size = base * SHORTEST_HOP * (LONGEST_HOP / SHORTEST_HOP) ** unit(word[0])
     factor = factored(matrix, gradient, point, 0.0)
-    _look(evaluator, plan, factor, base, counters, memory)
+    if counters[HOP] == COUNTED:
+        _look(evaluator, plan, factor, base, counters, memory)
     spread(factor, point, _deviation(plan, counters, 0, size, point.size), point)
 
 
@@ -150,6 +156,42 @@ def _look(
         if counters[CLIFFS] == 0 and counters[HOPS] < LOOKS:
             direction = _deviation(plan, counters, line, base, point.size)
             counters[CLIFFS] += has_cliff(evaluator, factor, point, direction, base, counters)
+            # A warm start settles by fewer searches, chosen with those of a smooth fitness.
+            counters[JUMPS] += counters[CLIFFS] if counters[WARMED] == 0 else 0
+
+
+@compiled
+def scatters(counters: IntArray) -> bool:
+    """Whether the last development spread the population around the champion."""
+    return bool(counters[DEVELOPMENTS] % (TURNS // 2) == SCATTERS)
+
+
+@compiled
+def _choose_beside(size: int, word: Draws, counters: IntArray, memory: FloatArray) -> int:
+    """The same where the fitness jumps: there most that is better lies beside the champion.
+
+    Of eight developments four are hops, two scatter, one grows from beside the champion and one
+    from far away: in two of three from fresh individuals, and so fast that it costs little.
+    """
+    turn = counters[DEVELOPMENTS] % TURNS
+    memory[ROUGH] = 1.0
+    if counters[SETTLED] == 0:  # the champion first, whole: what follows is drawn around it
+        return 0
+    if turn % 2 == 1:
+        counters[HOP] = COUNTED
+        return 0
+    if scatters(counters):
+        counters[PROBES] = size
+        return 0
+    is_beside = turn == GROWS_BESIDE
+    memory[HORIZON] = 0.5 ** ((SHORT_GROWTH if is_beside else LONGEST_GROWTH) * unit(word[0]))
+    memory[GROWTH] = 2.0
+    if not is_beside and below(word[1], 3) > 0:
+        return -1
+    memory[GROWTH] = 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
+    counters[PROBES] = size // 3
+    counters[HOP] = UNCOUNTED if is_beside else 0
+    return 0 if is_beside else below(word[2], size)
 
 
 @compiled
@@ -157,13 +199,15 @@ def _choose(plan: Plan, size: int, counters: IntArray, memory: FloatArray) -> in
     """What kind of development comes next; gives the individual it begins with, -1: a fresh one."""
     number = counters[DEVELOPMENTS]
     word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    if counters[JUMPS] > 0 and number > EARLY:
+        return _choose_beside(size, word, counters, memory)
     grows = number == EARLY or (number > EARLY and number % 2 == 0)
     last_early = EARLY - counters[WARMED]  # behind an earlier result, the last of them is a hop
     settled = counters[SETTLED] == 1 and number > last_early
     chosen = below(word[1], 3 * size) - size if grows else 0
     memory[ROUGH] = counters[SETTLED] == 1 or grows
     if settled and (chosen >= size or number % 4 == 1 or number == EARLY):
-        counters[HOP] = 1
+        counters[HOP] = COUNTED
     elif grows:
         memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
         memory[GROWTH] = 2.0 if number == EARLY else 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
@@ -249,7 +293,7 @@ def _next_part(counters: IntArray, memory: FloatArray, fitness: FloatArray) -> N
     counters[SEQUENCE], counters[STEP] = 0, 0
     if memory[OLD] == fitness[0] and counters[DEVELOPMENTS] > 1:
         counters[SETTLED] = 1
-    if counters[HOP]:
+    if counters[HOP] == COUNTED:
         counters[HOPS] += 1
         counters[RETURNED] += abs(memory[REACHED] - fitness[0]) <= fitness[0] * SAME
     if counters[FRESH]:

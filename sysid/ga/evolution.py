@@ -3,7 +3,13 @@
 import numpy as np
 
 from sysid.ga.chromosome import decoded, located
-from sysid.ga.development import EARLY, adaptive_sequence, start_development
+from sysid.ga.development import (
+    EARLY,
+    TRIALS,
+    adaptive_sequence,
+    scatters,
+    start_development,
+)
 from sysid.ga.operators import cross, flip, rank, reflected, scheduled, stepped, two_of
 from sysid.ga.random import CHILDREN, INITIAL, RESTART, STRATA, below, draws, unit
 from sysid.ga.sequence import fixed_sequence
@@ -18,9 +24,11 @@ from sysid.ga.state import (
     GENETIC,
     HOPS,
     IMPROVED,
+    JUMPS,
     LOCAL,
     MIGRATION,
     PHASE,
+    PROBES,
     RETURNED,
     RMS,
     SAME,
@@ -164,6 +172,11 @@ def _generation(
 ) -> None:  # fmt: skip
     if counters[SEQUENCE] and plan.method == IMPROVED:
         adaptive_sequence(evaluator, plan, words, fitness, counters, memory)
+        # Two steps of a hop simulate no more than one generation of another kind.
+        again = counters[JUMPS] > 0 and counters[SEQUENCE] and counters[PROBES] == 0
+        step = words.shape[1] + 1 + TRIALS
+        if again and counters[EVALUATIONS] + step <= plan.evaluations:
+            adaptive_sequence(evaluator, plan, words, fitness, counters, memory)
     elif counters[SEQUENCE]:
         fixed_sequence(evaluator, plan, words, fitness, counters)
     elif plan.method < IMPROVED:
@@ -189,7 +202,9 @@ def _turn(
     if counters[SEQUENCE] or plan.method == SIMPLE:
         return
     if plan.method == IMPROVED:
-        if counters[DEVELOPMENTS] < EARLY or counters[STEP] >= max(1, plan.stagnation // 10):
+        early = counters[DEVELOPMENTS] < EARLY
+        beside = counters[JUMPS] > 0 and not scatters(counters)
+        if early or beside or counters[STEP] >= max(1, plan.stagnation // 10):
             start_development(evaluator, plan, words, fitness, counters, memory)
     elif counters[STAGNATION] >= plan.stagnation:
         counters[SEQUENCE], counters[STAGNATION] = 1, 0

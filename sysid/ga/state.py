@@ -11,9 +11,9 @@ SIMPLE, PAPER, IMPROVED, IMPROVED_PAPER_STEPS = 0, 1, 2, 3
 # Places in an island's counters.
 (
     GENERATION, EVALUATIONS, STAGNATION, SEQUENCE, STEP, FAILED, DEVELOPMENTS, SETTLED, PROBES,
-    FRESH, TRIED, CONFIRMED, HOP, HOPS, RETURNED, CLIFFS, WARMED,
-) = range(17)  # fmt: skip
-N_COUNTERS = 17
+    FRESH, TRIED, CONFIRMED, HOP, HOPS, RETURNED, CLIFFS, WARMED, JUMPS,
+) = range(18)  # fmt: skip
+N_COUNTERS = 18
 
 # Places in an island's memory of the sequence search; the point's D places follow.
 DAMPING, HORIZON, GROWTH, ROUGH, OLD, REACHED, POINT = range(7)

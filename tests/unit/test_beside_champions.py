@@ -1,0 +1,89 @@
+"""Where the fitness jumps, most developments begin beside the champion."""
+
+from functools import cache
+from itertools import pairwise
+
+from sysid.ga.development import COUNTED, UNCOUNTED
+from sysid.ga.island import Island, evolve
+from sysid.ga.state import (
+    CLIFFS,
+    DEVELOPMENTS,
+    FRESH,
+    HOP,
+    HOPS,
+    JUMPS,
+    SEQUENCE,
+    STEP,
+)
+from sysid.islands.archipelago import found, plans
+from sysid.settings import GeneticAlgorithm, Stop
+from tests.searching import bits, example
+
+ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
+GENERATIONS = 400
+
+
+@cache
+def generations(model: str) -> tuple[Island, ...]:
+    """An island after every one of its generations, each evolved by itself."""
+    problem = example(model)
+    (plan,) = plans(problem, ALONE, 3)
+    states = [found(problem, ALONE, 3)[0]]
+    for _ in range(GENERATIONS):
+        states.append(evolve(problem.evaluator, plan, states[-1], 1))
+    return tuple(states)
+
+
+def begun(model: str, place: int) -> list[int]:
+    """That counter in each development which was begun after jumps had been met, or any."""
+    return [
+        int(after.counters[place])
+        for before, after in pairwise(generations(model))
+        if after.counters[DEVELOPMENTS] > before.counters[DEVELOPMENTS] > 4
+        and (before.counters[JUMPS] > 0 or model == "duffing-eq16")
+    ]
+
+
+def test_jumps_once_met_stay_known_when_a_better_champion_comes() -> None:
+    problem = example("coulomb-eq16")
+    (plan,) = plans(problem, ALONE, 3)
+    start = found(problem, ALONE, 3)[0]
+    start.counters[[JUMPS, CLIFFS]] = 1
+    later = evolve(problem.evaluator, plan, start, 8)
+    assert later.champion_rms < 0.9 * evolve(problem.evaluator, plan, start, 1).champion_rms
+    assert (later.counters[JUMPS], later.counters[CLIFFS]) == (1, 0)
+    assert generations("coulomb-eq16")[-1].counters[JUMPS] > 0
+    assert generations("duffing-eq16")[-1].counters[JUMPS] == 0
+
+
+def test_there_most_developments_are_hops_and_some_still_begin_anywhere() -> None:
+    hops = begun("coulomb-eq16", HOP)
+    assert len(hops) > 30
+    assert sum(hop > 0 for hop in hops) >= 0.4 * len(hops)
+    assert UNCOUNTED in hops
+    assert sum(begun("coulomb-eq16", FRESH)) >= 2
+    smooth = begun("duffing-eq16", HOP)
+    assert UNCOUNTED not in smooth
+    assert sum(hop > 0 for hop in smooth) < 0.6 * len(smooth)
+
+
+def test_growing_from_beside_the_champion_is_no_evidence_for_it() -> None:
+    """It need not lead back where a better one lies near, so it tells nothing of the champion."""
+    states = generations("coulomb-eq16")
+    ends = {COUNTED: 0, UNCOUNTED: 0}
+    for before, after in pairwise(states):
+        hop = int(before.counters[HOP])
+        ended = before.counters[SEQUENCE] == 1 and after.counters[SEQUENCE] == 0
+        if ended and hop and after.champion_rms == before.champion_rms:
+            ends[hop] += 1
+            assert after.counters[HOPS] - before.counters[HOPS] == (hop == COUNTED)
+            assert after.counters[STEP] == 0
+    assert min(ends.values()) > 0
+
+
+def test_it_can_be_cut_anywhere_there_too() -> None:
+    problem = example("coulomb-eq16")
+    (plan,) = plans(problem, ALONE, 3)
+    at_once = evolve(problem.evaluator, plan, found(problem, ALONE, 3)[0], GENERATIONS)
+    assert at_once.counters[JUMPS] > 0
+    assert bits(at_once) == bits(generations("coulomb-eq16")[-1])
