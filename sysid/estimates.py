@@ -61,7 +61,7 @@ def _free(parameter: Parameter, known: Known, d: int) -> Estimate:
     value, status = float(known.theta[d]), known.statuses[d]
     blind = bool(known.blind[d])
     reason = known.reason or _reason(parameter.name, status, blind, known.groups)
-    error = None if blind else float(np.sqrt(known.covariance[d, d]))
+    error = None if blind else sqrt(max(float(known.covariance[d, d]), 0.0))
     return _estimate(parameter, value, error, known.quantile, status, reason)
 
 

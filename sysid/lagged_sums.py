@@ -169,7 +169,7 @@ def colour_of(residual: FloatArray, present: BoolArray, room: int | None = None)
     n = residual.size
     width = _width(residual, present)
     reach = min(ceil(width), n - 1)
-    length = _good_length(n + (reach if room is None else max(reach, room)))
+    length = padded(n + (reach if room is None else max(reach, room)))
     autocovariance = _autocorrelated(residual, length)[: reach + 1] / n
     if not present.all():
         pairs = np.rint(_autocorrelated(present.astype(np.float64), length)[: reach + 1])
@@ -189,7 +189,7 @@ def _autocorrelated(values: FloatArray, length: int) -> FloatArray:
     return irfft(np.square(seen.real) + np.square(seen.imag), length)
 
 
-def _good_length(least: int) -> int:
+def padded(least: int) -> int:
     """The next even length that a fast transform likes: a power of two times 1, 3, 5, 9 or 15."""
     return min(one << max(1, (-(-least // one) - 1).bit_length()) for one in (1, 3, 5, 9, 15))
 

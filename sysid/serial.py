@@ -21,9 +21,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.fft import rfft
+from numpy.typing import NDArray
 from scipy.special import chdtrc, stdtrit
 
-from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, laid_out, whiteness
+from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, laid_out, padded, whiteness
 from sysid.past_outputs import reads_outputs
 from sysid.problem import Problem
 from sysid.types import FloatArray
@@ -168,18 +169,41 @@ def _is_coloured(laid: Laid, size: float) -> bool:
 
 
 def _with_colour(laid: Laid, columns: FloatArray) -> Coloured:
-    """Of one series SᵀRS; R of what a first-order recursion leaves, coloured again by it."""
-    spread = np.zeros((columns.shape[1], laid.values.size))
-    spread[:, laid.present] = columns.T
+    """Of one series SᵀRS."""
+    root, pole = spectrum_root(laid)
+    moved = transformed(laid, columns, root)
+    slow = min(max(pole, 0.0), _STEEPEST)
+    samples = np.count_nonzero(laid.present) * (1.0 - slow) / (1.0 + slow)
+    return Coloured(np.asarray((moved @ moved.conj().T).real), samples, pole > _STEEPEST)
+
+
+def spectrum_root(laid: Laid) -> tuple[FloatArray, float]:
+    """Root (F,) of the spectrum of a series as `colour_of` has it, and the pole of its recursion.
+
+    Of what a first-order recursion leaves, coloured again by it.
+    """
     both = laid.present[1:] & laid.present[:-1]
     before, after = laid.values[:-1][both], laid.values[1:][both]
     found = float(before @ after / (before @ before))
     pole = min(max(found, -_STEEPEST), _STEEPEST)
     left = np.where(both, laid.values[1:] - pole * laid.values[:-1], 0.0)
-    colour = colour_of(left, both, room=2 * left.size)  # the recursion rings on
-    frequency = np.linspace(0.0, np.pi, colour.size)
-    colour /= np.abs(1.0 - pole * np.exp(-1j * frequency))
-    moved = rfft(spread, 2 * (colour.size - 1), axis=1) * colour
-    slow = max(pole, 0.0)
-    samples = np.count_nonzero(laid.present) * (1.0 - slow) / (1.0 + slow)
-    return Coloured(np.asarray((moved @ moved.conj().T).real), samples, found > _STEEPEST)
+    root = colour_of(left, both, room=2 * left.size)  # the recursion rings on
+    frequency = np.linspace(0.0, np.pi, root.size)
+    root /= np.abs(1.0 - pole * np.exp(-1j * frequency))
+    return root, found
+
+
+def white_root(laid: Laid) -> FloatArray:
+    """The same of a series taken for white: (F,), as many as `spectrum_root` has of its size."""
+    size = padded(3 * (laid.values.size - 1)) // 2 + 1
+    mean = float(laid.values @ laid.values) / np.count_nonzero(laid.present)
+    both_signs = np.full(size, 2.0)  # each frequency stands for its negative too
+    both_signs[[0, -1]] = 1.0
+    return np.asarray(np.sqrt(mean * both_signs / (2 * (size - 1))))
+
+
+def transformed(laid: Laid, columns: FloatArray, root: FloatArray) -> NDArray[np.complex128]:
+    """Transforms (D, F) of the sensitivities (n, D) of a series, times a root (F,)."""
+    spread = np.zeros((columns.shape[1], laid.values.size))
+    spread[:, laid.present] = columns.T
+    return np.asarray(rfft(spread, 2 * (root.size - 1), axis=1) * root)

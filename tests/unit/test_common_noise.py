@@ -91,3 +91,28 @@ def test_it_is_told_as_white_noise() -> None:
     found = analysed(noise(1, 0.9)).uncertainty
     assert found is not None
     assert found.noise_colour == "white"
+
+
+@pytest.mark.parametrize(("correlation", "pole"), [(-0.9, 0.9), (-1.0, 0.95), (0.9, 0.95)])
+def test_what_noise_leaves_of_a_difference_is_never_below_nothing(
+    correlation: float, pole: float
+) -> None:
+    draws = 60
+    covered = 0
+    for seed in range(draws):
+        for one in analysed(noise(seed, correlation, pole)).estimates:
+            assert one.stderr is not None
+            assert one.stderr >= 0.0  # and a number: the difference of two spectra was below 0
+            assert one.interval95 is not None
+            covered += one.interval95[0] <= TRUTH[one.name] <= one.interval95[1]
+    assert covered >= 0.88 * draws * len(TRUTH)
+
+
+def test_the_same_noise_in_two_outputs_counts_once() -> None:
+    columns = np.random.default_rng(0).standard_normal((2 * TIMES.size, 4))
+    data = [Channel(one.name, TIMES, one.values, "m") for one in CLEAN]
+    problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
+    found = coloured_jointly(problem, noise(0, 1.0).ravel(), columns)
+    assert found is not None
+    assert found.samples == pytest.approx(TIMES.size)
+    assert found.degrees == pytest.approx(TIMES.size - 4)
