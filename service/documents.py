@@ -4,6 +4,8 @@ import json
 from typing import Any
 
 from service.errors import FieldError, InvalidRequest, TooLarge
+from service.storage.columns import require_storable_texts
+from service.storage.errors import UnstorableValue
 from sysid.errors import InvalidModel
 from sysid.models import documents
 
@@ -22,7 +24,7 @@ def read_yaml(text: bytes) -> Any:
     """
     _check_size(text)
     try:
-        return documents.read_yaml(text.decode("utf-8-sig"))
+        return _storable(documents.read_yaml(text.decode("utf-8-sig")))
     except UnicodeDecodeError as error:
         raise InvalidRequest.at("", f"not UTF-8 text: byte {error.start} does not fit") from None
     except InvalidModel as error:
@@ -41,12 +43,24 @@ def read_json(text: bytes) -> Any:
     """
     _check_size(text)
     try:
-        return json.loads(text, parse_constant=_refuse_constant)
+        found = json.loads(text, parse_constant=_refuse_constant)
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
         raise InvalidRequest.at("", f"the body is not JSON: {place}: {error.msg}") from None
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
         raise InvalidRequest.at("", f"the body is not JSON: {error}") from None
+    return _storable(found)
+
+
+def _storable(document: Any) -> Any:
+    """The document, whose texts a database can keep: escapes can stand for what is no text."""
+    try:
+        require_storable_texts(
+            json.dumps(document, ensure_ascii=False, default=repr, skipkeys=True)
+        )
+    except UnstorableValue as error:
+        raise InvalidRequest.at("", str(error)) from None
+    return document
 
 
 def _check_size(text: bytes) -> None:

@@ -59,7 +59,7 @@ def _asked(header: str | None) -> float | None:
         return float(header)
     try:
         until = parsedate_to_datetime(header)
-    except ValueError:
+    except (ValueError, OverflowError):  # the latter of a zone that no integer holds
         return None
     if until.tzinfo is None:  # RFC 5322's -0000; HTTP's dates are of GMT
         until = until.replace(tzinfo=UTC)

@@ -79,7 +79,8 @@ def _repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldErro
         first: dict[str, tuple[int, tuple[Any, str]]] = {}
         for position, (given, labels) in enumerate(zip(axis.values, axis.labels, strict=True)):
             x = labels.get(body.trend.x)
-            for name in [given] if isinstance(given, str) else given:
+            names = given if isinstance(given, list) else [given]
+            for name in (one for one in names if isinstance(one, str)):  # others are told before
                 dataset = checker.dataset(name)
                 key = dataset if isinstance(dataset, str) else dataset.sha256
                 at, before = first.setdefault(key, (position, (x, name)))

@@ -1,6 +1,7 @@
 """RFC 9457 problem documents: the one place where an error becomes an answer."""
 
 import errno
+import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from http import HTTPStatus
@@ -34,7 +35,10 @@ log = logging.getLogger(__name__)
 
 TRY_AGAIN = {"Retry-After": "1"}
 TOO_DEEP = "the body is nested too deeply"
+NO_UNICODE = "a text holds half of a surrogate pair; it is not valid Unicode"
 MOST_FAULTS = 1000
+MOST_CHARACTERS, MOST_IN_ALL = 1000, 20_000
+"""Of one sentence, and of all: a value that is quoted may be as long as a body."""
 """So many fields that cannot be read are told; each costs a look at what is known there."""
 PROBLEM_TYPE = "application/problem+json"
 KINDS = {
@@ -69,12 +73,29 @@ def problem(
         "type": f"/problems/{kind}",
         "title": title,
         "status": status,
-        "detail": detail,
+        "detail": _short(detail, MOST_IN_ALL if errors else MOST_CHARACTERS),
         "instance": request.url.path,
     }
     if errors:
-        content["errors"] = [error.as_dict() for error in errors]
-    return JSONResponse(content, status, dict(headers or {}), media_type=PROBLEM_TYPE)
+        told = (error.as_dict() for error in errors)
+        content["errors"] = [
+            {**one, "detail": _short(one["detail"], MOST_CHARACTERS)} for one in told
+        ]
+    return _Problem(content, status, dict(headers or {}), media_type=PROBLEM_TYPE)
+
+
+class _Problem(JSONResponse):
+    """JSON also where it names a field whose name is no Unicode text: halves of pairs escaped."""
+
+    def render(self, content: Any) -> bytes:
+        """The document in UTF-8."""
+        text = json.dumps(content, ensure_ascii=False, separators=(",", ":"))
+        return text.encode("utf-8", "backslashreplace")
+
+
+def _short(text: str, most: int) -> str:
+    """The text, of a very long one beginning and end."""
+    return text if len(text) <= most else f"{text[: most // 2]} … {text[-(most // 2) :]}"
 
 
 def install(app: FastAPI) -> None:
@@ -87,6 +108,7 @@ def install(app: FastAPI) -> None:
     for passing in (*PASSING, SqlTimeout):
         app.add_exception_handler(passing, _database_away)
     app.add_exception_handler(RecursionError, _too_deep)
+    app.add_exception_handler(UnicodeEncodeError, _no_unicode)
     app.add_exception_handler(OSError, _system_error)
     app.add_exception_handler(Exception, _unexpected)
 
@@ -128,6 +150,13 @@ def _too_deep(request: Request, error: Exception) -> Response:
     if request.method not in ("POST", "PUT", "PATCH"):
         return _unexpected(request, error)
     return _service_error(request, InvalidRequest.at("", TOO_DEEP))
+
+
+def _no_unicode(request: Request, error: Exception) -> Response:
+    """Only the escapes of a body's JSON can make half of a surrogate pair; UTF-8 has none."""
+    if request.method not in ("POST", "PUT", "PATCH"):
+        return _unexpected(request, error)
+    return _service_error(request, InvalidRequest.at("", NO_UNICODE))
 
 
 def _sysid_error(request: Request, error: Exception) -> Response:

@@ -72,10 +72,15 @@ def to_json(value: object) -> str:
         text = _ENCODER.encode(value)
     except ValueError as error:
         raise UnstorableValue(f"a document holds NaN or an infinite number: {error}") from error
+    require_storable_texts(text)
+    return text
+
+
+def require_storable_texts(text: str) -> None:
+    """Raise `UnstorableValue` if a text in a JSON document is none that a database can keep."""
     # json.dumps escapes NUL as \u0000; an escaped backslash before u0000 is an ordinary text.
     nul = "\\u0000" in text and "\\u0000" in text.replace("\\\\", "")
     _require_storable(text, nul=nul)
-    return text
 
 
 def state_type(states: type[StrEnum]) -> Enum:

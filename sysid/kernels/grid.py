@@ -73,9 +73,9 @@ def grid_of(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel])
     step = model.solver.step or _simulation_step(outputs)
     first = min(float(channel.times[0]) for channel in outputs)
     begin = min([first, *(float(channel.times[0]) for channel in inputs)])
-    start = first - ceil((first - begin) / step - 1e-6) * step
     end = max(float(channel.times[-1]) for channel in outputs)
-    _check_length((end - start) / step * model.solver.substeps)
+    _check_length((end - begin) / step * model.solver.substeps)
+    start = first - ceil((first - begin) / step - 1e-6) * step
     points = ceil((end - start) / step - _ON_GRID) + 1
     return Grid(start, step, points, model.solver.substeps)
 

@@ -93,7 +93,8 @@ def _points(channel: Channel, start: float, step: float) -> int:
         for points in range(2, MOST_POINTS + 1, 2):
             if _is_aligned(channel.times, start, step / points):
                 return points
-    return int(np.clip(2 * ceil(DENSE * step / period / 2 - 1e-3), 4, MOST_POINTS))
+    wanted = min(DENSE * step / period, MOST_POINTS)
+    return int(np.clip(2 * ceil(wanted / 2 - 1e-3), 4, MOST_POINTS))
 
 
 def _is_aligned(times: FloatArray, start: float, spacing: float) -> bool:

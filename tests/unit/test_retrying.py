@@ -116,8 +116,9 @@ def test_in_the_end_the_refusal_is_raised(
 
 
 @pytest.mark.parametrize(
-    ("header", "pause"), [("2", 2.0), ("0", 0.0), (" 7 ", 7.0), ("soon", 0.5), ("-3", 0.5)]
-)
+    ("header", "pause"), [("2", 2.0), ("0", 0.0), (" 7 ", 7.0), ("soon", 0.5), ("-3", 0.5),
+                          ("Mon, 01 Jan 2024 00:00:00 +99999999999999999999", 0.5)],
+)  # fmt: skip
 def test_what_the_server_asks_for_is_waited(slept: list[float], header: str, pause: float) -> None:
     server = Server(AWAY, 200, headers={"Retry-After": header})
     assert synchronously(server, "job", "job_1") == JOB

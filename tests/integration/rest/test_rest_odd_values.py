@@ -1,0 +1,79 @@
+"""Values of JSON that no field means are refused with a sentence, never with an error inside."""
+
+import json
+from typing import Any
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.app import create_app
+from tests.identified import identified
+from tests.rest import CSV, recording, refused, settings_of
+
+HALF = "\ud800"
+SMALL = {"population": 16, "generations": 5, "islands": 1}
+
+
+def sent(server: TestClient, path: str, body: Any) -> Any:
+    """The answer to a body that the client's own JSON would refuse."""
+    return server.post(path, content=json.dumps(body), headers={"content-type": "application/json"})
+
+
+@pytest.mark.parametrize("given", [0.1, 3, None, {"a": []}, [3], [None], [["x"]], [{}], []])
+def test_a_batch_whose_recordings_are_no_names_is_refused(
+    server: TestClient, dataset: str, given: Any
+) -> None:
+    axis = {"path": "/datasets", "values": [[dataset], given], "labels": [{"n": 1}, {"n": 2}]}
+    body = {"model": "fopdt", "datasets": [dataset], "sweep": {"axes": [axis]}, "trend": {"x": "n"}}
+    faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
+    assert {one["pointer"] for one in faults} == {"/sweep/axes/0/values/1"}
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("/v1/jobs", {"model": "fopdt", "datasets": [HALF]}),
+        ("/v1/jobs", {"model": HALF, "datasets": ["steps"]}),
+        ("/v1/jobs", {"model": "fopdt", "datasets": ["steps"], HALF: 1}),
+        ("/v1/jobs", {"model": "fopdt", "datasets": ["steps"], "warm_start": HALF}),
+        ("/v1/models", {"name": "own", "title": HALF}),
+        ("/v1/datasets:simulate", {"model": "fopdt", "parameters": {HALF: 1}, "samples": 9,
+                                   "sample_time": 1, "inputs": {"u": {"kind": "step"}}}),
+        ("/v1/runs:compare", {"runs": [HALF, "x"]}),
+    ],
+)  # fmt: skip
+def test_half_of_a_surrogate_pair_is_refused(
+    server: TestClient, dataset: str, path: str, body: dict[str, Any]
+) -> None:
+    answer = sent(server, path, body)
+    assert 400 <= answer.status_code < 500, answer.text
+    assert answer.json()["detail"]
+
+
+@pytest.mark.parametrize("text", [HALF, "a\x00b"])
+def test_a_model_that_cannot_be_stored_is_not_called_valid(server: TestClient, text: str) -> None:
+    document = server.get("/v1/models/fopdt").json()["document"]
+    for changed in ({"title": text}, {text: 1}):
+        told = sent(server, "/v1/models:check", {**document, **changed}).json()
+        assert told["valid"] is False
+        assert "text holds" in told["errors"][0]["detail"]
+
+
+def test_a_very_long_value_is_not_repeated_in_full(server: TestClient) -> None:
+    body = {"model": "fopdt", "datasets": ["a" * 100_000]}
+    answer = server.post("/v1/jobs", json=body)
+    [fault] = refused(answer, 422, "invalid")
+    assert fault["detail"].startswith("there is no dataset 'aaa")
+    assert len(answer.content) < 25_000
+
+
+def test_times_at_the_ends_of_what_doubles_can_hold_are_simulated_or_refused(tmp_path: Any) -> None:
+    with TestClient(create_app(settings_of(tmp_path)), raise_server_exceptions=False) as server:
+        steps = server.post("/v1/datasets", content=recording(), headers=CSV).json()["id"]
+        job = {"model": "fopdt", "datasets": [steps], "algorithm": SMALL}
+        _, [run] = identified(server.app.state.parts, job)  # type: ignore[attr-defined]
+        for times, status in (([0, 1e-320], 200), ([1e-320, 2e-320], 200), ([-1e308, 0], 422)):
+            series = {"kind": "series", "times": times, "values": [0, 1], "hold": "zero"}
+            body = {"inputs": {"u": series}, "samples": 51, "sample_time": 0.1}
+            answer = server.post(f"/v1/runs/{run}:simulate", json=body)
+            assert answer.status_code == status, answer.text
