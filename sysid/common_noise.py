@@ -77,7 +77,11 @@ def coloured_jointly(problem: Problem, seen: FloatArray, columns: FloatArray) ->
     size, vectors = np.linalg.eigh(middle)
     if size[0] < 0.0:  # where outputs that are not measured all the time nearly cancel out
         middle = (vectors * np.maximum(size, 0.0)) @ vectors.T
-    return whole._replace(middle=middle, samples=whole.samples / (1.0 + twice / seen.size))
+    counted = 1.0 / (1.0 + twice / seen.size)
+    return whole._replace(
+        middle=middle, samples=whole.samples * counted,
+        series=tuple((one, max(counted * degrees, 1.0)) for one, degrees in whole.series),
+    )  # fmt: skip
 
 
 def _pairs(problem: Problem, seen: FloatArray) -> Iterator[_Pair]:

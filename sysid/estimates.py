@@ -27,7 +27,7 @@ class Known:
     statuses : tuple of EstimateStatus
     covariance : FloatArray, shape (D, D)
         In the parameters' units.
-    quantile : float
+    quantile : FloatArray, shape (D,)
         Of the t distribution, for 95 %.
     blind : BoolArray, shape (D,)
         Parameters without a standard error.
@@ -43,7 +43,7 @@ class Known:
     theta: FloatArray
     statuses: tuple[EstimateStatus, ...]
     covariance: FloatArray
-    quantile: float
+    quantile: FloatArray
     blind: BoolArray
     groups: tuple[Group, ...]
     null: FloatArray
@@ -62,7 +62,7 @@ def _free(parameter: Parameter, known: Known, d: int) -> Estimate:
     blind = bool(known.blind[d])
     reason = known.reason or _reason(parameter.name, status, blind, known.groups)
     error = None if blind else sqrt(max(float(known.covariance[d, d]), 0.0))
-    return _estimate(parameter, value, error, known.quantile, status, reason)
+    return _estimate(parameter, value, error, float(known.quantile[d]), status, reason)
 
 
 def _given(problem: Problem, known: Known, parameter: Parameter) -> Estimate:
@@ -76,7 +76,8 @@ def _given(problem: Problem, known: Known, parameter: Parameter) -> Estimate:
         why = known.reason or "the data do not tell what it is tied to"
         return _estimate(parameter, value, None, 0.0, "tied", f"{reason}; {why}")
     error = sqrt(max(float(slope @ known.covariance @ slope), 0.0))
-    return _estimate(parameter, value, error, known.quantile, "tied", reason)
+    quantile = float(np.max(known.quantile[slope != 0.0], initial=0.0))
+    return _estimate(parameter, value, error, quantile, "tied", reason)
 
 
 def _tied(

@@ -13,7 +13,8 @@ freedom. Where a is too near 1 the record is short beside its drift, and the err
 bound. Different outputs are taken for independent here; see `sysid.common_noise`.
 
 Nor is s² that of every output of every experiment. Where they are clearly noisy by unequal amounts
-in the weighted residuals (Bartlett 1937), Ω has of each its own variance.
+in the weighted residuals (Bartlett 1937), Ω has of each its own variance, and an interval has the
+degrees of freedom of those series that tell it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, stdtrit
 
 from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, laid_out, padded, whiteness
+from sysid.linear import RANK
 from sysid.past_outputs import reads_outputs
 from sysid.problem import Problem
 from sysid.types import FloatArray
@@ -49,18 +51,28 @@ class Coloured(NamedTuple):
     """Ω (D, D) of the sandwich, and how many white samples would say as much.
 
     `drifts` where that number is not known: the residuals wander over the whole record. `is_white`
-    where they are of unequal size only.
+    where they are of unequal size only. `series` has of each series its part of Ω and the degrees
+    of freedom that it tells that by; empty: all are of one.
     """
 
     middle: FloatArray
     samples: float
     drifts: bool
     is_white: bool = False
+    series: tuple[tuple[FloatArray, float], ...] = ()
 
     @property
     def degrees(self) -> float:
         """Degrees of freedom of the t distribution: those of white samples, one at least."""
         return max(self.samples - len(self.middle), 1.0)
+
+    def degrees_along(self, direction: FloatArray) -> float:
+        """Those of the variance of one combination (D,) of Sᵀe (Satterthwaite 1946)."""
+        each = np.array([direction @ middle @ direction for middle, _ in self.series])
+        if not np.sum(each) > 0:
+            return self.degrees
+        degrees = np.array([one for _, one in self.series])
+        return max(float(np.sum(each) ** 2 / np.sum(each**2 / degrees)), 1.0)
 
     def widening(self, direction: FloatArray, power: float, norm: float) -> float:
         """Square of how much wider than of white residuals an interval of one parameter is.
@@ -73,7 +85,7 @@ class Coloured(NamedTuple):
             Mean square of the residuals; sum of squares of that combination.
         """
         told = max(float(direction @ self.middle @ direction) / (power * norm), _NARROWEST)
-        reach = float(stdtrit(self.degrees, 0.975)) ** 2 / QUANTILE
+        reach = float(stdtrit(self.degrees_along(direction), 0.975)) ** 2 / QUANTILE
         return float(told * reach * self.samples / self.degrees)
 
 
@@ -101,20 +113,42 @@ def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloure
     told = [is_free and _is_coloured(laid, part.size) for part, laid in found]
     if not any(told) and not _are_uneven([seen[part.rows] for part, _ in found]):
         return None
-    nothing = np.zeros((columns.shape[1], columns.shape[1]))
-    whole = Coloured(nothing, 0.0, drifts=False, is_white=not any(told))
+    each = []
     for (part, _), has_colour in zip(found, told, strict=True):
         own, values = columns[part.rows], seen[part.rows]
         if has_colour:
-            one = _with_colour(laid_out(part.times, values), own)
+            each.append(_with_colour(laid_out(part.times, values), own))
         else:
             mean = float(np.mean(np.square(values)))
-            one = Coloured(mean * (own.T @ own), float(values.size), drifts=False)
-        whole = Coloured(
-            whole.middle + one.middle, whole.samples + one.samples, whole.drifts or one.drifts,
-            whole.is_white,
-        )  # fmt: skip
-    return whole
+            each.append(Coloured(mean * (own.T @ own), float(values.size), drifts=False))
+    used = _used([columns[part.rows] for part, _ in found])
+    return _together(each, used)._replace(is_white=not any(told))
+
+
+def _used(columns: Sequence[FloatArray]) -> FloatArray:
+    """How many of the degrees of freedom estimates of the parameters (D) take from each series."""
+    own = [one.T @ one for one in columns]
+    inverse = np.linalg.pinv(np.sum(own, axis=0), rcond=RANK**2, hermitian=True)
+    used = np.array([np.sum(inverse * one) for one in own])
+    total = float(np.sum(used))  # 0 where nothing has an effect
+    return np.asarray(used * (len(inverse) / total if total > 0 else 0.0))
+
+
+def _together(each: Sequence[Coloured], used: FloatArray) -> Coloured:
+    """Ω of several series.
+
+    Residuals of a series are smaller than its noise by the degrees of freedom that were taken from
+    it. What all have lost on average is not allowed for here.
+    """
+    size, samples = len(each[0].middle), np.array([one.samples for one in each])
+    degrees = np.maximum(samples - used, 1.0)
+    total = float(np.sum(samples))
+    grown = samples / degrees * (max(total - size, 1.0) / total)
+    middles = [by * one.middle for one, by in zip(each, grown.tolist(), strict=True)]
+    return Coloured(
+        np.sum(middles, axis=0), total, any(one.drifts for one in each),
+        series=tuple(zip(middles, degrees.tolist(), strict=True)),
+    )  # fmt: skip
 
 
 def _are_uneven(series: Sequence[FloatArray]) -> bool:

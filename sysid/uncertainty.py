@@ -178,7 +178,7 @@ def _analysed(
     )
     statuses = _statuses(place, found, pulled)
     told = Known(
-        theta, statuses, physical, float(stdtrit(_told_by(n, d, colour, white), 0.975)), member,
+        theta, statuses, physical, stdtrit(_told_by(n, inverse, colour, white), 0.975), member,
         uncertainty.groups, rows[~kept], scale,
     )  # fmt: skip
     estimates = _beside_jumps(problem, estimates_of(problem, told), one_sided, aside * scale)
@@ -298,7 +298,7 @@ def _covariance(
 ) -> tuple[FloatArray, float]:  # fmt: skip
     """Covariance of the places, and the standard deviation of the noise."""
     n, d = columns.shape
-    widening = n / (n - d) if colour is None else colour.samples / _degrees(n, d, colour)
+    widening = n / (n - d) if colour is None else colour.samples / colour.degrees
     if scale == 0.0:
         variance = float(error @ error) / (n - d)
         if colour is not None:
@@ -312,18 +312,18 @@ def _covariance(
     return widening * bread @ filling @ bread, noise
 
 
-def _degrees(n: int, d: int, colour: Coloured | None) -> float:
-    """Degrees of freedom of the t distribution."""
-    return float(n - d) if colour is None else colour.degrees
+def _told_by(
+    n: int, inverse: FloatArray, colour: Coloured | None, white: Whitening | None
+) -> FloatArray:
+    """Degrees of freedom of the intervals (D,): of whitened samples too, what a mean would have.
 
-
-def _told_by(n: int, d: int, colour: Coloured | None, white: Whitening | None) -> float:
-    """Degrees of freedom of the intervals: of whitened samples too, what a mean would have.
-
-    The correlation time is estimated from no more than that.
+    The correlation time is estimated from no more than that. `inverse` (D, D) is (SᵀS)⁻¹.
     """
-    degrees = _degrees(n, d, colour)
-    return degrees if white is None else min(degrees, max(white.samples - d, 1.0))
+    d = len(inverse)
+    degrees = np.full(d, float(n - d))
+    if colour is not None:
+        degrees = np.array([colour.degrees_along(row) for row in inverse])
+    return degrees if white is None else np.minimum(degrees, max(white.samples - d, 1.0))
 
 
 def _named(colour: Coloured | None, white: Whitening | None) -> NoiseColour:
@@ -371,6 +371,14 @@ def _without(problem: Problem, theta: FloatArray, reason: str) -> tuple[Estimate
     statuses: list[EstimateStatus] = ["unidentifiable"] * d
     blind = np.ones(d, dtype=np.bool_)
     known = Known(
-        theta, tuple(statuses), np.zeros((d, d)), 0.0, blind, (), np.eye(d), np.ones(d), reason
+        theta,
+        tuple(statuses),
+        np.zeros((d, d)),
+        np.zeros(d),
+        blind,
+        (),
+        np.eye(d),
+        np.ones(d),
+        reason,
     )
     return estimates_of(problem, known)

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 
 from sysid.models.library import load_model
+from sysid.models.spec import parse_model
 from sysid.problem import Problem
-from sysid.records import Record
+from sysid.records import Channel, Record
 from sysid.refinement import refine
 from sysid.result import Estimate
 from sysid.settings import Loss
+from sysid.simulation import simulate
 from sysid.types import FloatArray
 from sysid.uncertainty import analyse
 from tests.searching import COULOMB, DUFFING, example, force, noisy, record
@@ -47,7 +49,8 @@ def test_estimates_scatter_as_their_standard_errors_say() -> None:
 
 
 def test_records_of_unequal_noise_each_count_with_their_own() -> None:
-    # The sandwich of White (1980) for two series, each of its own variance.
+    # The sandwich of White (1980) for two series, each of its own variance, by what degrees of
+    # freedom the estimates leave it.
     exact, vague = record(noisy(seed=1)), record(noisy(n=80, sd=0.06, seed=2))
     problem = Problem.build(load_model("duffing-eq16"), [exact, vague])
     end = refine(problem, [truth(problem)])[0]
@@ -60,15 +63,45 @@ def test_records_of_unequal_noise_each_count_with_their_own() -> None:
         problem.predictions(end.theta + step) - problem.predictions(end.theta - step)
     ).T / 2e-5  # fmt: skip
     error = problem.evaluator.measured - problem.predictions(end.theta[None])[0]
-    inner = sum(
-        np.mean(error[rows] ** 2) * slopes[rows].T @ slopes[rows]
-        for rows in (slice(0, 300), slice(300, 380))
-    )
     bread = np.linalg.inv(slopes.T @ slopes)
-    expected = np.sqrt(np.diag(bread @ inner @ bread) * 380 / 376)
+    inner = 0.0
+    for rows in (slice(0, 300), slice(300, 380)):
+        squares = slopes[rows].T @ slopes[rows]
+        left = error[rows].size - np.trace(bread @ squares)
+        inner = inner + np.sum(error[rows] ** 2) / left * squares
+    expected = np.sqrt(np.diag(bread @ inner @ bread))
     pooled = np.sqrt(np.diag(bread) * np.sum(error**2) / 376)
     assert [one.stderr for one in found.estimates] == pytest.approx(expected, rel=1e-3)
     assert np.max(np.abs(expected / pooled - 1)) > 0.1
+
+
+def test_intervals_that_a_short_exact_output_tells_cover_the_truth() -> None:
+    # y tells a, T and c by 20 samples, z tells b by 1000: s² of y by 17 degrees of freedom.
+    truth_ = np.array([2.0, 0.8, 0.3, 1.0])
+    spans = {"a": (0.1, 5), "T": (0.1, 3), "c": (-3, 3), "b": (-3, 3)}
+    model = parse_model({
+        "name": "two", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m", "w": "m"},
+        "parameters": {name: {"lower": low, "upper": up} for name, (low, up) in spans.items()},
+        "equations": {"x": "(u - x)/T", "w": "u - w"}, "initial": {"x": 0, "w": 0},
+        "outputs": {"y": "a*x + c", "z": "b*w"},
+    })  # fmt: skip
+    times, random = 0.05 * np.arange(1000.0), np.random.default_rng(7)
+    u = Channel("u", times, np.repeat(random.normal(size=50), 20), hold="zero")
+    given = dict(zip(spans, truth_.tolist(), strict=True))
+    y, z = (one.values for one in simulate(model, [u], given, times=times).channels)
+    draws, covered = 200, np.zeros(4)
+    for _ in range(draws):
+        data = (
+            Channel("y", times[::50], y[::50] + random.normal(0, 0.02, 20), "m"),
+            Channel("z", times, z + random.normal(0, 0.2, 1000), "m"),
+        )
+        problem = Problem.build(model, [Record((u,), data)], weights={"y": 1.0, "z": 1.0})
+        end = refine(problem, [truth_])[0]
+        assert end is not None
+        found = [one.interval95 for one in analyse(problem, end.theta).estimates]
+        covered += [a <= v <= b for (a, b), v in zip(filter(None, found), truth_, strict=True)]
+    assert np.min(covered) >= 0.91 * draws  # 88 to 91 % with one s² and one t for all
+    assert np.sum(covered[:3]) >= 0.93 * 3 * draws
 
 
 def test_standard_errors_beside_the_jumps_of_coulomb_friction_are_those_of_repetition() -> None:
