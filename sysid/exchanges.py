@@ -2,9 +2,10 @@
 
 No data tell which is the first. It need not show in the equations, whose inner states differ, so
 it is looked for as the sums of `sysid.translations` are: parameters of one unit are exchanged,
-apart from one another, and the model is simulated. Only what changes nothing then counts. One order
-is given, the largest first; bounds that do not hold the other order tell which is which, and leave
-nothing to be exchanged.
+apart from one another, and the model is simulated, once more with all others moved: two gains at
+one bound make parallel sections alike at that estimate only. What changes nothing then counts. One
+order is given, the largest first; bounds that do not hold the other order tell which is which, and
+leave nothing to be exchanged.
 """
 
 from collections.abc import Iterator
@@ -21,8 +22,11 @@ from sysid.types import FloatArray
 Exchanges = tuple[tuple[int, ...], ...]
 """Groups of places in the problem's space, rising, any two of which can be exchanged."""
 
-_APART = 0.05  # of the range that both may have: how far they are set apart at least
+_APART = 0.05  # of their size: how far the two are set apart at least
+_LEAST = 1e-3  # of the range: values nearer 0 are taken to be of that size
+_MOVED = 0.02, 0.05  # of its size: by how much each of the others is moved
 _SAME = 1e-9  # of the output's size: rounding
+_ALONE, _AGAIN = 3, 2  # simulations for a pair, and with the others moved
 
 
 def exchanges(
@@ -40,10 +44,11 @@ def exchanges(
     for one, other in _candidates(problem, theta):
         if any({one, other} <= group for group in groups):
             continue
-        if most is not None and spent + 3 > most:
+        if most is not None and spent + _ALONE + _AGAIN > most:
             break
-        spent += 3
-        if _changes_nothing(problem, theta, one, other):
+        found, count = _changes_nothing(problem, theta, one, other)
+        spent += count
+        if found:
             joined = [group for group in groups if group & {one, other}]
             groups = [group for group in groups if not group & {one, other}]
             groups.append(set().union({one, other}, *joined))
@@ -99,20 +104,41 @@ def _candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[int, int]
             yield i, j
 
 
-def _changes_nothing(problem: Problem, theta: FloatArray, one: int, other: int) -> bool:
-    """Whether the output is the same with two parameters exchanged, and not with their mean."""
-    evaluator = problem.evaluator
-    low, high = (
-        float(end)
-        for end in (max(evaluator.lower[[one, other]]), min(evaluator.upper[[one, other]]))
-    )
-    half = max(0.5 * abs(theta[one] - theta[other]), 0.5 * _APART * (high - low))
+def _changes_nothing(problem: Problem, theta: FloatArray, one: int, other: int) -> tuple[bool, int]:
+    """Whether two parameters that are exchanged leave the output as it is, and their mean does not.
+
+    And the simulations this took.
+    """
+    evaluator, pair = problem.evaluator, [one, other]
+    low, high = float(max(evaluator.lower[pair])), float(min(evaluator.upper[pair]))
+    least = 0.5 * _APART * float(_size(theta[pair], high - low).max())
+    half = min(max(0.5 * abs(theta[one] - theta[other]), least), 0.5 * (high - low))
     middle = min(max(0.5 * (theta[one] + theta[other]), low + half), high - half)
-    tried = np.repeat(theta[None], 3, axis=0)
+    tried = np.repeat(theta[None], _ALONE, axis=0)
     tried[:, one] = middle + half, middle - half, middle
     tried[:, other] = middle - half, middle + half, middle
     here, there, equal = problem.predictions(tried)
+    if not _is_same(here, there) or _is_same(here, equal):
+        return False, _ALONE
+    others = np.delete(np.arange(theta.size), pair)
+    tried[:, others] = _moved(problem, theta)[others]
+    return _is_same(*problem.predictions(tried[:_AGAIN])), _ALONE + _AGAIN
+
+
+def _is_same(here: FloatArray, there: FloatArray) -> bool:
     with np.errstate(invalid="ignore"):
-        size = _SAME * float(np.max(np.abs(here)))
-        moves = bool(np.max(np.abs(equal - here)) > size)
-        return moves and bool(np.max(np.abs(there - here)) <= size)
+        return bool(np.max(np.abs(there - here)) <= _SAME * np.max(np.abs(here)))
+
+
+def _size(values: FloatArray, span: FloatArray | float) -> FloatArray:
+    """Of values: their own, or where they are small beside the range a small part of that."""
+    return np.asarray(np.minimum(np.maximum(np.abs(values), _LEAST * span), span))
+
+
+def _moved(problem: Problem, theta: FloatArray) -> FloatArray:
+    """Values a little off, away from the nearer bound, and no two of them by as much."""
+    lower, upper = problem.evaluator.lower, problem.evaluator.upper
+    inward = np.where(theta - lower < upper - theta, 1.0, -1.0)
+    return np.asarray(
+        theta + inward * np.linspace(*_MOVED, theta.size) * _size(theta, upper - lower)
+    )
