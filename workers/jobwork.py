@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from workers.errors import RecordsUnavailable
@@ -111,12 +111,16 @@ class JobWork:
 
     def absorb(self, handle: Handle, done: tuple[Done, ...]) -> None:
         """Take in what a pack gave; islands whose turn did not come are sent again."""
+        items = self.flying.pop(handle)
+        waiting = self._waiting(handle, items)
         again: list[Item] = []
-        for item, one in zip(self.flying.pop(handle), done, strict=True):
+        for item, one in zip(items, done, strict=True):
             run = self._active.get(one.run)
             if run is None:
                 continue  # it failed while another of its islands was still out
             run.seconds += one.seconds
+            if run not in waiting:
+                continue
             if one.outcome is not None:
                 self._take(run, one)
             elif isinstance(item, Evolve):
@@ -140,19 +144,18 @@ class JobWork:
         Only a run that was alone is blamed, and not for what came of it elsewhere: two packs of
         its islands that are lost at once are one death.
         """
-        names = {item.run for item in self.flying.pop(handle)}
-        for run in [self._active[name] for name in names if name in self._active]:
+        items = self.flying.pop(handle)
+        are_several = len({item.run for item in items}) > 1
+        for run in self._waiting(handle, items):
             run.gather_again()
-            if run in self._ready:
-                continue
             run.is_suspect = True
-            if len(names) > 1 or self._may_go_on(run, reason):
+            if are_several or self._may_go_on(run, reason):
                 self._ready.append(run)
 
     def fail(self, handle: Handle, reason: str) -> None:
         """A programming error: the runs of the pack fail with it."""
-        for name in {item.run for item in self.flying.pop(handle)}:
-            self._fail(name, Failure(reason, "InternalError"))
+        for run in self._waiting(handle, self.flying.pop(handle)):
+            self._fail(run.run, Failure(reason, "InternalError"))
 
     def stop(self) -> None:
         """Begin nothing more."""
@@ -185,7 +188,19 @@ class JobWork:
             return
         for name in dict.fromkeys(item.run for item in items):
             self._tell_begin(self._active[name])
-        self.flying[self._crew.submit(items, keys, shared)] = tuple(items)
+        handle = self._crew.submit(items, keys, shared)
+        self.flying[handle] = tuple(items)
+        for item in items:
+            self._active[item.run].packs.add(handle)
+
+    def _waiting(self, handle: Handle, items: Sequence[Item]) -> list[ActiveRun]:
+        """The runs that wait for this pack, which is back; not those that go on without it."""
+        names = dict.fromkeys(item.run for item in items)
+        found = [self._active[name] for name in names if name in self._active]
+        found = [run for run in found if handle in run.packs]
+        for run in found:
+            run.packs.discard(handle)
+        return found
 
     def _tell_begin(self, run: ActiveRun) -> None:
         if not run.is_begun:

@@ -6,7 +6,7 @@ from sysid.ga.island import Island
 from sysid.islands.run_state import RunState
 from sysid.run import border, exchange, is_finished
 from workers.packing import Cost, is_worth_spreading, slice_seconds
-from workers.ports import Advance, Evolve, Evolved, Item, QueuedRun, RunSpec
+from workers.ports import Advance, Evolve, Evolved, Handle, Item, QueuedRun, RunSpec
 
 MAX_KILLS = 2
 """A run over which workers died so often, and which did not go on between, is given up."""
@@ -34,6 +34,9 @@ class ActiveRun:
         While the run is spread: its islands, by number, as they stand.
     awaited : set
         Numbers of the islands that are with the workers.
+    packs : set
+        Handles of the packs that it waits for. One that is not among them is of an epoch that
+        began anew since, and tells nothing.
     """
 
     run: str
@@ -47,6 +50,7 @@ class ActiveRun:
     generation_seconds: float = 0.0
     islands: dict[int, Island] = field(default_factory=dict)
     awaited: set[int] = field(default_factory=set)
+    packs: set[Handle] = field(default_factory=set)
 
     @classmethod
     def of(cls, queued: QueuedRun) -> "ActiveRun":
@@ -92,8 +96,6 @@ class ActiveRun:
         """Take in an island; whether it was the last, so that the run stands at its border."""
         assert self.state is not None
         index = evolved.island.index
-        if index not in self.awaited or evolved.target != border(self.spec.algorithm, self.state):
-            return False  # it was sent again after a worker died, and is here already
         spent = self.state.seconds + seconds / len(self.islands)  # as if all were beside another
         self.state = replace(self.state, seconds=spent)
         self.islands[index] = evolved.island
@@ -107,7 +109,7 @@ class ActiveRun:
 
     def gather_again(self) -> None:
         """Forget the islands that are with the workers: the epoch begins anew."""
-        self.islands, self.awaited = {}, set()
+        self.islands, self.awaited, self.packs = {}, set(), set()
 
 
 def _generations(state: RunState) -> int:

@@ -11,11 +11,14 @@ from tests.runs import RECORDS, ListedRuns, Notebook, bits, carry_out, spec
 from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
 from workers.feeding import Feeder
 from workers.inline import InlineCrew
+from workers.jobwork import JobWork
 from workers.packing import PACKS_PER_CPU
 from workers.ports import (
     Advance,
     Advanced,
     Done,
+    Evolve,
+    Evolved,
     Failure,
     Item,
     QueuedRun,
@@ -294,3 +297,61 @@ def test_islands_whose_turn_did_not_come_are_sent_again(monkeypatch: pytest.Monk
     monkeypatch.setattr("workers.tasks.PACK_LIMIT_SECONDS", 0.0)  # one island of a pack at a time
     spread = carry_out(InlineCrew(slots=2), {"r": one})
     assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])
+
+
+def spread(monkeypatch: pytest.MonkeyPatch) -> tuple[JobWork, ScriptedCrew, Notebook]:
+    """A run of four islands, of which the first two are one pack and the others another."""
+    monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
+    one = spec(islands=4)
+    kept = begin(build(one.problem, RECORDS)[0], one.algorithm, 1)
+    crew, notebook = ScriptedCrew(fails), Notebook()
+    work = JobWork(ListedRuns([QueuedRun("a0", one, kept)]), notebook, crew)
+    assert work.read_ahead(1, 0.0)
+    work.feed(2)
+    assert sorted(map(len, work.flying.values())) == [2, 2]
+    return work, crew, notebook
+
+
+def test_islands_of_a_run_that_goes_on_without_their_pack_are_not_sent_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    work, crew, _ = spread(monkeypatch)
+    first, second = work.flying
+    work.lose(second, "killed")
+    assert work.is_hungry
+    island = crew.packs[first][0]
+    assert isinstance(island, Evolve)
+    done = Done("a0", Evolved(island.island, island.target), 0.1), Done("a0", None, 0.0)
+    work.absorb(first, done)
+    assert (work.flying, work.is_hungry) == ({}, True)
+
+
+def test_a_run_that_goes_on_is_not_sent_a_second_time_when_an_older_pack_is_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    work, _, notebook = spread(monkeypatch)
+    first, second = work.flying
+    work.lose(first, "killed")
+    work.feed(0)
+    work.lose(second, "killed")
+    assert (len(work.flying), work.is_hungry) == (1, False)
+    assert notebook.kills == {"a0": [1]}
+    [whole] = work.flying
+    work.absorb(whole, (Done("a0", Failure("as told"), 0.1),))
+    assert notebook.failures == {"a0": [Failure("as told")]}
+
+
+def test_what_an_older_pack_says_of_a_run_that_goes_on_is_not_heard(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    work, _, notebook = spread(monkeypatch)
+    first, second = work.flying
+    work.lose(first, "killed")
+    work.absorb(second, (Done("a0", Failure("too late"), 0.1), Done("a0", None, 0.0)))
+    assert (notebook.failures, work.is_hungry) == ({}, True)
+    work.feed(2)
+    third, fourth = work.flying
+    work.fail(third, "internal error")
+    work.fail(fourth, "internal error")
+    assert [one.reason for one in notebook.failures["a0"]] == ["internal error"]
+    assert (work.flying, work.is_hungry) == ({}, False)
