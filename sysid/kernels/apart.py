@@ -15,6 +15,7 @@ OWN = 64
 """Kernels that a process compiles itself: it takes half a second less than to start another."""
 
 _SECONDS = 300.0
+_KEPT = ("PATH", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH")  # what an interpreter may need to start
 _made: list[None] = []  # one entry for each, since += on a number is two steps of two threads
 _log = logging.getLogger(__name__)
 
@@ -31,13 +32,15 @@ def object_code_bounded(assembly: str) -> bytes:
 
 
 def _compiled_apart(assembly: str) -> bytes:
-    path = os.pathsep.join(entry for entry in sys.path if entry) or os.getcwd()
+    # What this process imports and no more: `-m` alone would put the folder it stands in first.
+    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    kept = {name: os.environ[name] for name in _KEPT if name in os.environ}
     return subprocess.run(
-        [sys.executable, "-m", "sysid.kernels.apart"],
+        [sys.executable, "-P", "-m", "sysid.kernels.apart"],
         input=assembly.encode(),
         stdout=subprocess.PIPE,
         timeout=_SECONDS,
-        env={"PATH": os.environ.get("PATH", ""), "PYTHONPATH": path},
+        env={**kept, "PYTHONPATH": path},
         check=True,
     ).stdout
 

@@ -2,6 +2,8 @@
 is one of ours."""
 
 import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -33,6 +35,17 @@ def test_after_many_kernels_another_process_makes_the_same_code(
     monkeypatch.setattr(apart, "object_code", refuse)
     assert apart.object_code_bounded(code) == expected
     assert len(apart._made) == apart.OWN
+
+
+def test_modules_in_the_folder_one_stands_in_are_not_taken_for_ours(
+    code: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    expected = object_code(code)
+    (tmp_path / "llvmlite.py").write_text("raise SystemExit(3)")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    monkeypatch.setattr(apart, "object_code", refuse)
+    assert apart.object_code_bounded(code) == expected
 
 
 @pytest.mark.parametrize(
