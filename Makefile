@@ -42,10 +42,12 @@ test check: export PYTHONDONTWRITEBYTECODE =
 test: $(READY) check-code
 	$(BIN)/python -m pytest
 
-# Side by side, each with its output in one piece where this make can do that.
+# Side by side, or as -j says; each with its output in one piece where this make can do that. The
+# part that failed may have ended before the others, which go on.
 check: $(READY)
-	@$(MAKE) --no-print-directory -j3 $(if $(filter output-sync,$(.FEATURES)),--output-sync) \
-	  check-code check-unit check-laws
+	@$(MAKE) --no-print-directory --keep-going $(if $(filter -j% --jobserver%,$(MAKEFLAGS)),,-j3) \
+	  $(if $(filter output-sync,$(.FEATURES)),--output-sync) check-code check-unit check-laws || \
+	  { echo "make check failed: see '***' above; each part: make check-code, check-unit, check-laws"; exit 1; }
 
 check-code: $(READY)
 	$(BIN)/ruff check .
