@@ -73,6 +73,7 @@ def rows_of(done: Study, peers: list[Peer]) -> list[Row]:
     rows = [
         Row(f"{name}: lagid, target hit", hits, f"of {count}", count, ">="),
         Row(f"{name}: lagid, median simulations to the target", done.to_target(), ""),
+        Row(f"{name}: the same, islands side by side", done.side_by_side(), ""),
         Row(f"{name}: lagid, CPU to the target, prorated", prorated, "ms",
             best if np.isfinite(best) else None),
         Row(f"{name}: lagid, CPU to the target, direct", direct, "ms"),

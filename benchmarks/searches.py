@@ -58,13 +58,16 @@ class Goal:
 class Search:
     """What one search gave: distance to the optimum, cost to the target, cost of the whole.
 
-    `seconds` are those of the search, `after` those of the refinement, the standard errors and
-    the tests of the residuals that follow it.
+    `to_target` counts all islands up to the generation in which the first of them is there;
+    `in_order` what one process simulates until then, which evolves the islands one after the
+    other from migration to migration. `seconds` are those of the search, `after` those of the
+    refinement, the standard errors and the tests of the residuals that follow it.
     """
 
     distance: float
     evaluations: int
     to_target: int | None
+    in_order: int | None
     seconds_to_target: float
     prorated: float
     seconds: float
@@ -125,24 +128,45 @@ def search(system: System, seed: int, method: SearchMethod = "improved") -> tupl
         hit, took = None, np.nan
         if found.rms <= goal.rms and goal.tolerances is None:  # by the refinement alone
             hit, took = found.evaluations, seconds + after
+        in_order = hit
     else:
-        hit, took = _replay(problem, algorithm, seed, generation)
+        replayed, took = _replay(problem, algorithm, seed, generation)
+        hit, in_order = replayed.evaluations, _in_order(problem, algorithm, seed, state, goal)
     share = np.nan if hit is None else seconds * hit / state.evaluations
     settled = state.generation < algorithm.generations and all(
         island.generation == state.generation for island in state.islands
     )
     made = Search(
-        goal.distance(found.rms), found.evaluations, hit, took, share, seconds, after, settled
-    )
+        goal.distance(found.rms), found.evaluations, hit, in_order, took, share, seconds, after,
+        settled,
+    )  # fmt: skip
     return made, goal
 
 
 def _hit(state: RunState, goal: Goal) -> int | None:
     """First generation in which an island is at the target."""
-    at: list[int] = []
-    for island in state.islands:
-        at += [step.generation for step in island.history if _is_hit(step, goal)][:1]
-    return min(at) if at else None
+    return min((step.generation for _, step in _hits(state, goal)), default=None)
+
+
+def _hits(state: RunState, goal: Goal) -> list[tuple[int, Improvement]]:
+    """Islands that got to the target, in their order, and the step by which each did."""
+    firsts = [
+        (i, next((step for step in island.history if _is_hit(step, goal)), None))
+        for i, island in enumerate(state.islands)
+    ]
+    return [(i, step) for i, step in firsts if step is not None]
+
+
+def _in_order(
+    problem: Problem, algorithm: GeneticAlgorithm, seed: int, state: RunState, goal: Goal
+) -> int:
+    """Simulations of one process up to the target, as the counter of an optimiser gives them."""
+    hits, every = _hits(state, goal), algorithm.migration.every
+    begin_ = max(min(step.generation for _, step in hits) - 1, 0) // every * every
+    island, step = next(one for one in hits if one[1].generation <= begin_ + every)
+    ended = _replay(problem, algorithm, seed, begin_ + every)[0].islands[:island]
+    waiting = _replay(problem, algorithm, seed, begin_)[0].islands[island + 1 :] if begin_ else ()
+    return step.evaluations + sum(one.evaluations for one in (*ended, *waiting))
 
 
 def _is_hit(step: Improvement, goal: Goal) -> bool:
@@ -151,9 +175,9 @@ def _is_hit(step: Improvement, goal: Goal) -> bool:
 
 def _replay(
     problem: Problem, algorithm: GeneticAlgorithm, seed: int, generation: int
-) -> tuple[int, float]:
-    """Evaluations and CPU seconds of all islands up to a generation of the same search."""
+) -> tuple[RunState, float]:
+    """All islands at a generation of the same search, and the CPU seconds up to there."""
     shorter = replace(algorithm, generations=max(generation, 1), refine=algorithm.refine)
     start = time.process_time()
     state = advance(problem, shorter, begin(problem, shorter, seed))
-    return state.evaluations, time.process_time() - start
+    return state, time.process_time() - start
