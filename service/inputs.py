@@ -30,6 +30,8 @@ from sysid.units import difference, factor
 MOST_DRAWS = 10_000_000
 """Values of one random binary signal at most."""
 
+_MOMENT = 1e-9  # of a sampling period: how long before the start a step shows where it comes from
+
 
 class Signals:
     """Values of inputs at given times; remembers the datasets they came from.
@@ -121,7 +123,8 @@ class Signals:
                 f"{pointer}/time",
                 f"{signal.time:g} s is outside the simulation, from {start:g} to {stop:g} s",
             )
-        before = start - float(self._times[1] - self._times[0])
+        # States start where the first input does: at the start, not a sample before it.
+        before = start - _MOMENT * float(self._times[1] - self._times[0])
         later = signal.offset + signal.amplitude
         times = np.array([before, signal.time, stop])
         return Channel(name, times, np.array([signal.offset, later, later]), unit, "zero")

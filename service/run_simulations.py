@@ -34,6 +34,12 @@ from sysid.models.model import FixedInitial, Model
 from sysid.records import Channel, Recording
 from sysid.types import FloatArray
 
+_SMALL = 0.02  # of a step: what moves or differs by less is at rest
+_MORE = (
+    "the measures tell of how it settles too, not of the step alone; give the states' starts, "
+    "such as x(0), or a later step"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
@@ -87,7 +93,7 @@ def simulate(
         reference=None if reference is None else series(reference, max_points),
         command=None if found.command is None else series(found.command, max_points),
         metrics=_metrics(asked.times, found.outputs, body.control),
-        notes=[*asked.notes, *found.notes],
+        notes=[*asked.notes, *found.notes, *_start_notes(asked.times, found.outputs, body.control)],
         dataset=dataset,
     )
 
@@ -254,6 +260,29 @@ def _metrics(
         steady_error=known(found.steady_error), final_value=known(found.final_value),
         runs_away=found.runs_away, is_settled=found.is_settled,
     )  # fmt: skip
+
+
+def _start_notes(
+    times: FloatArray, outputs: Sequence[Channel], control: ControlIn | None
+) -> list[str]:
+    """What to mind where the loop may not be at rest when its reference steps."""
+    if control is None or not isinstance(control.reference, StepInput):
+        return []
+    step = control.reference
+    [output] = [one for one in outputs if one.name == control.output]
+    band, earlier = _SMALL * abs(step.amplitude), output.values[times < step.time]
+    if earlier.size:
+        if np.ptp(earlier[-max(earlier.size // 4, 2) :]) <= band:
+            return []
+        return [f"{output.name} still moves when the reference steps: {_MORE}"]
+    start = float(output.values[0])
+    if abs(start - step.offset) <= band:
+        return []
+    unit = "" if output.unit == "1" else f" {output.unit}"
+    return [
+        f"{output.name} starts at {start:.4g}{unit} with a reference of {step.offset:.4g}{unit} "
+        f"before the step: unless the loop rests there, {_MORE}"
+    ]
 
 
 def _stored(

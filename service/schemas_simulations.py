@@ -88,8 +88,8 @@ class StepMetricsOut(Answer):
     the last tenth of the record (`final_value`), and null where `is_settled` is false: it leaves
     the band in that tenth still. `steady_error` is the reference minus that mean.
     `overshoot_percent` is told of the reference, `overshoot_of_final_percent` and `rise_time`
-    (10 to 90 %) of that mean. Of a loop that `runs_away`, which leaves the reference farther and
-    farther behind, none of these is told.
+    (10 to 90 %) of the way from where the output stood to that mean. Of a loop that `runs_away`,
+    which leaves the reference farther and farther behind, none of these is told.
     """
 
     output: str

@@ -15,6 +15,7 @@ _WINDOWS = 3  # the last quarters of the record: what comes first, the step itse
 _GROWTH = 1.03  # a limit cycle's peaks differ by less, by where the samples lie
 _SWING_GROWTH = 1.01  # the same of swings between turning points that are interpolated
 _STEADY = 0.99  # of the last increment: from there on, growth does not slow down
+_ROUNDING = 1e-9  # of the step: an output that moves less has not answered
 _BEYOND = 1e100  # steps away from the reference: not to be squared
 
 
@@ -25,12 +26,12 @@ class StepMetrics:
     Attributes
     ----------
     rise_time : float
-        From 10 % to 90 % of the way to the final value.
+        From 10 % to 90 % of the way from where the output stood to the final value.
     overshoot_percent : float
         Farthest way beyond the reference, in per cent of the step; 0 if it is not passed.
     overshoot_of_final_percent : float
-        Farthest way beyond the final value, in per cent of the way to it: what is left of the
-        overshoot where a steady error keeps the output from the reference.
+        Farthest way beyond the final value, in per cent of the way to it from where the output
+        stood: what is left of the overshoot where a steady error keeps it from the reference.
     settling_time : float
         From when on the output stays within `band` of its mean over the last tenth of the record;
         ``nan`` if it leaves it in that tenth still.
@@ -91,11 +92,15 @@ def step_metrics(
         return StepMetrics(nan, nan, nan, nan, band, nan, nan, runs_away=True, is_settled=False)
     tail = t >= t[-1] - _TAIL * (t[-1] - t[0])
     final = float(np.mean(y[tail]))
+    # A steady error keeps the output from the reference before the step as after it.
+    start = float(values[~later][-1]) if not later.all() else float(y[0])
+    if abs(final - start) <= _ROUNDING * abs(height):
+        start = final
     settling = _settled(t, np.abs(y - final), band, float(t[tail][0]))
     return StepMetrics(
-        rise_time=_rise_time(t, y, before, final),
+        rise_time=_rise_time(t, y, start, final),
         overshoot_percent=_overshoot(y, before, after),
-        overshoot_of_final_percent=_overshoot(y, before, final),
+        overshoot_of_final_percent=_overshoot(y, start, final),
         settling_time=settling,
         band=band,
         steady_error=after - final,

@@ -256,6 +256,26 @@ def test_with_a_steady_error_rise_and_overshoot_of_the_final_value_are_told_besi
     assert down.overshoot_of_final_percent == pytest.approx(found.overshoot_of_final_percent)
 
 
+@pytest.mark.parametrize(("before", "after"), [(60.0, 70.0), (60.0, 50.0), (42.0, 52.0)])
+def test_rise_and_overshoot_count_from_where_a_steady_error_kept_the_output(
+    before: float, after: float
+) -> None:
+    settles = [42 + 0.47 * (reference - 42) for reference in (before, after)]
+    way = 1 - np.exp(-SINCE) * np.cos(2 * SINCE)
+    values = settles[0] + (settles[1] - settles[0]) * way
+    found = step_metrics(LONG, values, at=1.0, before=before, after=after)
+    plain = step_metrics(LONG, way, at=1.0, before=0.0, after=1.0)
+    assert plain.rise_time > 0.3
+    assert plain.overshoot_of_final_percent > 10
+    assert found.rise_time == pytest.approx(plain.rise_time)
+    assert found.overshoot_of_final_percent == pytest.approx(plain.overshoot_of_final_percent)
+
+
+def test_an_output_that_does_not_answer_has_no_rise() -> None:
+    found = step_metrics(LONG, 3 + 1e-12 * np.sin(LONG), at=1.0, before=0.0, after=1.0)
+    assert np.isnan([found.rise_time, found.overshoot_of_final_percent]).all()
+
+
 def test_a_response_that_grows_or_is_not_finite_runs_away() -> None:
     swing: FloatArray = np.exp(0.5 * TIMES) * np.sin(8 * TIMES)
     for values in (1 + swing, np.where(TIMES < 3, swing, np.inf), -0.1 * TIMES):

@@ -94,6 +94,41 @@ def test_without_transport_the_controller_is_a_step_late_and_friction_leaves_an_
     assert "0.00125 s late" in note
 
 
+def test_a_loop_that_is_not_at_rest_when_its_reference_steps_is_told(served: Served) -> None:
+    def told(**step: float) -> list[str]:
+        control = {"input": "u", "output": "y", "gain": 0.2, "reference": {"kind": "step", **step}}
+        body = {"control": control, "samples": 4000, "sample_time": 0.05,
+                "parameters": {"y0": 5.0, "x(0)": 0.0}}  # fmt: skip
+        return list(simulated(served, served.lag, body)["notes"])
+
+    [note] = told(offset=1.0, amplitude=2.0)
+    assert note.startswith("y starts at 5 with a reference of 1 before the step")
+    assert told(offset=5.0, amplitude=2.0) == []  # there the controller asks for nothing
+    assert told(offset=1.0, amplitude=2.0, time=150.0) == []
+    [note] = told(offset=1.0, amplitude=2.0, time=1.0)
+    assert note.startswith("y still moves when the reference steps")
+
+
+@pytest.mark.parametrize("time", [0.0, 1.0])
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_starts_are_those_at_the_first_sample_also_where_a_step_comes(
+    served: Served, time: float, is_closed: bool
+) -> None:
+    step = {"kind": "step", "offset": 1.0, "amplitude": 2.0, "time": time}
+    loop = {"control": {"input": "u", "output": "y", "gain": 0.2, "reference": step}}
+    body = {"samples": 100, "sample_time": 0.05, "parameters": {"y0": 5.0, "x(0)": 1.0}}
+    found = simulated(
+        served, served.lag, {**body, **(loop if is_closed else {"inputs": {"u": step}})}
+    )
+    values, p = np.array(found["outputs"][0]["values"]), found["parameters"]
+    # Until the lag is over the plant is driven by what stood before the start.
+    driven = p["K"] * (0.2 * (1.0 - 6.0) if is_closed else 1.0)
+    times = 0.05 * np.arange(int(p["L"] / 0.05))
+    expected = 5.0 + driven + (1.0 - driven) * np.exp(-times / p["T"])
+    assert values[0] == pytest.approx(6.0)
+    np.testing.assert_allclose(values[: times.size], expected, rtol=1e-4)
+
+
 def test_overridden_parameters_are_used_and_ties_follow_them(served: Served) -> None:
     found = simulated(served, served.arm, {**LOOP, "parameters": {"F_c": 0.0, "k_a": 50.0}})
     assert found["parameters"]["F_c"] == 0.0
