@@ -9,6 +9,7 @@ from sysid.errors import Fault, InvalidModel, InvalidSettings
 from sysid.language.scope import Scope, Timing
 from sysid.language.tree import Expression, Past
 from sysid.models import equations as eq
+from sysid.models.lag_units import check_lag_units
 from sysid.models.model import FixedInitial, Form, Initial, MeasuredInitial, Model, Output, Quantity
 from sysid.models.normal import normal_form
 from sysid.models.polynomial import FIELDS as POLYNOMIAL_FIELDS
@@ -114,6 +115,7 @@ def _equations(reader: Reader, fields: Mapping[str, Any]) -> Model:
     _, trees = eq.equations(reader, fields.get("equations"), scope)
     _, outputs = eq.outputs(reader, fields.get("outputs"), scope, states)
     _check_outputs(reader, outputs, scope)
+    check_lag_units(reader, form, found, (*trees, *(one.expression for one in outputs)))
     starts = initial(reader, fields.get("initial"), scope.states, FixedInitial(0.0))
     settings = solver(reader, fields.get("solver"), form)
     reader.finish()
@@ -208,6 +210,7 @@ def _polynomial(reader: Reader, fields: Mapping[str, Any]) -> Model:
         },
     )
     found_terms = expand(reader, fields, scope)
+    check_lag_units(reader, "difference", found, (found_terms.tree,))
     starts = initial(reader, fields.get("initial"), scope.states, MeasuredInitial())
     settings = solver(reader, fields.get("solver"), "polynomial")
     reader.finish()

@@ -257,3 +257,37 @@ def test_what_is_no_document_is_refused_in_one_line(document: object) -> None:
 def test_documents_beyond_the_limits_are_refused(changes: dict[str, Any], pointer: str) -> None:
     found = faults(CONTINUOUS, **changes)
     assert "at most" in found[pointer]
+
+
+@pytest.mark.parametrize(
+    ("unit", "index", "right"),
+    [
+        ("min", "t - L", "this lag counts seconds: give it in s, or write t - 60*L"),
+        ("ms", "t - 0.1 - L", "this lag counts seconds: give it in s, or write t - 0.001*L"),
+    ],
+)
+def test_a_lag_in_minutes_is_not_read_in_seconds(unit: str, index: str, right: str) -> None:
+    lag = {"L": {"lower": 0, "upper": 1, "unit": unit}, "c": {"lower": 0, "upper": 1}}
+    changed = {"parameters": lag, "equations": {"x": "v", "v": f"q(t) - c*v({index}) - x"}}
+    assert faults(CONTINUOUS, **changed) == {"/parameters/L/unit": f"found {unit!r}, but {right}"}
+    factored = index.replace("L", f"{right.rpartition('- ')[2]}")
+    parse_model(CONTINUOUS | changed | {"equations": {"x": "v", "v": f"q - c*v({factored}) - x"}})
+
+
+@pytest.mark.parametrize(
+    ("unit", "index", "right"),
+    [
+        ("s", "k-1-d", "samples: write d/h, or the unit samples"),
+        ("min", "k-1-d", "samples: write k - 60*d/h, or the unit samples"),
+        ("min", "k-1-d/h", "seconds: give it in s, or write k - 60*d/h"),
+    ],
+)
+def test_a_recursions_lag_in_seconds_is_not_read_in_samples(
+    unit: str, index: str, right: str
+) -> None:
+    changed = {"parameters": {"d": {"lower": 1, "upper": 9, "unit": unit}},
+               "equations": {"x": "0.5*w + w(k-3)", "w": f"x({index})"}}  # fmt: skip
+    told = faults(DISCRETE, **changed)
+    assert told == {"/parameters/d/unit": f"found {unit!r}, but this lag counts {right}"}
+    fits = {"s": "k-1-d/h", "min": "k-1-60*d/h"}[unit]
+    parse_model(DISCRETE | changed | {"equations": {"x": "w", "w": f"x({fits})"}})
