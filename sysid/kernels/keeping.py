@@ -18,7 +18,8 @@ Kind = Literal["o", "loop"]
 
 _MAGIC = b"lagid-kernel-1\n"
 _DIGEST_SIZE = 32
-_MOST_FILES = 2_000  # each update of lagid leaves some fifty behind; the oldest are removed
+_MOST_FILES = 2_000
+"""Each update of lagid leaves some fifty behind; those not used for the longest time go."""
 _OURS = re.compile(r"[0-9a-f]{64}\.(o|loop)")
 _ADVICE = "set LAGID_CACHE_DIR to a folder that this user alone can write to"
 _log = logging.getLogger(__name__)
@@ -62,6 +63,8 @@ def stored(key: str, kind: Kind = "o") -> bytes | None:
             if _belongs_to_another(os.fstat(file.fileno())):
                 return None
             content = file.read()
+        with contextlib.suppress(OSError):  # in a folder that may only be read
+            os.utime(folder / name)  # what is used stays the longest
     except OSError:
         return None
     start = len(_MAGIC) + _DIGEST_SIZE
@@ -123,9 +126,14 @@ def _is_private(folder: Path) -> bool:
 
 
 def _prune(folder: Path) -> None:
-    """Remove the oldest files beyond the most that are kept."""
-    files = [one for one in os.scandir(folder) if _OURS.fullmatch(one.name)]
-    if len(files) > _MOST_FILES:
-        files.sort(key=lambda one: one.stat().st_mtime_ns)
-        for one in files[: len(files) - _MOST_FILES]:
-            os.unlink(one.path)
+    """Remove the files beyond the most that are kept; other processes may do so meanwhile."""
+    files = [one.path for one in os.scandir(folder) if _OURS.fullmatch(one.name)]
+    if len(files) <= _MOST_FILES:
+        return
+    used = []
+    for path in files:
+        with contextlib.suppress(FileNotFoundError):
+            used.append((os.stat(path).st_mtime_ns, path))
+    for _, path in sorted(used)[: len(used) - _MOST_FILES]:
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(path)

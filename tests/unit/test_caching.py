@@ -246,6 +246,38 @@ def test_the_newest_files_are_kept(folder: Path, monkeypatch: pytest.MonkeyPatch
     assert kept == [f"{2:064x}.loop", f"{3:064x}.loop", "a letter.o"]
 
 
+def test_what_is_used_stays_longer_than_what_is_newer(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(keeping, "_MOST_FILES", 2)
+    for number in range(2):
+        keeping.store(f"{number:064x}", b"code", "loop")
+        os.utime(folder / f"{number:064x}.loop", ns=(number, number))
+    assert keeping.stored(f"{0:064x}", "loop") == b"code"
+    keeping.store(f"{2:064x}", b"code", "loop")
+    assert sorted(one.name for one in folder.iterdir()) == [f"{0:064x}.loop", f"{2:064x}.loop"]
+
+
+def test_files_that_another_process_removes_meanwhile_are_no_fault(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(keeping, "_MOST_FILES", 1)
+    monkeypatch.setattr(keeping, "_told", [])
+    for number in range(2):
+        keeping.store(f"{number:064x}", b"code", "loop")
+    listed = os.scandir
+
+    def outrun(at: Path) -> list[os.DirEntry[str]]:
+        found = list(listed(at))
+        for one in found:
+            os.unlink(one.path)
+        return found
+
+    monkeypatch.setattr(keeping.os, "scandir", outrun)
+    keeping.store(f"{2:064x}", b"code", "loop")
+    assert not caplog.records
+
+
 @pytest.mark.slow
 def test_processes_that_compile_at_once_leave_one_whole_file(tmp_path: Path) -> None:
     (tmp_path / "module.py").write_text(MODULE)
