@@ -15,7 +15,7 @@ from service.storage.sessions import Database
 from service.storage.tables import Run
 
 AT_ONCE = 500
-FORMULA = ("=", "+", "-", "@", "\t", "\r")
+FORMULA = (*"=+-@\t\r\n", *"\uff1d\uff0b\uff0d\uff20")  # the last: in full width
 """What a formula begins with, in one spreadsheet or another."""
 _NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
 COLUMNS = ("number", "id", "state", "valid", "best_rms", "fit_estimation", "fit_validation",

@@ -27,6 +27,8 @@ from service.cli.reidentifying import reidentify
 from service.errors import ServiceError
 
 SERVER_FAILS = 500
+NO_TEXT = "surrogates not allowed"
+"""What Python says of words of a command that were typed, or named a file, in another encoding."""
 app = typer.Typer(
     name="lagid",
     help="Identification of nonlinear systems with unknown time lags.",
@@ -89,9 +91,10 @@ def main() -> None:
         sys.stderr.close()
         sys.exit(1)
     except Exception as error:  # the process border; what is no user's mistake goes on as it is
-        if not _is_expected(error):
+        sentence = _sentence(error)
+        if sentence is None:
             raise
-        _end(str(error))
+        _end(sentence)
 
 
 def _usage(error: TyperException) -> str:
@@ -115,12 +118,14 @@ def _end(message: str, code: int = 1) -> None:
     sys.exit(code)
 
 
-def _is_expected(error: Exception) -> bool:
-    """Whether an error was raised on purpose by the core or the storage."""
+def _sentence(error: Exception) -> str | None:
+    """What is told of a user's mistake that the core, the storage or a text's encoding finds."""
     from service.storage.errors import StorageError
     from sysid.errors import SysidError
 
-    return isinstance(error, SysidError | StorageError)
+    if isinstance(error, UnicodeEncodeError) and error.reason == NO_TEXT:
+        return f"{error.object[:200]!r} is not UTF-8 text; write it in UTF-8"
+    return str(error) if isinstance(error, SysidError | StorageError) else None
 
 
 if __name__ == "__main__":

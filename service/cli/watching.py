@@ -76,7 +76,7 @@ class Many:
         if is_over:
             return parts
         pace = self._pace(done["finished"]) if job["state"] == "running" else 0.0
-        parts += [f"{pace:.3g} runs/s"] if pace else []
+        parts += [f"{pace:.3g} runs/s"] if pace > 0 else []
         if done["seconds_left"] is not None:
             parts.append(f"{duration(done['seconds_left'])} left".replace("\u202f", " "))
         return [*parts, *([text] if (text := self._last(done["finished"])) else [])]

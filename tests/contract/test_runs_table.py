@@ -74,7 +74,7 @@ def test_no_text_of_a_user_is_a_formula_in_a_spreadsheet(database: Database) -> 
     cells = [Cell(number=0), Cell(number=1)]
     job = ended(database, cells, {0: EVIL, 1: "-2"})
     assert [one["error"] for one in rows(database, job)] == [f"'{EVIL}", "-2"]
-    for text in ("+1+cmd|' /C calc'!A0", "-2*K", "@SUM(1)", "\t=1", "\r=1"):
+    for text in ("+1+cmd|' /C calc'!A0", "-2*K", "@SUM(1)", "\t=1", "\r=1", "\n=1", "\uff1d1"):
         [row] = rows(database, ended(database, [Cell(number=0)], {0: text}))
         assert row["error"] == f"'{text}".replace("\r", " ")
 

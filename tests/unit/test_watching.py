@@ -83,6 +83,13 @@ def test_the_last_run_is_not_asked_for_at_every_look():
     assert log.asked <= 11
 
 
+def test_a_job_that_began_anew_has_no_pace_below_zero():
+    log = Log()
+    log.show(0, job("running", 30))
+    log.show(10, job("running", 12))
+    assert log.told[-1] == "job_1 running, 12/40 runs"
+
+
 def test_one_run_is_told_with_its_rms():
     log = Log("m")
     log.show(0, job("running", 0, runs=1, generation=12, best_rms=0.5))
