@@ -316,19 +316,6 @@ def test_a_job_file_that_cannot_be_used_is_one_line(
     assert expected in refused(lagid("submit", job, LAGID_URL=server))
 
 
-@pytest.mark.parametrize("words", [["watch"], ["dataset", "add", "d.csv", "--name"]])
-def test_a_word_that_is_no_text_is_one_line(words: list[str], tmp_path: Path) -> None:
-    (tmp_path / "d.csv").write_bytes(recording())
-    done = subprocess.run(
-        [sys.executable, "-m", "service.cli.main", *words, b"\xf6sse"],
-        capture_output=True, text=True, timeout=90, check=False, cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
-    )  # fmt: skip
-    told = refused(done)
-    assert r"\udcf6" in told
-    assert told.endswith("is not UTF-8 text; write it in UTF-8")
-
-
 def test_an_open_event_stream_does_not_hold_up_the_end(tmp_path: Path) -> None:
     port = free_port()
     url = f"http://127.0.0.1:{port}"
