@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 from service import models, warm_starts
 from service.conversion import faults_of
 from service.errors import FieldError
-from service.experiments import experiments_in
+from service.experiments import experiments_in, experiments_named
 from service.named_datasets import dataset_of
 from service.pointers import explained
 from service.record_checks import (
@@ -38,6 +38,7 @@ from sysid.unused import unused
 
 Body = dict[str, Any]
 NOTHING: Set[str] = frozenset()
+MOST_NAMED = 1000  # experiments that are believed before they are known
 MOST_GENES = 10_000_000  # individuals times parameters: 80 MB for each copy of a population
 
 
@@ -136,9 +137,14 @@ class JobChecker:
         return dataset_of(self._session, reference)
 
     def _all_parameters(self, body: Body, model: Model) -> tuple[Parameter, ...]:
-        """The model's parameters, and the initial states to be estimated in each experiment."""
+        """The model's parameters, and the initial states to be estimated in each experiment.
+
+        Of datasets that are missing, or could not be read, as many experiments as are named.
+        """
         found = [self.dataset(reference) for reference in body["datasets"]]
         pieces = sum(experiments_in(one) for one in found if isinstance(one, Dataset))
+        if not all(isinstance(one, Dataset) for one in found):
+            pieces = max(pieces, min(experiments_named(body["parameters"]), MOST_NAMED))
         return (*model.parameters, *initial_parameters(model, pieces))
 
     def _samples(self, body: Body) -> int:

@@ -1,7 +1,7 @@
 """The parameters that a job has: its model's, and the starts of every experiment that it fits."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -35,6 +35,11 @@ def parameters_of_job(
             experiments += experiments_in(repository.get(name))
         except StorageError:
             experiments += 1
-    named = (_NUMBERED.search(name) for name in body.get("parameters", {}))
-    least = max((int(one[1]) for one in named if one), default=1)
-    return (*model.parameters, *initial_parameters(model, max(experiments, least)))
+    experiments = max(experiments, experiments_named(body.get("parameters", {})))
+    return (*model.parameters, *initial_parameters(model, experiments))
+
+
+def experiments_named(parameters: Iterable[str]) -> int:
+    """How many experiments there are at least, by the starts that are named."""
+    named = (_NUMBERED.search(name) for name in parameters)
+    return max((int(one[1]) for one in named if one), default=1)

@@ -56,6 +56,11 @@ def faults(answer: Any) -> dict[str, str]:
         ({"seed": [], "sweep": {"axes": [{"path": "/seed", "range": [0, 900_000]}]}},
          {"/seed", "/sweep/axes"}),
         ({"chanels": {"u": "volts"}, "skip": 10_000}, {"/chanels"}),
+        ({"datasets": 3, "parameters": {one: {"fixed": 1} for one in ("K", "T", "L", "y0")}},
+         {"/datasets"}),
+        ({"datasets": 3, "parameters": {"x(0)[2]": {"fixed": 0}}}, {"/datasets"}),
+        ({"datasets": ["none"], "parameters": {"x(0)[2]": {"fixed": 0}, "x[2]": {"fixed": 0}}},
+         {"/datasets/0", "/parameters/x[2]"}),
     ],
 )  # fmt: skip
 def test_a_job_is_told_all_its_faults_and_none_that_follows_from_another(
