@@ -26,6 +26,8 @@ _APART = 0.05  # of their size: how far the two are set apart at least
 _LEAST = 1e-3  # of the range: values nearer 0 are taken to be of that size
 _MOVED = 0.02, 0.05  # of its size: by how much each of the others is moved
 _SAME = 1e-9  # of the output's size: rounding
+_AT_ONCE = 8  # simulations
+_LOOKED_AT = 10_000  # samples, about, by which what cannot be is ruled out
 _ALONE, _AGAIN = 3, 2  # simulations for a pair, and with the others moved
 
 
@@ -40,8 +42,8 @@ def exchanges(
         Simulations that may be run; pairs beyond are not looked at.
     """
     groups: list[set[int]] = []
-    spent = 0
-    for one, other in _candidates(problem, theta):
+    pairs, spent = _likely(problem, theta, list(_candidates(problem, theta)), most)
+    for one, other in pairs:
         if any({one, other} <= group for group in groups):
             continue
         if most is not None and spent + _ALONE + _AGAIN > most:
@@ -49,9 +51,7 @@ def exchanges(
         found, count = _changes_nothing(problem, theta, one, other)
         spent += count
         if found:
-            joined = [group for group in groups if group & {one, other}]
-            groups = [group for group in groups if not group & {one, other}]
-            groups.append(set().union({one, other}, *joined))
+            groups = _joined(groups, one, other)
     return tuple(sorted(tuple(sorted(group)) for group in groups)), spent
 
 
@@ -102,6 +102,64 @@ def _candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[int, int]
         in_lags = [problem.space[d].name in lagged for d in (i, j)]
         if in_lags[0] == in_lags[1] and not (scaled[i] or scaled[j]):
             yield i, j
+
+
+def _joined(groups: list[set[int]], one: int, other: int) -> list[set[int]]:
+    """Groups with two members in one of them."""
+    near = [group for group in groups if group & {one, other}]
+    far = [group for group in groups if not group & {one, other}]
+    return [*far, set().union({one, other}, *near)]
+
+
+def _likely(
+    problem: Problem, theta: FloatArray, pairs: list[tuple[int, int]], most: int | None
+) -> tuple[list[tuple[int, int]], int]:
+    """Pairs without those that a simulation for each parameter rules out, and how many it took.
+
+    For each pair it would be several: of 24 gains hundreds. Where all have one value a little more
+    of either of two that can be exchanged has the same effect.
+    """
+    groups: list[set[int]] = []
+    for pair in pairs:
+        groups = _joined(groups, *pair)
+    kept, spent = list(pairs), 0
+    for group in groups:
+        members = sorted(group)
+        low = float(np.max(problem.evaluator.lower[members]))
+        high = float(np.min(problem.evaluator.upper[members]))
+        if (
+            len(members) <= _ALONE
+            or low >= high
+            or (most is not None and spent + len(group) > most)
+        ):
+            continue
+        spent += len(members)
+        answers = _answers(problem, theta, members, low, high)
+        kept = [
+            (i, j) for i, j in kept
+            if i not in group or not np.isfinite([answers[i], answers[j]]).all()
+            or _is_same(answers[i], answers[j])
+        ]  # fmt: skip
+    return kept, spent
+
+
+def _answers(
+    problem: Problem, theta: FloatArray, members: list[int], low: float, high: float
+) -> dict[int, FloatArray]:
+    """For each of some parameters the output, in part, with all at one value and it a bit above."""
+    value = float(np.median(theta[members]))
+    more = _APART * float(_size(np.array(value), high - low))
+    value = min(max(value, low), high - more)
+    found: dict[int, FloatArray] = {}
+    for first in range(0, len(members), _AT_ONCE):  # of a long record there is no room for all
+        some = members[first : first + _AT_ONCE]
+        tried = np.repeat(theta[None], len(some), axis=0)
+        tried[:, members] = value
+        tried[np.arange(len(some)), some] += more
+        outputs = problem.predictions(tried)
+        step = max(1, outputs.shape[1] // _LOOKED_AT)
+        found |= dict(zip(some, outputs[:, ::step].copy(), strict=True))
+    return found
 
 
 def _changes_nothing(problem: Problem, theta: FloatArray, one: int, other: int) -> tuple[bool, int]:

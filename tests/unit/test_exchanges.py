@@ -131,6 +131,42 @@ def test_three_in_a_row_are_one_group() -> None:
     assert exchange_notes(posed, groups, {"T1", "T2"}) == ()
 
 
+def test_of_many_parameters_most_pairs_are_ruled_out_by_one_simulation_of_each() -> None:
+    gains = [f"g{i}" for i in range(12)]
+    made = parse_model({
+        "name": "many", "form": "differential", "inputs": {"u": "V"},
+        "states": {"x": "V", "y": "V"},
+        "parameters": dict.fromkeys(("T1", "T2"), SPAN)
+        | {name: {"lower": -1, "upper": 1} for name in gains},
+        "equations": {
+            "x": f"({' + '.join(f'g{i}*tanh({i + 1}*u)' for i in range(12))} - x)/T1",
+            "y": "(x - y)/T2",
+        },
+        "outputs": {"z": "y"}, "initial": {"x": 0, "y": 0},
+    })  # fmt: skip
+    posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
+    values = {"T1": 1.5, "T2": 0.5} | dict(zip(gains, np.linspace(-0.5, 0.6, 12), strict=True))
+    theta = np.array([values[one.name] for one in posed.space])
+    found, spent = exchanges(posed, theta)
+    assert [[posed.space[d].name for d in group] for group in found] == [["T1", "T2"]]
+    assert spent == 12 + 5  # of three for each of 67 pairs
+
+
+def test_four_in_a_row_are_one_group_though_looked_at_together_first() -> None:
+    names = ["T1", "T2", "T3", "T4"]
+    made = parse_model({
+        "name": "four", "form": "differential", "inputs": {"u": "V"},
+        "states": dict.fromkeys("abcd", "V"), "parameters": dict.fromkeys(names, SPAN),
+        "equations": {"a": "(u - a)/T1", "b": "(a - b)/T2", "c": "(b - c)/T3", "d": "(c - d)/T4"},
+        "outputs": {"z": "d"}, "initial": dict.fromkeys("abcd", 0),
+    })  # fmt: skip
+    posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
+    found, spent = exchanges(posed, np.array([0.4, 1.0, 2.0, 0.7]))
+    assert found == ((0, 1, 2, 3),)
+    assert spent == 4 + 3 * 5
+    assert exchanges(posed, np.array([0.4, 1.0, 2.0, 0.7]), 8)[1] <= 8
+
+
 def test_whatever_the_seed_the_larger_comes_first_and_it_is_told() -> None:
     found = [
         identify(model("in series"), recorded("in series"), GeneticAlgorithm(islands=2), seed=seed)
