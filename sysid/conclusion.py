@@ -10,6 +10,7 @@ import numpy as np
 from sysid.deadline import Clock, Deadline
 from sysid.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.exchanges import exchange_notes, exchanges, ordered
+from sysid.feedback import feedback_notes
 from sysid.islands.archipelago import analysis_budget, of_island
 from sysid.islands.run_state import RunState
 from sysid.metrics import Metrics
@@ -19,7 +20,7 @@ from sysid.onset import onset_delays
 from sysid.problem import Problem, metrics_of
 from sysid.records import common_sample_time
 from sysid.refinement import Refined, refine
-from sysid.residuals import ResidualTests, residual_tests
+from sysid.residuals import ResidualTests, residual_tests, series_of
 from sysid.result import Estimate, Identification, Improvement, IslandSummary
 from sysid.settings import GeneticAlgorithm
 from sysid.step_check import step_notes
@@ -102,6 +103,7 @@ def _concluded(
                 {one.name for one in analysis.estimates if one.stderr is not None},
             ),
             *time_notes(any(end.is_cut_short for end in refined if end is not None)),
+            *_feedback(problem, simulated, analysis),
             *step_notes(problem, theta, analysis.estimates, simulated, deadline.is_past_grace),
             *noise_notes(problem, times, noise.is_complete),
         ),
@@ -113,6 +115,14 @@ def _concluded(
         holds={one.name: one.hold for one in problem.records[0].inputs},
         sample_time=common_sample_time(problem.records),
     )
+
+
+def _feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -> list[str]:
+    """Whether a controller made an input; past white residuals it does the estimates no harm."""
+    known = analysis.uncertainty
+    if known is not None and known.noise_colour == "white":
+        return []
+    return feedback_notes(series_of(problem, simulated))
 
 
 def _estimated(

@@ -1,0 +1,114 @@
+"""An input that a controller makes from the output is recognised; one of an open loop is not."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from sysid import Channel, Record, identify, load_model
+from sysid.feedback import feedback_notes, share_told
+from sysid.residuals import Series
+from sysid.types import FloatArray
+
+N, STEP, LATE = 1500, 0.1, 20  # samples, s, samples of dead time
+TIMES = STEP * np.arange(N)
+
+
+def loop(seed: int, reference: FloatArray, quantum: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Input and output of K = 2, T = 8 s, L = 2 s under PI control with a slow disturbance."""
+    draws = np.random.default_rng(seed)
+    keep, state, total, slow = np.exp(-STEP / 8.0), 0.0, 0.0, 0.0
+    u, y = np.zeros(N), np.zeros(N)
+    for k in range(N):
+        slow = 0.97 * slow + draws.normal(0, 0.15)
+        y[k] = state + slow + draws.normal(0, 0.05)
+        total += STEP * (reference[k] - y[k])
+        u[k] = 1.2 * (reference[k] - y[k]) + 0.15 * total
+        if quantum:
+            u[k] = quantum * np.round(u[k] / quantum)
+        state = keep * state + (1 - keep) * 2.0 * (u[k - LATE] if k >= LATE else 0.0)
+    return u, y
+
+
+def held(u: FloatArray) -> Channel:
+    return Channel("u", TIMES, u, hold="zero")
+
+
+def series(residual: FloatArray, hidden: int | None = None) -> Series:
+    scored = np.ones(N, dtype=np.bool_)
+    if hidden is not None:
+        scored[hidden::37] = False
+    return Series(0, "y", TIMES, residual, scored, 1.0, ())
+
+
+def delayed(u: FloatArray, gain: float = 2.0) -> FloatArray:
+    """Free run of the plant with a given gain."""
+    keep, y = np.exp(-STEP / 8.0), np.zeros(N)
+    for k in range(1, N):
+        past = u[k - 1 - LATE] if k > LATE else 0.0
+        y[k] = keep * y[k - 1] + (1 - keep) * gain * past
+    return y
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("quantum", [0.0, 0.1])
+@pytest.mark.parametrize("height", [0.0, 5.0])
+@pytest.mark.parametrize("gain", [2.0, 1.0])
+def test_a_loop_is_recognised_with_and_without_reference_and_with_a_poor_model(
+    seed: int, quantum: float, height: float, gain: float
+) -> None:
+    u, y = loop(seed, height * ((TIMES // 15) % 2), quantum)
+    assert share_told(series(y - delayed(u, gain)), held(u)) > 0.8
+    assert share_told(series(y - delayed(u, gain), hidden=5), held(u)) > 0.8
+
+
+def wave(of: Callable[[FloatArray, np.random.Generator], FloatArray], seed: int) -> FloatArray:
+    return of(TIMES, np.random.default_rng(seed))
+
+
+INPUTS: dict[str, Callable[[FloatArray, np.random.Generator], FloatArray]] = {
+    "sine": lambda t, _: np.sin(t),
+    "square": lambda t, _: np.sign(np.sin(2 * np.pi * t / 6)),
+    "multisine": lambda t, _: sum(
+        (np.cos(2 * np.pi * k * t / 40 + k * k) for k in range(1, 41)), np.zeros(t.size)
+    ),
+    "chirp": lambda t, _: np.sin(0.05 * t**2),
+    "trapezium": lambda t, _: np.clip(3 * np.sin(2 * np.pi * t / 17), -1, 1),
+    "binary": lambda t, g: np.repeat(g.choice([-1.0, 1.0], t.size // 8 + 1), 8)[: t.size],
+    "white": lambda t, g: g.normal(size=t.size),
+    "filtered": lambda t, g: np.convolve(g.normal(size=t.size), np.ones(10) / 10, "same"),
+    "walk": lambda t, g: np.cumsum(g.normal(size=t.size)),
+}
+
+
+@pytest.mark.parametrize("name", INPUTS)
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+@pytest.mark.parametrize("hold", ["zero", "first"])
+def test_an_open_loop_is_not_taken_for_one_however_poor_the_model(
+    name: str, noise: float, hold: Literal["zero", "first"]
+) -> None:
+    for seed in range(3):
+        u = wave(INPUTS[name], seed)
+        draws = np.random.default_rng(seed + 9)
+        misfit = delayed(u) - delayed(u, gain=1.0) ** 2 + noise * np.std(u) * draws.normal(size=N)
+        assert share_told(series(misfit), Channel("u", TIMES, u, hold=hold)) < 0.3
+
+
+def test_too_short_constant_and_irregular_records_are_not_judged() -> None:
+    u, y = loop(0, np.zeros(N))
+    judged = series(y - delayed(u))
+    assert share_told(judged, held(np.ones(N))) == 0.0
+    assert share_told(judged._replace(residual=np.zeros(N)), held(u)) == 0.0
+    short = judged.scored & (TIMES < 5.0)
+    assert share_told(judged._replace(scored=short), held(u)) == 0.0
+    uneven = TIMES + 0.04 * np.random.default_rng(0).random(N)
+    assert share_told(judged._replace(times=uneven), held(u)) == 0.0
+
+
+def test_a_regulated_record_without_reference_is_warned_of() -> None:
+    u, y = loop(1, np.zeros(N))
+    found = identify(load_model("fopdt"), [Record((held(u),), (Channel("y", TIMES, y),))], seed=1)
+    [note] = [one for one in found.warnings if "closed loop" in one]
+    assert note.startswith("input 'u' follows the residuals of y: they tell")
+    assert feedback_notes([]) == []
