@@ -52,7 +52,13 @@ def exchanges(
         spent += count
         if found:
             groups = _joined(groups, one, other)
-    return tuple(sorted(tuple(sorted(group)) for group in groups)), spent
+    found = sorted(tuple(sorted(group)) for group in groups)
+    return tuple(one for one in found if _is_falling(ordered(problem, theta, (one,)), one)), spent
+
+
+def _is_falling(theta: FloatArray, group: tuple[int, ...]) -> bool:
+    """Whether bounds let a group be put in order: those of some pairs do not need to be of all."""
+    return bool(np.all(np.diff(theta[list(group)]) <= 0.0))
 
 
 def ordered(problem: Problem, theta: FloatArray, groups: Exchanges) -> FloatArray:

@@ -131,6 +131,21 @@ def test_three_in_a_row_are_one_group() -> None:
     assert exchange_notes(posed, groups, {"T1", "T2"}) == ()
 
 
+def test_what_no_bounds_let_be_put_in_order_is_not_said_to_be() -> None:
+    spans = {"T1": (0.1, 1.2), "T2": (0.1, 5.0), "T3": (0.9, 5.0)}
+    made = parse_model({
+        "name": "three", "form": "differential", "inputs": {"u": "V"},
+        "states": {"x": "V", "y": "V", "w": "V"},
+        "parameters": {k: {"lower": low, "upper": up, "unit": "s"}
+                       for k, (low, up) in spans.items()},
+        "equations": {"x": "(u - x)/T1", "y": "(x - y)/T2", "w": "(y - w)/T3"},
+        "outputs": {"z": "w"}, "initial": {"x": 0, "y": 0, "w": 0},
+    })  # fmt: skip
+    posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
+    assert exchanges(posed, np.array([1.0, 1.1, 3.0]))[0] == ()  # T1 cannot be 3
+    assert exchanges(posed, np.array([1.15, 1.1, 1.0]))[0] == ((0, 1, 2),)
+
+
 def test_of_many_parameters_most_pairs_are_ruled_out_by_one_simulation_of_each() -> None:
     gains = [f"g{i}" for i in range(12)]
     made = parse_model({
