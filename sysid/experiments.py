@@ -77,7 +77,13 @@ def output_weights(
 
 def _reciprocal_deviation(name: str, records: Sequence[Record], skip: int) -> float:
     values = np.concatenate([_channel(r.outputs, name, "output").values[skip:] for r in records])
-    deviation = float(np.std(values[np.isfinite(values)])) if np.any(np.isfinite(values)) else 0.0
+    seen = values[np.isfinite(values)]
+    if not seen.size:
+        raise InvalidRecord(
+            f"output {name!r} has no value after the first {skip} samples, so nothing is left to "
+            "compare with; give a smaller skip, or a longer record"
+        )
+    deviation = float(np.std(seen))
     if deviation == 0.0:
         raise InvalidRecord(
             f"output {name!r} is constant, so its standard deviation gives no weight; "

@@ -13,8 +13,11 @@ INVALID = 422
 INSIDE = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: where a field of a name is, and what in a value of an axis is wrong."""
 
-SETTING = re.compile(r"\b(\w+): \{([^{}:]+): ([^{}:,]+)\}")
-"""A field of a job in a note, as a job file has it: ``loss: {noise_model: ar1}``."""
+SETTING = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)\}")
+"""A field of a job in a note, as a job file has it: ``loss: {noise_model: ar1}``.
+
+What the model is to be given is a field of its document, which no option sets.
+"""
 
 
 @dataclass(frozen=True, slots=True)

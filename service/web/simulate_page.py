@@ -178,7 +178,8 @@ def _units(model: Model, request: Mapping[str, Any], fitted: Dataset | None) -> 
 
 
 def _defaults(model: Model, request: Mapping[str, Any], fitted: Dataset | None) -> dict[str, str]:
-    period = (fitted.sample_time if fitted else None) or model.solver.step or 0.01
+    period = (fitted.sample_time or _mean_period(fitted)) if fitted else None
+    period = period or model.solver.step or 0.01
     duration = min(fitted.duration if fitted else 10.0, MOST_DEFAULT_SAMPLES * period)
     channels = request.get("channels", {})
     return {
@@ -187,6 +188,13 @@ def _defaults(model: Model, request: Mapping[str, Any], fitted: Dataset | None) 
         "duration": f"{duration:.6g}", "sample_time": f"{period:.6g}",
         **{f"channel.{name}": channels.get(name, name) for name in chain(*signals_of(model))},
     }  # fmt: skip
+
+
+def _mean_period(irregular: Dataset) -> float | None:
+    """A period (s) for a recording that has none: of as many samples over the same time."""
+    if irregular.n_samples < 2 or not irregular.duration > 0:
+        return None
+    return float(f"{irregular.duration / (irregular.n_samples - 1):.2g}")
 
 
 def _step(model: Model, run: Run) -> dict[str, str]:

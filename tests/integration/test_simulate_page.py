@@ -12,8 +12,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
+from service.storage.tables import Dataset
 from service.turns import AT_ONCE, WAITING, simulating
-from service.web.simulate_page import _Known
+from service.web.simulate_page import _defaults, _Known
 from sysid import refinement
 from sysid.models.library import load_model
 from sysid.problem import Problem
@@ -144,6 +145,14 @@ def test_the_form_is_shown_with_the_values_of_the_run(place: Place) -> None:
     assert 'name="sample_time" value="0.1"' in answer.text
     assert "figure-simulation" not in answer.text
     assert f'href="/runs/{place.run}/simulate"' in place.client.get(f"/runs/{place.run}").text
+
+
+def test_of_an_irregular_recording_the_form_suggests_its_own_duration_and_density() -> None:
+    oven = Dataset(n_samples=586, duration=3600.0, sample_time=None, channels=[])
+    found = _defaults(load_model("fopdt"), {}, oven)
+    assert (found["duration"], found["sample_time"]) == ("3600", "6.2")
+    single = Dataset(n_samples=1, duration=0.0, sample_time=None, channels=[])
+    assert _defaults(load_model("fopdt"), {}, single)["sample_time"] == "0.01"
 
 
 def test_the_form_suggests_a_step_within_what_was_measured(place: Place) -> None:

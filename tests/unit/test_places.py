@@ -84,6 +84,7 @@ def test_a_number_that_is_none_is_wrong_usage_at_its_option(
 
 
 WHITE = "if it is the noise that is coloured, use loss: {noise_model: ar1}"
+MODEL = "with half of it L = 1 s instead of 2 s; give the model solver: {substeps: 8}"
 HELD = "if it was held, use hold: {u: zero}"
 
 
@@ -93,6 +94,7 @@ HELD = "if it was held, use hold: {u: zero}"
         (identify.PLACES, WHITE, ", use --noise-model ar1"),
         (identify.PLACES, HELD, ", use --set hold.u=zero"),
         (Places(), WHITE, ", use --set loss.noise_model=ar1"),
+        (identify.PLACES, MODEL, "give the model solver: {substeps: 8}"),
         (Places(), "a set {1: 2} of pairs: {a, b}", "a set {1: 2} of pairs: {a, b}"),
     ],
 )

@@ -88,6 +88,12 @@ def test_outputs_are_weighted_by_their_deviation_or_as_asked() -> None:
     assert chosen.fitness(theta)[0] == pytest.approx(expected)
 
 
+def test_outputs_of_which_every_sample_is_skipped_are_not_called_constant() -> None:
+    model = differential({"x": "(u(t) - x)*b"}, "x", outputs={"y": "x", "z": "2*x"})
+    with pytest.raises(InvalidRecord, match="'y' has no value after the first 9999 samples"):
+        Problem.build(model, [record(outputs=("y", "z"))], skip=9999)
+
+
 def test_channels_are_found_by_name_and_others_are_ignored() -> None:
     data = record()
     times = data.inputs[0].times
