@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from math import inf
 
 from sysid.language.intervals import Interval, bounds
-from sysid.language.tree import Binary, Call, Expression, Past, Unary
+from sysid.language.tree import Binary, Call, Expression, Number, Past, Unary
 from sysid.models.lags import longest_lag, past_signals
 from sysid.models.sections import interval
 from sysid.parameters import Parameter
@@ -75,10 +75,19 @@ def _divisors(tree: Expression) -> Iterator[Expression]:
     match tree:
         case Binary("/", _, divisor):
             yield divisor
+            if isinstance(divisor, Binary) and divisor.operator == "**":
+                yield divisor.left  # whose square would pass 0 without a change of its sign
+        case Binary("**", base, exponent) if not _is_whole(exponent):
+            yield base
         case Call("sqrt" | "log", (argument,)):
             yield argument
     for one in _parts(tree):
         yield from _divisors(one)
+
+
+def _is_whole(exponent: Expression) -> bool:
+    """Whether any base, of either sign and 0, has such a power."""
+    return isinstance(exponent, Number) and exponent.value >= 0 and exponent.value % 1 == 0
 
 
 def _parts(tree: Expression) -> tuple[Expression, ...]:

@@ -137,3 +137,21 @@ def test_of_two_lags_in_a_row_each_may_take_what_the_other_leaves() -> None:
     first, second = (reach(made, one) for one in made.space)
     assert first[0] == pytest.approx(0.1, abs=1e-6)
     assert second[0] == pytest.approx(-0.2, abs=1e-6)
+
+
+@pytest.mark.parametrize(("equation", "span", "expected"), [
+    ("(u - x)/c**2", (-2.0, -1.0), (-np.inf, 0.0)),
+    ("(u - x)*c**-2", (1.0, 2.0), (0.0, np.inf)),
+    ("u - c**0.5*x", (1.0, 2.0), (0.0, np.inf)),
+    ("u - c**3*x", (1.0, 2.0), ANYWHERE),
+])  # fmt: skip
+def test_a_base_keeps_its_sign_where_its_power_needs_one(
+    equation: str, span: tuple[float, float], expected: tuple[float, float]
+) -> None:
+    model = parse_model({
+        "name": "power", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "V"},
+        "parameters": {"c": {"lower": span[0], "upper": span[1]}}, "equations": {"x": equation},
+        "outputs": {"y": "x"}, "initial": {"x": 0},
+    })  # fmt: skip
+    problem = Problem.build(model, [Record((U,), (Channel("y", TIMES, np.sin(TIMES), "V"),))])
+    assert reach(problem, problem.space[0]) == expected
