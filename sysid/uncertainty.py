@@ -84,7 +84,7 @@ class _Directions:
     """Singular values and directions of the sensitivities, over the places.
 
     `null` are those along which the output does not change, `weak` those of which the data say
-    little; `member` marks the parameters that `null` moves.
+    little; `member` marks the parameters that `null` moves, `vague` those that are not told well.
     """
 
     singular: FloatArray
@@ -92,6 +92,7 @@ class _Directions:
     null: BoolArray
     weak: BoolArray
     member: BoolArray
+    vague: BoolArray
 
 
 def analyse(
@@ -162,7 +163,8 @@ def _analysed(
     member |= np.any(shifts != 0.0, axis=0)
     spread = np.sqrt(np.maximum(np.einsum("id,de,ie->i", rows, covariance, rows), 0.0))
     weak = kept & ((spread >= _SAYS_NOTHING) | (noise >= _SAYS_NOTHING * singular))
-    directions = _Directions(singular, rows, ~kept, weak, member)
+    vague = np.diag(covariance) >= _SAYS_NOTHING**2
+    directions = _Directions(singular, rows, ~kept, weak, member, vague)
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
     found = _blocks(directions)
     names = tuple(p.name for p in problem.space)
@@ -239,7 +241,9 @@ def _blocks(directions: _Directions) -> tuple[Block, ...]:
     if not directions.weak.any():
         return found
     weak = directions.rows[directions.weak]
-    member = np.any(weak**2 > _WEAK_MEMBER, axis=0) & ~directions.member
+    # One that has a small part in a direction of which nothing is known is not known either.
+    has_part = np.any(weak**2 > _WEAK_MEMBER, axis=0) | directions.vague
+    member = has_part & ~directions.member
     return found + tuple(one for one in blocks(weak, member) if one.basis.size)
 
 

@@ -104,6 +104,23 @@ def test_intervals_that_a_short_exact_output_tells_cover_the_truth() -> None:
     assert np.sum(covered[:3]) >= 0.93 * 3 * draws
 
 
+def test_what_has_a_small_part_in_an_unknown_direction_is_not_identified() -> None:
+    spans = {"a": (0.1, 5.0), "b": (0.1, 5.0), "T": (0.1, 3.0)}
+    model = parse_model({
+        "name": "two", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
+        "parameters": {name: {"lower": low, "upper": up} for name, (low, up) in spans.items()},
+        "equations": {"x": "(u - x)/T"}, "outputs": {"y": "a*x", "z": "b*x"}, "initial": {"x": 0},
+    })  # fmt: skip
+    times = 0.1 * np.arange(3.0)
+    noise = np.random.default_rng(3).normal(0, 0.1, 3)
+    data = tuple(Channel(name, times, np.sin(times) + noise, "m") for name in "yz")
+    problem = Problem.build(model, [Record((Channel("u", times, np.sin(1.3 * times)),), data)])
+    for one in analyse(problem, np.array([5.0, 5.0, 0.635])).estimates:
+        assert one.stderr is not None
+        assert one.stderr > one.upper - one.lower
+        assert one.status in ("group", "unidentifiable"), one
+
+
 def test_standard_errors_beside_the_jumps_of_coulomb_friction_are_those_of_repetition() -> None:
     values, errors = [], []
     for seed in range(40):
