@@ -52,8 +52,8 @@ def exchanges(
         spent += count
         if found:
             groups = _joined(groups, one, other)
-    found = sorted(tuple(sorted(group)) for group in groups)
-    return tuple(one for one in found if _is_falling(ordered(problem, theta, (one,)), one)), spent
+    every = sorted(tuple(sorted(group)) for group in groups)
+    return tuple(one for one in every if _is_falling(ordered(problem, theta, (one,)), one)), spent
 
 
 def _is_falling(theta: FloatArray, group: tuple[int, ...]) -> bool:
