@@ -111,7 +111,7 @@ def _field(column: Column, text: str, convert: Callable[[str], float], row: int)
         value = convert(text) if text.strip() else float("nan")
     except ValueError:
         raise InvalidUpload(
-            f"found {_shortened(text)}, which is not a number{_hint(text, column)}",
+            f"found {_shortened(text)}, which is not a number{_hint(text, column, convert)}",
             row=row, column=column.name,
         ) from None  # fmt: skip
     if isinf(value):
@@ -143,7 +143,9 @@ def _shortened(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def _hint(text: str, column: Column) -> str:
+def _hint(text: str, column: Column, convert: Callable[[str], float]) -> str:
+    if convert is _decimal_comma and "." in text and not any(map(str.isalpha, text)):
+        return "; decimal points and commas are mixed: other numbers of the file have commas"
     if "," in text and "." in text:
         return "; decimal points and commas are mixed"
     if column.role == "time":

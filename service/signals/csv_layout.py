@@ -8,10 +8,13 @@ from typing import Literal
 
 from service.signals.errors import InvalidUpload
 from sysid.errors import nearest
+from sysid.units import factor
 
 SEPARATORS = ("\t", ";", ",")
 TIME_NAMES = ("t", "t_s", "time", "time_s")
 SECONDS = ("", "s", "sec", "second", "seconds")
+LONGEST_TIME_UNIT = 86_400.0
+"""Seconds of a day: a longer unit is a slip."""
 
 _UNIT = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$")
 _DECIMAL_COMMA = re.compile(r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$")
@@ -138,8 +141,19 @@ def _check_time(
             "the file has this time column and sample_time is given too; leave one out",
             row=1, column=name,
         )  # fmt: skip
-    if unit.lower() not in SECONDS:
-        raise InvalidUpload(f"times are in [{unit}]; need seconds", row=1, column=name)
+    if seconds_in(unit) is None:
+        raise InvalidUpload(
+            f"times are in [{unit}]; need seconds, or another unit of time such as [ms] or [min]",
+            row=1, column=name,
+        )  # fmt: skip
+
+
+def seconds_in(unit: str) -> float | None:
+    """Seconds in one unit of a time column; None if it is no unit of time."""
+    if unit.lower() in SECONDS:
+        return 1.0
+    found = factor(unit, "s")
+    return found if found is not None and 0 < found <= LONGEST_TIME_UNIT else None
 
 
 def _has_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:

@@ -1,11 +1,12 @@
 """CSV files as recordings.
 
-The rules. The first column is ``t`` (also ``t_s``, ``time``, ``t [s]``) in seconds, or the
-sampling period is given. The header may carry a unit in brackets (``u [V]``). Comma, semicolon
-and tab separate; decimal commas are detected where the separator is not a comma. UTF-8, with or
-without a byte-order mark. An empty field or ``nan`` is a missing value: it is reported, an output
-is not scored there, and an input with one cannot be used. Times must grow, except from one
-segment to the next. Irregular times are kept as they are, never resampled.
+The rules. The first column is ``t`` (also ``t_s``, ``time``, ``t [s]``) in seconds, or in the unit
+of time that its heading names (``t [min]``), or the sampling period is given. The header may carry
+a unit in brackets (``u [V]``). Comma, semicolon and tab separate; decimal commas are detected where
+the separator is not a comma. UTF-8, with or without a byte-order mark. An empty field or ``nan`` is
+a missing value: it is reported, an output is not scored there, and an input with one cannot be
+used. Times must grow, except from one segment to the next. Irregular times are kept as they are,
+never resampled.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,7 +19,7 @@ from typing import BinaryIO, cast
 import numpy as np
 
 from service.signals.csv_columns import Table, Values, read_columns
-from service.signals.csv_layout import Layout, find_layout
+from service.signals.csv_layout import Layout, find_layout, seconds_in
 from service.signals.errors import InvalidUpload
 from service.signals.segments import Labels, lay_out
 from sysid.records import Channel, Recording, Segment, sampling_of
@@ -127,7 +128,7 @@ def _times(
         times = np.concatenate(counts) * sample_time
     else:
         name = layout.columns[place].name
-        times = table.numbers(name)
+        times = _in_seconds(table.numbers(name), layout.columns[place].unit, notes)
         _check_growth(times, starts, table, name)
         _report_shared(times, starts, notes)
         times = _from_the_start(times, notes)
@@ -159,6 +160,16 @@ def _labels(column: Values) -> list[float | str]:
     except ValueError:
         return list(texts)
     return list(numbers) if np.isfinite(numbers).all() else list(texts)
+
+
+def _in_seconds(times: FloatArray, unit: str, notes: list[str]) -> FloatArray:
+    size = seconds_in(unit) or 1.0
+    if size == 1.0:
+        return times
+    notes.append(f"times were converted from {unit} to s: lags and time constants are in s")
+    # A product with a whole number of units per second would not be the double nearest to it.
+    converted: FloatArray = times * size if size > 1.0 else times / round(1.0 / size)
+    return converted
 
 
 def _check_growth(times: FloatArray, starts: IntArray, table: Table, name: str) -> None:

@@ -32,6 +32,17 @@ def test_the_time_column_goes_by_several_names(name: str) -> None:
     assert recording.names == ("u",)
 
 
+@pytest.mark.parametrize(
+    ("unit", "row", "seconds"), [("min", 0.1, 6.0), ("ms", 3.0, 0.003), ("h", 0.5, 1800.0),
+                                 ("Sec", 3.0, 3.0)],
+)  # fmt: skip
+def test_times_in_another_unit_become_seconds(unit: str, row: float, seconds: float) -> None:
+    recording, notes = read_csv(f"t [{unit}],u\n0,1\n{row},2\n{2 * row},3\n".encode())
+    assert recording.channel("u").times.tolist() == [0.0, seconds, 2 * seconds]
+    told = f"times were converted from {unit} to s: lags and time constants are in s"
+    assert notes == (() if unit == "Sec" else (told,))
+
+
 def test_a_unit_that_is_part_of_a_name_stays_in_the_name() -> None:
     recording, _ = read_csv(b"t_s,P1_true_Pa\n0,1\n1,2\n")
     assert recording.names == ("P1_true_Pa",)
@@ -142,7 +153,10 @@ def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, word
         ("1,2\n3,4\n", "header"),
         ("a,u\n0,1\n", "no time column"),
         ("t,\n0,1\n", "has no name"),
-        ("t [ms],u\n0,1\n", "need seconds"),
+        ("t [V],u\n0,1\n", "times are in [V]; need seconds, or another unit of time"),
+        ("t [Hz],u\n0,1\n", "need seconds"),
+        ("t;u\n0.5;1,5\n", "other numbers of the file have commas"),
+        ("t;u\n1,5;2,5\n2,5;abc.d\n", "name columns of labels"),
         ("t,u,u\n0,1,2\n", "names must differ"),
         ("t,u\n0,1\n1\n", "has 1 fields, but the header has 2"),
         ("t,u\n0,1\n1,2,3\n", "has 3 fields, but the header has 2"),
