@@ -81,7 +81,8 @@ def problem(
         content["errors"] = [
             {**one, "detail": _short(one["detail"], MOST_CHARACTERS)} for one in told
         ]
-    return _Problem(content, status, dict(headers or {}), media_type=PROBLEM_TYPE)
+    given = {"Vary": "Accept", **(headers or {})}  # no cache gives it to who asks for a page
+    return _Problem(content, status, given, media_type=PROBLEM_TYPE)
 
 
 class _Problem(JSONResponse):

@@ -216,6 +216,7 @@ def test_what_scripts_load_has_a_problem_document_also_in_a_browser(
 ) -> None:
     answer = client.get(path, headers={"accept": "text/html,*/*;q=0.8"})
     assert answer.headers["content-type"] == "application/problem+json"
+    assert answer.headers["vary"] == "Accept"
 
 
 def test_every_column_of_a_page_has_a_heading() -> None:
