@@ -8,8 +8,10 @@ An input is told by its own past as far as that goes (least squares, 25 samples)
 once with the residuals of now and the last three samples. What they tell of the rest is compared
 with `_CLEAR`. Samples at which the input does what its past tells least, a tenth of them, are left
 out: there a reference has jumped. An input whose past tells all of it, such as a sine, or one that
-is held between jumps, leaves no rest, and nothing is said. Nor is it where residuals are white: the
-noise of now does not tell what the input was, and a free run's estimates are unbiased.
+is held between jumps, leaves no rest, and nothing is said. One that is read as straight between its
+samples moves the output by the next one: there what a model misses looks the same, where noise is
+small beside it, and both are told. Nothing is said where residuals are white either: the noise of
+now does not tell what the input was, and a free run's estimates are unbiased.
 """
 
 from collections.abc import Iterable
@@ -34,20 +36,34 @@ _EACH = 4  # samples for each coefficient, at least
 
 def feedback_notes(series: Iterable[Series]) -> list[str]:
     """What to say of inputs that follow the residuals of an output, each pair once."""
-    found: dict[tuple[str, str], float] = {}
+    found: dict[tuple[str, str], tuple[float, Channel]] = {}
     for one in series:
         for channel in one.inputs:
-            pair = (channel.name, one.output)
-            found[pair] = max(found.get(pair, 0.0), share_told(one, channel))
+            pair, share = (channel.name, one.output), share_told(one, channel)
+            if pair not in found or share > found[pair][0]:
+                found[pair] = share, channel
     return [
         f"input {name!r} follows the residuals of {output}: they tell {100 * share:.0f} % of what "
-        "its own past does not. In a closed loop noise drives the input, the estimates lean "
-        "towards minus the inverse of the controller, and standard errors do not tell that: let "
-        "the reference excite the loop, or identify in an open one. If there is no controller, "
-        "the output answers at once and the model does not"
-        for (name, output), share in found.items()
+        f"its own past does not. {_causes(channel)}"
+        for (name, output), (share, channel) in found.items()
         if share > _CLEAR
     ]
+
+
+def _causes(channel: Channel) -> str:
+    """What that may come from: of an input that is not held, its way to the next sample as well."""
+    loop = (
+        "In a closed loop noise drives the input, the estimates lean towards minus the inverse of "
+        "the controller, and standard errors do not tell that: let the reference excite the loop, "
+        "or identify in an open one. "
+    )
+    if channel.hold == "zero":
+        return f"{loop}If there is no controller, the output answers at once and the model does not"
+    return (
+        f"{loop}If there is no controller, the model misses some of how the output answers within "
+        "a sample, since the input is read as going straight from one to the next: look at its "
+        "order and bounds first"
+    )
 
 
 def share_told(one: Series, channel: Channel) -> float:

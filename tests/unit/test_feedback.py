@@ -112,3 +112,16 @@ def test_a_regulated_record_without_reference_is_warned_of() -> None:
     [note] = [one for one in found.warnings if "closed loop" in one]
     assert note.startswith("input 'u' follows the residuals of y: they tell")
     assert feedback_notes([]) == []
+
+
+def test_what_a_model_misses_of_an_input_read_as_straight_is_told_as_another_cause() -> None:
+    u = wave(INPUTS["filtered"], 0)
+    keep, y = np.exp(-STEP / 0.3), np.zeros(N)
+    for k in range(1, N):  # an open loop: straight from sample to sample, and no dead time
+        y[k] = keep * y[k - 1] + (1 - keep) * 0.5 * (u[k] + u[k - 1])
+    straight, stepped = (
+        feedback_notes([series(y)._replace(inputs=(Channel("u", TIMES, u, hold=hold),))])
+        for hold in ("first", "zero")
+    )
+    assert "misses some of how the output answers within a sample" in straight[0]
+    assert not any("within a sample" in one for one in stepped)
