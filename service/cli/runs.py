@@ -129,7 +129,7 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Compare runs of several models on the same data."""
-    with connected(url, key) as client, told_at(Places({"?run": "RUN"})):
+    with connected(url, key) as client, told_at(Places({"/runs": "RUN"})):
         found = client.compare(*runs)
     if as_json:
         print_json(found)

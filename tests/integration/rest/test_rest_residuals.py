@@ -210,12 +210,12 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
     assert "not to be had any more" in asked["note"]
 
 
-def command(served: Served, monkeypatch: pytest.MonkeyPatch, *words: str) -> str:
+def command(served: Served, monkeypatch: pytest.MonkeyPatch, *words: str, ends: int = 0) -> str:
     """What a command under ``lagid runs`` prints."""
     client = Client("http://testserver", transport=Through(served.server))
     monkeypatch.setattr("service.cli.runs.connected", lambda url, key: nullcontext(client))
     done = CliRunner().invoke(runs_app, list(words))
-    assert done.exit_code == 0, done.output
+    assert done.exit_code == ends, done.output
     return done.output
 
 
@@ -235,6 +235,15 @@ def test_the_command_line_compares_and_says_what_depends_on_the_model(
     text = command(served, monkeypatch, "compare", *served.runs)
     assert text.index("sopdt") < text.index("fopdt")
     assert "note: L depends on the model" in text
+
+
+def test_the_command_line_says_what_of_its_own_words_does_not_compare(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    alone = command(served, monkeypatch, "compare", served.runs[0], ends=1)
+    assert alone.startswith("lagid: RUN: found")
+    unknown = command(served, monkeypatch, "compare", served.runs[0], "run_x", ends=1)
+    assert "--set" not in unknown
 
 
 def test_the_asynchronous_client_asks_the_same(served: Served) -> None:
