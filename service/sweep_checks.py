@@ -28,6 +28,8 @@ ALONE: Mapping[str, TypeAdapter[Any]] = {
     "/noise/seed": TypeAdapter(Seed),
     "/noise/sigma": TypeAdapter(Sigma),
 }
+MOST_TOLD = 200
+"""Values that cannot be used, after which no more are looked at: of some that takes 2 ms each."""
 SINGLE = ("/trend/parameters", "/trend/reference")
 """Fields of a trend that do not depend on the axes."""
 
@@ -53,8 +55,10 @@ def faults_of_job(
             ))  # fmt: skip
         else:
             steps = steps_of(body.sweep.axes, groups)
-            found += _sweep_faults(checker, document, steps, frozenset(known), unread)
-            found += _repeated_recordings(checker, body)
+            wrong = list(_sweep_faults(checker, document, steps, frozenset(known), unread))
+            found += wrong
+            if len(wrong) < MOST_TOLD:
+                found += _repeated_recordings(checker, body)
     model = checker.model(body.model)
     trend = trend_faults(session, body, None if isinstance(model, list) else model[0])
     are_axes_known = unread.isdisjoint({"sweep", "trend"})
@@ -105,12 +109,17 @@ def _sweep_faults(
     value makes of a field of which a part is `unread`.
     """
     told: set[str] = set()
+    n_wrong = 0
     for step in (step for group in groups for step in group):
         if step.pointer in told or _is_good_alone(step.cell):
             continue
+        if n_wrong == MOST_TOLD:
+            yield FieldError("", f"{MOST_TOLD} values of axes are told; the rest is not looked at")
+            return
         found = list(_step_faults(checker, document, step, known, unread))
         if found:
             told.add(step.pointer)
+            n_wrong += 1
         yield from found
 
 

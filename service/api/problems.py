@@ -77,7 +77,9 @@ def problem(
         "instance": request.url.path,
     }
     if errors:
-        told = (error.as_dict() for error in errors)
+        told = [error.as_dict() for error in errors[: MOST_FAULTS + 1]]
+        if len(errors) > len(told):
+            told.append(FieldError("", "and more faults, not told here").as_dict())
         content["errors"] = [
             {**one, "detail": _short(one["detail"], MOST_CHARACTERS)} for one in told
         ]

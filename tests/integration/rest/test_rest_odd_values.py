@@ -77,3 +77,29 @@ def test_times_at_the_ends_of_what_doubles_can_hold_are_simulated_or_refused(tmp
             body = {"inputs": {"u": series}, "samples": 51, "sample_time": 0.1}
             answer = server.post(f"/v1/runs/{run}:simulate", json=body)
             assert answer.status_code == status, answer.text
+
+
+@pytest.mark.parametrize("path", ["/model", "/parameters/K/fixed"])
+def test_of_very_many_wrong_values_some_are_told_and_the_rest_is_not_looked_at(
+    server: TestClient, dataset: str, path: str
+) -> None:
+    wrong = [f"m{n}" if path == "/model" else -100 - n for n in range(3000)]
+    axis = {"path": path, "values": wrong}
+    body = {"model": "fopdt", "datasets": [dataset], "sweep": {"axes": [axis]}}
+    faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
+    assert [one["pointer"] for one in faults[:-1]] == [
+        f"/sweep/axes/0/values/{n}" for n in range(200)
+    ]
+    assert faults[-1] == {
+        "pointer": "", "detail": "200 values of axes are told; the rest is not looked at"
+    }  # fmt: skip
+    axis["values"] = [*wrong[:200], 0.5 if path != "/model" else "fopdt"]
+    assert len(refused(server.post("/v1/jobs", json=body), 422, "invalid")) <= 201
+
+
+def test_of_very_many_faults_a_thousand_are_told(server: TestClient, dataset: str) -> None:
+    names = {f"p{n}": {"upper": 1} for n in range(5000)}
+    body = {"model": "fopdt", "datasets": [dataset], "parameters": names}
+    faults = refused(server.post("/v1/jobs", json=body), 422, "invalid")
+    assert len(faults) == 1002
+    assert faults[-1]["detail"] == "and more faults, not told here"
