@@ -122,7 +122,8 @@ def _feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -> li
     known = analysis.uncertainty
     if known is not None and known.noise_colour == "white":
         return []
-    return feedback_notes(series_of(problem, simulated))
+    advises = problem.prediction == "simulation" and problem.loss.noise_model == "white"
+    return feedback_notes(series_of(problem, simulated), advises_noise_model=advises)
 
 
 def _estimated(

@@ -34,7 +34,7 @@ _MOST = 5_000
 _EACH = 4  # samples for each coefficient, at least
 
 
-def feedback_notes(series: Iterable[Series]) -> list[str]:
+def feedback_notes(series: Iterable[Series], *, advises_noise_model: bool = False) -> list[str]:
     """What to say of inputs that follow the residuals of an output, each pair once."""
     found: dict[tuple[str, str], tuple[float, Channel]] = {}
     for one in series:
@@ -44,18 +44,19 @@ def feedback_notes(series: Iterable[Series]) -> list[str]:
                 found[pair] = share, channel
     return [
         f"input {name!r} follows the residuals of {output}: they tell {100 * share:.0f} % of what "
-        f"its own past does not. {_causes(channel)}"
+        f"its own past does not. {_causes(channel, advises_noise_model)}"
         for (name, output), (share, channel) in found.items()
         if share > _CLEAR
     ]
 
 
-def _causes(channel: Channel) -> str:
+def _causes(channel: Channel, advises_noise_model: bool) -> str:
     """What that may come from: of an input that is not held, its way to the next sample as well."""
+    advice = " and use loss: {noise_model: ar1}" if advises_noise_model else ""
     loop = (
         "In a closed loop noise drives the input, the estimates lean towards minus the inverse of "
-        "the controller, and standard errors do not tell that: let the reference excite the loop, "
-        "or identify in an open one. "
+        "the controller, and standard errors do not tell that: let the reference excite the loop"
+        f"{advice}, or identify in an open one. "
     )
     if channel.hold == "zero":
         return f"{loop}If there is no controller, the output answers at once and the model does not"

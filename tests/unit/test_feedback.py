@@ -1,13 +1,14 @@
 """An input that a controller makes from the output is recognised; one of an open loop is not."""
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 
 from sysid import Channel, Record, identify, load_model
 from sysid.feedback import feedback_notes, share_told
+from sysid.problem import Loss
 from sysid.residuals import Series
 from sysid.types import FloatArray
 
@@ -108,9 +109,17 @@ def test_too_short_constant_and_irregular_records_are_not_judged() -> None:
 
 def test_a_regulated_record_without_reference_is_warned_of() -> None:
     u, y = loop(1, np.zeros(N))
-    found = identify(load_model("fopdt"), [Record((held(u),), (Channel("y", TIMES, y),))], seed=1)
-    [note] = [one for one in found.warnings if "closed loop" in one]
+    record = Record((held(u),), (Channel("y", TIMES, y),))
+
+    def told(**options: Any) -> str:
+        found = identify(load_model("fopdt"), [record], seed=1, **options)
+        [note] = [one for one in found.warnings if "closed loop" in one]
+        return note
+
+    note = told()
     assert note.startswith("input 'u' follows the residuals of y: they tell")
+    assert "use loss: {noise_model: ar1}" in note
+    assert "noise_model" not in told(loss=Loss(noise_model="ar1"))
     assert feedback_notes([]) == []
 
 
