@@ -148,9 +148,8 @@ def _analysed(
     pulled = is_pulled(influence, sloping, place)
     scale = physical_scale(problem, theta)
     powers = scalings(problem.model, problem.all_parameters)
-    shifts, more = translations(
-        problem, theta, columns, scale, None if most is None else most - count
-    )
+    left = None if most is None else most - count
+    shifts, more = translations(problem, theta, columns, scale, left)
     count += more
     columns, known = without_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
     singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
