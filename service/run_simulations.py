@@ -123,7 +123,20 @@ def _asked(session: Session, store: ObjectStore, run_id: str, body: RunSimulateI
         at = "/control/reference"
         reference = signals.channel(at, "reference", unit, body.control.reference)
     values = _values(model, run, body.parameters)
+    given = inputs if reference is None else [*inputs, reference]
+    notes = [*notes, *_early_notes(model, given, period)]
     return _Asked(model, values, times, inputs, reference, signals.parents, notes)
+
+
+def _early_notes(model: Model, given: Sequence[Channel], period: float) -> list[str]:
+    """What to say of signals from before t = 0: the solver begins where the first of them does."""
+    first = min((one for one in given), key=lambda one: float(one.times[0]), default=None)
+    if first is None or model.form != "differential" or first.times[0] > -0.5 * period:
+        return []
+    return [
+        f"{first.name} is given from {float(first.times[0]):.6g} s on: there the states start, not "
+        "at t = 0, with the values that are told for it"
+    ]
 
 
 def _period(

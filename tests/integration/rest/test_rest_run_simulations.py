@@ -94,6 +94,23 @@ def test_without_transport_the_controller_is_a_step_late_and_friction_leaves_an_
     assert "0.00125 s late" in note
 
 
+def test_that_states_start_where_an_earlier_input_does_is_told(served: Served) -> None:
+    def found(since: float) -> dict[str, Any]:
+        u = {"kind": "series", "times": [since, 20.0], "values": [0.0, 0.0], "hold": "zero"}
+        return simulated(served, served.lag, {
+            "inputs": {"u": u}, "samples": 100, "sample_time": 0.05,
+            "parameters": {"y0": 5.0, "x(0)": 1.0},
+        })  # fmt: skip
+
+    early, at_zero = found(-2.0), found(0.0)
+    assert at_zero["notes"] == []
+    assert at_zero["outputs"][0]["values"][0] == pytest.approx(6.0)
+    [note] = early["notes"]
+    assert note.startswith("u is given from -2 s on: there the states start")
+    gone = np.exp(-2.0 / early["parameters"]["T"])
+    assert early["outputs"][0]["values"][0] == pytest.approx(5.0 + gone, rel=1e-4)
+
+
 def test_a_loop_that_is_not_at_rest_when_its_reference_steps_is_told(served: Served) -> None:
     def told(**step: float) -> list[str]:
         control = {"input": "u", "output": "y", "gain": 0.2, "reference": {"kind": "step", **step}}
