@@ -30,13 +30,14 @@ def beside(
     kind : type
         The body's wire type.
     faults : sequence of FieldError
-        Of the fields that cannot be read; nothing more is told of these.
+        Of the fields that cannot be read; nothing more is told of these. Those of query values and
+        headers leave the body as it is.
     meant : callable
         Faults of a body of that type that do not depend on the fields named besides, which are
         those that were left out, wholly or in part.
     """
-    left_out = [one.pointer for one in faults]
-    if not isinstance(body, dict) or "" in left_out:
+    left_out = [one.pointer for one in faults if one.pointer.startswith("/")]
+    if not isinstance(body, dict) or any(not one.pointer for one in faults):
         return []
     highest = ["/".join(one.split("/")[:2]) for one in left_out]  # where what holds it is no more
     found = _whole(kind, _without(body, left_out)) or _whole(kind, _without(body, highest))

@@ -159,3 +159,13 @@ def test_what_follows_from_a_fault_is_not_told_above_or_below_it() -> None:
 
     found = beside(JobIn, body, [FieldError(one, "x") for one in silent], everything)
     assert [one.pointer for one in found] == ["/a/bc", "/b", "/seeds"]
+
+
+@pytest.mark.parametrize("changes", [{}, {"seed": "x"}, {"parameters": {"LL": {"upper": 1}}}])
+def test_a_header_that_cannot_be_used_is_told_beside_the_faults_of_the_body(
+    server: TestClient, dataset: str, changes: dict[str, Any]
+) -> None:
+    body = {"model": "fopdt", "datasets": [dataset], **changes}
+    answer = server.post("/v1/jobs", json=body, headers={"Idempotency-Key": "k" * 201})
+    parts = {f"/{name}/LL" if name == "parameters" else f"/{name}" for name in changes}
+    assert set(faults(answer)) == {"?idempotency-key", *parts}
