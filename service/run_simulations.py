@@ -130,7 +130,7 @@ def _asked(session: Session, store: ObjectStore, run_id: str, body: RunSimulateI
 
 def _early_notes(model: Model, given: Sequence[Channel], period: float) -> list[str]:
     """What to say of signals from before t = 0: the solver begins where the first of them does."""
-    first = min((one for one in given), key=lambda one: float(one.times[0]), default=None)
+    first = min(given, key=lambda one: float(one.times[0]), default=None)
     if first is None or model.form != "differential" or first.times[0] > -0.5 * period:
         return []
     return [
