@@ -63,7 +63,7 @@ class Polynomial(NamedTuple):
 
 def expand(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> Polynomial:
     """What a document's lags, degree and terms say."""
-    written = fields.get("terms", "all")
+    known, written = reader.count(), fields.get("terms", "all")
     selects = isinstance(written, Mapping)
     terms = _candidates(reader, fields, scope) if selects else _terms(reader, fields, scope)
     if _wants_constant(reader, fields):
@@ -72,7 +72,9 @@ def expand(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> Polynomia
         detail = f"gives {len(terms)} coefficients; at most {MAX_PARAMETERS} are allowed"
         reader.fault("/terms", detail)
         terms = ()
-    rule = _rule(reader, written, len(terms)) if selects else None
+    # Where lags or degree are at fault it is not known how many candidates there will be.
+    candidates = len(terms) if reader.count() == known else 0
+    rule = _rule(reader, written, candidates) if selects else None
     coefficients = _coefficients(reader, fields.get("coefficients"), terms)
     return Polynomial(_sum([_product(term) for term in terms]), coefficients, terms, rule)
 
@@ -85,7 +87,7 @@ def _rule(reader: Reader, written: Mapping[str, Any], candidates: int) -> TermRu
     exchange = _truth(reader, fields.get("exchange", True), "/terms/exchange")
     err = None if fields.get("err") is None else _share(reader, fields["err"])
     most, keep = min(candidates, MAX_PARAMETERS), fields.get("keep")
-    if keep is None and err is None and criterion == "none":
+    if keep is None and err is None and fields.get("criterion", "none") == "none":
         reader.fault("/terms/keep", "is missing; say how many terms to keep, such as 8")
     error = reader.choice(fields.get("error", "one-step"), _ERRORS, "/terms/error")
     # Without candidates, that is the fault to tell.

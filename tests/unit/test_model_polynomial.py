@@ -175,3 +175,17 @@ def test_a_fault_of_a_polynomial_document_is_told_where_it_is(
 ) -> None:
     found = faults(**changes)
     assert part in found[pointer]
+
+
+@pytest.mark.parametrize(
+    ("changes", "place"),
+    [
+        ({"terms": {"select": "frols", "criterion": "aic"}}, "/terms/criterion"),
+        ({"lags": {"y": [0, 1], "u": [1]}, "terms": {"select": "frols", "keep": 8}}, "/lags/y/0"),
+        ({"degree": 12, "terms": {"select": "frols", "keep": 8}}, "/degree"),
+    ],
+)
+def test_one_slip_is_not_told_as_a_fault_of_keep_besides(
+    changes: dict[str, Any], place: str
+) -> None:
+    assert list(faults(**changes)) == [place]
