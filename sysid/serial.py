@@ -4,7 +4,9 @@ s²(SᵀS)⁻¹ takes the residuals for white. Those of measured records seldom 
 small by as much as they are alike over the time in which the sensitivities change. Where they are
 clearly not white, the middle of the sandwich (SᵀS)⁻¹ Ω (SᵀS)⁻¹ becomes Ω = SᵀRS with the
 autocovariance R of each series of residuals (output errors: Ljung 1999, sec. 9.3), from a Parzen
-window as wide as their colour asks for after a first-order prewhitening (Andrews and Monahan 1992).
+window as wide as their colour asks for, after they are prewhitened by a recursion (Andrews and
+Monahan 1992). It is of first order, or of as many as Akaike's criterion takes (Burg's method; den
+Haan and Levin 1997): slow noise beside white has a correlation of neighbours that says too little.
 For free runs only: one step ahead the sensitivities are made of measured outputs and of the noise.
 
 Coloured samples say less than as many white ones: of first-order noise with pole a > 0 those of a
@@ -41,6 +43,8 @@ QUANTILE = 3.841458820694124
 
 _STEEPEST = 0.97
 """Of the recursion (Andrews and Monahan 1992): one nearer 1 would follow a single drift."""
+
+_LONGEST = 25  # of the recursion: past values
 
 _NARROWEST = 1e-3  # of the variance under white residuals: below is rounding
 
@@ -207,24 +211,55 @@ def _with_colour(laid: Laid, columns: FloatArray) -> Coloured:
     root, pole = spectrum_root(laid)
     moved = transformed(laid, columns, root)
     slow = min(max(pole, 0.0), _STEEPEST)
-    samples = np.count_nonzero(laid.present) * (1.0 - slow) / (1.0 + slow)
-    return Coloured(np.asarray((moved @ moved.conj().T).real), samples, pole > _STEEPEST)
+    share = (1.0 - slow) / (1.0 + slow)
+    n = np.count_nonzero(laid.present)
+    # The same of any colour: the mean of its spectrum over what it is at frequency 0.
+    lowest = float(root[0] ** 2) * 2 * (root.size - 1)
+    if lowest > 0:
+        share = min(share, float(laid.values @ laid.values) / n / lowest)
+    return Coloured(np.asarray((moved @ moved.conj().T).real), n * share, pole > _STEEPEST)
 
 
 def spectrum_root(laid: Laid) -> tuple[FloatArray, float]:
-    """Root (F,) of the spectrum of a series as `colour_of` has it, and the pole of its recursion.
+    """Root (F,) of the spectrum of a series as `colour_of` has it, and the pole of first order.
 
-    Of what a first-order recursion leaves, coloured again by it.
+    Of what a recursion leaves, coloured again by it.
     """
     both = laid.present[1:] & laid.present[:-1]
     before, after = laid.values[:-1][both], laid.values[1:][both]
     found = float(before @ after / (before @ before))
-    pole = min(max(found, -_STEEPEST), _STEEPEST)
-    left = np.where(both, laid.values[1:] - pole * laid.values[:-1], 0.0)
+    weights = np.array([min(max(found, -_STEEPEST), _STEEPEST)])
+    if laid.present.all():
+        longer = _recursion(laid.values)
+        weights = weights if longer.size < 2 else longer
+    kernel = np.concatenate([[1.0], -weights])
+    filtered = np.convolve(laid.values, kernel)
+    left = np.where(both, filtered[1 : laid.values.size], 0.0)
     root = colour_of(left, both, room=2 * left.size)  # the recursion rings on
-    frequency = np.linspace(0.0, np.pi, root.size)
-    root /= np.abs(1.0 - pole * np.exp(-1j * frequency))
+    root /= np.abs(rfft(kernel, 2 * (root.size - 1)))
     return root, found
+
+
+def _recursion(values: FloatArray) -> FloatArray:
+    """Weights (p,) of the past values in a recursion, by Burg; p by Akaike's criterion."""
+    ahead, behind, weights = values[1:], values[:-1], np.zeros(0)
+    power, best = float(np.mean(np.square(values))), np.zeros(0)
+    least = values.size * np.log(power)
+    for order in range(1, min(_LONGEST, round(values.size ** (1 / 3))) + 1):
+        both = float(ahead @ ahead + behind @ behind)
+        if not both > 0:
+            break
+        reflected = 2.0 * float(ahead @ behind) / both
+        weights = np.append(weights - reflected * weights[::-1], reflected)
+        power *= 1.0 - reflected**2
+        ahead, behind = (ahead - reflected * behind)[1:], (behind - reflected * ahead)[:-1]
+        if not power > 0:
+            break
+        told = values.size * np.log(power) + 2.0 * order
+        if told < least:
+            least, best = told, weights
+    steepest = float(np.max(np.abs(np.roots(np.append(1.0, -best))), initial=0.0))
+    return best * min(1.0, _STEEPEST / max(steepest, _STEEPEST)) ** np.arange(1, best.size + 1)
 
 
 def white_root(laid: Laid) -> FloatArray:
