@@ -27,7 +27,7 @@ from service.errors import (
 )
 from service.pointers import body_type, explained
 from service.sentences import detail_of
-from service.storage.errors import StorageError
+from service.storage.errors import HALF_A_PAIR, StorageError
 from service.storage.patience import PASSING, is_passing
 from sysid.errors import SysidError
 
@@ -35,7 +35,6 @@ log = logging.getLogger(__name__)
 
 TRY_AGAIN = {"Retry-After": "1"}
 TOO_DEEP = "the body is nested too deeply"
-NO_UNICODE = "a text holds half of a surrogate pair; it is not valid Unicode"
 MOST_FAULTS = 1000
 MOST_CHARACTERS, MOST_IN_ALL = 1000, 20_000
 """Of one sentence, and of all: a value that is quoted may be as long as a body."""
@@ -159,7 +158,7 @@ def _no_unicode(request: Request, error: Exception) -> Response:
     """Only the escapes of a body's JSON can make half of a surrogate pair; UTF-8 has none."""
     if request.method not in ("POST", "PUT", "PATCH"):
         return _unexpected(request, error)
-    return _service_error(request, InvalidRequest.at("", NO_UNICODE))
+    return _service_error(request, InvalidRequest.at("", HALF_A_PAIR))
 
 
 def _sysid_error(request: Request, error: Exception) -> Response:

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 from sqlalchemy import JSON, BigInteger, DateTime, Dialect, Enum, Integer, String, TypeDecorator
 from sqlalchemy.dialects.postgresql import JSONB
 
-from service.storage.errors import UnstorableValue
+from service.storage.errors import HALF_A_PAIR, UnstorableValue
 
 Document: TypeAlias = dict[str, Any]
 """A JSON object."""
@@ -97,4 +97,4 @@ def _require_storable(text: str, *, nul: bool = False) -> None:
     if nul or "\x00" in text:
         raise UnstorableValue("a text holds the character NUL (U+0000); remove it")
     if not text.isascii() and _SURROGATE.search(text):
-        raise UnstorableValue("a text holds half of a surrogate pair; it is not valid Unicode")
+        raise UnstorableValue(HALF_A_PAIR)
