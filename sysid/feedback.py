@@ -52,13 +52,15 @@ def feedback_notes(series: Iterable[Series], *, advises_noise_model: bool = Fals
 
 def _causes(channel: Channel, advises_noise_model: bool) -> str:
     """What that may come from: of an input that is not held, its way to the next sample as well."""
-    advice = " and use loss: {noise_model: ar1}" if advises_noise_model else ""
+    is_held = channel.hold == "zero"
+    # No noise model is for dynamics that a model misses, which may be the cause otherwise.
+    advice = " and use loss: {noise_model: ar1}" if advises_noise_model and is_held else ""
     loop = (
         "In a closed loop noise drives the input, the estimates lean towards minus the inverse of "
         "the controller, and standard errors do not tell that: let the reference excite the loop"
         f"{advice}, or identify in an open one. "
     )
-    if channel.hold == "zero":
+    if is_held:
         return f"{loop}If there is no controller, the output answers at once and the model does not"
     return (
         f"{loop}If there is no controller, the model misses some of how the output answers within "
