@@ -13,6 +13,7 @@ import numpy as np
 
 from sysid.ga.chromosome import coded, decoded, located
 from sysid.ga.cliffs import MOST, has_cliff
+from sysid.ga.far_away import is_behind, is_coloured
 from sysid.ga.gauss_newton import (
     damped_step,
     factored,
@@ -167,16 +168,34 @@ def scatters(counters: IntArray) -> bool:
 
 
 @compiled
-def _choose_beside(size: int, word: Draws, counters: IntArray, memory: FloatArray) -> int:
+def _is_lost(evaluator: Evaluator, plan: Plan, words: WordArray, counters: IntArray) -> bool:
+    """Whether this is a hop's turn that is better spent far away. Not where a budget ends."""
+    turn = counters[DEVELOPMENTS] % TURNS
+    if turn % 2 == 0 or turn == 1 or counters[SETTLED] == 0 or counters[JUMPS] == 0:
+        return False
+    if counters[EVALUATIONS] + max(words.shape) + 2 > plan.evaluations:
+        return False
+    return is_coloured(evaluator, plan, words, counters)
+
+
+@compiled
+def _choose_beside(
+    size: int, word: Draws, is_lost: bool, counters: IntArray, memory: FloatArray
+) -> int:
     """The same where the fitness jumps: there most that is better lies beside the champion.
 
     Of eight developments four are hops, two scatter, one grows from beside the champion and one
-    from far away: in two of three from fresh individuals, and so fast that it costs little.
+    from far away: in two of three from fresh individuals, and so fast that it costs little. Where
+    the champion's errors are no noise, three of the hops give their turns to fresh individuals.
     """
     turn = counters[DEVELOPMENTS] % TURNS
     memory[ROUGH] = 1.0
     if counters[SETTLED] == 0:  # the champion first, whole: what follows is drawn around it
         return 0
+    if is_lost:
+        memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * (1.0 + unit(word[0])) / 2.0)
+        memory[GROWTH] = 2.0
+        return -1
     if turn % 2 == 1:
         counters[HOP] = COUNTED
         return 0
@@ -195,12 +214,12 @@ def _choose_beside(size: int, word: Draws, counters: IntArray, memory: FloatArra
 
 
 @compiled
-def _choose(plan: Plan, size: int, counters: IntArray, memory: FloatArray) -> int:
+def _choose(plan: Plan, size: int, is_lost: bool, counters: IntArray, memory: FloatArray) -> int:
     """What kind of development comes next; gives the individual it begins with, -1: a fresh one."""
     number = counters[DEVELOPMENTS]
     word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
     if counters[JUMPS] > 0 and number > EARLY:
-        return _choose_beside(size, word, counters, memory)
+        return _choose_beside(size, word, is_lost, counters, memory)
     grows = number == EARLY or (number > EARLY and number % 2 == 0)
     last_early = EARLY - counters[WARMED]  # behind an earlier result, the last of them is a hop
     settled = counters[SETTLED] == 1 and number > last_early
@@ -231,7 +250,8 @@ def start_development(
     early = counters[DEVELOPMENTS] <= EARLY
     memory[DAMPING] = EARLY_DAMPING if early else FIRST_DAMPING
     memory[HORIZON], memory[REACHED] = 1.0, np.inf
-    chosen = _choose(plan, words.shape[0], counters, memory)
+    is_lost = _is_lost(evaluator, plan, words, counters)
+    chosen = _choose(plan, words.shape[0], is_lost, counters, memory)
     # The places of a fresh start, or the slopes of a hop, would pass the budget.
     if counters[EVALUATIONS] + max(words.shape) + 1 > plan.evaluations:
         chosen, counters[HOP] = max(chosen, 0), 0
@@ -302,6 +322,18 @@ def _next_part(counters: IntArray, memory: FloatArray, fitness: FloatArray) -> N
 
 
 @compiled
+def _end_part(
+    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray, reached: float,
+    counters: IntArray, memory: FloatArray,
+) -> None:  # fmt: skip
+    """Go on to the next part; a growth from far away, beside jumps, not if it is behind already."""
+    races = memory[HORIZON] < 1.0 and counters[JUMPS] > 0 and counters[HOP] == 0
+    if races and is_behind(evaluator, plan, words, counters, memory[HORIZON], reached):
+        memory[HORIZON] = 1.0
+    _next_part(counters, memory, fitness)
+
+
+@compiled
 def _trials(plan: Plan, counters: IntArray, memory: FloatArray, matrix: FloatArray,
             gradient: FloatArray, base: float) -> FloatArray:  # fmt: skip
     """Places to try: steps of several dampings, and probes spread as the estimate's covariance."""
@@ -350,9 +382,9 @@ def adaptive_sequence(
             memory[REACHED] = reached[best]
             _keep(words, fitness, memory, proposals[best], reached[best])
         if reached[best] > base * (1.0 - enough) or counters[STEP] >= MOST_STEPS:
-            _next_part(counters, memory, fitness)
+            _end_part(evaluator, plan, words, fitness, reached[best], counters, memory)
         return
     memory[DAMPING] *= FACTOR**TRIALS
     counters[FAILED] += 1
     if counters[FAILED] == 2 or not np.isfinite(base):
-        _next_part(counters, memory, fitness)
+        _end_part(evaluator, plan, words, fitness, base, counters, memory)

@@ -16,6 +16,7 @@ from sysid.ga.state import (
     EVALUATIONS,
     GENERATION,
     HOPS,
+    JUMPS,
     MIGRATION,
     PHASE,
     RETURNED,
@@ -81,11 +82,13 @@ def migrate(
 def send(ways: Routes, fleet: Fleet, epoch: int, news: News) -> None:
     """One exchange in place: see `migrate`. An edge writes one improvement at most."""
     words, fitness = fleet.words.copy(), fleet.fitness.copy()
-    champions = fleet.champions.copy()
+    champions, jumps = fleet.champions.copy(), fleet.counters[:, JUMPS].copy()
     for e in range(ways.edges.shape[0]):
         source, destination = ways.edges[e, 0], ways.edges[e, 1]
         begin, end = fleet.first[source], fleet.first[source + 1]
         exact = ways.bits[source] == ways.bits[destination]
+        known = fleet.counters[destination]
+        known[JUMPS] = max(known[JUMPS], jumps[source])  # of the fitness, not of the place
         for p in range(begin, min(end, begin + ways.migrants)):
             word = words[p : p + 1]
             if not exact:
