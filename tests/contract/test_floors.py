@@ -11,7 +11,7 @@ from service.dispatch.claiming import Leases
 from service.dispatcher import Dispatcher
 from service.floors import Floors
 from service.storage.tables import OPEN, State
-from tests.dispatching import Place
+from tests.dispatching import LIMIT_SECONDS, Place
 from workers.inline import InlineCrew
 
 SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
@@ -54,7 +54,7 @@ def test_other_jobs_are_carried_out_while_floors_are_made(place, monkeypatch):
 
     def held(problem, theta):
         begun.set()
-        assert may_go_on.wait(60)
+        assert may_go_on.wait(LIMIT_SECONDS)
         return made(problem, theta)
 
     monkeypatch.setattr(floors, "floor", held)
@@ -62,7 +62,7 @@ def test_other_jobs_are_carried_out_while_floors_are_made(place, monkeypatch):
     states = []
 
     def meanwhile():
-        assert begun.wait(60)
+        assert begun.wait(LIMIT_SECONDS)
         quiet = place.submit(algorithm=SMALL)
         states.append(place.until(quiet, State.SUCCEEDED).state)
         states.append(place.job(noisy).state)
@@ -79,14 +79,14 @@ def test_a_job_is_cancelled_while_its_floors_are_made(place, monkeypatch):
 
     def held(problem, theta):
         begun.set()
-        assert may_go_on.wait(60)
+        assert may_go_on.wait(LIMIT_SECONDS)
         raise ZeroDivisionError
 
     monkeypatch.setattr(floors, "floor", held)
     noisy = place.submit(**NOISY)
 
     def meanwhile():
-        assert begun.wait(60)
+        assert begun.wait(LIMIT_SECONDS)
         place.cancel(noisy)
         place.until(noisy, State.CANCELLED)
         may_go_on.set()
