@@ -1,7 +1,7 @@
 """What workers do before their first task."""
 
-from sysid.ga.evolution import generations
 from sysid.identify import identify
+from sysid.islands.voyage import _sail
 from sysid.models.library import load_model
 from sysid.settings import GeneticAlgorithm
 from sysid.warming import warm_up
@@ -10,6 +10,6 @@ from tests.searching import noisy, record
 
 def test_after_warming_up_another_model_compiles_nothing() -> None:
     warm_up()
-    before = len(generations.signatures)  # type: ignore[attr-defined]
+    before = len(_sail.signatures)  # type: ignore[attr-defined]
     identify(load_model("duffing-eq16"), record(noisy()), GeneticAlgorithm(generations=2))
-    assert len(generations.signatures) == before == 1  # type: ignore[attr-defined]
+    assert len(_sail.signatures) == before == 1  # type: ignore[attr-defined]
