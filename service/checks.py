@@ -113,13 +113,9 @@ class JobChecker:
         key = repr(reference)
         if key not in self._models:
             try:
-                self._models[key] = models.resolve(self._session, reference)
+                self._models[key] = models.resolve(self._session, reference, is_new=True)
             except SysidError as error:
-                inside = "/model" if isinstance(reference, Mapping) else ""
-                self._models[key] = [
-                    FieldError(inside + fault.pointer, fault.detail, fault.column)
-                    for fault in faults_of(error)
-                ]
+                self._models[key] = [_in_job(reference, fault) for fault in faults_of(error)]
         return self._models[key]
 
     def identifiers(self, references: list[str]) -> list[str]:
@@ -267,3 +263,12 @@ def _freedom_faults(parameters: tuple[Parameter, ...], population: int) -> Itera
             f"found {population} individuals of {len(free)} free parameters; need at most "
             f"{MOST_GENES // len(free)}, so that the population fits into memory",
         )
+
+
+def _in_job(reference: Any, fault: FieldError) -> FieldError:
+    """A fault of a model at its place in the job that names the model or holds it."""
+    if isinstance(reference, Mapping):
+        return FieldError("/model" + fault.pointer, fault.detail, fault.column)
+    if fault.pointer == "/model":
+        return fault
+    return FieldError("/model", f"{reference}: {fault.pointer}: {fault.detail}")

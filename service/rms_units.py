@@ -12,6 +12,7 @@ from service.storage.errors import NotFound
 from sysid.errors import SysidError
 from sysid.models.library import load_model
 from sysid.models.model import Model
+from sysid.models.spec import parse_model
 
 Body = Mapping[str, Any]
 
@@ -24,7 +25,8 @@ def model_of(body: Body) -> Model | None:
 @lru_cache(maxsize=256)
 def _model(reference: str) -> Model | None:
     try:
-        return load_model(json.loads(reference))
+        source = json.loads(reference)
+        return load_model(source) if isinstance(source, str) else parse_model(source)
     except SysidError:
         return None
 

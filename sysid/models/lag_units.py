@@ -4,27 +4,26 @@ Units are labels to a model: ``u(t - L)`` reads L in seconds, whatever its unit 
 minutes would be estimated in seconds and told in minutes.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 from sysid.language.lags import past_values
 from sysid.language.laurent import Monomial, collect
 from sysid.language.scope import Timing
-from sysid.language.tree import Expression, Past, Symbol
+from sysid.language.tree import Past, Symbol
+from sysid.models.model import Model
 from sysid.models.reader import Reader, pointer
-from sysid.parameters import Parameter
 from sysid.units import factor
 
 _PERIOD = (Symbol("h", "period"), -1)
 _SECONDS = "s"
 
 
-def check_lag_units(
-    reader: Reader, form: Timing, parameters: Sequence[Parameter], trees: Sequence[Expression]
-) -> None:
+def check_lag_units(reader: Reader, model: Model) -> None:
     """Report each parameter that is a lag as it stands, in another unit than that of lags."""
-    units = {one.name: one.unit for one in parameters}
+    units = {one.name: one.unit for one in model.parameters}
+    form: Timing = "differential" if model.form == "differential" else "difference"
     told = set()
-    for tree in trees:
+    for tree in (*model.equations, *(one.expression for one in model.outputs)):
         for past in past_values(tree):
             for name, in_periods in _bare(past):
                 size = factor(units.get(name, "1"), _SECONDS)

@@ -40,13 +40,16 @@ _FIELDS = {
 _MODEL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
-def parse_model(document: object) -> Model:
+def parse_model(document: object, *, is_new: bool = False) -> Model:
     """The model that a document describes.
 
     Parameters
     ----------
     document : object
         A mapping as read from YAML or JSON.
+    is_new : bool
+        Whether what documents were taken with before, and is told wrongly, is a fault: a lag in
+        another unit than that of lags. What is stored can be read with it.
 
     Raises
     ------
@@ -60,6 +63,8 @@ def parse_model(document: object) -> Model:
     fields = reader.section(document, "", _FIELDS[form])
     _head(reader, fields)
     model = _polynomial(reader, fields) if form == "polynomial" else _equations(reader, fields)
+    if is_new:
+        check_lag_units(reader, model)
     reader.finish()
     model = replace(model, document=normal_form(fields, model))
     try:
@@ -115,7 +120,6 @@ def _equations(reader: Reader, fields: Mapping[str, Any]) -> Model:
     _, trees = eq.equations(reader, fields.get("equations"), scope)
     _, outputs = eq.outputs(reader, fields.get("outputs"), scope, states)
     _check_outputs(reader, outputs, scope)
-    check_lag_units(reader, form, found, (*trees, *(one.expression for one in outputs)))
     starts = initial(reader, fields.get("initial"), scope.states, FixedInitial(0.0))
     settings = solver(reader, fields.get("solver"), form)
     reader.finish()
@@ -210,7 +214,6 @@ def _polynomial(reader: Reader, fields: Mapping[str, Any]) -> Model:
         },
     )
     found_terms = expand(reader, fields, scope)
-    check_lag_units(reader, "difference", found, (found_terms.tree,))
     starts = initial(reader, fields.get("initial"), scope.states, MeasuredInitial())
     settings = solver(reader, fields.get("solver"), "polynomial")
     reader.finish()
