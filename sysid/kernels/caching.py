@@ -36,9 +36,7 @@ _UNEXPECTED = (
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-@cache
-def fingerprint() -> str:
-    """Digest of the sources of all compiled functions."""
+def _digest_of_sources() -> str:
     package = Path(__file__).parents[1]
     digest = sha256()
     for pattern in _SOURCES:
@@ -48,9 +46,22 @@ def fingerprint() -> str:
     return digest.hexdigest()
 
 
+# Read before any module with a compiled function is loaded, all of which load this one first.
+_AT_START = _digest_of_sources()
+
+
+def fingerprint() -> str:
+    """Digest of the sources of all compiled functions, as this process began with them."""
+    return _AT_START
+
+
 @cache
-def _digest_of(source: str) -> str:
-    return sha256(Path(source).read_bytes()).hexdigest()
+def _digest_of(source: str) -> str | None:
+    """Digest of a file, None if there is none."""
+    try:
+        return sha256(Path(source).read_bytes()).hexdigest()
+    except OSError:
+        return None
 
 
 class _Kept:
@@ -61,6 +72,7 @@ class _Kept:
     def __init__(self, function: Callable[..., Any]) -> None:
         self._code = function.__code__
         self._name = f"{function.__module__}.{function.__qualname__}"
+        self._source = _digest_of(self._code.co_filename)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The function for some types of arguments, None if none is kept that can be used."""
@@ -72,9 +84,15 @@ class _Kept:
             return None
 
     def save_overload(self, sig: Any, compiled_: Any) -> None:
-        """Keep what was compiled, except code with addresses of this process in it."""
+        """Keep what was compiled, except code with addresses of this process in it.
+
+        Neither where sources have changed since the process began (an update in place): it may
+        have loaded some of them before and some after, and the others take what lies here.
+        """
         try:
-            if not compiled_.library.has_dynamic_globals:
+            if _digest_of_sources() != _AT_START:
+                tell(f"{self._name}: sources have changed since this process began")
+            elif not compiled_.library.has_dynamic_globals:
                 store(self._key(sig, compiled_.target_context), _reduced(compiled_), "loop")
         except _UNEXPECTED as error:
             tell(f"{self._name} is not saved ({error!r})")
@@ -83,9 +101,11 @@ class _Kept:
         """Nothing: what is compiled anew replaces what was kept."""
 
     def _key(self, sig: Any, target_context: Any) -> str:
+        if self._source is None:
+            raise OSError(f"{self._code.co_filename} cannot be read")
         parts = (
             fingerprint(), _VERSIONS, target_context.codegen().magic_tuple(), self._name,
-            self._code.co_firstlineno, _digest_of(self._code.co_filename), str(sig),
+            self._code.co_firstlineno, self._source, str(sig),
         )  # fmt: skip
         return sha256(repr(parts).encode()).hexdigest()
 

@@ -3,6 +3,7 @@
 import ast
 import logging
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -129,6 +130,30 @@ def test_another_fingerprint_compiles_anew(tmp_path: Path) -> None:
     assert run("a") == "4.0 0"
     assert run("a") == "4.0 1"
     assert run("b") == "4.0 0"
+
+
+UPDATED = """
+import sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[1])
+from sysid.ga import operators
+source = Path(operators.__file__)
+source.write_text(source.read_text() + "\\n# another version\\n")
+from module import doubled
+print(doubled(2.0))
+"""
+
+
+def test_code_compiled_while_an_update_replaces_sources_is_not_kept(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "sysid", tmp_path / "sysid")
+    (tmp_path / "module.py").write_text(MODULE)
+    done = subprocess.run(
+        [sys.executable, "-c", UPDATED, str(tmp_path)], check=True, capture_output=True, text=True,
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+    )  # fmt: skip
+    assert done.stdout.strip() == "4.0"
+    assert "sources have changed since this process began" in done.stderr
+    assert not (tmp_path / "cache").exists()
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "cut late", "flipped", "longer"])
