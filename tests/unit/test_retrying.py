@@ -11,6 +11,7 @@ import pytest
 
 from service import client as synchronous
 from service.client import AsyncClient, Client, ProblemError, ServerUnreachable
+from tests.rest import awaited
 
 JOB = {"id": "job_1", "state": "queued"}
 AWAY = httpx.codes.SERVICE_UNAVAILABLE
@@ -56,7 +57,7 @@ def asynchronously(server: Server, name: str, *given: Any, **settings: Any) -> A
         async with AsyncClient("http://here", transport=transport, **settings) as client:
             return await getattr(client, name)(*given)
 
-    return asyncio.run(work())
+    return awaited(work)
 
 
 Asked = Callable[..., Any]
@@ -169,7 +170,7 @@ def test_events_are_asked_for_again_and_told_from_where_they_broke_off(
             return [event async for event in client.events("job_1")]
 
     server = Server(AWAY, 200)
-    assert asyncio.run(work()) == [event]
+    assert awaited(work) == [event]
 
 
 def test_events_of_a_server_that_is_not_there() -> None:
