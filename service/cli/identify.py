@@ -70,7 +70,11 @@ def identify(
         str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")
     ] = None,
     validation: Annotated[
-        Path | None, typer.Option(help="Recording that is kept for validation.")
+        Path | None,
+        typer.Option(
+            help="Recording that is kept for validation; of DATA itself the last part: "
+            "--set validation.fraction=0.3."
+        ),
     ] = None,
     noise_model: Annotated[
         str | None,
