@@ -126,12 +126,14 @@ class Uncertainty:
     """Local analysis at the estimate; rows and columns are the free parameters `names`.
 
     `noise_colour` tells what the covariance takes the residuals for. Where they drift over the
-    whole record, it is a lower bound.
+    whole record, it is a lower bound. `correlation` is of this covariance, `alike` that of
+    (SᵀS)⁻¹: how alike the sensitivities S are, whatever the colour of the residuals.
     """
 
     names: tuple[str, ...]
     covariance: FloatArray
     correlation: FloatArray
+    alike: FloatArray
     condition: float
     singular_values: FloatArray
     noise_sd: float

@@ -171,6 +171,7 @@ def _analysed(
         names=names,
         covariance=physical,
         correlation=_correlation(physical),
+        alike=_correlation(inverse * np.outer(scale, scale)),
         condition=float(singular[0] / singular[-1]) if kept.all() else float("inf"),
         singular_values=singular,
         noise_sd=noise,

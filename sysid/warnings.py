@@ -242,7 +242,8 @@ def _correlated(
 ) -> list[str]:
     """Ridges; a lag on one that may as well be 0 is not separable from the other parameter.
 
-    Of parameters that have no standard error their groups tell.
+    Coloured residuals turn the ellipsoid of the estimates; what one sensitivity makes up for in
+    another stays. Of parameters that have no standard error their groups tell.
     """
     blind = {e.name for e in estimates if e.stderr is None}
     vague = {e.name for e in estimates if e.name in lagged and _is_vague_lag(e)}
@@ -252,10 +253,12 @@ def _correlated(
             second, r = uncertainty.names[j], float(uncertainty.correlation[i, j])
             if {first, second} & blind:
                 continue
-            if {first, second} & vague and abs(r) > _RIDGE:
+            alike = float(uncertainty.alike[i, j])
+            if {first, second} & vague and max(abs(r), abs(alike)) > _RIDGE:
+                plain = "" if abs(r) > _RIDGE else f", {alike:.3f} if the residuals were white"
                 found.append(
-                    f"{first} and {second} not separable (r = {r:.3f}): the data fix a combination "
-                    "of them, and the lag is less than two of its standard errors"
+                    f"{first} and {second} not separable (r = {r:.3f}{plain}): the data fix a "
+                    "combination of them, and the lag is less than two of its standard errors"
                 )
             elif abs(r) > _STRONG:
                 found.append(

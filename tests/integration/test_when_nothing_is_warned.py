@@ -1,5 +1,7 @@
 """A good result warns of nothing, and of a doubtful one no sentence is superfluous."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from sysid.records import Channel, Record
 from sysid.result import Identification
 from sysid.settings import GeneticAlgorithm
 from sysid.types import FloatArray
+from sysid.warnings import _correlated
 from tests.searching import DUFFING as TRUTH
 from tests.searching import noisy, record
 
@@ -74,3 +77,11 @@ def test_a_lag_that_may_as_well_be_zero_is_not_separable_from_what_it_is_on_a_ri
     y = problem.predictions(np.array([[0.2, 0.05]]))[0] + noise(0.02)
     found = identify(FOPDT, driven("u", TIMES / 6, y), parameters=sought)
     assert told(found, "T and L not separable")
+    # Coloured residuals may turn the ellipsoid; what one sensitivity makes up for in another stays.
+    assert found.uncertainty is not None
+    turned = replace(found.uncertainty, correlation=np.array([[1.0, 0.5], [0.5, 1.0]]))
+    [ridge] = _correlated(turned, found.estimates, {"L"})
+    r = found.uncertainty.alike[0, 1]
+    assert f"not separable (r = 0.500, {r:.3f} if the residuals were white)" in ridge
+    apart = replace(turned, alike=turned.correlation)
+    assert _correlated(apart, found.estimates, {"L"}) == []
