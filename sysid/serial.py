@@ -229,7 +229,7 @@ def spectrum_root(laid: Laid) -> tuple[FloatArray, float]:
     before, after = laid.values[:-1][both], laid.values[1:][both]
     found = float(before @ after / (before @ before))
     weights = np.array([min(max(found, -_STEEPEST), _STEEPEST)])
-    if laid.present.all():
+    if laid.present.all() and found <= _STEEPEST:  # a longer one takes a drift for oscillations
         longer = _recursion(laid.values)
         weights = weights if longer.size < 2 else longer
     kernel = np.concatenate([[1.0], -weights])

@@ -128,3 +128,16 @@ def test_slow_noise_beside_white_is_as_slow_as_it_is() -> None:
         root, _ = spectrum_root(laid_out(np.arange(float(n)), slow + own))
         powers.append(root[0] ** 2 * 2 * (root.size - 1))
     assert np.mean(powers) == pytest.approx((1 + pole) / (1 - pole) + 1.0, rel=0.2)
+
+
+def test_a_drift_has_a_recursion_of_first_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long one takes what a model misses for oscillations, and says little lies between them."""
+    times, random = np.arange(400.0), np.random.default_rng(0)
+    wander, slow = (
+        laid_out(times, lfilter([1.0], [1.0, -pole], random.standard_normal(400)))
+        for pole in (0.999, 0.9)
+    )
+    before = spectrum_root(wander)[0], spectrum_root(slow)[0]
+    monkeypatch.setattr("sysid.serial._recursion", lambda values: np.array([0.5, 0.2]))
+    np.testing.assert_array_equal(spectrum_root(wander)[0], before[0])
+    assert np.max(np.abs(spectrum_root(slow)[0] - before[1])) > 0
