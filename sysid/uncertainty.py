@@ -158,8 +158,7 @@ def _analysed(
     inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
     colour = coloured_jointly(problem, influence, columns)
     covariance, noise = _covariance(error, columns, inverse, loss_scale(problem), colour)
-    member = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | np.any(powers != 0.0, axis=0)
-    member |= np.any(shifts != 0.0, axis=0)
+    member = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | _moved(powers) | _moved(shifts)
     spread = np.sqrt(np.maximum(np.einsum("id,de,ie->i", rows, covariance, rows), 0.0))
     weak = kept & ((spread >= _SAYS_NOTHING) | (noise >= _SAYS_NOTHING * singular))
     vague = np.diag(covariance) >= _SAYS_NOTHING**2
@@ -191,6 +190,11 @@ def _analysed(
         linear = linear_model(error, columns, plateau > 0, place, stated, scale, inverse, root)
     held = _held_back(problem, influence, sloping, place) if pulled.any() else ()
     return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, held, linear)
+
+
+def _moved(directions: FloatArray) -> BoolArray:
+    """Which parameters (D,) any of some directions (m, D) moves."""
+    return np.asarray(np.any(directions != 0.0, axis=0))
 
 
 def _held_back(
