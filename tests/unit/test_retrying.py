@@ -1,14 +1,15 @@
 """The clients send a call again that a server could not serve just then, and only such a call."""
 
-import asyncio
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import pytest
 
+from service import async_client as asynchronous
 from service import client as synchronous
 from service.client import AsyncClient, Client, ProblemError, ServerUnreachable
 from tests.rest import awaited
@@ -41,8 +42,9 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     async def sleep(seconds: float) -> None:
         pauses.append(seconds)
 
-    monkeypatch.setattr(synchronous.time, "sleep", pauses.append)
-    monkeypatch.setattr(asyncio, "sleep", sleep)
+    # In the clients alone: threads of other tests may sleep meanwhile.
+    monkeypatch.setattr(synchronous, "time", SimpleNamespace(sleep=pauses.append))
+    monkeypatch.setattr(asynchronous, "asyncio", SimpleNamespace(sleep=sleep))
     return pauses
 
 
