@@ -7,6 +7,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from service.storage.jobs import JobRepository
+from service.storage.queue import Queue
 from service.storage.tables import State
 from tests.e2e.conftest import Site
 from tests.e2e.filled import TRUE, end_running, progress
@@ -159,6 +160,34 @@ def test_a_job_is_cancelled_and_resumed_from_its_page(own_site: Site, page: Page
     expect(page.locator("#job .chip")).to_have_text("queued")
     with own_site.parts.database.write() as session:
         assert JobRepository(session).counts()[State.QUEUED] == 1
+
+
+def test_the_page_of_a_resumed_job_goes_on_after_its_earlier_end(
+    own_site: Site, page: Page
+) -> None:
+    job, database = own_site.filled.queued, own_site.parts.database
+    with database.write() as session:
+        JobRepository(session).cancel(job)
+        JobRepository(session).resume(job)
+    page.add_init_script(
+        """const Plain = EventSource;
+        window.open_after_end = [];
+        window.EventSource = class extends Plain {
+          constructor(url) {
+            super(url);
+            const isOpen = () => open_after_end.push(this.readyState !== Plain.CLOSED);
+            this.addEventListener('end', () => setTimeout(isOpen));
+          }
+        };"""
+    )
+    page.goto(f"{own_site.url}/jobs/{job}")
+    page.wait_for_function("() => open_after_end.length === 1")
+    assert page.evaluate("open_after_end") == [True]
+    with database.write() as session:
+        claim = Queue(session).claim("test")
+        assert claim is not None
+        assert claim.job.id == job
+    expect(page.locator("#job .chip")).to_have_text("running")
 
 
 def test_a_failed_job_says_why_and_a_name_is_never_markup(site: Site, page: Page) -> None:

@@ -9,21 +9,17 @@ let stream = null;
 
 // An event only says that something is new; the page and the figures themselves say what.
 const renew = throttled(async () => {
-  const wasOpen = isOpen();
   await refresh();
   watch();
   await redraw(isOpen() ? ['history', 'convergence'] : undefined);
-  if (wasOpen && !isOpen()) close();
+  if (!isOpen()) close();
 }, 1000 + Number(runs) / 10); // the database looks at all runs of a sweep for its page
 
 function listen() {
-  if (stream || !isOpen()) return; // a finished job opens no stream
+  if (!isOpen() || (stream && stream.readyState !== EventSource.CLOSED)) return; // a finished job opens no stream
   stream = new EventSource(`/v1/jobs/${encodeURIComponent(job)}/events`);
-  for (const kind of ['message', 'state', 'progress', 'log']) stream.addEventListener(kind, renew);
-  stream.addEventListener('end', () => {
-    close();
-    renew();
-  });
+  // Of a resumed job the stream tells its earlier end, too: whether it is over, the page says.
+  for (const kind of ['message', 'state', 'progress', 'log', 'end']) stream.addEventListener(kind, renew);
 }
 
 function close() {
