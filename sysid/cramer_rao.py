@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sysid.directions import NULL_MEMBER
 from sysid.errors import InvalidSettings
 from sysid.linear import RANK
 from sysid.problem import Problem
@@ -18,7 +19,7 @@ from sysid.sensitivities import sensitivities
 from sysid.symmetries import scalings
 from sysid.translations import translations
 from sysid.types import FloatArray
-from sysid.uncertainty import NULL_MEMBER, physical_scale, without_symmetries
+from sysid.uncertainty import physical_scale, without_symmetries
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -43,8 +43,8 @@ class Block:
 
     @property
     def tells_nothing(self) -> bool:
-        """Whether there are as many directions as parameters, so that no combination is left."""
-        return bool(self.basis.shape[0] >= self.members.size)
+        """Whether no combination is left: as many directions as parameters, or one alone."""
+        return bool(self.members.size < 2 or self.basis.shape[0] >= self.members.size)
 
 
 def blocks(null: FloatArray, member: BoolArray) -> tuple[Block, ...]:
@@ -83,12 +83,13 @@ def written(
         return ()
     value, unit = theta[block.members], scale[block.members]
     has_logarithm = bool(np.all(value != 0.0))
-    rows = block.basis * (unit / value if has_logarithm else 1.0)
-    entries = np.array(list(_orthogonal(rows)))
-    sums = entries / (value if has_logarithm else unit)
+    per_place = unit / value if has_logarithm else np.ones(value.size)
+    entries = np.array(list(_orthogonal(block.basis * per_place)))
+    small = _small(entries * per_place)
+    powers = _powers(entries, value, small) if has_logarithm else None
+    sums = np.where(small, 0.0, entries / (value if has_logarithm else unit))
     sums = sums / _leading(sums)
-    powers = _powers(entries, value) if has_logarithm else None
-    terms = _rational(sums)
+    terms = _rational(sums, small, unit)
     if powers is not None and (terms is None or powers[1] <= terms[1]):
         texts = [(e, _product([names[d] for d in block.members], e)) for e in powers[0]]
         found = [(text, float(np.prod(value**e)), e / value) for e, text in texts]
@@ -150,24 +151,47 @@ def _upright(entry: FloatArray) -> FloatArray:
     return -entry if np.sum(entry[large] < 0) > np.sum(entry[large] > 0) else entry
 
 
+def _small(parts: FloatArray) -> BoolArray:
+    """Which parameters have next to no part in a combination; two of them have one always.
+
+    By how much it changes over their ranges: factors have units, and of a large parameter a small
+    one counts.
+    """
+    second = np.sort(np.abs(parts), axis=1)[:, -2:-1]
+    return np.asarray(np.abs(parts) < _PIVOT * second)
+
+
 def _leading(sums: FloatArray) -> FloatArray:
-    """For each row its first entry that is not small, so that sums begin with a plain name."""
-    large = np.abs(sums) > _PIVOT * np.max(np.abs(sums), axis=1, keepdims=True)
-    return np.take_along_axis(sums, np.argmax(large, axis=1)[:, None], axis=1)
+    """For each row its first entry that is not 0, so that sums begin with a plain name."""
+    return np.take_along_axis(sums, np.argmax(sums != 0.0, axis=1)[:, None], axis=1)
 
 
-def _rational(entries: FloatArray) -> tuple[FloatArray, float] | None:
-    """The entries as small fractions, and how far off they are; None where they are not."""
+def _rational(
+    entries: FloatArray, small: BoolArray, unit: FloatArray | None = None
+) -> tuple[FloatArray, float] | None:
+    """The entries as small fractions, and how far off they are; None where they are not.
+
+    None too where that would leave out a parameter that is not `small`. With the ranges (M,) of
+    the members they are factors of a sum that begins with 1, and off by what that makes of it.
+    """
     nearest = np.array(
         [[float(Fraction(v).limit_denominator(_DENOMINATOR)) for v in row] for row in entries]
     )
-    off = float(np.max(np.abs(nearest - entries)))
+    if np.any((nearest == 0.0) & ~small):
+        return None
+    apart = np.abs(nearest - entries)
+    if unit is not None:
+        first = np.argmax(entries != 0.0, axis=1)
+        apart = apart * np.maximum(1.0, np.abs(unit / unit[first][:, None]))
+    off = float(np.max(apart))
     return (nearest, off) if off < _RATIONAL and np.max(np.abs(nearest)) <= _LARGEST else None
 
 
-def _powers(entries: FloatArray, value: FloatArray) -> tuple[FloatArray, float] | None:
+def _powers(
+    entries: FloatArray, value: FloatArray, small: BoolArray
+) -> tuple[FloatArray, float] | None:
     """The same for powers of `value` (M,); None too where one of them is not a real number."""
-    found = _rational(entries)
+    found = _rational(entries, small)
     if found is None:
         return None
     fractional = found[0] != np.rint(found[0])

@@ -25,10 +25,11 @@ import numpy as np
 from scipy.special import stdtrit
 
 from sysid.common_noise import coloured_jointly
+from sysid.directions import untold, weighed
 from sysid.estimates import Known, estimates_of
 from sysid.exchanges import Exchanges
 from sysid.ga.chromosome import placed
-from sysid.groups import Block, blocks, written
+from sysid.groups import Block, written
 from sysid.islands.archipelago import loss_scale
 from sysid.linear import RANK, Linear, linear_model
 from sysid.problem import Problem
@@ -41,11 +42,6 @@ from sysid.symmetries import scalings
 from sysid.translations import translations
 from sysid.types import BoolArray, FloatArray
 from sysid.whitening import Whitening
-
-_SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
-# Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
-# about, and of one that has no effect at all, which is known to many digits.
-_WEAK_MEMBER, NULL_MEMBER = 0.05, 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,22 +73,6 @@ class Analysis:
     """Parameters that can change places."""
     is_cut_short: bool = False
     """Whether minima beside the estimate were not looked for because the time was over."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Directions:
-    """Singular values and directions of the sensitivities, over the places.
-
-    `null` are those along which the output does not change, `weak` those of which the data say
-    little; `member` marks the parameters that `null` moves, `vague` those that are not told well.
-    """
-
-    singular: FloatArray
-    rows: FloatArray
-    null: BoolArray
-    weak: BoolArray
-    member: BoolArray
-    vague: BoolArray
 
 
 def analyse(
@@ -158,13 +138,11 @@ def _analysed(
     inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
     colour = coloured_jointly(problem, influence, columns)
     covariance, noise = _covariance(error, columns, inverse, loss_scale(problem), colour)
-    member = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | _moved(powers) | _moved(shifts)
-    spread = np.sqrt(np.maximum(np.einsum("id,de,ie->i", rows, covariance, rows), 0.0))
-    weak = kept & ((spread >= _SAYS_NOTHING) | (noise >= _SAYS_NOTHING * singular))
-    vague = np.diag(covariance) >= _SAYS_NOTHING**2
-    directions = _Directions(singular, rows, ~kept, weak, member, vague)
+    # A factor that is 0 is not moved by what scales it: the others are, without any effect.
+    moved = _moved(powers * theta) | _moved(shifts)
+    directions = weighed(singular, rows, ~kept, moved, covariance, noise)
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
-    found = _blocks(directions)
+    found = untold(directions)
     names = tuple(p.name for p in problem.space)
     uncertainty = Uncertainty(
         names=names,
@@ -179,8 +157,8 @@ def _analysed(
     )
     statuses = _statuses(place, found, pulled)
     told = Known(
-        theta, statuses, physical, stdtrit(_told_by(n, inverse, colour, white), 0.975), member,
-        uncertainty.groups, rows[~kept], scale,
+        theta, statuses, physical, stdtrit(_told_by(n, inverse, colour, white), 0.975),
+        directions.member, uncertainty.groups, rows[~kept], scale,
     )  # fmt: skip
     estimates = _beside_jumps(problem, estimates_of(problem, told), one_sided, aside * scale)
     linear = None
@@ -237,18 +215,6 @@ def without_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[Flo
                                full_matrices=False)[1:]  # fmt: skip
     rows = rows[size > RANK]
     return columns - (columns @ rows.T) @ rows, rows.shape[0]
-
-
-def _blocks(directions: _Directions) -> tuple[Block, ...]:
-    """Parameters that have no effect of their own, then those of which the data say little."""
-    found = blocks(directions.rows[directions.null], directions.member)
-    if not directions.weak.any():
-        return found
-    weak = directions.rows[directions.weak]
-    # One that has a small part in a direction of which nothing is known is not known either.
-    has_part = np.any(weak**2 > _WEAK_MEMBER, axis=0) | directions.vague
-    member = has_part & ~directions.member
-    return found + tuple(one for one in blocks(weak, member) if one.basis.size)
 
 
 def _beside_jumps(

@@ -234,3 +234,23 @@ def test_of_the_eight_parameters_of_the_actuator_six_combinations_can_be_found()
 def replace_output(record: Record, values: FloatArray) -> Record:
     old = record.outputs[0]
     return Record(record.inputs, (Channel(old.name, old.times, values, old.unit),))
+
+
+def test_a_factor_of_a_sum_is_small_or_not_by_what_it_makes_of_it() -> None:
+    """Of a parameter in the thousands a factor of 1/2000 counts."""
+    written = document({"x": "(sin(a) + b/2000)*u - c*x"}, ("a", "b", "c"))
+    written["parameters"]["b"] = {"lower": 1, "upper": 5000}
+    problem, theta = posed(written, {"a": 0.3, "b": 1000.0, "c": 1.1})
+    (group,) = told(analyse(problem, theta)).values()
+    assert group.members == ("a", "b")
+    assert group.value == pytest.approx(0.3 + 1000 / 2000 / np.cos(0.3), rel=1e-3)
+
+
+def test_where_a_factor_is_zero_the_other_has_no_effect_and_it_is_no_group() -> None:
+    written = document({"x": "a*b*u + 1 - c*x"}, ("a", "b", "c"))
+    written["parameters"]["a"] = {"lower": 0, "upper": 2}
+    problem, theta = posed(written, {"a": 0.0, "b": 2.3, "c": 1.1})
+    analysis = analyse(problem, theta)
+    assert statuses(analysis) == {"a": "at bound", "b": "unidentifiable", "c": "identified"}
+    assert told(analysis) == {}
+    assert analysis.estimates[0].stderr is not None
