@@ -216,7 +216,8 @@ def _sum(names: Sequence[str], factors: FloatArray) -> str:
     for name, factor in zip(names, factors, strict=True):
         if factor == 0.0:
             continue
-        size = name if abs(factor) == 1.0 else f"{abs(factor):.4g}*{name}"
+        digits = f"{abs(factor):.4g}"
+        size = name if digits == "1" else f"{digits}*{name}"
         sign = ("-" if factor < 0 else "") if not text else (" - " if factor < 0 else " + ")
         text += sign + size
     return text

@@ -155,7 +155,8 @@ def _analysed(
         noise_colour=_named(colour, white),
         groups=tuple(g for one in found for g in written(one, names, theta, scale, physical)),
     )
-    statuses = _statuses(place, found, pulled)
+    combined = {name for group in uncertainty.groups for name in group.members}
+    statuses = _statuses(place, found, pulled, np.array([name in combined for name in names]))
     told = Known(
         theta, statuses, physical, stdtrit(_told_by(n, inverse, colour, white), 0.975),
         directions.member, uncertainty.groups, rows[~kept], scale,
@@ -307,12 +308,13 @@ def _named(colour: Coloured | None, white: Whitening | None) -> NoiseColour:
 
 
 def _statuses(
-    place: FloatArray, found: tuple[Block, ...], pulled: BoolArray
+    place: FloatArray, found: tuple[Block, ...], pulled: BoolArray, combined: BoolArray
 ) -> tuple[EstimateStatus, ...]:
     """What the data say of each parameter: see `EstimateStatus`.
 
-    Of one that they pull beyond its bound they say something, however large a residual the bound
-    leaves and standard errors with it.
+    `combined` (D,) are those in a combination; one in none is untold by itself, whatever moves the
+    others. Of one that they pull beyond its bound they say something, however large a residual the
+    bound leaves and standard errors with it.
     """
     statuses: list[EstimateStatus] = ["identified"] * place.size
     for d in np.flatnonzero((place < AT_BOUND) | (place > 1.0 - AT_BOUND)):
@@ -320,7 +322,7 @@ def _statuses(
     for block in found:
         for d in block.members:
             if not pulled[d]:
-                statuses[d] = "unidentifiable" if block.tells_nothing else "group"
+                statuses[d] = "group" if combined[d] else "unidentifiable"
     return tuple(statuses)
 
 
