@@ -30,7 +30,8 @@ from sysid.errors import InvalidSettings, nearest
 from sysid.models.initial import initial_parameters
 from sysid.models.model import Model
 from sysid.noise import Noise, with_noise
-from sysid.records import Record, split_record
+from sysid.records import Record
+from sysid.splitting import split_record
 
 if TYPE_CHECKING:
     from sysid.problem import Problem

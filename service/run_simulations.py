@@ -243,7 +243,7 @@ def _check_finite(found: _Simulated, asked: _Asked, control: ControlIn | None) -
 def _sampled(channel: Channel | None, times: FloatArray) -> Channel | None:
     if channel is None:
         return None
-    return replace(channel, times=times, values=sampled(channel, times))
+    return replace(channel, times=times, values=sampled(channel, times), history=None)
 
 
 def _metrics(

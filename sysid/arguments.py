@@ -56,6 +56,13 @@ class Arguments:
             self.fail(name, f"found {value!r}; need a finite number")
         return float(value)
 
+    def flag(self, name: str, *, default: bool) -> bool:
+        """Return true or false."""
+        value = self._given[name] if self.has(name) else default
+        if not isinstance(value, bool):
+            self.fail(name, f"found {value!r}; need true or false")
+        return value
+
     def positive(self, name: str) -> float:
         """Return a number above 0."""
         value = self.number(name)

@@ -12,11 +12,12 @@ import numpy as np
 
 from sysid.arguments import Arguments
 from sysid.errors import InvalidRecord, InvalidSettings, nearest
+from sysid.histories import changed, with_history, without_history
 from sysid.noise import Noise, noise_samples
 from sysid.pooling import pool, select
-from sysid.records import HOLDS, Channel, Hold, Recording, Segment, time_of_cut
+from sysid.records import HOLDS, Channel, Hold, Recording, Segment
 from sysid.resampling import resample
-from sysid.types import FloatArray
+from sysid.splitting import time_of_cut
 from sysid.units import difference, factor, is_blank, is_read, suggestion
 
 KINDS = ("gaussian", "uniform-sum")
@@ -68,27 +69,44 @@ def add_noise(recording: Recording, given: Arguments) -> Recording:
         )
     except InvalidSettings as error:
         given.fail(error.pointer.rpartition("/")[2], error.detail)
-    return _changed(
-        recording,
-        names,
-        lambda one: one.values + noise_samples(noise, one.values.size, names.index(one.name)),
-    )
+    return _with_channels(recording, names, lambda one: _noisy(one, noise, names.index(one.name)))
+
+
+def _noisy(channel: Channel, noise: Noise, stream: int) -> Channel:
+    """Noise on the samples first, so that their draw is the same with a history and without."""
+    size, history = channel.values.size, channel.history
+    if history is None:
+        return replace(channel, values=channel.values + noise_samples(noise, size, stream))
+    drawn = noise_samples(noise, size + history.values.size, stream)
+    return replace(
+        channel, values=channel.values + drawn[:size],
+        history=history._replace(values=history.values + drawn[size:]),
+    )  # fmt: skip
 
 
 def trim(recording: Recording, given: Arguments) -> Recording:
-    """Keep a span of time (`start` to `stop`, s) or of samples (`rows`: [first, last + 1])."""
-    given.only("start", "stop", "rows")
+    """Keep a span of time (`start` to `stop`, s) or of samples (`rows`: [first, last + 1]).
+
+    What was recorded before the span goes with it as history, unless `history` is false.
+    """
+    given.only("start", "stop", "rows", "history")
     if given.has("rows"):
         if given.has("start") or given.has("stop"):
             given.fail("rows", "is given together with a time; give rows, or start and stop")
-        return _rows(recording, given)
+        return _cut_out(_rows(recording, given), recording, given)
     if not given.has("start") and not given.has("stop"):
         given.fail("", "need start, stop (seconds), or rows")
     start = given.number("start", recording.start)
     stop = given.number("stop", recording.stop)
     if stop <= start:
         given.fail("stop", f"found {stop!r}; need more than the start, {start!r}")
-    return _span(recording, start, stop)
+    return _cut_out(_span(recording, start, stop), recording, given)
+
+
+def _cut_out(part: Recording, whole: Recording, given: Arguments) -> Recording:
+    if given.flag("history", default=True):
+        return with_history(part, whole)
+    return without_history(part)
 
 
 def _rows(recording: Recording, given: Arguments) -> Recording:
@@ -99,7 +117,7 @@ def _rows(recording: Recording, given: Arguments) -> Recording:
     if last > times.size:
         given.fail("rows", f"found [{first}, {last}]; the recording has {times.size} rows")
     channels = tuple(
-        replace(one, times=one.times[first:last], values=one.values[first:last])
+        replace(one, times=one.times[first:last], values=one.values[first:last], history=None)
         for one in recording.channels
     )
     return Recording(channels, _clipped(recording.segments, times[first], times[last - 1]))
@@ -124,14 +142,18 @@ def _clipped(segments: tuple[Segment, ...], start: float, stop: float) -> tuple[
 
 
 def split(recording: Recording, given: Arguments) -> Recording:
-    """Keep one part: the last `fraction` of the samples (``validation``) or what comes before."""
-    given.only("fraction", "part")
+    """Keep one part: the last `fraction` of the samples (``validation``) or what comes before.
+
+    What was recorded before the part goes with it as history, unless `history` is false.
+    """
+    given.only("fraction", "part", "history")
     part = given.choice("part", ("estimation", "validation"))
     longest = max((one.times for one in recording.channels), key=len)
     cut = time_of_cut(longest, given.number("fraction"), f"{given.pointer}/fraction")
     if part == "validation":
-        return _span(recording, cut, np.inf)
-    return _span(recording, -np.inf, float(np.nextafter(cut, -np.inf)))
+        return _cut_out(_span(recording, cut, np.inf), recording, given)
+    before = _span(recording, -np.inf, float(np.nextafter(cut, -np.inf)))
+    return _cut_out(before, recording, given)
 
 
 def detrend(recording: Recording, given: Arguments) -> Recording:
@@ -140,20 +162,24 @@ def detrend(recording: Recording, given: Arguments) -> Recording:
     degree = ("mean", "linear").index(given.choice("kind", ("mean", "linear"), "mean"))
     names = given.texts("channels") if given.has("channels") else list(recording.names)
 
-    def flat(channel: Channel) -> FloatArray:
+    def flat(channel: Channel) -> Channel:
         known = np.isfinite(channel.values)
         if np.count_nonzero(known) <= degree:
             given.fail("", f"channel {channel.name!r} has too few values")
         trend = np.polynomial.Polynomial.fit(channel.times[known], channel.values[known], degree)
-        return np.asarray(channel.values - trend(channel.times), dtype=np.float64)
+        return changed(channel, lambda times, values: np.asarray(values - trend(times)))
 
-    return _changed(recording, names, flat)
+    return _with_channels(recording, names, flat)
 
 
 def subtract_offset(recording: Recording, given: Arguments) -> Recording:
     """Subtract a number from each named channel."""
     offsets = {name: given.number(name) for name, _ in given.items()}
-    return _changed(recording, list(offsets), lambda one: one.values - offsets[one.name])
+    return _with_channels(
+        recording,
+        list(offsets),
+        lambda one: changed(one, lambda _, values: values - offsets[one.name]),
+    )
 
 
 def set_hold(recording: Recording, given: Arguments) -> Recording:
@@ -164,7 +190,7 @@ def set_hold(recording: Recording, given: Arguments) -> Recording:
 def set_unit(recording: Recording, given: Arguments) -> Recording:
     """Convert named channels to other units; of one that has none the unit is only written down."""
     units = {name: given.text(name) for name, _ in given.items()}
-    changed = {}
+    made = {}
     for name, unit in units.items():
         channel = recording.channel(name)
         times = 1.0 if is_blank(channel.unit) or is_blank(unit) else factor(channel.unit, unit)
@@ -173,10 +199,13 @@ def set_unit(recording: Recording, given: Arguments) -> Recording:
             told = difference(channel.unit, unit) or f"{' and '.join(unread)} cannot be read"
             need = f"need a unit of the same quantity as {channel.unit}"
             given.fail(name, f"{told}; {need}{suggestion(unit)}")
-        values = channel.values if times == 1.0 else channel.values * times
-        changed[name] = replace(channel, unit=unit.strip() or "1", values=values)
-    channels = tuple(changed.get(one.name, one) for one in recording.channels)
+        made[name] = replace(_scaled(channel, times), unit=unit.strip() or "1")
+    channels = tuple(made.get(one.name, one) for one in recording.channels)
     return replace(recording, channels=channels)
+
+
+def _scaled(channel: Channel, by: float) -> Channel:
+    return channel if by == 1.0 else changed(channel, lambda _, values: values * by)
 
 
 def rename(recording: Recording, given: Arguments) -> Recording:
@@ -196,17 +225,14 @@ def rename(recording: Recording, given: Arguments) -> Recording:
     )
 
 
-def _changed(
-    recording: Recording, names: Sequence[str], change: Callable[[Channel], FloatArray]
+def _with_channels(
+    recording: Recording, names: Sequence[str], change: Callable[[Channel], Channel]
 ) -> Recording:
     for name in names:
         recording.channel(name)
     return replace(
         recording,
-        channels=tuple(
-            replace(one, values=change(one)) if one.name in names else one
-            for one in recording.channels
-        ),
+        channels=tuple(change(one) if one.name in names else one for one in recording.channels),
     )
 
 

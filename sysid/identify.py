@@ -8,12 +8,13 @@ from sysid.errors import InvalidSettings
 from sysid.models.model import Model
 from sysid.noise import Noise, with_noise
 from sysid.problem import Problem
-from sysid.records import Record, split_record, start_of_validation
+from sysid.records import Record
 from sysid.result import Identification
 from sysid.run import RunState, advance, begin, conclude, is_finished
 from sysid.selection import selected
 from sysid.settings import GeneticAlgorithm, Loss, Prediction
 from sysid.signal_units import check_units
+from sysid.splitting import split_record, start_of_validation
 from sysid.unused import check_used
 
 _PROGRESS_SECONDS = 0.25

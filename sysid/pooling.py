@@ -38,14 +38,17 @@ def select(recording: Recording, given: Arguments) -> Recording:
     )
     if not kept:
         given.fail("", f"none of the {len(recording.segments)} segments satisfies this")
-    return Recording(tuple(_within(one, kept) for one in recording.channels), kept)
+    is_first = kept[0] is recording.segments[0]
+    return Recording(tuple(_within(one, kept, is_first) for one in recording.channels), kept)
 
 
-def _within(channel: Channel, kept: tuple[Segment, ...]) -> Channel:
+def _within(channel: Channel, kept: tuple[Segment, ...], is_first: bool) -> Channel:
+    """Samples of the segments; the history is that of the first one of the recording."""
     starts = np.searchsorted(channel.times, [one.start for one in kept])
     stops = np.searchsorted(channel.times, [one.stop for one in kept], side="right")
     rows = np.concatenate([np.arange(a, b) for a, b in zip(starts, stops, strict=True)])
-    return replace(channel, times=channel.times[rows], values=channel.values[rows])
+    history = channel.history if is_first else None
+    return replace(channel, times=channel.times[rows], values=channel.values[rows], history=history)
 
 
 def _condition(name: str, value: Any, given: Arguments) -> Condition:
@@ -78,7 +81,8 @@ def pool(recording: Recording, given: Arguments) -> Recording:
 
     The input becomes the median of its samples over bins of time, at the mean time of each bin's
     samples; each output keeps every sample at its own time. This resolves a lag that is shorter
-    than the sampling period when every repeat has another phase.
+    than the sampling period when every repeat has another phase. What the input was before
+    ``start`` is its history.
 
     With ``outputs_from``, conditions as in `select`, outputs are those of some segments only: where
     every repeat has the same input, those kept for validation may help to tell it.
@@ -95,7 +99,7 @@ def pool(recording: Recording, given: Arguments) -> Recording:
     stop = given.number("stop", float(np.nextafter(last, np.inf)))
     if stop <= start:
         given.fail("stop", f"found {stop!r}; need more than the start, {start!r}")
-    pooled = [_medians(source, recording.segments, start, stop, width)]
+    pooled = [_input(source, recording.segments, start, stop, width)]
     pooled += [_gathered(one, kept.segments, start, stop) for one in outputs]
     for channel in pooled:
         if channel is None:
@@ -129,17 +133,30 @@ def _gathered(
     if rows.size == 0:
         return None
     ordered = rows[np.argsort(times[rows], kind="stable")]
-    return replace(channel, times=times[ordered], values=channel.values[ordered])
+    return replace(channel, times=times[ordered], values=channel.values[ordered], history=None)
+
+
+def _input(
+    channel: Channel, segments: tuple[Segment, ...], start: float, stop: float, width: float
+) -> Channel | None:
+    """The pooled input; its history is what the repeats recorded before the start."""
+    bins = _medians(channel, segments, start, stop, width)
+    before = _medians(channel, segments, -np.inf, start, width, first=start)
+    if bins is None or before is None:
+        return bins
+    return bins.after(before)
 
 
 def _medians(
-    channel: Channel, segments: tuple[Segment, ...], start: float, stop: float, width: float
-) -> Channel | None:
+    channel: Channel, segments: tuple[Segment, ...], start: float, stop: float, width: float,
+    first: float | None = None,
+) -> Channel | None:  # fmt: skip
+    """Medians of the samples from start to stop; a bin begins at `first`, or else at the start."""
     gathered = _gathered(channel, segments, start, stop)
     if gathered is None:
         return None
-    bins = _bins(gathered.times, start, width)
-    firsts = np.flatnonzero(np.diff(bins, prepend=-1))
+    bins = _bins(gathered.times, start if first is None else first, width)
+    firsts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
     medians = np.array([np.median(part) for part in np.split(gathered.values, firsts[1:])])
     counts = np.diff(firsts, append=bins.size)
     # Not the bin's middle: where its samples are few or uneven, that would shift the curve in time.

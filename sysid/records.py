@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sysid.errors import InvalidRecord, InvalidSettings, nearest
+from sysid.errors import InvalidRecord, nearest
 from sysid.types import FloatArray
 
 Hold = Literal["zero", "first", "band-limited"]
@@ -47,6 +47,13 @@ def sampling_of(times: FloatArray) -> Sampling:
     return Sampling(times.size, float(np.median(np.diff(times))), is_regular=False)
 
 
+class History(NamedTuple):
+    """Samples from before a channel's first: times (s, not decreasing) and values."""
+
+    times: FloatArray
+    values: FloatArray
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Channel:
     """One measured signal on its own times.
@@ -61,6 +68,10 @@ class Channel:
         In `unit`; ``nan`` is a missing value.
     hold : {"zero", "first", "band-limited"}
         What an input does between its samples.
+    history : History or None
+        What was recorded before the first sample. A lag reads an input there; nothing else does:
+        simulation and comparison begin where the samples do. None: nothing is known, and the
+        first value is taken to have stood all the time before.
 
     Raises
     ------
@@ -73,6 +84,7 @@ class Channel:
     values: FloatArray
     unit: str = "1"
     hold: Hold = "first"
+    history: History | None = None
 
     def __post_init__(self) -> None:
         if self.times.ndim != 1 or self.times.shape != self.values.shape or self.times.size == 0:
@@ -82,6 +94,24 @@ class Channel:
             )
         if not np.all(np.isfinite(self.times)) or np.any(np.diff(self.times) < 0):
             raise InvalidRecord(f"the times of channel {self.name!r} decrease or are not finite")
+        if self.history is not None:
+            times = np.append(self.history.times, self.times[0])
+            if np.any(np.diff(times) < 0) or not np.all(np.isfinite(times)):
+                raise InvalidRecord(
+                    f"the history of channel {self.name!r} is not before its first sample, or its "
+                    "times decrease or are not finite"
+                )
+
+    @property
+    def whole(self) -> "Channel":
+        """History and samples as samples of one channel."""
+        if self.history is None:
+            return self
+        times, values = (
+            np.concatenate(pair)
+            for pair in zip(self.history, (self.times, self.values), strict=True)
+        )
+        return replace(self, times=times, values=values, history=None)
 
     @property
     def sampling(self) -> Sampling:
@@ -89,7 +119,7 @@ class Channel:
         return sampling_of(self.times)
 
     def between(self, start: float, stop: float) -> "Channel":
-        """Return the samples with `start` ≤ time ≤ `stop`.
+        """Return the samples with `start` ≤ time ≤ `stop`; what was cut off before is lost.
 
         Raises
         ------
@@ -102,7 +132,21 @@ class Channel:
                 f"channel {self.name!r} has no sample from {start:g} to {stop:g} s; "
                 f"its samples are from {self.times[0]:g} to {self.times[-1]:g} s"
             )
-        return replace(self, times=self.times[first:last], values=self.values[first:last])
+        kept = self.history if first == 0 else None
+        return replace(
+            self, times=self.times[first:last], values=self.values[first:last], history=kept
+        )
+
+    def cut(self, start: float, stop: float) -> "Channel":
+        """Return the same samples as `between`, with all that was before them as their history."""
+        return self.between(start, stop).after(self)
+
+    def after(self, other: "Channel") -> "Channel":
+        """Return this channel with what another was before it as its history."""
+        whole = other.whole
+        count = int(np.searchsorted(whole.times, self.times[0]))
+        history = History(whole.times[:count], whole.values[:count]) if count else None
+        return replace(self, history=history)
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +273,7 @@ class Recording:
 
     def _piece(self, segment: Segment) -> "Recording":
         cut = [channel.between(segment.start, segment.stop) for channel in self.channels]
-        return Recording(tuple(replace(one, times=own_times(one.times, segment)) for one in cut))
+        return Recording(tuple(_on_own_times(one, segment) for one in cut))
 
 
 def both_ways(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> dict[str, str]:
@@ -257,6 +301,13 @@ def own_times(times: FloatArray, segment: Segment) -> FloatArray:
     return np.round(times - segment.start + segment.origin, 9)
 
 
+def _on_own_times(channel: Channel, segment: Segment) -> Channel:
+    history = channel.history
+    if history is not None:
+        history = history._replace(times=own_times(history.times, segment))
+    return replace(channel, times=own_times(channel.times, segment), history=history)
+
+
 def _as_input(channel: Channel, role: str) -> Channel:
     missing = np.flatnonzero(~np.isfinite(channel.values))
     if missing.size:
@@ -265,7 +316,18 @@ def _as_input(channel: Channel, role: str) -> Channel:
             f"the first at t = {channel.times[missing[0]]:g} s; an input must be known "
             "everywhere: trim the recording or fill the gaps"
         )
-    return replace(channel, name=role)
+    return replace(channel, name=role, history=_known(channel.history))
+
+
+def _known(history: History | None) -> History | None:
+    """The history behind its last missing value: what lies before that may be of another test."""
+    if history is None:
+        return None
+    missing = np.flatnonzero(~np.isfinite(history.values))
+    first = int(missing[-1]) + 1 if missing.size else 0
+    if first == history.values.size:
+        return None
+    return History(history.times[first:], history.values[first:])
 
 
 def _as_output(channel: Channel, role: str) -> Channel:
@@ -273,7 +335,7 @@ def _as_output(channel: Channel, role: str) -> Channel:
         raise InvalidRecord(
             f"output {role!r} (channel {channel.name!r}) has no value: all are missing (NaN)"
         )
-    return replace(channel, name=role)
+    return replace(channel, name=role, history=None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -307,58 +369,3 @@ def common_sample_time(records: Sequence[Record]) -> float | None:
     if not all(one.is_regular for one in found) or np.ptp(periods) > _SAME_PERIOD * min(periods):
         return None
     return periods[0]
-
-
-def split_record(record: Record, fraction: float) -> tuple[Record, Record]:
-    """Split a record in time: first the part for estimation, then `fraction` for validation.
-
-    The cut lies at a sample of the longest output, which begins the validation part.
-
-    Raises
-    ------
-    InvalidSettings
-        If the fraction is not between 0 and 1, or leaves a channel of a part without samples.
-    """
-    cut = start_of_validation(record, fraction)
-    parts = []
-    for start, stop in ((-np.inf, np.nextafter(cut, -np.inf)), (cut, np.inf)):
-        try:
-            parts.append(
-                replace(
-                    record,
-                    inputs=tuple(one.between(start, stop) for one in record.inputs),
-                    outputs=tuple(one.between(start, stop) for one in record.outputs),
-                )
-            )
-        except InvalidRecord as error:
-            raise InvalidSettings("/validation/fraction", f"found {fraction!r}: {error}") from None
-    return parts[0], parts[1]
-
-
-def start_of_validation(record: Record, fraction: float) -> float:
-    """Time (s) at which the last `fraction` of a record begins, a sample of the longest output.
-
-    Raises
-    ------
-    InvalidSettings
-        If the fraction is not between 0 and 1, or one part would be empty.
-    """
-    return time_of_cut(max((one.times for one in record.outputs), key=len), fraction)
-
-
-def time_of_cut(times: FloatArray, fraction: float, pointer: str = "/validation/fraction") -> float:
-    """Time (s) of the sample at which the last `fraction` of the samples begins.
-
-    Raises
-    ------
-    InvalidSettings
-        If the fraction is not between 0 and 1, or one part would be empty.
-    """
-    if not 0 < fraction < 1:
-        raise InvalidSettings(pointer, f"found {fraction!r}; need a number between 0 and 1")
-    first = times.size - round(fraction * times.size)
-    if not 0 < first < times.size:
-        raise InvalidSettings(
-            pointer, f"found {fraction!r}: one part of {times.size} samples would be empty"
-        )
-    return float(times[first])

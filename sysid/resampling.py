@@ -1,12 +1,15 @@
 """All channels of a recording on one regular grid."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from math import floor
 
 import numpy as np
 
 from sysid.arguments import Arguments
+from sysid.histories import MORE
 from sysid.kernels.inputs import mean_of_held
-from sysid.records import Channel, Recording, Segment
+from sysid.records import Channel, History, Recording, Segment
 from sysid.types import FloatArray
 
 MOST_SAMPLES = 50_000_000
@@ -24,6 +27,9 @@ def resample(recording: Recording, given: Arguments) -> Recording:
     to half a period behind it, which keeps faster components from being folded into the slow ones.
     Of a channel with zero-order hold it is the mean over the period for which it is then held:
     the jumps stay, on average, where they are, and so does a lag behind them.
+
+    The grid goes on backwards through what a channel was before: its history, and where it was
+    recorded longer than others what lies before the grid. Of segments only the first has one.
     """
     given.only("sample_time", "method")
     period = given.positive("sample_time")
@@ -35,25 +41,32 @@ def resample(recording: Recording, given: Arguments) -> Recording:
     for grid in grids:
         if grid.size == 0:
             given.fail("", "the channels share no time")
-    times = np.concatenate(grids)
     read = _mean if method == "mean" else _between
-    channels = tuple(
-        replace(
-            one,
-            times=times,
-            values=np.concatenate(
-                [
-                    read(one.between(*span), grid, period)
-                    for span, grid in zip(spans, grids, strict=True)
-                ]
-            ),
-        )
-        for one in recording.channels
-    )
+    channels = []
+    for one in recording.channels:
+        first, *later = [one.between(*span) for span in spans]
+        begun = _on_grid(first, grids[0], period, read)
+        values = [begun.values]
+        values += [read(part, grid, period) for part, grid in zip(later, grids[1:], strict=True)]
+        channels.append(replace(begun, times=np.concatenate(grids), values=np.concatenate(values)))
     segments = tuple(
         _moved(one, grid) for one, grid in zip(recording.segments, grids, strict=False)
     )
-    return Recording(channels, segments)
+    return Recording(tuple(channels), segments)
+
+
+def _on_grid(
+    channel: Channel, grid: FloatArray, period: float,
+    read: Callable[[Channel, FloatArray, float], FloatArray],
+) -> Channel:  # fmt: skip
+    """A channel on a grid, and before it as far as anything is known."""
+    whole = channel.whole
+    known = max(floor((grid[0] - whole.times[0]) / period + _ON_BORDER), 0)
+    back = min(known, grid.size + MORE)  # no lag is longer than the record
+    times = np.concatenate([grid[0] - period * np.arange(back, 0, -1), grid])
+    values = read(whole, times, period)
+    history = History(times[:back], values[:back]) if back else None
+    return replace(channel, times=grid, values=values[back:], history=history)
 
 
 def _grid(channels: list[Channel], period: float) -> FloatArray:

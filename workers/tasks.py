@@ -15,10 +15,10 @@ from sysid.models.model import Model
 from sysid.models.spec import parse_model
 from sysid.noise import Noise, with_noise
 from sysid.problem import Problem, rms_against
-from sysid.records import split_record, start_of_validation
 from sysid.run import CALL_SECONDS, advance_island, begin, conclude, is_finished
 from sysid.run import advance as advance_run
 from sysid.selection import selected
+from sysid.splitting import split_record, start_of_validation
 from workers.ports import (
     Advance,
     Advanced,

@@ -1,13 +1,13 @@
 """Inputs between their samples: each is laid once onto a fine uniform grid that kernels read."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from typing import Literal
 
 import numpy as np
 
 from sysid.errors import InvalidRecord
-from sysid.records import Channel
+from sysid.records import Channel, History
 from sysid.types import FloatArray
 
 DENSE = 8
@@ -18,6 +18,7 @@ MOST_POINTS = 64
 
 _JITTER = 0.05  # of a fine point, that times written with few digits are off
 
+_OFF_PERIOD = 0.05  # of a sampling period, that samples count as regular
 _HALF_WIDTH = 48  # of the band-limited interpolation, in samples
 _KAISER = 8.0  # 80 dB
 
@@ -61,6 +62,8 @@ def fine_input(
     mean over a step enters whole, however the jump lies: the response is as smooth in the lag as
     the plant makes it, and at whole lags it is what it was.
 
+    Before its first sample the input is what its history says, and before that its first value.
+
     Parameters
     ----------
     start, step, steps : float, float, int
@@ -70,6 +73,7 @@ def fine_input(
     mean : {"around", "after"} or None
         How a held input is averaged; None: it is not.
     """
+    channel = _with_usable_history(channel)
     points = _points(channel, start, step)
     cap = ceil(lag * points) + 2
     count = cap + (steps + 2) * points + 2
@@ -82,6 +86,22 @@ def fine_input(
     return FineInput(
         between_samples(channel, times), cap, points, jump, points - jump, max(cap - 2, 0)
     )
+
+
+def _with_usable_history(channel: Channel) -> Channel:
+    """History and samples together; of a band-limited channel the history that keeps its period.
+
+    Between irregular samples nothing is band-limited, and a gap in what was recorded before must
+    not make a record useless that is regular itself.
+    """
+    if channel.history is None or channel.hold != "band-limited":
+        return channel.whole
+    period = (channel.times[-1] - channel.times[0]) / max(channel.times.size - 1, 1)
+    times, values = channel.history
+    expected = channel.times[0] - period * np.arange(times.size, 0, -1)
+    off = np.flatnonzero(np.abs(times - expected) >= 0.5 * _OFF_PERIOD * period)
+    first = int(off[-1]) + 1 if off.size else 0
+    return replace(channel, history=History(times[first:], values[first:])).whole
 
 
 def _points(channel: Channel, start: float, step: float) -> int:
@@ -110,7 +130,7 @@ def sampling_period(channel: Channel) -> float | None:
 
 
 def between_samples(channel: Channel, times: FloatArray) -> FloatArray:
-    """Values of a channel at any times, by its hold; its end values outside the record."""
+    """Values of a channel at any times, by its hold; its end values outside its samples."""
     if channel.hold == "first" or channel.times.size < 2:
         return np.interp(times, channel.times, channel.values)
     if channel.hold == "zero":
@@ -174,5 +194,5 @@ def _band_limited(channel: Channel, times: FloatArray) -> FloatArray:
 def _is_regular(times: FloatArray, period: float) -> bool:
     return bool(
         period > 0
-        and np.max(np.abs(times - times[0] - period * np.arange(times.size))) < 0.05 * period
+        and np.max(np.abs(times - times[0] - period * np.arange(times.size))) < _OFF_PERIOD * period
     )

@@ -12,9 +12,10 @@ from sysid.models.library import load_model
 from sysid.models.spec import parse_model
 from sysid.noise import Noise, with_noise
 from sysid.problem import Problem
-from sysid.records import Channel, Record, split_record
+from sysid.records import Channel, Record
 from sysid.result import Identification
 from sysid.settings import GeneticAlgorithm
+from sysid.splitting import split_record
 from tests.searching import DUFFING, force
 from workers.ports import ProblemSpec
 from workers.tasks import build, prepared

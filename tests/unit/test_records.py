@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from sysid.errors import InvalidRecord, InvalidSettings, nearest
-from sysid.records import Channel, Record, Recording, Segment, sampling_of, split_record
+from sysid.records import Channel, Record, Recording, Segment, sampling_of
+from sysid.splitting import split_record
 
 
 def ramp(name: str, samples: int = 10, period: float = 0.1) -> Channel:
