@@ -1,6 +1,5 @@
 """The REST calls as values, shared by the synchronous and the asynchronous client."""
 
-import asyncio
 import json
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -265,6 +264,8 @@ def checked(answer: "httpx.Response") -> "httpx.Response":
 
 
 async def _read_pieces(path: Path) -> AsyncIterator[bytes]:
+    import asyncio  # late, for commands that open no connection
+
     with path.open("rb") as file:
         while piece := await asyncio.to_thread(file.read, PIECE):
             yield piece

@@ -4,8 +4,7 @@ import json
 from typing import Any
 
 from service.errors import FieldError, InvalidRequest, TooLarge
-from service.storage.columns import require_storable_texts
-from service.storage.errors import UnstorableValue
+from service.storage.texts import fault_in_json
 from sysid.errors import InvalidModel
 from sysid.models import documents
 
@@ -54,12 +53,10 @@ def read_json(text: bytes) -> Any:
 
 def _storable(document: Any) -> Any:
     """The document, whose texts a database can keep: escapes can stand for what is no text."""
-    try:
-        require_storable_texts(
-            json.dumps(document, ensure_ascii=False, default=repr, skipkeys=True)
-        )
-    except UnstorableValue as error:
-        raise InvalidRequest.at("", str(error)) from None
+    written = json.dumps(document, ensure_ascii=False, default=repr, skipkeys=True)
+    fault = fault_in_json(written)
+    if fault is not None:
+        raise InvalidRequest.at("", fault)
     return document
 
 

@@ -27,8 +27,9 @@ from service.errors import (
 )
 from service.pointers import body_type, explained
 from service.sentences import detail_of
-from service.storage.errors import HALF_A_PAIR, StorageError
+from service.storage.errors import StorageError
 from service.storage.patience import PASSING, is_passing
+from service.storage.texts import HALF_A_PAIR
 from sysid.errors import SysidError
 
 log = logging.getLogger(__name__)

@@ -192,13 +192,14 @@ def _refuse_same(data: Path, validation: Path | None) -> None:
 def read(path: Path, reading: Reading) -> "Recording":
     """A recording from a file; notes about it go to stderr."""
     from service.signals.csv_reader import read_csv
-    from service.signals.limits import DEFAULT_LIMITS
-    from service.signals.reader import read_mcap
     from sysid.signal_units import unknown_units
 
     if not path.is_file():
         fail(f"there is no file {path}")
     if path.suffix.lower() == ".mcap":
+        from service.signals.limits import DEFAULT_LIMITS
+        from service.signals.reader import read_mcap
+
         recording, notes = read_mcap(path, DEFAULT_LIMITS)
     else:
         recording, notes = read_csv(

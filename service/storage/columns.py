@@ -1,7 +1,6 @@
 """Column types that mean the same on SQLite and on PostgreSQL."""
 
 import json
-import re
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any, TypeAlias
@@ -9,7 +8,8 @@ from typing import Any, TypeAlias
 from sqlalchemy import JSON, BigInteger, DateTime, Dialect, Enum, Integer, String, TypeDecorator
 from sqlalchemy.dialects.postgresql import JSONB
 
-from service.storage.errors import HALF_A_PAIR, UnstorableValue
+from service.storage.errors import UnstorableValue
+from service.storage.texts import fault_in_json, fault_of
 
 Document: TypeAlias = dict[str, Any]
 """A JSON object."""
@@ -20,7 +20,6 @@ WrittenType = JSON(none_as_null=True)
 """JSON as it was written: JSONB sorts keys, and a search draws parameters in their order."""
 
 _ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=False, separators=(",", ":"))
-_SURROGATE = re.compile("[\ud800-\udfff]")
 
 LargeInteger = BigInteger().with_variant(Integer(), "sqlite")
 """64 bits on both: SQLite calls that INTEGER, and numbers rows by no other type."""
@@ -61,8 +60,9 @@ class Text(TypeDecorator[str]):
 
     def process_bind_param(self, value: str | None, dialect: Dialect) -> str | None:
         """The same text, once it is known to be storable."""
-        if value is not None:
-            _require_storable(value)
+        fault = None if value is None else fault_of(value)
+        if fault is not None:
+            raise UnstorableValue(fault)
         return value
 
 
@@ -72,15 +72,10 @@ def to_json(value: object) -> str:
         text = _ENCODER.encode(value)
     except ValueError as error:
         raise UnstorableValue(f"a document holds NaN or an infinite number: {error}") from error
-    require_storable_texts(text)
+    fault = fault_in_json(text)
+    if fault is not None:
+        raise UnstorableValue(fault)
     return text
-
-
-def require_storable_texts(text: str) -> None:
-    """Raise `UnstorableValue` if a text in a JSON document is none that a database can keep."""
-    # json.dumps escapes NUL as \u0000; an escaped backslash before u0000 is an ordinary text.
-    nul = "\\u0000" in text and "\\u0000" in text.replace("\\\\", "")
-    _require_storable(text, nul=nul)
 
 
 def state_type(states: type[StrEnum]) -> Enum:
@@ -91,10 +86,3 @@ def state_type(states: type[StrEnum]) -> Enum:
         length=16,
         values_callable=lambda kind: [one.value for one in kind],
     )
-
-
-def _require_storable(text: str, *, nul: bool = False) -> None:
-    if nul or "\x00" in text:
-        raise UnstorableValue("a text holds the character NUL (U+0000); remove it")
-    if not text.isascii() and _SURROGATE.search(text):
-        raise UnstorableValue(HALF_A_PAIR)

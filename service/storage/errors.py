@@ -65,9 +65,6 @@ class InvalidCursor(StorageError, ValueError):
         self.cursor = cursor
 
 
-HALF_A_PAIR = "a text holds half of a surrogate pair; it is not valid Unicode"
-
-
 class UnstorableValue(StorageError, ValueError, DontWrapMixin):
     """A text or document holds what no database can keep: NUL, half a surrogate, NaN."""
 
