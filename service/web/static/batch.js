@@ -14,7 +14,7 @@ const recorded = () => (chosen()[0]?.dataset.channels ?? '').split('\n').filter(
 
 function channels() {
   const names = recorded();
-  const now = JSON.stringify([field('model').value, names]);
+  const now = JSON.stringify([model?.name, names]);
   if (!model || now === drawnFor) return;
   drawnFor = now;
   drawChannels(model, names);
@@ -56,7 +56,10 @@ function body() {
 }
 
 async function modelChosen() {
-  model = await chosenModel(form);
+  model = null;
+  const found = await chosenModel(form);
+  if (!found) return;
+  model = found;
   channels();
 }
 

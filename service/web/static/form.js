@@ -1,6 +1,6 @@
 // New identification: choices from the REST interface, live checks, and one POST to /v1/jobs.
 
-import { Problem, ask, element, post } from './live.js';
+import { Problem, ask, element, latest } from './live.js';
 import * as forms from './fields.js';
 import { clearFaults, fillTable, overrides, showFaults } from './fields.js';
 
@@ -71,9 +71,12 @@ async function choose(id) {
   await chosen();
 }
 
+const recordingOf = latest(async (id) => ({ dataset: id ? await ask(`/v1/datasets/${encodeURIComponent(id)}`) : null }));
+
 async function chosen() {
-  const id = field('dataset').value;
-  state.dataset = id ? await ask(`/v1/datasets/${encodeURIComponent(id)}`) : null;
+  const found = await recordingOf(field('dataset').value);
+  if (!found) return;
+  state.dataset = found.dataset;
   const facts = document.getElementById('dataset-facts');
   const channels = state.dataset?.channels ?? [];
   facts.textContent = channels.map((one) => (one.unit && one.unit !== '1' ? `${one.name} [${one.unit}]` : one.name)).join(' · ');
@@ -99,10 +102,15 @@ async function upload() {
   }
 }
 
+/** A model of the list, or the check of a text: only what was asked for last is shown. */
+const about = latest((question) => question());
+
 /** Show a model of the list; its text is there to be read, and to be changed with "own equations". */
 async function listed(changes) {
-  const model = await ask(`/v1/models/${encodeURIComponent(field('model').value)}`);
-  const text = await ask(`/pages/models/${encodeURIComponent(field('model').value)}.yaml`);
+  const name = encodeURIComponent(field('model').value);
+  const found = await about(() => Promise.all([ask(`/v1/models/${name}`), ask(`/pages/models/${name}.yaml`)]));
+  if (!found) return;
+  const [model, text] = found;
   field('equations').value = text;
   field('equations').readOnly = true;
   take(model.document, changes);
@@ -115,13 +123,12 @@ async function own(text, changes) {
   await check(changes);
 }
 
-let turn = 0;
+/** Whether the text can be used; null where something else was asked for meanwhile. */
 async function check(changes) {
-  const now = ++turn;
-  const found = await ask('/v1/models:check', {
-    method: 'POST', headers: { 'Content-Type': 'application/yaml' }, body: field('equations').value,
-  });
-  if (now !== turn) return false; // a later text is being checked
+  const text = field('equations').value;
+  const found = await about(() =>
+    ask('/v1/models:check', { method: 'POST', headers: { 'Content-Type': 'application/yaml' }, body: text }));
+  if (!found) return null;
   verdict(found);
   if (found.valid) take(found.normal_form, changes);
   return found.valid;
@@ -145,7 +152,7 @@ function take(document, changes) {
   const same = JSON.stringify(state.model) === JSON.stringify(document);
   state.model = document;
   if (same && !changes) return;
-  fillTable(document, changes ?? {});
+  fillTable(document, changes ?? overrides());
   mapChannels();
 }
 
@@ -232,10 +239,15 @@ function chosenValidation(value) {
 
 /** Own equations are checked before they are sent. */
 async function isReady() {
-  if (!isOwn() || (await check())) return true;
-  say('the model cannot be used yet');
-  field('equations').focus();
-  return false;
+  while (isOwn()) {
+    const usable = await check();
+    if (usable) return true;
+    if (usable === null) continue;
+    say('the model cannot be used yet');
+    field('equations').focus();
+    return false;
+  }
+  return true;
 }
 
 const say = (text) => forms.say(form, text);
@@ -257,12 +269,17 @@ field('dataset').addEventListener('change', shown(chosen));
 field('upload').addEventListener('change', shown(upload));
 field('model').addEventListener('change', shown(() => {
   field('source').value = 'listed';
+  // What was typed into the table of the model before would be lost.
+  state.model = null;
+  fillTable({}, {});
   return listed();
 }));
 for (const one of field('source'))
   one.addEventListener('change', shown(() => (isOwn() ? own() : listed())));
-field('equations').addEventListener('input', () =>
-  document.getElementById('check').replaceChildren(element('span', 'checking…', 'muted')));
+field('equations').addEventListener('input', () => {
+  about(async () => null); // an answer about the text before this one says nothing any more
+  document.getElementById('check').replaceChildren(element('span', 'checking…', 'muted'));
+});
 field('equations').addEventListener('input', delayed(shown(() => check()), 300));
 forms.submits(form, '/v1/jobs', body, isReady);
 panel.addEventListener('toggle', shown(() => panel.open && start()));

@@ -75,6 +75,21 @@ export async function ask(url, options = {}) {
   );
 }
 
+/** Of several answers the one to the last question counts; to one before it, or a refusal of it, null is heard. */
+export function latest(question) {
+  let last = 0;
+  return async (...given) => {
+    const mine = ++last;
+    try {
+      const found = await question(...given);
+      return mine === last ? found : null;
+    } catch (error) {
+      if (mine !== last) return null;
+      throw error;
+    }
+  };
+}
+
 export const put = (url, body) => post(url, body, 'PUT');
 
 export const post = (url, body, method = 'POST') =>

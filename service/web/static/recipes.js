@@ -1,13 +1,20 @@
 // What the forms of recipes (noise sweep, re-identification) share: models, channels, numbers.
 
-import { ask, element } from './live.js';
+import { ask, element, latest } from './live.js';
 import { fillTable } from './fields.js';
 
-/** The document of the chosen model, with its table of bounds drawn anew. */
+const modelOf = latest((name) => ask(`/v1/models/${encodeURIComponent(name)}`));
+
+/**
+ * The document of the chosen model, with its table of bounds drawn anew; null where another was chosen meanwhile.
+ * The table of the model before goes at once: what was typed into it now would be lost.
+ */
 export async function chosenModel(form) {
-  const { document: found } = await ask(`/v1/models/${encodeURIComponent(form.elements.model.value)}`);
-  fillTable(found, {});
-  return found;
+  fillTable({}, {});
+  const found = await modelOf(form.elements.model.value);
+  if (!found) return null;
+  fillTable(found.document, {});
+  return found.document;
 }
 
 export const inputsOf = (model) => Object.keys(model.inputs ?? {});

@@ -40,7 +40,11 @@ function drawSource() {
 const recorded = () => (field('dataset').selectedOptions[0]?.dataset.channels ?? '').split('\n').filter(Boolean);
 
 async function modelChosen() {
-  model = await chosenModel(form);
+  model = null;
+  document.getElementById('truth-values').replaceChildren();
+  const found = await chosenModel(form);
+  if (!found) return;
+  model = found;
   drawTruth();
   drawChannels(model, recorded());
 }
