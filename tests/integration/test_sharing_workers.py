@@ -54,13 +54,19 @@ def test_a_single_identification_gets_in_while_nine_sweeps_of_thousands_of_runs_
 
 
 class Counted(Leases):
-    """Leases that count what they claim."""
+    """Leases that count what they claim; after the first, the rival's first is waited for."""
 
     claimed = 0
+
+    def __init__(self, database: Database, seconds: float, both: threading.Barrier) -> None:
+        super().__init__(database, seconds)
+        self._both = both
 
     def claim(self, admission: Admission | None = None) -> Claim | None:
         found = super().claim(admission)
         self.claimed += found is not None
+        if found is not None and self.claimed == 1:
+            self._both.wait(LIMIT_SECONDS)
         return found
 
 
@@ -71,7 +77,8 @@ def test_two_dispatchers_split_the_jobs_of_one_database_and_each_run_is_done_onc
     jobs = [place.submit(sweep=sweep(4), algorithm=QUICK, seed=n) for n in range(12)]
     url = database.engine.url.render_as_string(hide_password=False)
     own = [Database(url), Database(url)]
-    leases = [Counted(one, 60.0) for one in own]
+    both = threading.Barrier(2)  # a quick one could have them all before the other begins
+    leases = [Counted(one, 60.0, both) for one in own]
     dispatchers = [
         Dispatcher(one, open_store(place.settings.store), InlineCrew(), mine)
         for one, mine in zip(own, leases, strict=True)

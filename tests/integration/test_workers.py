@@ -2,7 +2,6 @@
 
 import os
 import signal
-import threading
 import time
 from pathlib import Path
 
@@ -64,25 +63,14 @@ def test_a_cancelled_job_frees_the_workers_soon_and_they_go_on_working(ray_crew)
 
 
 def test_a_run_survives_the_death_of_its_worker(ray_crew) -> None:
-    one = spec(4, "long", generations=400)
-    killed: list[int] = []
-
-    def kill_one_worker() -> None:
-        while not killed:
-            for pid in workers_of(os.getpid()):
-                os.kill(pid, signal.SIGKILL)
-                killed.append(pid)
-                return
-            time.sleep(0.01)
-
-    thread = threading.Thread(target=kill_one_worker)
+    one = spec(4, "long", generations=4000)  # of many packs, each of which is fed from here
     feeder, notebook = Feeder(ray_crew), Notebook()
     feeder.add("job", ListedRuns([QueuedRun("r", one)]), notebook)
-    feeder.step(0.05)
-    thread.start()
-    while not feeder.step(0.05):
-        pass
-    thread.join()
+    killed: list[int] = []
+    while not feeder.step(0.01):
+        if not killed and (killed := workers_of(os.getpid())[:1]):
+            os.kill(killed[0], signal.SIGKILL)
+    assert killed
     assert notebook.failures == {}
     assert len(notebook.results["r"]) == 1
 

@@ -1,15 +1,29 @@
 """Turns at what is heavy: so many at once, some wait, the others are refused at once."""
 
 from concurrent.futures import ThreadPoolExecutor
-from threading import Event
+from threading import BoundedSemaphore, Event, Semaphore
 
 import pytest
 
+from service import turns as module
 from service.errors import Busy
 from service.turns import Turns
 
 
-def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused() -> None:
+def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = Semaphore(0)
+
+    class Told(BoundedSemaphore):
+        """Tells of everyone who has a place and asks for a turn."""
+
+        def acquire(self, blocking: bool = True, timeout: float | None = None) -> bool:
+            if timeout is not None:
+                asked.release()
+            return super().acquire(blocking, timeout)
+
+    monkeypatch.setattr(module, "BoundedSemaphore", Told)
     turns, begun, ended = Turns(at_once=2, waiting=1), [Event(), Event(), Event()], Event()
 
     def work(number: int) -> int:
@@ -22,7 +36,8 @@ def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused() -> None:
         first = [pool.submit(work, number) for number in range(2)]
         assert all(one.wait(30) for one in begun[:2])
         third = pool.submit(work, 2)
-        assert not begun[2].wait(0.05)
+        assert all(asked.acquire(timeout=30) for _ in range(3))
+        assert not begun[2].is_set()
         with pytest.raises(Busy, match="too many"), turns.one():
             pass
         ended.set()
