@@ -6,21 +6,28 @@ apart from one another, and the model is simulated, once more with all others mo
 one bound make parallel sections alike at that estimate only. What changes nothing then counts. One
 order is given, the largest first; bounds that do not hold the other order tell which is which, and
 leave nothing to be exchanged.
+
+Parallel sections change places as a whole, gains and initial states with them. What goes with what
+is read off the equations (`sysid.sections`), and tried in the same way. Of S states that are at
+most S(S - 1)/2 times five simulations.
 """
 
 from collections.abc import Iterator
-from itertools import combinations
+from itertools import chain, combinations
 
 import numpy as np
 
 from sysid.models.lags import past_signals
 from sysid.problem import Problem
+from sysid.sections import Unit, alike
 from sysid.symmetries import scalings
 from sysid.ties import names_in
 from sysid.types import FloatArray
 
-Exchanges = tuple[tuple[int, ...], ...]
-"""Groups of places in the problem's space, rising, any two of which can be exchanged."""
+Exchange = tuple[Unit, ...]
+"""Units of places in the problem's space, any two of which can be exchanged: (k, w)."""
+
+Exchanges = tuple[Exchange, ...]
 
 _APART = 0.05  # of their size: how far the two are set apart at least
 _LEAST = 1e-3  # of the range: values nearer 0 are taken to be of that size
@@ -41,46 +48,87 @@ def exchanges(
     most : int or None
         Simulations that may be run; pairs beyond are not looked at.
     """
-    groups: list[set[int]] = []
+    groups: list[Exchange] = []
     pairs, spent = _likely(problem, theta, list(_candidates(problem, theta)), most)
-    for one, other in pairs:
-        if any({one, other} <= group for group in groups):
+    single = (((one,), (other,)) for one, other in pairs)
+    together = (pair for pair in alike(problem) if _holds_both(problem, theta, *pair))
+    for one, other in chain(single, together):
+        if _group_of(groups, one) == _group_of(groups, other):
             continue
         if most is not None and spent + _ALONE + _AGAIN > most:
             break
         found, count = _changes_nothing(problem, theta, one, other)
         spent += count
         if found:
-            groups = _joined(groups, one, other)
+            groups = _with(groups, one, other)
     every = sorted(tuple(sorted(group)) for group in groups)
     return tuple(one for one in every if _is_falling(ordered(problem, theta, (one,)), one)), spent
 
 
-def _is_falling(theta: FloatArray, group: tuple[int, ...]) -> bool:
+def _is_falling(theta: FloatArray, group: Exchange) -> bool:
     """Whether bounds let a group be put in order: those of some pairs do not need to be of all."""
-    return bool(np.all(np.diff(theta[list(group)]) <= 0.0))
+    return bool(np.all(np.diff(theta[[unit[0] for unit in group]]) <= 0.0))
+
+
+def _holds_both(problem: Problem, theta: FloatArray, one: Unit, other: Unit) -> bool:
+    """Whether bounds let two units change places."""
+    lower, upper = problem.evaluator.lower, problem.evaluator.upper
+    here, there = [*one, *other], [*other, *one]
+    return bool(np.all((lower[here] <= theta[there]) & (theta[there] <= upper[here])))
+
+
+def _group_of(groups: list[Exchange], unit: Unit) -> Exchange:
+    found = (one for one in groups if any(set(unit) == set(own) for own in one))
+    return next(found, (unit,))
+
+
+def _with(groups: list[Exchange], one: Unit, other: Unit) -> list[Exchange]:
+    """Groups with two units in one of them, the places of all in the order of its first."""
+    first, second = _group_of(groups, one), _group_of(groups, other)
+    goes_to = dict(zip(one, other, strict=True))
+    here = next(own for own in first if set(own) == set(one))
+    there = next(own for own in second if set(own) == set(other))
+    order = [there.index(goes_to[d]) for d in here]
+    beside = tuple(tuple(own[i] for i in order) for own in second)
+    return [*(group for group in groups if group not in (first, second)), first + beside]
 
 
 def ordered(problem: Problem, theta: FloatArray, groups: Exchanges) -> FloatArray:
     """Values (..., D) with those of each group falling, where the bounds hold them so."""
     found = np.array(theta)
     for group in groups:
-        members = list(group)
-        falling = -np.sort(-found[..., members], axis=-1)
-        lower, upper = problem.evaluator.lower[members], problem.evaluator.upper[members]
-        fits = np.all((lower <= falling) & (falling <= upper), axis=-1, keepdims=True)
-        found[..., members] = np.where(fits, falling, found[..., members])
+        units = np.array(group)
+        values = found[..., units]  # (..., k, w)
+        order = np.argsort(-values[..., 0], axis=-1, kind="stable")
+        falling = np.take_along_axis(values, order[..., None], axis=-2)
+        lower, upper = problem.evaluator.lower[units], problem.evaluator.upper[units]
+        fits = np.all((lower <= falling) & (falling <= upper), axis=(-2, -1), keepdims=True)
+        found[..., units] = np.where(fits, falling, values)
     return found
 
 
 def exchange_notes(problem: Problem, groups: Exchanges, told: set[str]) -> tuple[str, ...]:
     """Notes of what can be exchanged among the names `told`: those with standard errors."""
-    named = [[problem.space[d].name for d in group] for group in groups]
-    return tuple(
-        f"{' and '.join(names)} can be exchanged without any effect on the output: which is which "
-        "no data tell; they are given from the largest to the smallest"
-        for names in named
-        if set(names) <= told
+    return tuple(_note(problem, group) for group in groups if _is_told(problem, group, told))
+
+
+def _is_told(problem: Problem, group: Exchange, told: set[str]) -> bool:
+    """Whether of each unit something is told that the others have another value of."""
+    columns = zip(*group, strict=True)
+    return any(all(problem.space[d].name in told for d in one) for one in columns)
+
+
+def _note(problem: Problem, group: Exchange) -> str:
+    names = [[problem.space[d].name for d in unit] for unit in group]
+    if len(names[0]) == 1:
+        return (
+            f"{' and '.join(one for (one,) in names)} can be exchanged without any effect on the "
+            "output: which is which no data tell; they are given from the largest to the smallest"
+        )
+    units = " and ".join(f"({', '.join(unit)})" for unit in names)
+    return (
+        f"{units} can be exchanged as a whole without any effect on the output: which is which no "
+        f"data tell; they are given from the largest {names[0][0]} to the smallest"
     )
 
 
@@ -168,23 +216,28 @@ def _answers(
     return found
 
 
-def _changes_nothing(problem: Problem, theta: FloatArray, one: int, other: int) -> tuple[bool, int]:
-    """Whether two parameters that are exchanged leave the output as it is, and their mean does not.
+def _changes_nothing(
+    problem: Problem, theta: FloatArray, one: Unit, other: Unit
+) -> tuple[bool, int]:
+    """Whether two units that are exchanged leave the output as it is, and their mean does not.
 
     And the simulations this took.
     """
-    evaluator, pair = problem.evaluator, [one, other]
-    low, high = float(max(evaluator.lower[pair])), float(min(evaluator.upper[pair]))
-    least = 0.5 * _APART * float(_size(theta[pair], high - low).max())
-    half = min(max(0.5 * abs(theta[one] - theta[other]), least), 0.5 * (high - low))
-    middle = min(max(0.5 * (theta[one] + theta[other]), low + half), high - half)
+    evaluator, pair = problem.evaluator, np.array([one, other])
+    low, high = evaluator.lower[pair].max(axis=0), evaluator.upper[pair].min(axis=0)
+    least = 0.5 * _APART * _size(theta[pair], high - low).max(axis=0)
+    half = np.minimum(np.maximum(0.5 * np.abs(np.diff(theta[pair], axis=0)[0]), least),
+                      0.5 * (high - low))  # fmt: skip
+    middle = np.minimum(np.maximum(0.5 * theta[pair].sum(axis=0), low + half), high - half)
+    # Each to the side on which it is, so that sections stay what they are.
+    half = np.where(theta[pair[0]] < theta[pair[1]], -half, half)
     tried = np.repeat(theta[None], _ALONE, axis=0)
-    tried[:, one] = middle + half, middle - half, middle
-    tried[:, other] = middle - half, middle + half, middle
+    tried[:, pair[0]] = middle + half, middle - half, middle
+    tried[:, pair[1]] = middle - half, middle + half, middle
     here, there, equal = problem.predictions(tried)
     if not _is_same(here, there) or _is_same(here, equal):
         return False, _ALONE
-    others = np.delete(np.arange(theta.size), pair)
+    others = np.delete(np.arange(theta.size), pair.ravel())
     tried[:, others] = _moved(problem, theta)[others]
     return _is_same(*problem.predictions(tried[:_AGAIN])), _ALONE + _AGAIN
 

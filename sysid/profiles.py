@@ -149,8 +149,10 @@ class _Walk:
         should_stop: Callable[[], bool] | None,
     ) -> None:  # fmt: skip
         self._problem, self._d, self._should_stop = problem, d, should_stop
-        self._larger = [i for group in groups if d in group for i in group if i < d]
-        self._smaller = [i for group in groups if d in group for i in group if i > d]
+        columns = [one for group in groups for one in zip(*group, strict=True) if d in one]
+        beside = [(i, theta[i] - theta[d] or d - i) for one in columns for i in one if i != d]
+        self._larger = [i for i, above in beside if above > 0]
+        self._smaller = [i for i, above in beside if above < 0]
         self.stopped, self.evaluations = False, 1
         self._place = float(placed(problem.evaluator, theta[None])[0, d])
         rms = float(problem.fitness(theta[None])[0])

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.exchanges import exchange_notes, exchanges, ordered
+from sysid.exchanges import Exchanges, exchange_notes, exchanges, ordered
 from sysid.identify import identify
 from sysid.models.model import Model
 from sysid.models.spec import parse_model
@@ -14,6 +14,7 @@ from sysid.profiles import profile
 from sysid.records import Channel, Record
 from sysid.settings import GeneticAlgorithm
 from sysid.simulation import simulate
+from sysid.types import FloatArray
 
 TIMES = 0.1 * np.arange(300.0)
 U = Channel("u", TIMES, np.repeat(np.random.default_rng(3).normal(size=30), 10), hold="zero")
@@ -52,10 +53,10 @@ def problem(form: str, **bounds: dict[str, float]) -> Problem:
 
 
 @pytest.mark.parametrize(("form", "expected"), [
-    ("in series", ((2, 3),)), ("symmetric", ((2, 3),)), ("unlike", ()),
+    ("in series", (((2,), (3,)),)), ("symmetric", (((2,), (3,)),)), ("unlike", ()),
 ])  # fmt: skip
 def test_an_exchange_is_found_whether_or_not_the_equations_show_it(
-    form: str, expected: tuple[tuple[int, int], ...]
+    form: str, expected: Exchanges
 ) -> None:
     found, spent = exchanges(problem(form), THETA)
     assert found == expected
@@ -73,26 +74,28 @@ def test_what_is_known_as_a_product_or_a_sum_only_is_no_exchange(form: str) -> N
 
 
 def test_it_is_found_at_a_double_pole_too() -> None:
-    assert exchanges(problem("in series"), np.array([2.0, 0.3, 1.0, 1.0]))[0] == ((2, 3),)
+    assert exchanges(problem("in series"), np.array([2.0, 0.3, 1.0, 1.0]))[0] == (((2,), (3,)),)
 
 
 PARALLEL = {"equations": {"x": "(K*u - x)/T1", "y": "(M*u - y)/T2"}, "outputs": {"z": "x + y"}}
 BESIDE = {"equations": {"x": "(K*u - x)/T1", "y": "(x - y)/T2"}, "outputs": {"z": "y + M*x"}}
 
 
-@pytest.mark.parametrize(("form", "theta"), [
-    (PARALLEL, [5.0, 5.0, 1.5, 0.5]),  # both gains at their bound
-    (BESIDE, [2.0, 0.0, 1.5, 0.5]),  # the way past the second one is closed
+@pytest.mark.parametrize(("form", "theta", "expected"), [
+    # Both gains at their bound: not the time constants alone, but with the gains.
+    (PARALLEL, [5.0, 5.0, 1.5, 0.5], (((0, 2), (1, 3)),)),
+    (BESIDE, [2.0, 0.0, 1.5, 0.5], ()),  # the way past the second one is closed
 ])  # fmt: skip
 def test_what_can_be_exchanged_at_this_estimate_only_is_none(
-    form: dict[str, Any], theta: list[float]
+    form: dict[str, Any], theta: list[float], expected: Exchanges
 ) -> None:
     gain = {"lower": -5, "upper": 5, "unit": "m"}
     made = parse_model({
         **(model("in series").document or {}), **form,
         "parameters": {"K": gain, "M": gain, "T1": SPAN, "T2": SPAN},
     })  # fmt: skip
-    assert exchanges(Problem.build(made, [recorded("in series")]), np.array(theta))[0] == ()
+    found = exchanges(Problem.build(made, [recorded("in series")]), np.array(theta))[0]
+    assert found == expected
 
 
 @pytest.mark.parametrize("scale", ["linear", "log"])
@@ -102,7 +105,7 @@ def test_it_is_found_in_wide_bounds_where_the_middle_of_the_range_diverges(
 ) -> None:
     wide: dict[str, Any] = {"lower": 1e-3, "upper": 1e3, "scale": scale}
     posed = problem("in series", T1=wide, T2=wide)
-    assert exchanges(posed, np.array([2.0, 0.3, 1.5, second]))[0] == ((2, 3),)
+    assert exchanges(posed, np.array([2.0, 0.3, 1.5, second]))[0] == (((2,), (3,)),)
 
 
 def test_bounds_that_tell_which_is_which_leave_nothing_to_be_exchanged() -> None:
@@ -124,11 +127,147 @@ def test_three_in_a_row_are_one_group() -> None:
     })  # fmt: skip
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
     groups, _ = exchanges(posed, np.array([0.4, 1.0, 2.0]))
-    assert groups == ((0, 1, 2),)
+    assert groups == (((0,), (1,), (2,)),)
     assert ordered(posed, np.array([[0.4, 2.0, 1.0]]), groups).tolist() == [[2.0, 1.0, 0.4]]
     [note] = exchange_notes(posed, groups, {"T1", "T2", "T3"})
     assert note.startswith("T1 and T2 and T3 can be exchanged")
     assert exchange_notes(posed, groups, {"T1", "T2"}) == ()
+
+
+GAIN = {"lower": 0, "upper": 5, "unit": "m"}
+START = {"lower": -2, "upper": 2}
+
+
+def beside(
+    sections: str = "xy", records: int = 1, written: dict[str, str] | None = None, **changed: Any
+) -> Problem:
+    """First orders side by side, each with its own gain, time constant and start."""
+    document = {
+        "name": "beside", "form": "differential", "inputs": {"u": "V"},
+        "states": dict.fromkeys(sections, "m"),
+        "parameters": {f"K{s}": GAIN for s in sections} | {f"T{s}": SPAN for s in sections},
+        "equations": {s: f"(K{s}*u - {s})/T{s}" for s in sections} | (written or {}),
+        "outputs": {"z": "0 + " + " + ".join(sections)},
+        "initial": dict.fromkeys(sections, START),
+    }  # fmt: skip
+    document["parameters"] |= changed
+    return Problem.build(parse_model(document), [recorded("in series")] * records)
+
+
+def named(posed: Problem, found: Exchanges) -> list[list[str]]:
+    return [[" ".join(posed.space[d].name for d in unit) for unit in one] for one in found]
+
+
+def drawn(posed: Problem, seed: int = 1) -> FloatArray:
+    lower, upper = posed.evaluator.lower, posed.evaluator.upper
+    place = np.random.default_rng(seed).uniform(0.1, 0.4, lower.size)
+    return np.asarray(lower + place * (upper - lower))
+
+
+@pytest.mark.parametrize("written", [
+    {},
+    {"x": "(-x + Kx*u)/Tx", "y": "(u*Ky + -y)/Ty"},
+    {"x": "(Kx*u - x)/Tx*cos(x)", "y": "cos(y)*((Ky*u - y)/Ty)"},
+])  # fmt: skip
+def test_sections_side_by_side_change_places_with_gains_and_starts(written: dict[str, str]) -> None:
+    posed = beside(written=written)
+    found, spent = exchanges(posed, drawn(posed))
+    assert named(posed, found) == [["Kx Tx x(0)", "Ky Ty y(0)"]]
+    assert spent == 2 * 3 + 5  # a pair of gains, one of time constants; the sections
+    [note] = exchange_notes(posed, found, {"Tx", "Ty"})
+    assert note.startswith("(Kx, Tx, x(0)) and (Ky, Ty, y(0)) can be exchanged as a whole")
+    assert exchange_notes(posed, found, {"Tx", "Ky"}) == ()
+
+
+@pytest.mark.parametrize(("written", "changed"), [
+    ({"y": "(Ky*u - y*1.01)/Ty"}, {}),  # another form
+    ({"y": "(Ky*u(t - 0.1) - y)/Ty"}, {}),
+    ({"y": "(Ky*u - y - 0.1*x)/Ty"}, {}),  # the same, with what the other does not read
+    ({}, {"Ty": SPAN | {"unit": "min"}}),
+    ({}, {"Ty": SPAN | {"lower": 2}, "Tx": SPAN | {"upper": 1.9}}),  # bounds tell which is which
+    ({}, {"Ty": SPAN | {"fixed": 1.0}}),
+    ({"y": "(Ky*u - y)/Tx"}, {}),  # the sum of the gains is all that shows
+])  # fmt: skip
+def test_sections_that_are_not_alike_are_not_exchanged(
+    written: dict[str, str], changed: dict[str, Any]
+) -> None:
+    if "Tx" in written.get("y", ""):
+        changed = {**changed, "Ty": SPAN | {"fixed": 1.0}}
+    posed = beside(written=written, **changed)
+    assert exchanges(posed, drawn(posed))[0] == ()
+
+
+def test_three_sections_side_by_side_are_one_group_and_are_given_in_order() -> None:
+    posed = beside("xyw")
+    theta = drawn(posed)
+    found, spent = exchanges(posed, theta)
+    assert named(posed, found) == [["Kx Tx x(0)", "Ky Ty y(0)", "Kw Tw w(0)"]]
+    assert spent <= 2 * 9 + 2 * 5
+    after = ordered(posed, theta[None], found)[0]
+    assert after[0] > after[1] > after[2]
+    np.testing.assert_allclose(
+        posed.predictions(after[None]), posed.predictions(theta[None]), rtol=1e-12
+    )
+    assert exchanges(posed, theta, spent - 5)[1] <= spent - 5
+
+
+def test_each_experiment_has_starts_of_its_own() -> None:
+    posed = beside(records=2)
+    found, _ = exchanges(posed, drawn(posed))
+    assert named(posed, found) == [["Kx Tx x(0) x(0)[2]", "Ky Ty y(0) y(0)[2]"]]
+
+
+def test_sections_of_two_states_change_places_with_all_their_parameters() -> None:
+    made = parse_model({
+        "name": "modes", "form": "differential", "inputs": {"u": "V"},
+        "states": {"a": "m", "v": "m/s", "b": "m", "w": "m/s"},
+        "parameters": {name: {"lower": 0.1, "upper": 5} for name in ("ka", "ca", "kb", "cb")},
+        "equations": {"a": "v", "v": "u - ka*a - ca*v", "b": "w", "w": "u - kb*b - cb*w"},
+        "outputs": {"z": "a + b"}, "initial": {"a": 0, "v": START, "b": 0, "w": START},
+    })  # fmt: skip
+    posed = Problem.build(made, [recorded("in series")])
+    found, _ = exchanges(posed, np.array([3.0, 0.5, 1.0, 0.2, 0.4, -0.3]))
+    assert named(posed, found) == [["ka ca v(0)", "kb cb w(0)"]]
+
+
+def test_sections_that_begin_unlike_are_told_apart() -> None:
+    document = dict(beside().model.document or {})
+    made = parse_model({**document, "initial": {"x": 0, "y": 1}})
+    posed = Problem.build(made, [recorded("in series")])
+    assert exchanges(posed, drawn(posed))[0] == ()
+
+
+def test_whatever_the_seed_sections_are_given_in_one_order() -> None:
+    posed = beside()
+    theta = np.array([4.0, 1.0, 3.0, 0.4, 0.5, -0.5])
+    clean = posed.predictions(theta[None])[0]
+    noise = np.random.default_rng(4).normal(0, 0.02, clean.size)
+    data = Record((U,), (Channel("z", TIMES, clean + noise, "m"),))
+    for seed in range(3):
+        found = identify(posed.model, data, GeneticAlgorithm(islands=2), seed=seed)
+        values = {e.name: e.value for e in found.estimates}
+        assert values["Kx"] == pytest.approx(4.0, abs=0.3)
+        assert values["Ty"] == pytest.approx(0.4, abs=0.1)
+        assert values["x(0)"] > values["y(0)"]
+        assert any("can be exchanged as a whole" in text for text in found.warnings)
+        assert all(island.parameters[0] >= island.parameters[1] for island in found.islands)
+
+
+@pytest.mark.parametrize("name", ["Kx", "Ty"])
+def test_a_profile_stays_with_one_order_of_sections(name: str) -> None:
+    posed = beside()
+    theta = np.array([4.0, 1.0, 3.0, 0.4, 0.5, -0.5])
+    clean = posed.predictions(theta[None])[0]
+    noise = np.random.default_rng(4).normal(0, 0.02, clean.size)
+    data = Record((U,), (Channel("z", TIMES, clean + noise, "m"),))
+    again = Problem.build(posed.model, [data])
+    places = [one.name for one in again.space]
+    swapped = theta[[1, 0, 3, 2, 5, 4]]
+    found = profile(again, swapped, name, points=21)
+    partner = places.index({"Kx": "Ky", "Ty": "Tx"}[name])
+    own = found.others[:, partner - (partner > places.index(name))]
+    larger, smaller = (found.values, own) if name == "Kx" else (own, found.values)
+    assert np.all(larger >= smaller - 1e-5)
 
 
 def test_what_no_bounds_let_be_put_in_order_is_not_said_to_be() -> None:
@@ -143,7 +282,7 @@ def test_what_no_bounds_let_be_put_in_order_is_not_said_to_be() -> None:
     })  # fmt: skip
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
     assert exchanges(posed, np.array([1.0, 1.1, 3.0]))[0] == ()  # T1 cannot be 3
-    assert exchanges(posed, np.array([1.15, 1.1, 1.0]))[0] == ((0, 1, 2),)
+    assert exchanges(posed, np.array([1.15, 1.1, 1.0]))[0] == (((0,), (1,), (2,)),)
 
 
 def test_of_many_parameters_most_pairs_are_ruled_out_by_one_simulation_of_each() -> None:
@@ -163,7 +302,7 @@ def test_of_many_parameters_most_pairs_are_ruled_out_by_one_simulation_of_each()
     values = {"T1": 1.5, "T2": 0.5} | dict(zip(gains, np.linspace(-0.5, 0.6, 12), strict=True))
     theta = np.array([values[one.name] for one in posed.space])
     found, spent = exchanges(posed, theta)
-    assert [[posed.space[d].name for d in group] for group in found] == [["T1", "T2"]]
+    assert [[posed.space[d].name for (d,) in group] for group in found] == [["T1", "T2"]]
     assert spent == 12 + 5  # of three for each of 67 pairs
 
 
@@ -177,7 +316,7 @@ def test_four_in_a_row_are_one_group_though_looked_at_together_first() -> None:
     })  # fmt: skip
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
     found, spent = exchanges(posed, np.array([0.4, 1.0, 2.0, 0.7]))
-    assert found == ((0, 1, 2, 3),)
+    assert found == (((0,), (1,), (2,), (3,)),)
     assert spent == 4 + 3 * 5
     assert exchanges(posed, np.array([0.4, 1.0, 2.0, 0.7]), 8)[1] <= 8
 
