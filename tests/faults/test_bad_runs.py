@@ -3,6 +3,7 @@
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,10 +23,10 @@ ENDLESS = {"generations": 10_000_000, "stop": {"settled": None}}
 
 
 class Service:
-    """A standing service with one dataset."""
+    """A standing service with one dataset; while `broken` is there, without a dispatcher."""
 
-    def __init__(self, stand: Stand, dataset: str) -> None:
-        self.stand, self.dataset = stand, dataset
+    def __init__(self, stand: Stand, dataset: str, broken: Path) -> None:
+        self.stand, self.dataset, self.broken = stand, dataset, broken
 
     def submit(self, **body: Any) -> str:
         common = {"model": "duffing-eq16", "datasets": [self.dataset], "reuse": False}
@@ -46,24 +47,35 @@ class Service:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    """The service before its dispatcher can start."""
     folder = tmp_path_factory.mktemp("bad")
+    broken = folder / "broken"
+    broken.touch()
     environment = {
         "BREAK_SEEDS": str(DEADLY), "BREAK_MEMORY": str(GREEDY), "LAGID_WORKER_MEMORY_MB": "512",
+        "BREAK_RAY": str(broken),
     }  # fmt: skip
     with standing_service(Stand(folder / "data", environment=environment), wait=False) as stand:
         until(lambda: stand.answers() == 200, "the web answered", LIMIT_SECONDS)
         path = paper_example.write_csv(folder / "record.csv", seed=1)
-        yield Service(stand, stand.client.add_dataset(path, name="example 1")["id"])
+        yield Service(stand, stand.client.add_dataset(path, name="example 1")["id"], broken)
         stand.stop()
         assert stand.leftovers() == []
 
 
-def test_a_queued_job_is_cancelled_at_once_and_stays_so(service: Service) -> None:
-    job = service.submit(algorithm=ENDLESS)  # the dispatcher is still starting
-    assert service.stand.client.cancel(job)["state"] == "cancelled"
-    assert service.stand.client.cancel(job)["state"] == "cancelled"
-    assert [run.state for run in service.runs(job)] == [State.CANCELLED]
+@pytest.fixture
+def service(waiting: Service) -> Service:
+    """The service with its dispatcher, or soon."""
+    waiting.broken.unlink(missing_ok=True)
+    return waiting
+
+
+def test_a_queued_job_is_cancelled_at_once_and_stays_so(waiting: Service) -> None:
+    job = waiting.submit(algorithm=ENDLESS)
+    assert waiting.stand.client.cancel(job)["state"] == "cancelled"
+    assert waiting.stand.client.cancel(job)["state"] == "cancelled"
+    assert [run.state for run in waiting.runs(job)] == [State.CANCELLED]
 
 
 def test_a_run_that_kills_its_worker_fails_with_that_reason_and_the_others_go_on(
