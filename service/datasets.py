@@ -3,7 +3,7 @@
 import hashlib
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,6 +30,8 @@ from sysid.signal_units import unknown_units
 
 Kind = Literal["upload", "simulate", "derive"]
 Format = Literal["csv", "mcap"]
+HISTORY = "known_before"
+"""Of a derived dataset: for how long (s) before its first sample something is known."""
 
 
 def add_upload(
@@ -89,7 +91,8 @@ def derive(database: Database, store: ObjectStore, parent_id: str, body: DeriveI
     steps = ", ".join(next(iter(step), "?") for step in body.steps)
     return add_recording(
         database, store, recording, name=body.name or f"{parent.name} ({steps})", kind="derive",
-        key=_derivation_key(parent, body), details={"steps": body.steps, "warnings": []},
+        key=_derivation_key(parent, body),
+        details={"steps": body.steps, "warnings": [], HISTORY: _known_before(recording)},
         parents=[parent.id],
     )  # fmt: skip
 
@@ -149,11 +152,30 @@ def told(row: Dataset) -> DatasetOut:
 
 def told_again(stored: Stored, name: str | None) -> DatasetOut:
     """A dataset that was just sent; warned of if it is there already under another name."""
-    answer = told(stored.dataset)
-    if stored.is_new or name in (None, stored.dataset.name):
+    answer, row = told(stored.dataset), stored.dataset
+    if stored.is_new:
         return answer
-    warning = f"the same data were stored before, as {stored.dataset.name!r}; that name stays"
-    return answer.model_copy(update={"warnings": [*answer.warnings, warning]})
+    warnings = [*answer.warnings, *_forgetful(row)]
+    if name not in (None, row.name):
+        warnings.append(f"the same data were stored before, as {row.name!r}; that name stays")
+    return answer.model_copy(update={"warnings": warnings})
+
+
+def _forgetful(row: Dataset) -> Iterator[str]:
+    """What to say of a part that was derived before parts kept what was recorded before them."""
+    steps = row.details.get("steps") or []
+    cut = {name for step in steps for name in step} & {"trim", "split"}
+    if row.kind == "derive" and cut and HISTORY not in row.details:
+        yield (
+            "it was derived by an earlier version, and holds nothing of what was recorded before "
+            f"its first sample; with history: true in {' and '.join(sorted(cut))} it is derived "
+            "anew, with the input's past for lags to read"
+        )
+
+
+def _known_before(recording: Recording) -> float:
+    """For how long (s) before the start something is known."""
+    return recording.start - min(float(one.whole.times[0]) for one in recording.channels)
 
 
 def page(session: Session, cursor: str | None, limit: int) -> Page[DatasetOut]:
@@ -166,7 +188,12 @@ def signals(session: Session, store: ObjectStore, dataset_id: str, max_points: i
     """Channels of a dataset, reduced so that extremes stay visible."""
     row = DatasetRepository(session).get(dataset_id)
     channels = recording_of(store, row.sha256).channels
-    return SignalsOut(id=row.id, channels=[series(channel, max_points) for channel in channels])
+    before = [Channel(c.name, *c.history, c.unit) for c in channels if c.history is not None]
+    return SignalsOut(
+        id=row.id,
+        channels=[series(channel, max_points) for channel in channels],
+        history=[series(channel, max_points) for channel in before],
+    )
 
 
 def series(channel: Channel, max_points: int) -> Series:
@@ -212,13 +239,15 @@ def _written(store: ObjectStore, recording: Recording, metadata: Mapping[str, st
 
 
 def _summary(channel: Channel) -> dict[str, Any]:
-    sampling = channel.sampling
+    sampling, history = channel.sampling, channel.history
+    known = {} if history is None else {"history_samples": history.times.size,
+                                        "history_start": float(history.times[0])}  # fmt: skip
     return {
         "name": channel.name, "unit": channel.unit, "hold": channel.hold,
         "samples": channel.times.size, "start": float(channel.times[0]),
         "stop": float(channel.times[-1]),
         "sample_time": sampling.period if sampling.is_regular else None,
-        "missing": int(np.count_nonzero(~np.isfinite(channel.values))),
+        "missing": int(np.count_nonzero(~np.isfinite(channel.values))), **known,
     }  # fmt: skip
 
 

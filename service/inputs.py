@@ -20,6 +20,7 @@ from service.schemas_simulations import RunInputIn, SeriesInput
 from service.storage.datasets import DatasetRepository
 from service.storage.objects import ObjectStore
 from sysid.errors import InvalidRecord
+from sysid.histories import changed
 from sysid.language.checker import check
 from sysid.language.evaluation import values_at
 from sysid.language.scope import Scope
@@ -100,7 +101,8 @@ class Signals:
         """
         if isinstance(signal, DatasetInput):
             found = self._converted(pointer, name, unit, signal)
-            return replace(found, times=self._times, values=sampled(found, self._times))
+            values = sampled(found, self._times)
+            return replace(found, times=self._times, values=values, history=None)
         return Channel(name, self._times, self.of(pointer, signal), unit, hold_of(signal))
 
     def _converted(self, pointer: str, name: str, unit: str, signal: DatasetInput) -> Channel:
@@ -114,7 +116,7 @@ class Signals:
                 f"channel {found.name!r} of {signal.dataset} is in {found.unit}, but "
                 f"{name!r} is in {unit}: {told}",
             )
-        return Channel(name, found.times, found.values * times, unit, found.hold)
+        return replace(changed(found, lambda _, values: values * times), name=name, unit=unit)
 
     def _stepped(self, pointer: str, name: str, unit: str, signal: StepInput) -> Channel:
         start, stop = float(self._times[0]), float(self._times[-1])

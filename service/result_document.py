@@ -45,6 +45,10 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
         "correlation_times": dict(found.correlation_times),
         "residual_tests": residual_document(found.residual_tests),
         "onset_delays": onset_document(found.onset_delays),
+        "known_before": {
+            "estimation": list(found.known_before),
+            "validation": list(found.known_before_validation),
+        },
         "warnings": list(found.warnings),
         "selection": [one._asdict() for one in found.selection],
     }

@@ -108,7 +108,10 @@ class DeriveIn(Body):
 
 
 class ChannelOut(Answer):
-    """One channel of a dataset. `sample_time` is None where the sampling is irregular."""
+    """One channel of a dataset. `sample_time` is None where the sampling is irregular.
+
+    `history_samples` were recorded before `start`, from `history_start` (s) on: lags read them.
+    """
 
     name: str
     unit: str
@@ -118,6 +121,8 @@ class ChannelOut(Answer):
     stop: float
     sample_time: float | None
     missing: int
+    history_samples: int = 0
+    history_start: float | None = None
 
 
 class DatasetOut(Answer):
@@ -149,10 +154,14 @@ class Series(Answer):
 
 
 class SignalsOut(Answer):
-    """Channels of a dataset, reduced so that extremes stay visible."""
+    """Channels of a dataset, reduced so that extremes stay visible.
+
+    `history` has what is known of them from before their first samples.
+    """
 
     id: str
     channels: list[Series]
+    history: list[Series] = Field(default=[])
 
 
 class Edge(Answer):

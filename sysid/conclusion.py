@@ -114,6 +114,17 @@ def _concluded(
         correlation_times=times,
         holds={one.name: one.hold for one in problem.records[0].inputs},
         sample_time=common_sample_time(problem.records),
+        known_before=_known_before(problem),
+        known_before_validation=() if validation is None else _known_before(validation),
+    )
+
+
+def _known_before(problem: Problem) -> tuple[float, ...]:
+    """For how long (s) the inputs are known before what is scored of each experiment."""
+    since = problem.scored_from or tuple(one.start for one in problem.records)
+    return tuple(
+        one.known_before + max(first - one.start, 0.0)
+        for one, first in zip(problem.records, since, strict=True)
     )
 
 

@@ -104,7 +104,7 @@ def moves_alone(record: Record) -> tuple[str, float] | None:
     output goes a tenth of its range before an input has gone a hundredth of its own: where both
     grow slowly from nothing, either may be the first to leave its rest.
     """
-    inputs = min((_moved(one) for one in record.inputs), default=-inf)
+    inputs = min((_moved(one.whole) for one in record.inputs), default=-inf)
     found = []
     for output in record.outputs:
         there = np.isfinite(output.values)

@@ -301,6 +301,10 @@ def own_times(times: FloatArray, segment: Segment) -> FloatArray:
     return np.round(times - segment.start + segment.origin, 9)
 
 
+def _begin(channel: Channel) -> float:
+    return float(channel.whole.times[0])
+
+
 def _on_own_times(channel: Channel, segment: Segment) -> Channel:
     history = channel.history
     if history is not None:
@@ -345,6 +349,11 @@ class Record:
     inputs: tuple[Channel, ...]
     outputs: tuple[Channel, ...]
     name: str = ""
+
+    @property
+    def known_before(self) -> float:
+        """For how long (s) before the start all inputs are known; 0 if one is not."""
+        return max(self.start - max((_begin(one) for one in self.inputs), default=np.inf), 0.0)
 
     @property
     def start(self) -> float:

@@ -153,7 +153,9 @@ class Identification:
     `selection` has the terms that were selected, if the model asked for it. `correlation_times`
     (s) are those of each output's noise, where the noise model found any. `holds` tells what the
     inputs of the first experiment did between their samples, `sample_time` (s) how all outputs
-    were sampled; None where that was not regular, or not the same.
+    were sampled; None where that was not regular, or not the same. `known_before` and
+    `known_before_validation` tell of every experiment for how long (s) before its start the inputs
+    are known; further back their first value is taken to have stood.
     """
 
     estimates: tuple[Estimate, ...]
@@ -180,3 +182,5 @@ class Identification:
     correlation_times: Mapping[str, float] = field(default_factory=dict)
     holds: Mapping[str, Hold] = field(default_factory=dict)
     sample_time: float | None = None
+    known_before: tuple[float, ...] = ()
+    known_before_validation: tuple[float, ...] = ()

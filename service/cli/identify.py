@@ -1,7 +1,7 @@
 """`lagid identify`: one identification in this process, without a server."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
@@ -239,8 +239,15 @@ def tell(model: "Model", found: "Identification", seconds: float, json_file: str
     if found.fit_percent_validation is not None:
         out.print(f", validation {_percent(found.fit_percent_validation)}", markup=False, end="")
     out.print(f"; {found.evaluations} simulations in {seconds:.2f} s", markup=False)
+    if any(found.known_before):
+        out.print(f"inputs known before the record: {_seconds(found.known_before)}", markup=False)
     for warning in found.warnings:
         err.print(f"note: {PLACES.in_note(warning)}", markup=False)
+
+
+def _seconds(known: Sequence[float]) -> str:
+    least, most = min(known), max(known)
+    return f"{least:.4g} s" if least == most else f"{least:.4g} to {most:.4g} s"
 
 
 def _percent(fit: float) -> str:

@@ -4,6 +4,7 @@ import io
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,11 +16,15 @@ from service.signals.limits import DEFAULT_LIMITS, Limits
 from service.signals.mcap_content import Content, Source, no_signals, read_content, sorted_columns
 from service.signals.topics import DATASET, ChannelEntry, Manifest, parse_manifest
 from service.signals.writer import FittedOutput
-from sysid.records import Channel, Recording
+from sysid.errors import InvalidRecord
+from sysid.records import Channel, History, Recording
 from sysid.types import FloatArray
 
 CLOCK_FROM_NS = 10**17
 """Log times from here on (three years) are a clock's: they are counted from the first."""
+
+_Topics = Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]]
+"""Of every topic its times and its columns."""
 
 Readable = str | os.PathLike[str] | bytes | BinaryIO
 
@@ -101,7 +106,9 @@ def _ours(content: Content, metadata: Mapping[str, str]) -> Recording:
     for source in content.sources.values():
         if source.topic in manifest.clocks:
             topics[source.topic] = _topic(source, manifest)
-    channels = tuple(_channel(entry, topics) for entry in manifest.channels)
+    channels = tuple(
+        _with_history(_channel(entry, topics), manifest, topics) for entry in manifest.channels
+    )
     return Recording(channels, manifest.segments)
 
 
@@ -113,16 +120,29 @@ def _topic(source: Source, manifest: Manifest) -> tuple[FloatArray, dict[str, Fl
     return times, columns
 
 
-def _channel(
-    entry: ChannelEntry, topics: Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]]
-) -> Channel:
-    times, columns = topics.get(entry.topic, (np.empty(0), {}))
-    if entry.field not in columns:
+def _channel(entry: ChannelEntry, topics: _Topics) -> Channel:
+    times, values = _field(f"channel {entry.name!r}", entry.topic, entry.field, topics)
+    return Channel(entry.name, times, values, entry.unit, entry.hold)
+
+
+def _with_history(channel: Channel, manifest: Manifest, topics: _Topics) -> Channel:
+    if channel.name not in manifest.history:
+        return channel
+    topic, field = manifest.history[channel.name]
+    found = History(*_field(f"the history of {channel.name!r}", topic, field, topics))
+    try:
+        return replace(channel, history=found)
+    except InvalidRecord as error:
+        raise InvalidUpload(str(error)) from None
+
+
+def _field(what: str, topic: str, field: str, topics: _Topics) -> tuple[FloatArray, FloatArray]:
+    times, columns = topics.get(topic, (np.empty(0), {}))
+    if field not in columns:
         raise InvalidUpload(
-            f"channel {entry.name!r} should be field {entry.field!r} of topic {entry.topic!r}, "
-            "which the file does not hold"
+            f"{what} should be field {field!r} of topic {topic!r}, which the file does not hold"
         )
-    return Channel(entry.name, times, columns[entry.field], entry.unit, entry.hold)
+    return times, columns[field]
 
 
 def _foreign(content: Content, limits: Limits) -> tuple[Recording, tuple[str, ...]]:

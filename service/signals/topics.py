@@ -16,7 +16,7 @@ DATASET = "lagid.dataset"
 """Name of the metadata record that says what a file of ours holds."""
 
 FORMAT = "1"
-RESERVED = ("format", "sample_time", "channels", "topics", "segments")
+RESERVED = ("format", "sample_time", "channels", "topics", "segments", "history")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,14 +70,30 @@ def topics_of(recording: Recording, root: str = "/signals") -> tuple[Topic, ...]
     )
 
 
+def history_topics_of(recording: Recording) -> tuple[Topic, ...]:
+    """Topics of what was recorded before the first samples; none where nothing was."""
+    known = tuple(
+        Channel(one.name, one.history.times, one.history.values, one.unit)
+        for one in recording.channels
+        if one.history is not None and one.history.times.size
+    )
+    return topics_of(Recording(known), "/history") if known else ()
+
+
 def _same_times(a: Channel, b: Channel) -> bool:
     return a.times is b.times or np.array_equal(a.times, b.times)
 
 
 def manifest_of(
-    recording: Recording, topics: Sequence[Topic], metadata: Mapping[str, str]
+    recording: Recording,
+    topics: Sequence[Topic],
+    metadata: Mapping[str, str],
+    history: Sequence[Topic] = (),
 ) -> dict[str, str]:
     """Content of the record `DATASET`: everything that the messages themselves do not say.
+
+    A file without history does not speak of it; a program that knows of none reads the others as
+    the same recording without it.
 
     Raises
     ------
@@ -93,13 +109,20 @@ def manifest_of(
         for c, field in zip(topic.channels, topic.fields, strict=True)
     ]
     entries.sort(key=lambda entry: order.index(entry["name"]))
+    before = {
+        c.name: {"topic": topic.path, "field": field}
+        for topic in history
+        for c, field in zip(topic.channels, topic.fields, strict=True)
+    }
+    clocks = {topic.path: topic.clock.as_dict() for topic in (*topics, *history)}
     sampling = recording.sampling
     return {
         "format": FORMAT,
         "sample_time": f"{sampling.period:.12g}" if sampling.is_regular else "",
         "channels": json.dumps(entries),
-        "topics": json.dumps({topic.path: topic.clock.as_dict() for topic in topics}),
+        "topics": json.dumps(clocks),
         "segments": json.dumps([asdict(segment) for segment in recording.segments]),
+        **({"history": json.dumps(before)} if before else {}),
         **metadata,
     }
 
@@ -117,11 +140,12 @@ class ChannelEntry:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """The record `DATASET`, checked."""
+    """The record `DATASET`, checked. `history`: topic and field of it, by channel."""
 
     channels: tuple[ChannelEntry, ...]
     clocks: Mapping[str, Clock]
     segments: tuple[Segment, ...]
+    history: Mapping[str, tuple[str, str]]
 
 
 def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
@@ -138,9 +162,14 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
         channels = tuple(_channel(entry) for entry in json.loads(metadata["channels"]))
         clocks = json.loads(metadata["topics"])
         segments = tuple(_segment(entry) for entry in json.loads(metadata["segments"]))
+        history = {
+            name: (entry["topic"], entry["field"])
+            for name, entry in json.loads(metadata.get("history", "{}")).items()
+        }
         manifest = Manifest(
-            channels, {path: Clock.from_dict(entry) for path, entry in clocks.items()}, segments
-        )
+            channels, {path: Clock.from_dict(entry) for path, entry in clocks.items()}, segments,
+            history,
+        )  # fmt: skip
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from None
     names = {one.name for one in channels}
@@ -148,6 +177,10 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
         raise ValueError("its channels have no names, or the same name twice")
     if any(one.topic not in manifest.clocks for one in channels):
         raise ValueError("a channel names a topic that is not listed")
+    for name, (topic, field) in history.items():
+        is_text = isinstance(topic, str) and isinstance(field, str)
+        if name not in names or not is_text or topic not in manifest.clocks:
+            raise ValueError(f"the history of {name!r} is of no channel, or in no topic")
     return manifest
 
 

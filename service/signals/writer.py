@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Protocol
 
 from service.signals.mcap_file import McapFile
-from service.signals.topics import DATASET, Topic, make_topic, manifest_of, topics_of
+from service.signals.topics import (
+    DATASET,
+    Topic,
+    history_topics_of,
+    make_topic,
+    manifest_of,
+    topics_of,
+)
 from sysid.records import Channel, Recording
 from sysid.types import FloatArray
 
@@ -45,6 +52,7 @@ def write_recording(
     """Write a recording as an MCAP file.
 
     The same recording and metadata give the same bytes. Values and times come back bit for bit.
+    What was recorded before the first samples stands in topics of its own, below ``/history``.
 
     Parameters
     ----------
@@ -59,8 +67,9 @@ def write_recording(
     ValueError
         If the times do not fit into a file's clock, or a metadata key is the file's own.
     """
-    topics = topics_of(recording)
-    _write(target, topics, manifest_of(recording, topics, metadata or {}), attachments or {})
+    topics, history = topics_of(recording), history_topics_of(recording)
+    manifest = manifest_of(recording, topics, metadata or {}, history)
+    _write(target, (*topics, *history), manifest, attachments or {})
 
 
 def write_fit(

@@ -36,13 +36,17 @@ class SoughtParameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trace:
-    """One signal on its own times (s); `is_held` if it keeps its value until the next sample."""
+    """One signal on its own times (s); `is_held` if it keeps its value until the next sample.
+
+    `history` is the same signal before its first sample, as far as it is known.
+    """
 
     name: str
     unit: str
     times: Floats
     values: Floats
     is_held: bool = False
+    history: "Trace | None" = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,7 @@
 """Figures over time: measured against identified output, and the signals of a dataset."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from service.web.figures import MARGIN, Figure, finite, layout
 from service.web.formats import bracketed
 
 _GAP_PX = 20
+_SHOWN_BEFORE = 0.1  # of a record's duration, of what its inputs were before it
 _OUTPUT_PX, _RESIDUAL_PX, _INPUT_PX, _SIGNAL_PX = 240, 84, 110, 120
 
 
@@ -36,6 +38,8 @@ def response(
     for number, signal in enumerate(experiment.inputs, 2 * len(experiment.outputs) + 1):
         span = window(signal.times, start, stop)
         figure["data"].append(line(signal, span, f"y{number}", theme.GREEN, legend=True))
+        known = _near(signal, _SHOWN_BEFORE * _duration(experiment))
+        figure["data"] += _before(known, start, stop, f"y{number}", theme.GREEN)
         name_axis(figure, number, f"{signal.name}{bracketed(signal.unit)}")
     figure["layout"].update(_shading(experiment), uirevision=experiment.name)
     traces = [output.measured for output in experiment.outputs] + list(experiment.inputs)
@@ -62,6 +66,7 @@ def signals(
         span = window(signal.times, start, stop)
         colour = theme.SERIES[(number - 1) % len(theme.SERIES)]
         figure["data"].append(line(signal, span, f"y{number}", colour, legend=False))
+        figure["data"] += _before(signal.history, start, stop, f"y{number}", colour)
         name_axis(figure, number, f"{signal.name}{bracketed(signal.unit)}")
     figure["layout"]["meta"] = {"thinned": _is_thinned(channels)}
     return figure
@@ -163,6 +168,32 @@ def line(signal: Trace, span: slice, axis: str, colour: str, *, legend: bool) ->
         "line": {"color": colour, "width": 1.2, "shape": "hv" if signal.is_held else "linear"},
         "hovertemplate": f"%{{y:.6g}}<extra>{signal.name}</extra>",
     }  # fmt: skip
+
+
+def _duration(experiment: Experiment) -> float:
+    return max((float(np.ptp(one.measured.times)) for one in experiment.outputs), default=0.0)
+
+
+def _near(signal: Trace, seconds: float) -> Trace | None:
+    """The end of a signal's history; all of it could take half of the plot from the record."""
+    if signal.history is None:
+        return None
+    first = int(np.searchsorted(signal.history.times, signal.times[0] - seconds))
+    times, values = signal.history.times[first:], signal.history.values[first:]
+    return replace(signal.history, times=times, values=values)
+
+
+def _before(
+    history: Trace | None, start: float | None, stop: float | None, axis: str, colour: str
+) -> list[dict[str, Any]]:
+    """What is known of a signal from before its first sample: dotted, in the same row."""
+    if history is None or not history.times.size:
+        return []
+    drawn = line(history, window(history.times, start, stop), axis, colour, legend=False)
+    label = f"{history.name}, before the record"
+    look = {**drawn["line"], "dash": "dot"}
+    told = f"%{{y:.6g}}<extra>{label}</extra>"
+    return [{**drawn, "name": label, "line": look, "hovertemplate": told}]
 
 
 def _shading(experiment: Experiment) -> dict[str, Any]:

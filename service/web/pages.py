@@ -134,6 +134,7 @@ def dataset_page(session: Session, dataset_id: str) -> str:
               if edge.parent == dataset.id]  # fmt: skip
     return render(
         "dataset.html", dataset=dataset, height=figures_signals.signals_height(dataset.n_channels),
+        has_history=any(one.get("history_samples") for one in dataset.channels),
         channels=dataset.channels,
         lineage=[
             {"direction": direction, "id": name, "relation": relation, "href": _href(name)}

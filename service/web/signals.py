@@ -124,4 +124,6 @@ def _records(
 
 
 def _trace(channel: Channel) -> Trace:
-    return Trace(channel.name, channel.unit, channel.times, channel.values, channel.hold == "zero")
+    held, known = channel.hold == "zero", channel.history
+    before = None if known is None else Trace(channel.name, channel.unit, *known, held)
+    return Trace(channel.name, channel.unit, channel.times, channel.values, held, before)

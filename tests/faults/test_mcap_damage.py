@@ -236,6 +236,14 @@ def test_bytes_after_the_end_and_a_wrong_end_are_refused() -> None:
         {"segments": '[{"start": 1, "stop": 0, "origin": 0, "labels": {}}]'},
         {"segments": '[{"start": 0, "stop": 0, "origin": 0, "labels": {"a": []}}]'},
         {"segments": "[" * 3000},
+        {"history": "[]"},
+        {"history": '{"u": 1}'},
+        {"history": '{"u": {"topic": "/b", "field": "x"}}'},
+        {"history": '{"u": {"topic": ["/a"], "field": "x"}}'},
+        {"history": '{"u": {"topic": "/a", "field": "z"}}'},
+        {"history": '{"u": {"topic": "/a", "field": 7}}'},
+        {"history": '{"v": {"topic": "/a", "field": "x"}}'},
+        {"history": '{"u": {"topic": "/a", "field": "x"}}'},  # not before the first sample
     ],
 )  # fmt: skip
 def test_a_manifest_that_cannot_be_right_is_refused(change: dict[str, str]) -> None:

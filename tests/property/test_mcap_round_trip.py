@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from service.signals import mcap_file
 from service.signals.clock import clock_for
 from service.signals.reader import read_recording
-from sysid.records import HOLDS, Channel, Recording
+from sysid.records import HOLDS, Channel, History, Recording
 from tests.mcap_files import recorded
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=False)
@@ -36,7 +36,9 @@ def recordings(draw: st.DrawFn) -> Recording:
         times = draw(st.sampled_from(bases))
         values = draw(arrays(np.float64, times.size, elements=NUMBERS))
         unit, hold = draw(st.sampled_from(["V", "µm/s²", "1"])), draw(st.sampled_from(HOLDS))
-        channels.append(Channel(name, times, values, unit, hold))
+        cut = draw(st.integers(0, times.size - 1))
+        known = History(times[:cut], values[:cut]) if cut else None
+        channels.append(Channel(name, times[cut:], values[cut:], unit, hold, known))
     return Recording(tuple(channels))
 
 
@@ -51,6 +53,10 @@ def test_names_times_and_values_come_back_bit_for_bit(recording: Recording, chun
         assert (after.unit, after.hold) == (before.unit, before.hold)
         assert after.values.tobytes() == before.values.tobytes()
         np.testing.assert_array_equal(after.times, before.times)
+        assert (after.history is None) == (before.history is None)
+        if before.history is not None and after.history is not None:
+            assert after.history.values.tobytes() == before.history.values.tobytes()
+            np.testing.assert_array_equal(after.history.times, before.history.times)
 
 
 @given(recordings())
@@ -60,8 +66,10 @@ def test_the_plain_reader_counts_the_same_samples(recording: Recording) -> None:
     counts: dict[str, int] = {}
     for _, channel, _ in reader.iter_messages():
         counts[channel.topic] = counts.get(channel.topic, 0) + 1
-    distinct = {one.times.tobytes(): one.times.size for one in recording.channels}
-    assert sorted(counts.values()) == sorted(distinct.values())
+    samples = {one.times.tobytes(): one.times.size for one in recording.channels}
+    known = [one.history.times for one in recording.channels if one.history is not None]
+    before = {times.tobytes(): times.size for times in known}
+    assert sorted(counts.values()) == sorted([*samples.values(), *before.values()])
 
 
 @given(st.integers(2, 5000), st.sampled_from([0.01, 0.001, 1 / 610.35, 0.08, 1 / 3]))

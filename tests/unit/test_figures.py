@@ -170,6 +170,23 @@ def test_a_record_kept_for_validation_is_shaded_from_its_start() -> None:
     assert shape["x0"] == 0.0
 
 
+def before_record(name: str, known: Trace) -> Experiment:
+    return replace(experiment(100), inputs=(replace(signal(100, name), history=known),))
+
+
+def test_what_an_input_was_before_the_record_is_dotted_as_far_as_a_tenth_of_it() -> None:
+    times = np.arange(-50, 0) * 0.01
+    record = before_record("u", Trace("u", "V", times, np.cos(times)))
+    trace = drawn(figures_signals.response(record), "u, before the record")
+    assert trace["x"] == pytest.approx(times[-9:])
+    assert trace["yaxis"] == drawn(figures_signals.response(record), "u")["yaxis"]
+    assert trace["line"]["dash"] == "dot"  # type: ignore[index]
+    whole = drawn(figures_signals.signals(record.inputs), "u, before the record")
+    assert whole["x"] == pytest.approx(times)
+    names = [one["name"] for one in figures_signals.response(experiment(100))["data"]]
+    assert not any("before the record" in name for name in names)
+
+
 def test_a_long_response_is_thinned_and_a_stretch_of_it_is_not() -> None:
     record = experiment(20_000)
     whole = figures_signals.response(record)

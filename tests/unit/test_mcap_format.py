@@ -1,5 +1,6 @@
 """Files of ours as other programs see them: the plain `mcap` reader and protobuf's own decoder."""
 
+from dataclasses import replace
 from io import BytesIO
 
 import numpy as np
@@ -12,7 +13,7 @@ from mcap.reader import make_reader
 from service.signals import mcap_file
 from service.signals.reader import read_fit, read_metadata, read_recording
 from service.signals.writer import FittedOutput, write_fit, write_recording
-from sysid.records import Channel, Recording, Segment
+from sysid.records import Channel, History, Recording, Segment
 from tests.mcap_files import recorded
 
 TIMES = np.arange(40) * 0.01
@@ -89,6 +90,19 @@ def test_names_units_holds_and_segments_come_back() -> None:
     assert [one.unit for one in back.channels] == ["V", "m", "1"]
     assert [one.hold for one in back.channels] == ["zero", "first", "band-limited"]
     assert back.segments == two_bases().segments
+
+
+def test_a_history_stands_in_topics_of_its_own_and_its_absence_is_not_spoken_of() -> None:
+    known = replace(two_bases().channels[0], history=History(TIMES[:3] - 1, np.ones(3)))
+    with_history = Recording((known, *two_bases().channels[1:]), two_bases().segments)
+    reader = make_reader(BytesIO(recorded(with_history)))
+    topics = [channel.topic for _, channel, _ in reader.iter_messages()]
+    assert topics.count("/history") == 3
+    assert len(topics) == 46
+    assert "history" not in read_metadata(recorded(two_bases()))
+    back = read_recording(recorded(with_history)).channel("u [x]").history
+    assert back is not None
+    np.testing.assert_array_equal(back.times, TIMES[:3] - 1)
 
 
 def test_the_same_recording_gives_the_same_bytes() -> None:

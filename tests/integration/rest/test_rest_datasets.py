@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
+from service.datasets import told_again
 from service.signals.reader import read_recording
+from service.storage.columns import utc_now
+from service.storage.datasets import Stored
+from service.storage.tables import Dataset
 from tests.rest import CSV, recording, refused
 
 SIMULATION: dict[str, Any] = {
@@ -152,6 +156,63 @@ def test_lineage_leads_from_a_derived_dataset_to_its_source(
     edge = {"parent": dataset, "child": child["id"], "relation": "derived"}
     assert edge in server.get(f"/v1/datasets/{child['id']}/lineage").json()["edges"]
     assert edge in server.get(f"/v1/datasets/{dataset}/lineage").json()["edges"]
+
+
+def test_a_part_tells_and_keeps_what_was_recorded_before_it(
+    server: TestClient, dataset: str
+) -> None:
+    steps = [{"trim": {"rows": [100, 300]}}]
+    part = server.post(f"/v1/datasets/{dataset}:derive", json={"steps": steps}).json()
+    assert [one["history_samples"] for one in part["channels"]] == [100, 100]
+    assert part["channels"][0]["history_start"] == 0.0
+    assert part["samples"] == 200
+    assert part["details"]["known_before"] == pytest.approx(10.0)
+    signals = server.get(f"/v1/datasets/{part['id']}/signals").json()
+    assert [len(one["times"]) for one in signals["history"]] == [100, 100]
+    content = server.get(f"/v1/datasets/{part['id']}/content").content
+    kind = {"content-type": "application/x-mcap"}
+    copy = server.post("/v1/datasets?name=with history", content=content, headers=kind).json()
+    assert [one["history_samples"] for one in copy["channels"]] == [100, 100]
+    rows = server.get(f"/v1/datasets/{part['id']}/content.csv").text.splitlines()
+    assert len(rows) == 201
+    figure = server.get(f"/v1/datasets/{part['id']}/figures/signals").json()
+    assert [one["name"] for one in figure["data"]] == [
+        "u", "u, before the record", "y", "y, before the record",
+    ]  # fmt: skip
+    assert "Before them" in server.get(f"/datasets/{part['id']}").text
+    assert "Before them" not in server.get(f"/datasets/{dataset}").text
+
+
+def test_a_part_without_history_is_another_dataset(server: TestClient, dataset: str) -> None:
+    parts = [
+        server.post(
+            f"/v1/datasets/{dataset}:derive",
+            json={"steps": [{"split": {"fraction": 0.5, "part": "validation", "history": keep}}]},
+        ).json()
+        for keep in (True, False)
+    ]
+    assert [one["channels"][0]["history_samples"] for one in parts] == [150, 0]
+    assert parts[0]["channels"][0]["history_start"] == 0.0
+    assert parts[1]["channels"][0]["history_start"] is None
+    assert parts[0]["id"] != parts[1]["id"]
+    bad = {"steps": [{"trim": {"start": 1, "history": 1}}]}
+    fault = refused(server.post(f"/v1/datasets/{dataset}:derive", json=bad), 422, "invalid")[0]
+    assert fault["pointer"] == "/steps/0/trim/history"
+
+
+def test_a_part_that_was_derived_before_parts_kept_their_past_says_so() -> None:
+    steps = [{"offset": {"u": 1}}, {"trim": {"start": 1}}]
+    row = Dataset(
+        id="ds_1", name="part", kind="derive", sha256="", source_key="", size_bytes=1, n_channels=0,
+        n_samples=1, duration=1.0, sample_time=None, channels=[], details={"steps": steps},
+        created_at=utc_now(),
+    )  # fmt: skip
+    [warning] = told_again(Stored(row, is_new=False), None).warnings
+    assert "history: true in trim" in warning
+    row.details = {"steps": steps, "known_before": 0.0}
+    assert told_again(Stored(row, is_new=False), None).warnings == []
+    row.details = {"steps": steps[:1]}
+    assert told_again(Stored(row, is_new=False), None).warnings == []
 
 
 def test_metrics_count_jobs_by_state(server: TestClient) -> None:
