@@ -47,8 +47,7 @@ def simulate(
         If an input is missing or the times are too short for the model's lags.
     """
     _check(model, values)
-    fixed = {one.name: one.fixed for one in model.parameters if one.fixed is not None}
-    values = _with_ties(model, {**fixed, **values})
+    values = completed(model, values)
     known = tuple(_known(parameter, values[parameter.name]) for parameter in model.parameters)
     initial = tuple(
         _start(start, state.name, values)
@@ -65,11 +64,13 @@ def simulate(
     return Recording(tuple(replace(c, values=found[c.name].copy()) for c in outputs))
 
 
-def _with_ties(model: Model, values: Mapping[str, float]) -> dict[str, float]:
-    """The values, and those of tied parameters that are not among them."""
-    free = [replace(p, tied=None) if p.name in values else p for p in model.parameters]
-    ties = {name: value_of(tie, values) for name, tie in ties_of(model, free).items()}
-    return {**ties, **values}
+def completed(model: Model, values: Mapping[str, float]) -> dict[str, float]:
+    """The values, and those of fixed and tied parameters that are not among them."""
+    fixed = {one.name: one.fixed for one in model.parameters if one.fixed is not None}
+    known = {**fixed, **values}
+    free = [replace(p, tied=None) if p.name in known else p for p in model.parameters]
+    ties = {name: value_of(tie, known) for name, tie in ties_of(model, free).items()}
+    return {**ties, **known}
 
 
 def _check(model: Model, values: Mapping[str, float]) -> None:

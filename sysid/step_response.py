@@ -1,4 +1,4 @@
-"""What a step response is judged by: rise time, overshoot, settling time, steady error."""
+"""What a step response is judged by: rise time, overshoot, settling, and integrals of the error."""
 
 from dataclasses import dataclass
 from math import isfinite, nan
@@ -14,6 +14,7 @@ _TAIL = 0.1
 _WINDOWS = 3  # the last quarters of the record: what comes first, the step itself makes
 _GROWTH = 1.03  # a limit cycle's peaks differ by less, by where the samples lie
 _SWING_GROWTH = 1.01  # the same of swings between turning points that are interpolated
+_LASTING = 0.9  # of the swing two quarters before: one that decays faster will settle
 _STEADY = 0.99  # of the last increment: from there on, growth does not slow down
 _ROUNDING = 1e-9  # of the step: an output that moves less has not answered
 _BEYOND = 1e100  # steps away from the reference: not to be squared
@@ -48,6 +49,13 @@ class StepMetrics:
     is_settled : bool
         There is a settling time. A response that neither runs away nor has settled still moves at
         the end of the record: its final value and overshoot are those of the record.
+    iae, itae : float
+        ∫|e| dt and ∫t |e| dt of the error e = reference - output, from the step to the end of the
+        record; in the unit of the output times s and s². A steady error makes both grow with it.
+    swing, swing_period : float
+        Of an output that keeps swinging with the same size, as in a limit cycle: from peak to
+        peak, in its unit, and the period in s. ``nan`` where it settles or runs away, or where
+        the record is too short to tell.
     """
 
     rise_time: float
@@ -59,6 +67,10 @@ class StepMetrics:
     final_value: float
     runs_away: bool = False
     is_settled: bool = True
+    iae: float = nan
+    itae: float = nan
+    swing: float = nan
+    swing_period: float = nan
 
 
 def step_metrics(
@@ -97,6 +109,8 @@ def step_metrics(
     if abs(final - start) <= _ROUNDING * abs(height):
         start = final
     settling = _settled(t, np.abs(y - final), band, float(t[tail][0]))
+    error = np.abs(after - y)
+    swing, period = (nan, nan) if isfinite(settling) else _lasting_swing(t, y - after, band)
     return StepMetrics(
         rise_time=_rise_time(t, y, start, final),
         overshoot_percent=_overshoot(y, before, after),
@@ -106,6 +120,10 @@ def step_metrics(
         steady_error=after - final,
         final_value=final,
         is_settled=isfinite(settling),
+        iae=float(np.trapezoid(error, t)),
+        itae=float(np.trapezoid(t * error, t)),
+        swing=swing,
+        swing_period=period,
     )
 
 
@@ -132,13 +150,29 @@ def _runs_away(t: FloatArray, deviation: FloatArray, height: float) -> bool:
         away = np.abs(deviation)
     if not np.all(away < _BEYOND * height):
         return True
-    edges = t[0] + (t[-1] - t[0]) * np.arange(1, _WINDOWS + 2) / (_WINDOWS + 1)
+    edges = _edges(t)
     farthest = _greatest(t, away, edges)
     before = max(float(np.max(away[t <= edges[-2]])), height)
     if float(farthest[-1]) > _GROWTH * before and _grows(farthest, 1.0):
         return True
     swings = _greatest(*_swings(t, deviation), edges)
     return float(swings[-1]) > _BAND * height and _grows(swings, _SWING_GROWTH)
+
+
+def _lasting_swing(t: FloatArray, deviation: FloatArray, band: float) -> tuple[float, float]:
+    """Size and period of a swing that neither grows nor decays; ``nan`` if there is none."""
+    ends, sizes = _swings(t, deviation)
+    first, *_, last = _greatest(ends, sizes, _edges(t))
+    if not last > 2.0 * band or not last > _LASTING * first > 0.0:
+        return nan, nan
+    later = ends[ends > 0.5 * (t[0] + t[-1])]
+    return (float(last), 2.0 * float(np.mean(np.diff(later)))) if later.size > 2 else (nan, nan)
+
+
+def _edges(t: FloatArray) -> FloatArray:
+    """Ends of the quarters of the record, from that of the first on."""
+    edges: FloatArray = t[0] + (t[-1] - t[0]) * np.arange(1, _WINDOWS + 2) / (_WINDOWS + 1)
+    return edges
 
 
 def _greatest(t: FloatArray, values: FloatArray, edges: FloatArray) -> FloatArray:

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.closed_loop import ProportionalControl, Transport, close_loop
+from sysid.closed_loop import close_loop
+from sysid.controllers import PidControl, Transport
 from sysid.errors import InvalidRecord, InvalidSettings
 from sysid.kernels.compiler import kernel_key
 from sysid.kernels.layout import Variant
@@ -34,7 +35,7 @@ def stepped(height: float, unit: str = "rad") -> Channel:
 
 def arm(gain: float, transport: Transport | None = TUBE) -> tuple[FloatArray, StepMetrics]:
     """Angle of the arm after a step of 90°, and what it is judged by."""
-    control = ProportionalControl("P_a", "theta", gain, 0.25e6, transport)
+    control = PidControl("P_a", "theta", gain, 0.25e6, transport)
     loop = close_loop(load_model("actuator"), control)
     angle = simulate(loop.model, [stepped(pi / 2)], ACTUATOR, times=TIMES).channel("theta").values
     return angle, step_metrics(TIMES, angle, at=0.0, before=0.0, after=pi / 2)
@@ -84,7 +85,7 @@ def test_without_the_tube_friction_leaves_14_degrees() -> None:
 def test_a_loop_in_the_differential_form_equals_the_same_loop_written_by_hand(
     transport: Transport | None, limit: float | None
 ) -> None:
-    loop = close_loop(lag(), ProportionalControl("u", "y", 3.0, limit, transport))
+    loop = close_loop(lag(), PidControl("u", "y", 3.0, limit, transport))
     with_limit = "max(-1.5, min(1.5, 3*({0})))" if limit else "3*({0})"
     element = transport or Transport()
     error = with_limit.format(f"r(t - {element.delay}) - y(t - {element.delay})")
@@ -114,7 +115,7 @@ def test_a_recursion_that_answers_at_once_has_a_controller_one_step_late() -> No
     direct = {"name": "d", "form": "difference", "inputs": {"u": "V"}, "states": {"x": "m"},
               "equations": {"x": "0.5*x(k-1) + 0.4*u"}, "outputs": {"y": "x"}}  # fmt: skip
     late = direct | {"equations": {"x": "0.5*x(k-1) + 0.4*u(k-1)"}}
-    control = ProportionalControl("u", "y", 1.1)
+    control = PidControl("u", "y", 1.1)
     loops = [close_loop(parse_model(one), control) for one in (direct, late)]
     assert [loop.steps_late for loop in loops] == [1, 0]
     first, second = (simulate(loop.model, [stepped(1.0, "m")], {}, times=TIMES) for loop in loops)
@@ -135,7 +136,7 @@ DIRECT = {"name": "d", "form": "difference", "inputs": {"u": "V"}, "states": {"x
     [(0.03, 0, 3), (0.01, 0, 1), (0.005, 1, 1.5), (0.025, 0, 2.5), (0.0, 1, 1)],
 )
 def test_a_delay_of_a_step_or_more_is_no_circle(delay: float, steps_late: int, back: float) -> None:
-    control = ProportionalControl("u", "y", 0.9, None, Transport(1.0, 0.0, delay))
+    control = PidControl("u", "y", 0.9, None, Transport(1.0, 0.0, delay))
     loop = close_loop(parse_model(DIRECT), control, 0.01)
     assert loop.steps_late == steps_late
     found = simulate(loop.model, [stepped(1.0, "m")], {}, times=TIMES).channel("y").values
@@ -152,7 +153,7 @@ def test_during_a_dead_time_of_whole_steps_the_plant_goes_on() -> None:
     """Ten steps of delay are no ten samples that a recursion is given."""
     plant = parse_model({**DIRECT, "inputs": {"u": "V", "v": "V"},
                          "equations": {"x": "0.5*x(k-1) + 0.4*u + v"}})  # fmt: skip
-    control = ProportionalControl("u", "y", 0.9, None, Transport(1.0, 0.0, 0.1))
+    control = PidControl("u", "y", 0.9, None, Transport(1.0, 0.0, 0.1))
     loop = close_loop(plant, control, 0.01)
     steady = Channel("v", TIMES, np.ones(TIMES.size), "V")
     found = simulate(loop.model, [stepped(0.0, "m"), steady], {}, times=TIMES).channel("y").values
@@ -168,13 +169,13 @@ def test_other_numbers_of_controller_and_transport_need_no_other_kernel(
     keys = set()
     for size in (1.0, 1.7, -2.0):
         transport = Transport(size, abs(size) * time_constant, 0.05 * abs(size))
-        control = ProportionalControl("u", "y", 3.0 * size, 2.0 * abs(size), transport)
+        control = PidControl("u", "y", 3.0 * size, 2.0 * abs(size), transport)
         keys.add(kernel_key(close_loop(plant, control, 0.01).model, variant))
     assert len(keys) == 1
 
 
 def test_a_delay_whose_step_is_not_known_is_taken_for_less_than_one() -> None:
-    control = ProportionalControl("u", "y", 0.9, None, Transport(1.0, 0.0, 0.03))
+    control = PidControl("u", "y", 0.9, None, Transport(1.0, 0.0, 0.03))
     assert close_loop(parse_model(DIRECT), control).steps_late == 1
 
 
@@ -184,7 +185,7 @@ def test_a_polynomial_can_be_controlled() -> None:
         "lags": {"y": [1], "u": [1]}, "coefficients": {"lower": -2, "upper": 2},
         "initial": {"y": 0},
     })  # fmt: skip
-    loop = close_loop(narx, ProportionalControl("u", "y", 2.0))
+    loop = close_loop(narx, PidControl("u", "y", 2.0))
     names = [parameter.name for parameter in narx.parameters]
     values = loop.values(dict(zip(names, (0.8, 0.1), strict=True)))
     found = simulate(loop.model, [stepped(1.0, "1")], values, times=TIMES).channel("y").values
@@ -194,8 +195,8 @@ def test_a_polynomial_can_be_controlled() -> None:
 def test_an_output_with_the_input_in_it_needs_a_transport_that_takes_time() -> None:
     direct = lag("y + 0.1*u")
     with pytest.raises(InvalidSettings, match="algebraic loop"):
-        close_loop(direct, ProportionalControl("u", "y", 1.0, None, Transport(1.0, 0.0, 0.2)))
-    loop = close_loop(direct, ProportionalControl("u", "y", 1.0, None, Transport(1.0, 0.1, 0.0)))
+        close_loop(direct, PidControl("u", "y", 1.0, None, Transport(1.0, 0.0, 0.2)))
+    loop = close_loop(direct, PidControl("u", "y", 1.0, None, Transport(1.0, 0.1, 0.0)))
     found = simulate(loop.model, [stepped(1.0, "m")], {"T": 0.5, "L": 0.0}, times=TIMES)
     # y = x + 0.1 u and u = 1 - y at rest, where x = u
     assert found.channel("y").values[-1] == pytest.approx(1.1 / 2.1, rel=1e-6)
@@ -204,7 +205,7 @@ def test_an_output_with_the_input_in_it_needs_a_transport_that_takes_time() -> N
 def test_the_loop_names_its_signals_anew_where_the_plant_has_those_names() -> None:
     taken = lag(parameters={"T": {"lower": 0.1, "upper": 2}, "L": {"lower": 0, "upper": 1},
                             "reference": {"lower": 0, "upper": 1}})  # fmt: skip
-    loop = close_loop(taken, ProportionalControl("u", "y", 1.0))
+    loop = close_loop(taken, PidControl("u", "y", 1.0))
     assert [one.name for one in loop.model.inputs] == [loop.reference] == ["reference_"]
     assert [one.name for one in loop.model.outputs] == ["y", "u", "command"]
     assert [one.unit for one in loop.model.outputs] == ["m", "V", "V"]
@@ -213,10 +214,10 @@ def test_the_loop_names_its_signals_anew_where_the_plant_has_those_names() -> No
 @pytest.mark.parametrize(
     ("make", "pointer", "part"),
     [
-        (lambda: ProportionalControl("v", "y", 1.0), "/input", "no input 'v'"),
-        (lambda: ProportionalControl("u", "x", 1.0), "/output", "no output 'x'"),
-        (lambda: ProportionalControl("u", "y", float("nan")), "/gain", "finite"),
-        (lambda: ProportionalControl("u", "y", 1.0, 0.0), "/limit", "above 0"),
+        (lambda: PidControl("v", "y", 1.0), "/input", "no input 'v'"),
+        (lambda: PidControl("u", "x", 1.0), "/output", "no output 'x'"),
+        (lambda: PidControl("u", "y", float("nan")), "/gain", "finite"),
+        (lambda: PidControl("u", "y", 1.0, 0.0), "/limit", "above 0"),
         (lambda: Transport(1.0, -1.0), "/transport/time_constant", "0 or more"),
     ],
 )
