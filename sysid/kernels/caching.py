@@ -12,7 +12,7 @@ expected, functions are compiled as without a cache and the log says so.
 import pickle
 import sys
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -111,7 +111,7 @@ class _Kept:
 
 
 def _reduced(compiled_: Any) -> bytes:
-    """The function without empty environments of others.
+    """The function without empty environments of others, and the names that it defines.
 
     An environment holds a function's Python constants, and to make it again imports the
     function's module: for Numba's own versions of NumPy a good part of the compiler.
@@ -121,18 +121,23 @@ def _reduced(compiled_: Any) -> bytes:
     parts = compiled_._reduce()
     if len(parts) == _PARTS:
         parts = (*parts[:-1], tuple(one for one in parts[-1] if one.consts))
-    return bytes(dumps(parts))  # type: ignore[no-untyped-call]
+    module = compiled_.library._get_module_for_linking()
+    defined = (*module.functions, *module.global_variables)
+    names = {one.name for one in defined if not one.is_declaration}
+    return bytes(dumps((names, *parts)))  # type: ignore[no-untyped-call]
 
 
 def _rebuilt(content: bytes, target_context: Any) -> Any:
     """The function in this process.
 
     Numba's own cache first registers all that could be compiled, a quarter of a second; what is
-    loaded needs the memory management alone. The compiler registers it where it runs.
+    loaded needs the memory management alone. The compiler registers it where it runs. It also
+    reads the function's bitcode, which only the compiler asks for, to tell what is defined.
 
     Numba unpickles what it has pickled: as with the machine code itself, this is safe because
     only files that this user alone can have written get here (`sysid.kernels.keeping`).
     """
+    from llvmlite.binding import parse_assembly
     from numba.core.compiler import CompileResult
     from numba.core.runtime.nrt import rtsys
     from numba.core.serialize import loads
@@ -143,7 +148,21 @@ def _rebuilt(content: bytes, target_context: Any) -> Any:
         target_context.refresh()
     else:
         initialize(target_context)
-    return inside._rebuild(target_context, *loads(content))
+    names, (name, kind, (machine_code, bitcode)), *others = loads(content)
+    target_context.codegen()._engine._defined_symbols.update(names)
+    without = (name, kind, (machine_code, parse_assembly("").as_bitcode()))
+    rebuilt = inside._rebuild(target_context, without, *others)
+    rebuilt.library._get_module_for_linking = partial(_linked, rebuilt.library, bitcode)
+    return rebuilt
+
+
+def _linked(library: Any, bitcode: bytes) -> Any:
+    """The module of a loaded function, read where another is compiled that calls it."""
+    from llvmlite.binding import parse_bitcode
+
+    del library._get_module_for_linking  # Numba's own gives it from now on
+    library._shared_module = parse_bitcode(bitcode)
+    return library._shared_module
 
 
 def compiled(function: _Function) -> _Function:

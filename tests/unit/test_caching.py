@@ -156,6 +156,22 @@ def test_code_compiled_while_an_update_replaces_sources_is_not_kept(tmp_path: Pa
     assert not (tmp_path / "cache").exists()
 
 
+def test_what_was_loaded_is_taken_into_what_is_compiled_with_it(folder: Path) -> None:
+    def tripled(x: float) -> float:
+        return 3.0 * x + inner(x)
+
+    for loaded in (0, 1):
+        inner: Any = caching.compiled(doubled)
+        assert inner(2.0) == 4.0
+        assert sum(inner.stats.cache_hits.values()) == loaded
+        outer: Any = numba.njit(tripled)
+        assert outer(2.0) == 10.0
+        code = outer.inspect_llvm(outer.signatures[0])
+        assert not [
+            one for one in code.splitlines() if one.startswith("declare") and "doubled" in one
+        ]
+
+
 @pytest.mark.parametrize("damage", ["empty", "cut", "cut late", "flipped", "longer"])
 def test_a_damaged_loop_is_compiled_anew_and_replaced(folder: Path, damage: str) -> None:
     assert [hits(), hits()] == [0, 1]
