@@ -73,6 +73,8 @@ class Analysis:
     """Parameters that can change places."""
     is_cut_short: bool = False
     """Whether minima beside the estimate were not looked for because the time was over."""
+    slopes: tuple[FloatArray, FloatArray] | None = None
+    """Residuals (n,) and sensitivities (n, D) that are not whitened."""
 
 
 def analyse(
@@ -90,7 +92,10 @@ def analyse(
     if white is not None:
         columns = white.of(sensitive.columns.T).T
         sensitive = sensitive._replace(error=white.of(sensitive.error), columns=columns)
-    return _analysed(problem, theta, sensitive, most, white)
+    analysis = _analysed(problem, theta, sensitive, most, white)
+    if white is not None:
+        return analysis
+    return replace(analysis, slopes=(sensitive.error, sensitive.columns))
 
 
 def _unexplored(

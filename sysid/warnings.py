@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from sysid.assumed_past import past_notes
 from sysid.islands.archipelago import of_island
 from sysid.kernels.demand import is_difference, lags
 from sysid.onset import moves_alone
@@ -56,7 +57,7 @@ def warnings_of(
     found += _worse_than_a_line(problem, simulated)
     found += _without_excitation(problem, analysis.estimates)
     found += _steps_read_as_ramps(problem)
-    found += _begun_before(problem)
+    found += _begun_before(problem) or past_notes(problem, analysis)
     found += [text for e in analysis.estimates if (text := _of_estimate(e))]
     lagged = lag_parameters(problem)
     if analysis.uncertainty is not None:
