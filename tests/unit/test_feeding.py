@@ -27,6 +27,8 @@ from workers.ports import (
 )  # fmt: skip
 from workers.tasks import build
 
+pytestmark = pytest.mark.usefixtures("time_to_read")
+
 Answer = Callable[[Item], Done | PackLost]
 
 

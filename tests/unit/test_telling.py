@@ -12,6 +12,8 @@ from workers.packing import PACK_SECONDS
 from workers.ports import Advance, Advanced, Concluded, Done, Item
 from workers.tasks import advance
 
+pytestmark = pytest.mark.usefixtures("time_to_read")
+
 
 @pytest.fixture(scope="module")
 def concluded() -> Concluded:

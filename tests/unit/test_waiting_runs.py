@@ -11,6 +11,8 @@ from tests.unit.test_feeding import ScriptedCrew, fails, finish, jobs
 from workers.feeding import Feeder
 from workers.ports import Coming, NotYet, QueuedRun, Records
 
+pytestmark = pytest.mark.usefixtures("time_to_read")
+
 
 class Chained:
     """Each run comes when the one before it has ended, or never."""

@@ -1,0 +1,9 @@
+"""Fixtures of unit tests."""
+
+import pytest
+
+
+@pytest.fixture
+def time_to_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each step of a feeder reads all runs it wants, also when this process waits meanwhile."""
+    monkeypatch.setattr("workers.feeding.READ_SECONDS", float("inf"))
