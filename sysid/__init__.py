@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from sysid.noise import Noise
     from sysid.parameters import Parameter
     from sysid.problem import Problem
-    from sysid.records import Channel, Record, Recording
+    from sysid.records import Channel, History, Record, Recording
     from sysid.result import Estimate, Identification
     from sysid.settings import GeneticAlgorithm, IslandChange, Loss, Migration, SequenceSearch, Stop
     from sysid.simulation import simulate
 
 __all__ = [
-    "Channel", "Estimate", "GeneticAlgorithm", "Identification", "IslandChange", "Loss",
+    "Channel", "Estimate", "GeneticAlgorithm", "History", "Identification", "IslandChange", "Loss",
     "Migration", "Noise", "Parameter", "Problem", "Record", "Recording", "SequenceSearch", "Stop",
     "SysidError", "catalogue", "export", "identify", "load_model", "simulate",
 ]  # fmt: skip
@@ -36,7 +36,7 @@ _PLACES = {
     "noise": ("Noise",),
     "parameters": ("Parameter",),
     "problem": ("Problem",),
-    "records": ("Channel", "Record", "Recording"),
+    "records": ("Channel", "History", "Record", "Recording"),
     "result": ("Estimate", "Identification"),
     "settings": ("GeneticAlgorithm", "IslandChange", "Loss", "Migration", "SequenceSearch", "Stop"),
     "simulation": ("simulate",),

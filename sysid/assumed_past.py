@@ -33,6 +33,8 @@ def past_notes(problem: Problem, analysis: Analysis) -> list[str]:
     """What to say of estimates that are others without the samples that read an assumed input."""
     if analysis.slopes is None or analysis.linear is None or problem.prediction != "simulation":
         return []  # whitened, or not of squares
+    if analysis.is_cut_short:
+        return []  # the time is over
     if not all(isinstance(one, EstimatedInitial) for one in problem.model.initial):
         return []  # a start that is given carries the effect of the guess into the other samples
     parts = reads_assumed(problem, analysis)

@@ -129,7 +129,9 @@ def _tell(stored: dict[str, Any], as_json: bool) -> None:
         return
     period = stored["sample_time"]
     sampling = "irregular sampling" if period is None else f"sampling period {period:.6g} s"
-    out.print(f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, "
+    before = stored["details"].get("known_before")
+    known = f"known for {before:.6g} s before, " if before else ""
+    out.print(f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, {known}"
               f"channels {_channels(stored)}", markup=False, soft_wrap=True)  # fmt: skip
     for warning in stored["warnings"]:
         out.print(f"note: {warning}", markup=False, soft_wrap=True)

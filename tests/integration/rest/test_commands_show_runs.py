@@ -169,6 +169,26 @@ def test_a_dataset_is_derived_by_its_name(served: Served, tmp_path: Path) -> Non
         served.client.derive("step", [{"detrend": {}}])
 
 
+def test_a_free_run_over_a_part_reads_what_was_recorded_before_it(
+    served: Served, tmp_path: Path
+) -> None:
+    """The input jumps at 7 s, the output at 7.5 s: a part from 7.3 s on begins between them."""
+    steps = tmp_path / "steps.yaml"
+    steps.write_text("- trim: {start: 7.25}\n")
+    told = lagid("dataset", "derive", "steps", str(steps))
+    assert "known for 7.3 s before, channels u, y" in told.stdout
+    part = told.stdout.split()[0]
+    alone = served.client.derive("steps", [{"trim": {"start": 7.25, "history": False}}])["id"]
+    with_past, without = (
+        served.client.validate_run(served.runs[0], one)["rms"] for one in (part, alone)
+    )
+    assert with_past < 0.02
+    assert without > 2 * with_past
+    assert served.client.run(served.runs[0])["known_before"] == {
+        "estimation": [0.0], "validation": [pytest.approx(24.0)],
+    }  # fmt: skip
+
+
 def test_jobs_are_listed_by_state(served: Served) -> None:
     assert served.job in lagid("jobs", "--state", "succeeded").stdout
     assert served.job in lagid("jobs", "--state", "running", "--state", "succeeded").stdout
