@@ -42,7 +42,7 @@ def measure(client: Client, folder: Path) -> list[Row]:
         ]
         run = identify(client, {**alone, "name": f"dryer2 {model}, alone", "model": model})
         fit = run["fit_percent"]["validation"]
-        rows.append(Row(f"fit, {model}, input before row 500 not used", fit, "%", bar, ">="))
+        rows.append(Row(f"fit, {model}, input before row 500 not used", fit, "%"))
     slow = {"name": "dryer2 sopdt, noise model", "model": "sopdt", "loss": {"noise_model": "ar1"}}
     run = identify(client, {**common, **slow})
     print_estimates("dryer2, sopdt, first-order noise", run)
