@@ -148,7 +148,8 @@ def hold_of(signal: RunInputIn) -> Hold:
 
 
 def sampled(channel: Channel, times: FloatArray) -> FloatArray:
-    """Values of a channel at other times; of a held one, those after its jumps."""
+    """Values of a channel at other times, in its history too; of a held one, those after jumps."""
+    channel = channel.whole
     if channel.hold != "zero":
         return np.interp(times, channel.times, channel.values)
     last = np.searchsorted(channel.times, times, side="right") - 1

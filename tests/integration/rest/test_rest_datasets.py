@@ -183,6 +183,25 @@ def test_a_part_tells_and_keeps_what_was_recorded_before_it(
     assert "Before them" not in server.get(f"/datasets/{dataset}").text
 
 
+def test_an_input_from_a_part_is_what_was_recorded_before_it(
+    server: TestClient, dataset: str
+) -> None:
+    """It jumps at 7 s, and the part begins at 10 s."""
+    steps = [{"trim": {"rows": [100, 300]}}]
+    part = server.post(f"/v1/datasets/{dataset}:derive", json={"steps": steps}).json()["id"]
+    body = {"model": "fopdt", "parameters": {"K": 2, "T": 0.5, "L": 0.5, "y0": 0},
+            "samples": 120, "sample_time": 0.1,
+            "inputs": {"u": {"kind": "dataset", "dataset": part, "channel": "u"}}}  # fmt: skip
+    made = server.post("/v1/datasets:simulate", json=body)
+    assert made.status_code == 201, made.text
+    stored = read_recording(server.get(f"/v1/datasets/{made.json()['id']}/content").content)
+    u, y = stored.channel("u").values, stored.channel("y").values
+    assert not u[:70].any()
+    assert np.all(u[71:] == 1.0)
+    assert not y[:74].any()
+    assert y[-1] == pytest.approx(2.0, abs=0.01)
+
+
 def test_a_part_without_history_is_another_dataset(server: TestClient, dataset: str) -> None:
     parts = [
         server.post(
