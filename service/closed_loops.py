@@ -77,12 +77,10 @@ def closed(
     try:
         used, tuning = _controller(identified, control)
         loop = close_loop(model, used, step)
-        found = loop.simulate(
-            [replace(reference, name=loop.reference), *inputs], values, times=times
-        )
-        margins = _margins(identified, used)
     except InvalidSettings as error:
         raise InvalidRequest.at(f"/control{error.pointer}", error.detail) from None
+    found = loop.simulate([replace(reference, name=loop.reference), *inputs], values, times=times)
+    margins = _margins(identified, used)
     outputs = [found.channel(one.name) for one in model.outputs]
     _check_finite(outputs, times, used.gain, is_tuned=tuning is not None)
     command = found.channel(loop.command)

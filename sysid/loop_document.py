@@ -213,10 +213,11 @@ class LoopDocument:
         return {"substeps": substeps} if substeps > self.model.solver.substeps else {}
 
     def _too_short(self, name: str, time: float) -> str:
+        sampling = (self.period or 0.0) * self.model.solver.substeps
         told = "the filter's time constant T_d/N is" if name == "derivative_filter" else "T_t is"
         right = "a smaller N" if name == "derivative_filter" else "a longer one"
         return (
-            f"{told} {time:.4g} s, too short for steps of {self.period:.4g} s even if each is "
+            f"{told} {time:.4g} s, too short for steps of {sampling:.4g} s even if each is "
             f"divided into {_MOST_SUBSTEPS}; give {right}, or a shorter sampling period"
         )
 

@@ -199,6 +199,11 @@ def difference(unit: str | None, other: str | None) -> str:
     return f"{unit} is not {other}, and no number makes one of the other"
 
 
+def multiplied(unit: str, other: str) -> str:
+    """Product of two units as a text; of a number without dimension the other one."""
+    return other if unit in ("1", "") else f"{unit}·{other}"
+
+
 def suggestion(unit: str) -> str:
     """What may be meant by a text that is no known unit, to be added to a message about it.
 

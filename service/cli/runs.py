@@ -22,9 +22,17 @@ from service.cli.common import (
 from service.cli.jobs import runs as listing
 from service.cli.places import Places, told_at
 from service.documents import read_yaml
+from sysid.units import multiplied
 
 LISTING = "list"
 PROFILE = Places({"/parameters": "PARAMETER", "/points": "--points"})
+
+_MARGINS = (
+    ("gain margin", "gain_margin", ""),
+    ("phase margin", "phase_margin", "°"),
+    ("delay margin", "delay_margin", " s"),
+    ("M_s", "sensitivity_peak", ""),
+)
 
 RunName = Annotated[str, typer.Argument(metavar="RUN", help="Id of a run.")]
 
@@ -74,7 +82,7 @@ def simulate(
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate the identified model on a new input or under proportional control."""
+    """Simulate the identified model on a new input or under P, PI or PID control."""
     body = read_yaml(read_file(file))
     if not isinstance(body, dict):
         fail(f"{file} does not hold an object (name: value)")
@@ -90,6 +98,7 @@ def simulate(
                   f" to {max(values):.6g}, at the end {values[-1]:.6g}",
                   markup=False, soft_wrap=True)  # fmt: skip
     _print_step(found["metrics"])
+    _print_controller(found["controller"], found["tuning"], found["margins"])
     for note in found["notes"]:
         out.print(f"note: {note}", markup=False, soft_wrap=True)
     if found["dataset"]:
@@ -159,11 +168,40 @@ def _print_step(metrics: dict[str, Any] | None) -> None:
         ("overshoot of the final value", metrics["overshoot_of_final_percent"], "%"),
         ("settling time (2 %)", metrics["settling_time"], "s"),
         ("steady error", metrics["steady_error"], metrics["unit"]),
+        ("IAE", metrics["iae"], multiplied(metrics["unit"], "s")),
+        ("ITAE", metrics["itae"], multiplied(metrics["unit"], "s²")),
     )
     for name, value, unit in told:
         missing = "not in this record: it has not settled" if "settling" in name else "never"
         shown = missing if value is None else f"{value:.4g} {unit}"
         out.print(f"{name}: {shown}", markup=False)
+
+
+def _print_controller(
+    used: dict[str, Any] | None, tuning: dict[str, Any] | None, margins: dict[str, Any] | None
+) -> None:
+    """The controller's numbers, where a rule has them from, and how stable the loop is."""
+    if used is None:
+        return
+    parts = [f"K = {used['gain']:.6g}"]
+    if used["integral_time"] is not None:
+        parts.append(f"T_i = {used['integral_time']:.6g} s")
+    if used["derivative_time"]:
+        parts.append(f"T_d = {used['derivative_time']:.6g} s, N = {used['derivative_filter']:.4g}")
+    rule = "" if tuning is None else f" by {tuning['rule'].upper()} ({tuning['reference']})"
+    out.print(f"controller{rule}: {', '.join(parts)}", markup=False, soft_wrap=True)
+    limited = "" if used["lower"] is used["upper"] is None else (
+        f", {used['saturated_percent']:.3g} % of the time at a limit"
+    )  # fmt: skip
+    out.print(f"command: {used['command_min']:.6g} to {used['command_max']:.6g}{limited}",
+              markup=False)  # fmt: skip
+    if margins is not None and margins["is_stable"]:
+        shown = [
+            f"{name} {margins[key]:.3g}{unit}"
+            for name, key, unit in _MARGINS
+            if margins[key] is not None
+        ]
+        out.print(f"without limits: stable, {', '.join(shown)}", markup=False)
 
 
 def _tested(one: dict[str, Any]) -> tuple[object, ...]:

@@ -1,12 +1,12 @@
 """Figures of a simulated run: the outputs with their reference, what the controller gives below."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from service.schemas_datasets import Series
-from service.schemas_simulations import RunSimulationOut, StepMetricsOut
+from service.schemas_simulations import ControllerOut, RunSimulationOut, StepMetricsOut
 from service.web import theme
 from service.web.evidence import Trace
 from service.web.figures import Figure
@@ -15,6 +15,7 @@ from service.web.formats import bracketed
 
 _OUTPUT_PX, _INPUT_PX = 260, 120
 _WHOLE = slice(None)
+_LOOK = {"layer": "below", "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dot"}}
 
 
 def simulation(found: RunSimulationOut, step_time: float | None = None) -> Figure:
@@ -36,11 +37,13 @@ def simulation(found: RunSimulationOut, step_time: float | None = None) -> Figur
         figure["data"].append(_drawn(output, number, theme.BLUE))
         name_axis(figure, number, f"{output.name}{bracketed(output.unit)}")
         if found.metrics is not None and output.name == controlled:
-            figure["layout"]["shapes"] = _settling(found.metrics, number, step_time or 0.0)
+            figure["layout"]["shapes"] = [*_settling(found.metrics, number, step_time or 0.0)]
     for number, signal in enumerate(below, len(found.outputs) + 1):
         is_command = signal is found.command
         colour = theme.VERMILLION if is_command else theme.GREEN
         figure["data"].append(_drawn(signal, number, colour))
+        if found.command is not None and signal.values == found.command.values:
+            figure["layout"].setdefault("shapes", []).extend(_limits(found.controller, number))
         name = "command" if is_command else signal.name
         name_axis(figure, number, f"{name}{bracketed(signal.unit)}")
     return figure
@@ -75,17 +78,28 @@ def _drawn(signal: Series, number: int, colour: str, dash: str = "solid") -> dic
     return drawn
 
 
+def _limits(controller: ControllerOut | None, number: int) -> Iterator[dict[str, Any]]:
+    """Least and largest value that the controller may give."""
+    if controller is None:
+        return
+    for limit in (controller.lower, controller.upper):
+        if limit is not None:
+            yield _level(axis_id(f"y{number}"), limit)
+
+
+def _level(axis: str, height: float) -> dict[str, Any]:
+    """A dotted line at a height, all over the width."""
+    return {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": axis, "y0": height,
+            "y1": height, **_LOOK}  # fmt: skip
+
+
 def _settling(metrics: StepMetricsOut, number: int, since: float) -> Sequence[dict[str, Any]]:
     """The band of 2 % about the final value, and the time from which on it is kept."""
     if metrics.final_value is None or metrics.settling_time is None:
         return []
     axis = axis_id(f"y{number}")
-    look = {"layer": "below", "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dot"}}
-    edges = [metrics.final_value - metrics.band, metrics.final_value + metrics.band]
-    band = [
-        {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": axis, "y0": y, "y1": y, **look}
-        for y in edges
-    ]
+    edges = (metrics.final_value - metrics.band, metrics.final_value + metrics.band)
+    band = [_level(axis, y) for y in edges]
     settled = since + metrics.settling_time
     return [*band, {"type": "line", "x0": settled, "x1": settled, "yref": f"{axis} domain",
-                    "y0": 0, "y1": 1, **look}]  # fmt: skip
+                    "y0": 0, "y1": 1, **_LOOK}]  # fmt: skip

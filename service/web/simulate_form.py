@@ -20,15 +20,31 @@ KINDS: Mapping[Kind, str] = {
 }
 LABELS = {
     "kind": "kind", "input": "controlled input", "output": "controlled output", "gain": "gain",
+    "integral_time": "integral time", "derivative_time": "derivative time",
+    "derivative_filter": "derivative filter N", "derivative_on": "derivative on",
+    "setpoint_weight": "setpoint weight", "tuning": "tuning",
+    "closed_loop_time_constant": "closed-loop time constant", "lower": "lower limit",
+    "upper": "upper limit", "anti_windup": "anti-windup", "tracking_time": "tracking time",
     "limit": "limit of the command", "amplitude": "height of the step", "time": "time of the step",
     "offset": "reference before the step", "transport_gain": "transport gain",
     "time_constant": "transport time constant", "transport_delay": "transport time lag",
     "duration": "duration", "sample_time": "sampling period", "dataset": "recording",
     "skip": "samples not judged",
 }  # fmt: skip
+BY_HAND = "by hand"
+TUNINGS = {
+    BY_HAND: "by hand", "simc PI": "SIMC, PI", "simc PID": "SIMC, PID",
+    "amigo PI": "AMIGO, PI", "amigo PID": "AMIGO, PID",
+}  # fmt: skip
+"""Rule and controller: a rule chooses gain and times itself."""
+_NUMBERS = ("derivative_filter", "setpoint_weight", "limit", "lower", "upper", "tracking_time")
+_TUNED = ("gain", "integral_time", "derivative_time")
+_CHOSEN = ("derivative_on", "anti_windup")
 _PLACES = {
-    "/control/input": "input", "/control/output": "output", "/control/gain": "gain",
-    "/control/limit": "limit", "/control/transport/gain": "transport_gain",
+    "/control/tuning/closed_loop_time_constant": "closed_loop_time_constant",
+    **{f"/control/{name}": name for name in ("tuning", *_TUNED, *_NUMBERS, *_CHOSEN)},
+    "/control/input": "input", "/control/output": "output",
+    "/control/transport/gain": "transport_gain",
     "/control/transport/time_constant": "time_constant",
     "/control/transport/delay": "transport_delay", "/control/reference/amplitude": "amplitude",
     "/control/reference/time": "time", "/control/reference/offset": "offset",
@@ -73,8 +89,9 @@ def fields_of(model: Model, kind: Kind) -> list[str]:
         return ["dataset", "skip", *(f"channel.{name}" for name in signals)]
     if kind == "signal":
         return [*inputs, "duration", "sample_time"]
-    return ["input", "output", "gain", "limit", "amplitude", "time", "offset", "transport_gain",
-            "time_constant", "transport_delay", *inputs, "duration", "sample_time"]  # fmt: skip
+    return ["input", "output", "tuning", "closed_loop_time_constant", *_TUNED, *_NUMBERS, *_CHOSEN,
+            "amplitude", "time", "offset", "transport_gain", "time_constant", "transport_delay",
+            *inputs, "duration", "sample_time"]  # fmt: skip
 
 
 def asked(model: Model, query: Mapping[str, str]) -> Asked:
@@ -171,15 +188,12 @@ def _loop(reader: _Reader, model: Model) -> dict[str, Any]:
     control: dict[str, Any] = {
         "input": reader.text("input", model.inputs[0].name if model.inputs else ""),
         "output": reader.text("output", model.outputs[0].name),
-        "gain": reader.number("gain", 1.0),
+        **_controller(reader),
         "reference": {
             "kind": "step", "amplitude": reader.number("amplitude", 1.0),
             "time": reader.number("time", 0.0), "offset": reader.number("offset", 0.0),
         },
     }  # fmt: skip
-    limit = reader.number("limit")
-    if limit is not None:
-        control["limit"] = limit
     transport = {
         "gain": reader.number("transport_gain"), "time_constant": reader.number("time_constant"),
         "delay": reader.number("transport_delay"),
@@ -191,6 +205,28 @@ def _loop(reader: _Reader, model: Model) -> dict[str, Any]:
     others = [one.name for one in model.inputs if one.name != control["input"]]
     return {"control": control, "inputs": dict(_expressions(reader, others, "0")),
             "samples": samples, "sample_time": period}  # fmt: skip
+
+
+def _controller(reader: _Reader) -> dict[str, Any]:
+    """The controller's numbers; with a rule, which chooses them, those that it leaves."""
+    tuning = reader.text("tuning", BY_HAND)
+    found: dict[str, Any] = {}
+    if tuning == BY_HAND:
+        found["gain"] = reader.number("gain", 1.0)
+        names: tuple[str, ...] = (*_TUNED[1:], *_NUMBERS)
+    else:
+        rule, _, controller = tuning.partition(" ")
+        found["tuning"] = {"rule": rule, "controller": controller}
+        wanted = reader.number("closed_loop_time_constant")
+        if wanted is not None:
+            found["tuning"]["closed_loop_time_constant"] = wanted
+        names = _NUMBERS
+        if tuning not in TUNINGS:
+            known = ", ".join(TUNINGS)
+            reader.faults.append(FieldError("?tuning", f"found {tuning!r}; need one of {known}"))
+    given = {name: reader.number(name) for name in names}
+    found |= {name: value for name, value in given.items() if value is not None}
+    return found | {name: text for name in _CHOSEN if (text := reader.text(name))}
 
 
 def _signal(reader: _Reader, model: Model) -> dict[str, Any]:

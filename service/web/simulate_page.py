@@ -33,9 +33,11 @@ from service.web.evidence import Experiment, OutputTraces, Trace
 from service.web.figures import Figure, as_csv
 from service.web.figures_signals import response
 from service.web.figures_simulation import in_units, simulation
+from service.web.formats import bracketed
 from service.web.rendering import render
 from service.web.simulate_form import (
     KINDS,
+    TUNINGS,
     Asked,
     Kind,
     asked,
@@ -47,6 +49,7 @@ from service.web.simulate_form import (
 from sysid.errors import SysidError
 from sysid.models.model import Model
 from sysid.records import Record
+from sysid.units import multiplied
 
 DATASETS_LISTED = 200
 RECORDS_LISTED = 50
@@ -132,10 +135,12 @@ def simulate_page(
         faults = [at_home(one) for one in _faults(error)]
         status = error.status if isinstance(error, Unavailable) else 422
     page = render(
-        "simulate.html", known=known, kind=kind, kinds=KINDS,
-        values={**known.defaults, **(TAKEN if is_asked(query) else {}), **query},
+        "simulate.html", known=known, kind=kind, kinds=KINDS, tunings=TUNINGS,
+        values={**known.defaults, **(TAKEN if is_asked(query) else {}), **query,
+                **_numbers(context.get("result"))},
         faults={f.pointer[1:]: f.detail for f in faults},
         lines=[_line(one) for one in faults], query=_address(query), label_of=label_of,
+        times=multiplied, bracket=bracketed,
         **{"result": None, "free": None, "figure": None, **context},
     )  # fmt: skip
     return Shown(page, is_csv=False, status=status)
@@ -229,7 +234,9 @@ def _simulated(
     told = run_simulations.simulate(database, store, known.run, body, MAX_POINTS)
     found = in_units(told, known.units)
     since = wanted.body["control"]["reference"]["time"] if wanted.kind == "loop" else None
-    return simulation(found, since), {"result": found, "verdict": _verdict(found)}
+    entered = known.units.get(wanted.body["control"]["input"], "1") if since is not None else "1"
+    return simulation(found, since), {"result": found, "verdict": _verdict(found),
+                                      "command_unit": entered}  # fmt: skip
 
 
 def _valid(kind: type[Any], body: Mapping[str, Any]) -> Any:
@@ -239,6 +246,16 @@ def _valid(kind: type[Any], body: Mapping[str, Any]) -> Any:
         raise InvalidRequest(explained(error.errors(), body, kind)) from None
 
 
+def _numbers(found: RunSimulationOut | None) -> dict[str, str]:
+    """What a rule chose, as the form's own numbers: to go on from there by hand."""
+    if found is None or found.tuning is None or found.controller is None:
+        return {}
+    used = found.controller
+    chosen = {"gain": used.gain, "integral_time": used.integral_time,
+              "derivative_time": used.derivative_time or None}  # fmt: skip
+    return {name: "" if value is None else f"{value:.6g}" for name, value in chosen.items()}
+
+
 def _verdict(found: RunSimulationOut) -> tuple[str, str]:
     """The verdict on a step response as the sheet styles it, and in words."""
     metrics: StepMetricsOut | None = found.metrics
@@ -246,6 +263,8 @@ def _verdict(found: RunSimulationOut) -> tuple[str, str]:
         return "", ""
     if metrics.runs_away:
         return "failed", "runs away"
+    if metrics.swing is not None:
+        return "failed", "keeps swinging"
     return ("passed", "settles") if metrics.is_settled else ("apart", "does not settle")
 
 

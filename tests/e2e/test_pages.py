@@ -289,6 +289,25 @@ def test_a_run_is_simulated_in_a_closed_loop_from_its_page(site: Site, page: Pag
     page.wait_for_function("() => document.documentElement.scrollWidth <= innerWidth")
 
 
+def test_a_rule_tunes_a_pi_controller_and_its_numbers_can_be_changed_by_hand(
+    site: Site, page: Page
+) -> None:
+    page.goto(f"{site.url}/runs/{site.filled.finished_run}/simulate")
+    page.get_by_label("tuning").select_option("SIMC, PI")
+    page.get_by_label("time constant of SIMC").fill("1")
+    page.get_by_role("button", name="Simulate").click()
+    page.wait_for_selector("#result .main-svg")
+    expect(page.locator("#result")).to_contain_text("Controller by SIMC")
+    expect(page.get_by_label("integral time")).not_to_have_value("")
+    page.get_by_label("tuning").select_option("by hand")
+    page.get_by_label("upper limit").fill("1000")
+    page.get_by_label("time constant of SIMC").fill("")
+    page.get_by_role("button", name="Simulate").click()
+    page.wait_for_selector("#result .main-svg")
+    expect(page.locator("#result")).not_to_contain_text("Controller by SIMC")
+    expect(page.locator("#result")).to_contain_text("Phase margin")
+
+
 def test_a_run_is_run_freely_over_a_recording_from_its_page(site: Site, page: Page) -> None:
     page.goto(f"{site.url}/runs/{site.filled.finished_run}/simulate?kind=recording")
     page.get_by_label("stored recording").select_option(site.filled.dataset)

@@ -1,5 +1,7 @@
 """The page on which an identified model is simulated, and the free run over a recording."""
 
+import html
+import json
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -226,9 +228,71 @@ def test_a_signal_is_given_as_an_expression_and_its_numbers_come_as_csv(place: P
     assert float(last[2]) == pytest.approx(2, rel=1e-3)  # K times the input
 
 
+LOOP = "kind=loop&duration=20&sample_time=0.05&amplitude=1&offset=0"
+
+
+def curl_of(text: str) -> dict[str, Any]:
+    """The body that the page repeats for curl."""
+    found = re.search(r"LAGID&#39;\n(.*?)\nLAGID", text, re.DOTALL)
+    assert found is not None
+    return dict(json.loads(html.unescape(found.group(1))))
+
+
+def test_a_pi_controller_with_limits_is_simulated_as_by_rest(place: Place) -> None:
+    query = "gain=0.6&integral_time=1.1&lower=0&upper=0.65&setpoint_weight=0.8&derivative_on=error"
+    text = place.client.get(f"{place.page}?{LOOP}&{query}").text
+    body = curl_of(text)
+    assert body["control"] | {"reference": None} == {
+        "input": "u", "output": "y", "gain": 0.6, "integral_time": 1.1, "lower": 0.0,
+        "upper": 0.65, "setpoint_weight": 0.8, "derivative_on": "error", "reference": None,
+    }  # fmt: skip
+    told = place.client.post(f"/v1/runs/{place.run}:simulate", json=body).json()
+    margins, used = told["margins"], told["controller"]
+    shown = {
+        "Gain margin": f"{margins['gain_margin']:.2f}",
+        "Phase margin": f"{margins['phase_margin']:.1f}°",
+        "Time at a limit": f"{used['saturated_percent']:.3g} %",
+    }
+    for label, value in shown.items():
+        assert f"<dt>{label}</dt><dd>{value}" in text, label
+    assert re.search(r'"y0":0\.65,"y1":0\.65', text)  # the limit in the figure
+
+
+def test_a_rule_fills_in_the_numbers_that_it_chose(place: Place) -> None:
+    text = place.client.get(f"{place.page}?{LOOP}&gain=7&tuning=simc+PI").text
+    body = curl_of(text)
+    assert body["control"]["tuning"] == {"rule": "simc", "controller": "PI"}
+    assert "gain" not in body["control"]
+    assert re.search(r'name="gain" value="0\.(5|49999|50000)', text)
+    assert re.search(r'name="integral_time" value="(1|0\.9999|1\.000)', text)
+    assert "Skogestad" in text
+    assert "Controller by SIMC" in text
+    slower = place.client.get(
+        f"{place.page}?{LOOP}&tuning=simc+PID&closed_loop_time_constant=2"
+    ).text
+    assert curl_of(slower)["control"]["tuning"]["closed_loop_time_constant"] == 2.0
+    assert "no second time constant" in slower
+
+
+def test_a_limit_cycle_is_no_settling_time(place: Place) -> None:
+    text = place.client.get(f"{place.page}?{LOOP}&gain=5&integral_time=2&limit=1.5").text
+    assert text.count("keeps swinging") >= 2
+    assert "<dd>unstable</dd>" in text
+    assert "Gain margin" not in text
+
+
 @pytest.mark.parametrize(
     ("query", "line"),
     [
+        ("gain=1&integral_time=-1&duration=5&sample_time=0.1", "integral time: "),
+        ("gain=1&derivative_filter=0&duration=5&sample_time=0.1", "derivative filter N: "),
+        ("gain=1&lower=1&upper=0&duration=5&sample_time=0.1", "upper limit: found 0, and 1 as"),
+        ("gain=1&derivative_on=x&duration=5&sample_time=0.1", "derivative on: "),
+        ("tuning=magic&duration=5&sample_time=0.1", "tuning: found &#39;magic&#39;; need one of"),
+        (
+            "tuning=amigo+PI&closed_loop_time_constant=1&duration=5&sample_time=0.1",
+            "closed-loop time constant: rule &#39;amigo&#39; has none",
+        ),
         ("gain=abc&duration=5&sample_time=0.1", "gain: found &#39;abc&#39;; need a number"),
         ("gain=nan&duration=5&sample_time=0.1", "gain: found &#39;nan&#39;; need a number"),
         ("gain=1&duration=5", "sampling period: it is missing"),

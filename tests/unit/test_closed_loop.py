@@ -331,3 +331,35 @@ def test_metrics_need_a_step_that_was_recorded() -> None:
         step_metrics(TIMES, TIMES, at=6.0, before=0.0, after=1.0)
     with pytest.raises(InvalidRecord, match="does not change"):
         step_metrics(TIMES, TIMES, at=1.0, before=1.0, after=1.0)
+
+
+@pytest.mark.parametrize("rate", [0.0, -0.002])
+def test_a_swing_that_lasts_is_told_with_its_size_and_period(rate: float) -> None:
+    values = 1 + np.exp(rate * LONG) * 0.4 * np.cos(3 * LONG)
+    found = step_metrics(LONG, values, at=0.0, before=0.0, after=1.0)
+    assert not found.runs_away
+    assert np.isnan(found.settling_time)
+    assert found.swing == pytest.approx(0.8, rel=0.05)
+    assert found.swing_period == pytest.approx(2 * pi / 3, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        1 - np.exp(-SINCE) * np.cos(3 * SINCE),  # settles
+        1 - np.exp(-0.02 * SINCE) * np.cos(3 * SINCE),  # will settle
+        1 - np.exp(0.1 * SINCE) * np.cos(3 * SINCE),  # runs away
+        SINCE / 20,  # is under way
+        1 + 0.01 * np.cos(3 * SINCE),  # stays inside the band
+    ],
+)
+def test_what_settles_grows_or_is_under_way_does_not_keep_swinging(values: FloatArray) -> None:
+    found = step_metrics(LONG, values, at=1.0, before=0.0, after=1.0)
+    assert np.isnan([found.swing, found.swing_period]).all()
+
+
+def test_integrals_of_the_error_are_those_of_an_exponential() -> None:
+    times = np.arange(0, 40, 0.01)
+    found = step_metrics(times + 3, 2 * (1 - np.exp(-times / 2)), at=3.0, before=0.0, after=2.0)
+    assert found.iae == pytest.approx(2 * 2, rel=1e-4)
+    assert found.itae == pytest.approx(2 * 2**2, rel=1e-4)

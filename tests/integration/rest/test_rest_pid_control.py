@@ -1,0 +1,254 @@
+"""PI and PID control, tuning rules and margins in `:simulate`, over REST and the command line."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+from typer.testing import CliRunner
+
+from service.app import create_app
+from service.cli import runs as program
+from service.client import Client
+from service.run_simulations import _request
+from service.schemas_simulations import RunSimulateIn
+from tests.identified import identified
+from tests.integration.rest.test_client import Through
+from tests.rest import refused, settings_of
+
+STEP = {"kind": "step", "amplitude": 1.0}
+CONTROL = {"input": "u", "output": "y", "gain": 0.5, "integral_time": 1.0, "reference": STEP}
+BODY = {"control": CONTROL, "samples": 751, "sample_time": 0.02}
+PLANT = {"K": 2.0, "T": 1.0, "L": 0.5, "y0": 0.0, "x(0)": 0.0}
+ARX = {"name": "arx", "form": "difference", "inputs": {"u": "1"}, "states": {"x": "1"},
+       "parameters": {"a": {"lower": 0, "upper": 1}, "b": {"lower": 0, "upper": 1}},
+       "equations": {"x": "a*x(k-1) + b*u(k-1)"}, "outputs": {"y": "x"},
+       "initial": {"x": 0}}  # fmt: skip
+
+
+class Served(NamedTuple):
+    """An application with an identified lag and an identified recursion."""
+
+    server: TestClient
+    lag: str
+    arx: str
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    app = create_app(settings_of(tmp_path_factory.mktemp("controlled")))
+    with TestClient(app) as server:
+        found = []
+        for model, values in (("fopdt", {**PLANT}), (ARX, {"a": 0.9, "b": 0.1})):
+            made = server.post("/v1/datasets:simulate", json={
+                "model": model, "parameters": values, "samples": 200, "sample_time": 0.1,
+                "inputs": {"u": {"kind": "binary", "period": 2}},
+            })  # fmt: skip
+            assert made.status_code == 201, made.text
+            body = {"model": model, "datasets": [made.json()["id"]],
+                    "algorithm": {"population": 16, "generations": 25, "islands": 1}}  # fmt: skip
+            _, [run] = identified(app.state.parts, body)
+            found.append(run)
+        yield Served(server, *found)
+
+
+def simulated(served: Served, run: str | None = None, **control: Any) -> dict[str, Any]:
+    """The lag with its true parameters in a loop; other fields of the controller."""
+    body: dict[str, Any] = {**BODY, "control": {**CONTROL, **control}}
+    if run is None:
+        body["parameters"] = PLANT
+    answer = served.server.post(f"/v1/runs/{run or served.lag}:simulate", json=body)
+    assert answer.status_code == 200, answer.text
+    return dict(answer.json())
+
+
+def test_a_pi_controller_leaves_no_error_and_its_numbers_are_told(served: Served) -> None:
+    found = simulated(served, upper=0.62, setpoint_weight=0.9)
+    assert found["metrics"]["steady_error"] == pytest.approx(0.0, abs=1e-4)
+    assert found["controller"] == {
+        "gain": 0.5, "integral_time": 1.0, "derivative_time": 0.0, "derivative_filter": 10.0,
+        "derivative_on": "measurement", "setpoint_weight": 0.9, "lower": None, "upper": 0.62,
+        "tracking_time": 1.0, "command_min": pytest.approx(0.45, abs=1e-6), "command_max": 0.62,
+        "saturated_percent": found["controller"]["saturated_percent"],
+    }  # fmt: skip
+    assert 1.0 < found["controller"]["saturated_percent"] < 20.0
+    at_limit = np.mean(np.array(found["command"]["values"]) >= 0.62)
+    assert found["controller"]["saturated_percent"] == pytest.approx(100 * at_limit, abs=0.5)
+    assert found["tuning"] is None
+    proportional = simulated(served, integral_time=None)
+    # Of gain 0.5 and a plant of 2 half of the step is left.
+    assert proportional["metrics"]["steady_error"] == pytest.approx(0.5, abs=1e-3)
+    assert proportional["controller"]["integral_time"] is None
+
+
+def test_integrals_of_the_error_are_those_of_the_series(served: Served) -> None:
+    metrics = simulated(served)["metrics"]
+    whole = simulated(served)
+    times, values = (np.array(whole["outputs"][0][key]) for key in ("times", "values"))
+    assert times.size == BODY["samples"]
+    error = np.abs(1.0 - values)
+    assert metrics["iae"] == pytest.approx(float(np.trapezoid(error, times)))
+    assert metrics["itae"] == pytest.approx(float(np.trapezoid(times * error, times)))
+    # ∫e dt = T_i/(K k) of integral action, and the error of this loop never changes its sign much.
+    assert metrics["iae"] == pytest.approx(1.0 / (0.5 * 2.0), rel=0.1)
+
+
+def test_margins_are_those_of_the_loop_and_a_recursion_has_none(served: Served) -> None:
+    found = simulated(served)["margins"]
+    assert found["is_stable"]
+    assert found["gain_margin"] == pytest.approx(3.14, abs=0.01)
+    assert found["phase_margin"] == pytest.approx(61.4, abs=0.1)
+    assert found["delay_margin"] == pytest.approx(2.14 * 0.5, abs=0.01)
+    recursion = simulated(served, served.arx, gain=2.0)
+    assert recursion["margins"] is None
+    assert recursion["metrics"]["steady_error"] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_rule_chooses_the_numbers_and_says_whose_it_is(served: Served) -> None:
+    found = simulated(served, gain=None, integral_time=None, tuning={})
+    assert found["controller"]["gain"] == pytest.approx(0.5)
+    assert found["controller"]["integral_time"] == pytest.approx(1.0)
+    told = found["tuning"]
+    assert (told["rule"], told["controller"]) == ("simc", "PI")
+    assert told["closed_loop_time_constant"] == pytest.approx(0.5)
+    assert told["process_gain"] == pytest.approx(2.0)
+    assert "Skogestad" in told["reference"]
+    assert told["formulas"]
+    by_hand = simulated(served, gain=found["controller"]["gain"],
+                        integral_time=found["controller"]["integral_time"])  # fmt: skip
+    assert by_hand["outputs"] == found["outputs"]
+    slower = simulated(served, gain=None, integral_time=None,
+                       tuning={"closed_loop_time_constant": 2.0})  # fmt: skip
+    assert slower["controller"]["gain"] == pytest.approx(1.0 / (2.0 * 2.5))
+    tube = {"time_constant": 0.4, "delay": 0.2}
+    pid = simulated(served, gain=None, integral_time=None, transport=tube,
+                    tuning={"controller": "PID"})  # fmt: skip
+    assert pid["tuning"]["process_second_time_constant"] == pytest.approx(0.4)
+    assert pid["controller"]["derivative_time"] > 0
+    assert pid["metrics"]["is_settled"]
+    amigo = simulated(served, gain=None, integral_time=None, tuning={"rule": "amigo"})
+    assert "Åström" in amigo["tuning"]["reference"]
+    assert amigo["tuning"]["closed_loop_time_constant"] is None
+
+
+def test_a_pid_rule_that_gives_no_derivative_says_why(served: Served) -> None:
+    found = simulated(served, gain=None, integral_time=None, tuning={"controller": "PID"})
+    assert found["controller"]["derivative_time"] == 0.0
+    assert any("no second time constant" in note for note in found["notes"])
+
+
+def test_an_unstable_loop_and_a_limit_cycle_are_told_plainly(served: Served) -> None:
+    wild = simulated(served, gain=3.0, integral_time=1.0)
+    assert wild["metrics"]["runs_away"]
+    assert wild["metrics"]["settling_time"] is wild["metrics"]["iae"] is None
+    assert not wild["margins"]["is_stable"]
+    assert any("the loop is unstable" in note for note in wild["notes"])
+    bounded = simulated(served, gain=3.0, integral_time=1.0, limit=1.5)
+    metrics = bounded["metrics"]
+    assert not metrics["runs_away"]
+    assert metrics["settling_time"] is None
+    assert metrics["swing"] > 1.0
+    # A relay around a lag with dead time swings at about its ultimate period, 4 L and less.
+    assert 1.2 < metrics["swing_period"] < 2.6
+    assert any("keeps swinging and does not settle" in note for note in bounded["notes"])
+
+
+@pytest.mark.parametrize(
+    ("change", "pointer", "part"),
+    [
+        ({"integral_time": -1.0}, "/control/integral_time", "above 0"),
+        ({"integral_time": 0.0}, "/control/integral_time", "above 0"),
+        ({"derivative_time": -0.1}, "/control/derivative_time", "0"),
+        ({"derivative_filter": 0}, "/control/derivative_filter", "above 0"),
+        ({"derivative_on": "output"}, "/control/derivative_on", "measurement"),
+        ({"anti_windup": "clamping"}, "/control/anti_windup", "back-calculation"),
+        ({"tracking_time": 0}, "/control/tracking_time", "above 0"),
+        ({"lower": 1.0, "upper": -1.0}, "/control/upper", "found -1, and 1 as lower limit"),
+        ({"limit": 1.0, "lower": 0.0}, "/control/lower", "the limit ± is given too"),
+        ({"gain": None}, "/control/gain", "is missing; give it, or a rule as tuning"),
+        ({"tuning": {}}, "/control/gain", "leave it out, or leave out tuning"),
+        ({"tuning": {}, "gain": None}, "/control/integral_time", "the rule of tuning chooses"),
+        ({"tuning": {"rule": "ziegler"}}, "/control/tuning/rule", "simc"),
+        ({"tuning": {"controller": "PD"}}, "/control/tuning/controller", "PID"),
+        ({"tuning": {"closed_loop_time_constant": 0}},
+         "/control/tuning/closed_loop_time_constant", "above 0"),
+        ({"tuning": {"rule": "amigo", "closed_loop_time_constant": 1}, "gain": None,
+          "integral_time": None}, "/control/tuning/closed_loop_time_constant", "leave it out"),
+        ({"derivative_time": 1e-6}, "/control/derivative_filter", "too short for steps of 0.02"),
+        ({"integraltime": 1.0}, "/control/integraltime", "integral_time"),
+        ({"gain": 1e30}, "/control/gain", "the loop runs away"),
+    ],
+)  # fmt: skip
+def test_what_cannot_control_is_told_where_it_is(
+    served: Served, change: dict[str, Any], pointer: str, part: str
+) -> None:
+    body = {**BODY, "control": {**CONTROL, **change}, "parameters": PLANT}
+    faults = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
+                     "invalid")  # fmt: skip
+    assert pointer in {fault["pointer"] for fault in faults}, faults
+    assert any(part in fault["detail"] for fault in faults), faults
+
+
+@pytest.mark.parametrize("zero", [0, 0.0, -0.02])
+def test_a_sampling_period_of_zero_is_refused(served: Served, zero: float) -> None:
+    body = {**BODY, "sample_time": zero}
+    faults = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
+                     "invalid")  # fmt: skip
+    assert [fault["pointer"] for fault in faults] == ["/sample_time"]
+
+
+def test_a_rule_for_a_recursion_or_without_dead_time_is_refused(served: Served) -> None:
+    control = {key: value for key, value in CONTROL.items() if key not in ("gain", "integral_time")}
+    control["tuning"] = {}
+    path = f"/v1/runs/{served.arx}:simulate"
+    [fault] = refused(served.server.post(path, json={**BODY, "control": control}), 422, "invalid")
+    assert fault["pointer"] == "/control/tuning"
+    assert "this one is a recursion" in fault["detail"]
+    body = {**BODY, "control": control, "parameters": {**PLANT, "L": 0.0}}
+    path = f"/v1/runs/{served.lag}:simulate"
+    [fault] = refused(served.server.post(path, json=body), 422, "invalid")
+    assert fault["pointer"] == "/control/tuning/closed_loop_time_constant"
+    assert "no dead time to take instead" in fault["detail"]
+
+
+def test_a_request_of_before_is_kept_as_it_was_so_that_it_gives_the_same_dataset() -> None:
+    old = {"input": "u", "output": "y", "gain": 0.5, "limit": None,
+           "transport": {"gain": 1.0, "time_constant": 0.3, "delay": 0.1},
+           "reference": {"kind": "step", "amplitude": 1.0, "time": 0.0, "offset": 0.0}}  # fmt: skip
+    body = RunSimulateIn.model_validate({"control": old, "samples": 10, "store": True})
+    assert _request(body) == {
+        "inputs": {}, "control": old, "parameters": {}, "samples": 10, "sample_time": None,
+    }  # fmt: skip
+    new = RunSimulateIn.model_validate(
+        {"control": {**old, "integral_time": 2.0, "lower": 0.0}, "samples": 10}
+    )
+    assert _request(new)["control"] == {**old, "integral_time": 2.0, "lower": 0.0}
+
+
+def test_the_command_line_tells_controller_rule_and_margins(
+    served: Served, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def connected(url: str, key: str | None) -> Client:
+        return Client("http://testserver", transport=Through(served.server))
+
+    monkeypatch.setattr(program, "connected", connected)
+    file = tmp_path / "loop.json"
+
+    def told(**control: Any) -> str:
+        body = {**BODY, "parameters": PLANT, "control": {**CONTROL, **control}}
+        file.write_text(json.dumps(body))
+        done = CliRunner().invoke(program.app, ["simulate", served.lag, str(file)])
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    text = told(gain=None, integral_time=None, tuning={}, upper=0.62)
+    for part in ("IAE: 1.", "ITAE: 0.", "controller by SIMC (S. Skogestad", "K = 0.5, T_i = 1",
+                 "to 0.62, ", "% of the time at a limit", "stable, gain margin 3.14",
+                 "phase margin 61.4°"):  # fmt: skip
+        assert part in text, text
+    text = told(gain=3.0, limit=1.5)
+    assert "keeps swinging" in text
+    assert "gain margin" not in text
