@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from sqlalchemy.orm import Session
 
+from service.conversion import noise_model_of
 from service.errors import FieldError, InvalidRequest
 from service.models import model_of_run
 from service.schemas_comparison import (
@@ -239,7 +240,7 @@ def _notes(ordered: Sequence[_Candidate]) -> Iterator[str]:
             "some runs predict one step ahead and some simulate: "
             "their RMS, fits and criteria do not compare"
         )
-    losses = ({"noise_model": "white", **one.body["loss"]} for one in ordered)
+    losses = ({**one.body["loss"], "noise_model": noise_model_of(one.result)} for one in ordered)
     if len({repr(sorted(loss.items())) for loss in losses}) > 1:
         yield "the runs were fitted with different losses, which favour each its own measure"
     counts = {(one.result.get("criteria") or {}).get("samples") for one in ordered}

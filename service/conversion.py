@@ -47,6 +47,11 @@ def loss_of(document: Mapping[str, Any]) -> Loss:
     return Loss(**document)
 
 
+def noise_model_of(document: Mapping[str, Any]) -> str:
+    """The noise model that the estimates of a result document are of, whatever was asked for."""
+    return "ar1" if any((document.get("correlation_times") or {}).values()) else "white"
+
+
 def faults_of(error: SysidError) -> list[FieldError]:
     """What an error of the numerical core says of a job or model document, with its places."""
     match error:

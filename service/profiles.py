@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.conversion import loss_of
+from service.conversion import loss_of, noise_model_of
 from service.errors import Conflict, InvalidRequest
 from service.models import model_of_run
 from service.recordings import recording_of
@@ -131,7 +131,8 @@ def _problem(session: Session, store: ObjectStore, run_id: str) -> "tuple[Proble
     try:
         problem = Problem.build(
             model, records, parameters=changes, prediction=body["prediction"],
-            loss=loss_of(body["loss"]), weights=body["weights"], skip=body["skip"],
+            loss=loss_of({**body["loss"], "noise_model": noise_model_of(run.result)}),
+            weights=body["weights"], skip=body["skip"],
         )  # fmt: skip
     except InvalidSettings as error:  # a job of an older version, with rules that were others
         raise Conflict(f"run {run_id} cannot be profiled: {error}") from error

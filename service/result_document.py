@@ -42,6 +42,7 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
         "correlation": _correlation(found.uncertainty),
         "noise_sd": None if found.uncertainty is None else finite(found.uncertainty.noise_sd),
         "noise_colour": None if found.uncertainty is None else found.uncertainty.noise_colour,
+        "noise_model": found.noise_model,
         "correlation_times": dict(found.correlation_times),
         "residual_tests": residual_document(found.residual_tests),
         "onset_delays": onset_document(found.onset_delays),

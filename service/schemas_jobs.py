@@ -48,12 +48,13 @@ class ValidationIn(Body):
 class LossIn(Body):
     """What is minimised: squares, or soft-l1 with a scale in the output's unit.
 
-    With the noise model ar1 the estimates are those of generalised least squares in the end.
+    With the noise model ar1 the estimates are those of generalised least squares in the end; auto
+    is that where residuals are coloured and the model does not forget where it began, else white.
     """
 
     kind: Literal["squares", "soft-l1"] = "squares"
     scale: float = Field(default=1.0, gt=0)
-    noise_model: Literal["white", "ar1"] = "white"
+    noise_model: Literal["auto", "white", "ar1"] = "auto"
 
 
 class NoiseIn(Body):

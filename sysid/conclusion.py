@@ -15,6 +15,7 @@ from sysid.islands.archipelago import analysis_budget, of_island
 from sysid.islands.run_state import RunState
 from sysid.metrics import Metrics
 from sysid.neighbours import Neighbourhood, affordable, neighbourhood, widened
+from sysid.noise_choice import choice_notes, decided, settled, speaks_for_ar1
 from sysid.noise_model import Generalised, generalised, whitening
 from sysid.onset import onset_delays
 from sysid.problem import Problem, metrics_of
@@ -28,10 +29,6 @@ from sysid.threads import one_thread
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis, analyse
 from sysid.warnings import noise_notes, time_notes, warnings_of
-
-_LATE = 20_000_000
-"""Steps of integration or recursion that may follow where the run's time is over: about 0.2 s."""
-_CLOCK = 1e-3  # s: a search that took less says nothing of what a simulation takes
 
 
 def conclude(
@@ -67,7 +64,7 @@ def _concluded(
     deadline: Deadline,
 ) -> Identification:  # fmt: skip
     refined, ends, noise, analysis = _estimated(problem, algorithm, state, deadline)
-    theta = noise.theta
+    problem, theta = decided(problem, noise), noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
         raise NothingIdentifiable(p.name for p in problem.space)
     simulated = problem.predictions(theta[None])[0]
@@ -106,6 +103,7 @@ def _concluded(
             *_feedback(problem, simulated, analysis),
             *step_notes(problem, theta, analysis.estimates, simulated, deadline.is_past_grace),
             *noise_notes(problem, times, noise.is_complete),
+            *choice_notes(problem, noise),
         ),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         criteria=analysis.criteria,
@@ -216,7 +214,7 @@ def _with_neighbours(
     if most == 0 and is_late:
         return unchanged, replace(analysis, is_cut_short=True)
     if left is not None:
-        shared = 1 if problem.loss.noise_model == "white" else 2  # with the noise model
+        shared = 2 if problem.loss.noise_model == "ar1" else 1  # with the noise model
         most = min(most, max(0, left - kept) // shared)
     found = neighbourhood(problem, theta, rms, analysis.linear, state.seed, most)
     spent = before + found.evaluations
@@ -243,19 +241,20 @@ def _under_noise(
     problem: Problem, algorithm: GeneticAlgorithm, state: RunState,
     refined: tuple[Refined | None, ...], theta: FloatArray, analysis: Analysis, deadline: Deadline,
 ) -> tuple[Generalised, Analysis]:  # fmt: skip
-    """The estimates under the noise model that was asked for, and their analysis.
+    """The estimates under the noise model that was asked for or chosen, and their analysis.
 
     Those of the paper's methods stay as found; so do all where residuals may as well be white.
     """
-    if problem.loss.noise_model == "white":
+    asked = problem.loss.noise_model
+    if asked == "white" or not _polishes(algorithm, len(state.islands)):
+        return Generalised(theta, {}, 0, asked != "ar1"), analysis
+    if asked == "auto" and not speaks_for_ar1(problem, theta, analysis.uncertainty):
         return Generalised(theta, {}, 0, True), analysis
-    if not _polishes(algorithm, len(state.islands)):
-        return Generalised(theta, {}, 0, False), analysis
     left = _left(algorithm, state, refined)
     kept = analysis.evaluations + analysis_budget(theta.size)
     limits = (
         None if left is None else max(0, left - kept),
-        _in_time(problem, algorithm, state, deadline),
+        deadline.simulations(state.seconds, state.evaluations, problem.n_steps),
     )
     most = min((one for one in limits if one is not None), default=None)
     nothing = np.zeros((theta.size, theta.size))
@@ -263,6 +262,8 @@ def _under_noise(
     is_cut_short = analysis.is_cut_short
     found = generalised(problem, theta, covariance, state.seed, most)
     spent = analysis.evaluations + found.evaluations
+    if asked == "auto":
+        found = settled(problem, theta, found)
     if any(found.correlation_times.values()):
         white = whitening(problem, found.correlation_times)
         groups, theta = analysis.exchanges, ordered(problem, found.theta, analysis.exchanges)
@@ -272,19 +273,6 @@ def _under_noise(
         spent += analysis.evaluations
         analysis = _widened(problem, analysis, Neighbourhood(None, found.minima, found.rms, 0))
     return found, replace(analysis, evaluations=spent, is_cut_short=is_cut_short)
-
-
-def _in_time(
-    problem: Problem, algorithm: GeneticAlgorithm, state: RunState, deadline: Deadline
-) -> int | None:
-    """Simulations that the run's time leaves, by what those of the search took; None: no limit.
-
-    As many as are over at once are there always.
-    """
-    if algorithm.stop.seconds is None:
-        return None
-    each = max(state.seconds, _CLOCK) / max(state.evaluations, 1)
-    return max(_LATE // max(problem.n_steps, 1), int(deadline.left / each))
 
 
 def _left(

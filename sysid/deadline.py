@@ -7,6 +7,9 @@ Clock = Callable[[], float]
 """Seconds from any moment on."""
 
 _GRACE, _LEAST, _MOST = 0.1, 0.2, 10.0  # of the limit; s
+_LATE = 20_000_000
+"""Steps of integration or recursion that may follow where the time is over: about 0.2 s."""
+_CLOCK = 1e-3  # s: a search that took less says nothing of what a simulation takes
 
 
 class Deadline:
@@ -23,6 +26,7 @@ class Deadline:
 
     def __init__(self, limit: float | None, used: float, clock: Clock = perf_counter) -> None:
         self._clock = clock
+        self._is_limited = limit is not None
         limit = float("inf") if limit is None else limit
         self._end = clock() + (limit - used)
         self._grace = min(max(_GRACE * limit, _LEAST), _MOST)
@@ -39,3 +43,13 @@ class Deadline:
     def is_past_grace(self) -> bool:
         """Whether the grace is over as well."""
         return self._clock() >= self._end + self._grace
+
+    def simulations(self, seconds: float, evaluations: int, steps: int) -> int | None:
+        """Simulations of some steps that are left, by what those of a search took; None: no limit.
+
+        As many as are over at once are there always.
+        """
+        if not self._is_limited:
+            return None
+        each = max(seconds, _CLOCK) / max(evaluations, 1)
+        return max(_LATE // max(steps, 1), int(self.left / each))

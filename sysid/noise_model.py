@@ -66,6 +66,8 @@ class Generalised(NamedTuple):
         Where least squares ended from all starts, the estimate among them.
     rms : FloatArray, shape (m,)
         Of the whitened residuals there.
+    instead_of : FloatArray, shape (D,), or None
+        Estimates of squares, where nobody asked for a noise model (`sysid.noise_choice`).
     """
 
     theta: FloatArray
@@ -74,6 +76,7 @@ class Generalised(NamedTuple):
     is_complete: bool
     minima: FloatArray = np.zeros((0, 0))
     rms: FloatArray = np.zeros(0)
+    instead_of: FloatArray | None = None
 
 
 def whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
@@ -105,7 +108,7 @@ def generalised(
         return Generalised(theta, {}, 0, False)
     place = placed(problem.evaluator, theta[None])[0]
     error = search.errors(place[None])[0]
-    coloured = {one.output for one in parts(problem) if is_coloured(one, error[one.rows])}
+    coloured = _coloured(problem, error)
     known: Mapping[str, float] = {}
     random = moves_of(seed)
     for i in range(_ROUNDS if coloured else 0):
@@ -122,6 +125,16 @@ def generalised(
         if is_last:
             break
     return _told(problem, theta, place, known, search, not search.is_cut)
+
+
+def coloured_outputs(problem: Problem, theta: FloatArray) -> set[str]:
+    """Outputs whose residuals at theta (D,) are clearly not white."""
+    place = placed(problem.evaluator, theta[None])
+    return _coloured(problem, _Search(problem, 1).errors(place)[0])
+
+
+def _coloured(problem: Problem, error: FloatArray) -> set[str]:
+    return {one.output for one in parts(problem) if is_coloured(one, error[one.rows])}
 
 
 def _told(

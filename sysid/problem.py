@@ -272,7 +272,7 @@ def _built(
         raise InvalidRecord("there is no record to compare the model with; need one or more")
     if prediction not in ("simulation", "one-step"):
         raise InvalidSettings("/prediction", f"{prediction!r} is not 'simulation' or 'one-step'")
-    if prediction == "one-step" and loss.noise_model != "white":
+    if prediction == "one-step" and loss.noise_model == "ar1":
         raise InvalidSettings(
             "/loss/noise_model",
             f"{loss.noise_model} is for free runs; predictions one step ahead contain the noise",

@@ -106,7 +106,7 @@ def profile(
     names = [p.name for p in problem.space]
     if name not in names:
         raise InvalidSettings("/parameters", f"no free parameter {name!r}{nearest(name, names)}")
-    if problem.loss.noise_model != "white":
+    if problem.loss.noise_model == "ar1":
         raise InvalidSettings(
             "/loss/noise_model",
             f"profiles are of plain squares, not of those under {problem.loss.noise_model}; fit "

@@ -184,3 +184,8 @@ class Identification:
     sample_time: float | None = None
     known_before: tuple[float, ...] = ()
     known_before_validation: tuple[float, ...] = ()
+
+    @property
+    def noise_model(self) -> Literal["white", "ar1"]:
+        """The noise model that the estimates are of."""
+        return "ar1" if any(self.correlation_times.values()) else "white"

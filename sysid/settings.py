@@ -11,8 +11,8 @@ from sysid.errors import InvalidSettings
 SearchMethod = Literal["simple", "improved-paper", "improved"]
 TopologyName = Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"]
 Prediction = Literal["simulation", "one-step"]
-NoiseModel = Literal["white", "ar1"]
-NOISE_MODELS: tuple[NoiseModel, ...] = ("white", "ar1")
+NoiseModel = Literal["auto", "white", "ar1"]
+NOISE_MODELS: tuple[NoiseModel, ...] = ("auto", "white", "ar1")
 METHODS: tuple[SearchMethod, ...] = ("simple", "improved-paper", "improved")
 # What the compiled search counts in 64 bits, with room to add; no run of years comes near them.
 MOST_GENERATIONS = 10**9
@@ -159,12 +159,14 @@ class Loss:
     """What is minimised: squares (Eq. 10), or soft-l1 with a scale in the output's unit.
 
     With the noise model ``ar1`` the search minimises squares; from its end on the estimates are
-    those of generalised least squares under first-order noise (`sysid.noise_model`).
+    those of generalised least squares under first-order noise (`sysid.noise_model`). ``auto`` is
+    that for free runs by squares whose residuals are coloured and whose model does not forget
+    where it began (`sysid.noise_choice`), else ``white``.
     """
 
     kind: Literal["squares", "soft-l1"] = "squares"
     scale: float = 1.0
-    noise_model: NoiseModel = "white"
+    noise_model: NoiseModel = "auto"
 
     def __post_init__(self) -> None:
         if self.kind not in ("squares", "soft-l1"):
@@ -173,9 +175,10 @@ class Loss:
             raise InvalidSettings("/loss/scale", f"{self.scale!r} is not a positive number")
         if self.noise_model not in NOISE_MODELS:
             raise InvalidSettings(
-                "/loss/noise_model", f"{self.noise_model!r} is not {' or '.join(NOISE_MODELS)}"
+                "/loss/noise_model",
+                f"{self.noise_model!r} is not {', '.join(NOISE_MODELS[:-1])} or {NOISE_MODELS[-1]}",
             )
-        if self.noise_model != "white" and self.kind != "squares":
+        if self.noise_model == "ar1" and self.kind != "squares":
             raise InvalidSettings(
                 "/loss/noise_model",
                 f"{self.noise_model} is not available with {self.kind}; need the loss 'squares'",

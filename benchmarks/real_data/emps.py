@@ -9,6 +9,7 @@ from service.client import Client
 
 TITLE = "EMPS, free run on the test with pulses"
 SKIP = 20
+SQUARES = {"loss": {"noise_model": "white"}}
 ASYMMETRIC = ("Fp", "Fn", "o")
 RIDGE = (20.5, 21.0, 21.5, 22.0, 22.5, 23.0)
 """Values of Fc (N) at which the others are estimated again, to show how flat the ridge is."""
@@ -43,14 +44,13 @@ def measure(client: Client, folder: Path) -> list[Row]:
         Row("RMS, train", 1e3 * run["agreement"]["estimation"][0]["rms"], "mm"),
         Row("RMS, test", 1e3 * run["agreement"]["validation"][0]["rms"], "mm", 4.8),
     ]
-    noise = {**common, "name": "EMPS, noise model", "model": "emps", "loss": {"noise_model": "ar1"}}
-    slow = identify(client, noise)
-    print_estimates("EMPS, symmetric friction, first-order noise", slow)
-    rms = [1e3 * slow["agreement"][part][0]["rms"] for part in ("estimation", "validation")]
+    rows.append(Row("correlation time", run["correlation_times"].get("y", 0.0), "s"))
+    squares = identify(client, {**common, **SQUARES, "name": "EMPS, squares", "model": "emps"})
+    print_estimates("EMPS, symmetric friction, least squares", squares)
+    rms = [1e3 * squares["agreement"][part][0]["rms"] for part in ("estimation", "validation")]
     rows += [
-        Row("RMS, train, noise model ar1", rms[0], "mm"),
-        Row("RMS, test, noise model ar1", rms[1], "mm", 4.8),
-        Row("correlation time, noise model ar1", slow["correlation_times"]["y"], "s"),
+        Row("RMS, train, least squares", rms[0], "mm"),
+        Row("RMS, test, least squares", rms[1], "mm"),
     ]
     _print_ridge(client, common)
     document = asymmetric(client.model("emps")["document"])
@@ -70,8 +70,8 @@ def _print_ridge(client: Client, common: dict[str, Any]) -> None:
     print("\nalong the ridge of Fv and Fc (Fc given, the others estimated again)\n")
     print("| Fc, N | Fv, N·s/m | RMS train, mm | RMS test, mm |\n|--:|--:|--:|--:|")
     for level in RIDGE:
-        fixed = {"Fc": {"fixed": level}}
-        run = identify(client, {**common, "name": "ridge", "model": "emps", "parameters": fixed})
+        fixed = {**common, **SQUARES, "parameters": {"Fc": {"fixed": level}}}
+        run = identify(client, {**fixed, "name": "ridge", "model": "emps"})
         fv = next(one["value"] for one in run["parameters"] if one["name"] == "Fv")
         rms = [1e3 * run["agreement"][part][0]["rms"] for part in ("estimation", "validation")]
         print(f"| {level:g} | {fv:.1f} | {rms[0]:.3f} | {rms[1]:.3f} |")

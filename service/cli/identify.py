@@ -78,7 +78,10 @@ def identify(
     ] = None,
     noise_model: Annotated[
         str | None,
-        typer.Option(help="white, or ar1: least squares generalised to first-order noise."),
+        typer.Option(
+            help="white; ar1: least squares generalised to first-order noise; auto, the default: "
+            "ar1 where residuals are coloured and the model does not forget where it began."
+        ),
     ] = None,
     segments: Segments = None,
     sample_time: SampleTime = None,

@@ -103,7 +103,7 @@ def test_a_command_that_is_called_wrongly_exits_with_2(data: Path) -> None:
     line = refused(lagid("identify", data, "--model", "fopdt", "--set", "algorithm.bit=3"), 2)
     assert "did you mean 'bits'?" in line
     line = refused(lagid("identify", data, "--model", "fopdt", "--noise-model", "pink"), 2)
-    assert "need 'white' or 'ar1'" in line
+    assert "need 'auto', 'white' or 'ar1'" in line
 
 
 @pytest.mark.parametrize(

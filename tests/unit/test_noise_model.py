@@ -195,7 +195,7 @@ def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
     timed = replace(SMALL, stop=Stop(seconds=100.0, settled=None))
     state = advance(problem, timed, begin(problem, timed, 1))
     whole = conclude(problem, timed, replace(state, seconds=1.0))
-    monkeypatch.setattr("sysid.conclusion._LATE", 30 * problem.n_steps)
+    monkeypatch.setattr("sysid.deadline._LATE", 30 * problem.n_steps)
     late = conclude(problem, timed, replace(state, seconds=100.0))
     soon = conclude(problem, timed, replace(state, seconds=99.0))  # time for a hundredth more
     said = "not estimated to its end"
@@ -209,7 +209,7 @@ def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
 def test_what_a_noise_model_cannot_do_is_refused() -> None:
     with pytest.raises(InvalidSettings, match="need the loss 'squares'"):
         Loss("soft-l1", 0.1, "ar1")
-    with pytest.raises(InvalidSettings, match="white or ar1"):
+    with pytest.raises(InvalidSettings, match="auto, white or ar1"):
         Loss(noise_model="pink")  # type: ignore[arg-type]
     with pytest.raises(InvalidSettings, match="for free runs"):
         Problem.build(load_model(GAIN), [record(1)], loss=AR1, prediction="one-step")

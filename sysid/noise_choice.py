@@ -1,0 +1,77 @@
+"""The noise model ``auto``: squares or generalised least squares, by whether the model forgets.
+
+Coloured residuals are noise or dynamics that the model lacks, and they do not tell which. In a
+model that forgets (`sysid.forgetting`) squares are the better criterion for a free run: whitened
+ones shift what is missing to low frequencies. In one that does not, whatever disturbs the states
+stays in all later outputs, so that residuals drift also where the dynamics are right, and squares
+weigh the drift. Simulated plants of 17 kinds bear it out (decision 26, as amended).
+
+The correlation time has to be known, too: where a record is not five times as long, generalised
+least squares was no better than squares.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.forgetting import remembering
+from sysid.noise_model import Generalised, coloured_outputs
+from sysid.problem import Problem
+from sysid.result import Uncertainty
+from sysid.serial import parts
+from sysid.types import FloatArray
+
+_TIMES = 5.0  # correlation times that a record lasts at least
+
+
+def speaks_for_ar1(problem: Problem, theta: FloatArray, known: Uncertainty | None) -> bool:
+    """Whether residuals of least squares at theta (D,) are coloured and none of it is forgotten.
+
+    `known` is the uncertainty of those estimates, which tells the colour: no more is looked at
+    where it is white.
+    """
+    is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
+    if not is_free or known is None or known.noise_colour == "white":
+        return False
+    coloured = coloured_outputs(problem, theta)
+    return bool(coloured) and coloured <= remembering(problem, theta)
+
+
+def settled(problem: Problem, theta: FloatArray, found: Generalised) -> Generalised:
+    """What was found under first-order noise, or squares again where it is not known well."""
+    longest: dict[str, float] = {}
+    for one in parts(problem):
+        span = float(one.times[-1] - one.times[0])
+        longest[one.output] = max(span, longest.get(one.output, 0.0))
+    times = found.correlation_times
+    is_known = all(_TIMES * time <= longest[name] for name, time in times.items())
+    if found.is_complete and is_known and any(times.values()):
+        return found._replace(instead_of=theta)
+    return Generalised(theta, {}, found.evaluations, True)
+
+
+def decided(problem: Problem, noise: Generalised) -> Problem:
+    """The problem with the noise model that its estimates are of, in place of ``auto``."""
+    if problem.loss.noise_model != "auto":
+        return problem
+    model, records, parameters, prediction, loss, *others = problem.arguments
+    loss = replace(loss, noise_model="ar1" if any(noise.correlation_times.values()) else "white")
+    return replace(problem, arguments=(model, records, parameters, prediction, loss, *others))
+
+
+def choice_notes(problem: Problem, noise: Generalised) -> tuple[str, ...]:
+    """Why there is a noise model that nobody asked for, and what squares gave."""
+    if noise.instead_of is None:
+        return ()
+    squares = ", ".join(
+        f"{one.name} = {value:.4g}{'' if one.unit == '1' else f' {one.unit}'}"
+        for one, value in zip(problem.space, noise.instead_of.tolist(), strict=True)
+    )
+    found = problem.metrics(np.asarray(noise.instead_of))
+    unit = "" if found.unit == "1" else f" {found.unit}"
+    return (
+        "the noise model was chosen because the residuals of squares are not white and the model "
+        "does not forget where it began, as a drive or a tank, so that errors of a moment stay in "
+        f"all later outputs; squares gave {squares}, RMS {found.rms:.4g}{unit}; to have them, use "
+        "loss: {noise_model: white}",
+    )
