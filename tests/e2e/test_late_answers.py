@@ -3,9 +3,11 @@
 import re
 
 import pytest
-from playwright.sync_api import Page, Route, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
+from service.storage.jobs import JobRepository
 from tests.e2e.conftest import Site
+from tests.e2e.filled import end_running, progress
 from tests.e2e.test_form import EQUATIONS, opened, write_own
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -109,3 +111,55 @@ def test_bounds_that_were_typed_outlive_a_change_of_the_equations(site: Site, pa
     page.get_by_label("equations in YAML").fill(EQUATIONS.replace("K*u", "2*K*u"))
     expect(page.locator("#check")).to_have_text("the model can be used")
     expect(page.get_by_label("upper of L")).to_have_value("0.3")
+
+
+LIVE = "new URL('live.js', document.querySelector('script[type=module]').src)"
+
+
+def test_a_page_that_comes_late_does_not_bring_back_what_was(own_site: Site, page: Page) -> None:
+    job = own_site.filled.failed
+    page.goto(f"{own_site.url}/jobs/{job}")  # it has no stream: nothing else is asked for
+    asked: list[Route] = []
+
+    def hold_first(route: Route) -> None:
+        asked.append(route)
+        if len(asked) > 1:
+            route.continue_()
+
+    page.route(f"**/jobs/{job}", hold_first)
+    refresh = f"async () => {{ const {{ refresh }} = await import({LIVE}); await refresh(); }}"
+    page.evaluate(f"() => {{ window.first = ({refresh})(); }}")
+    while not asked:
+        page.wait_for_timeout(10)
+    earlier = asked[0].fetch()
+    with own_site.parts.database.write() as session:
+        JobRepository(session).resume(job)
+    page.evaluate(refresh)
+    chip = page.locator("#job .chip")
+    expect(chip).to_have_text("queued")
+    asked[0].fulfill(response=earlier)
+    page.evaluate("() => window.first")
+    expect(chip).to_have_text("queued")
+
+
+@pytest.mark.parametrize("refused", ["jobs/{job}", "v1/jobs/{job}/events"])
+def test_a_page_is_fresh_again_after_the_server_was_away(
+    own_site: Site, browser: Browser, refused: str
+) -> None:
+    job, database = own_site.filled.running, own_site.parts.database
+    page = browser.new_page()  # of its own: what fails is told on the console
+    page.goto(f"{own_site.url}/jobs/{job}")
+    expect(page.locator("#job .chip")).to_have_text("running")
+    times = iter(range(2))
+
+    def is_away(route: Route) -> None:
+        route.continue_() if next(times, None) is None else route.fulfill(status=503)
+
+    page.route("**/" + refused.format(job=job), is_away)
+    if "events" in refused:
+        page.reload()
+    progress(database, own_site.filled.lease, own_site.filled.running_run, 180)
+    expect(page.locator('[data-live="head"]')).to_contain_text("generation 180")
+    end_running(database, own_site.parts.store, own_site.filled.lease)
+    expect(page.locator("#job .chip")).to_have_text("succeeded")
+    page.close()

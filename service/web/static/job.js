@@ -5,21 +5,33 @@ import { Problem, element, post, put, refresh, throttled } from './live.js';
 
 const { job, runs } = document.getElementById('job').dataset;
 const isOpen = () => document.querySelector('[data-live="chip"]').dataset.open === '1';
+const NOT_FOUND = 404;
 let stream = null;
 
 // An event only says that something is new; the page and the figures themselves say what.
 const renew = throttled(async () => {
-  await refresh();
+  try {
+    await refresh();
+  } catch (error) {
+    if (!(error instanceof Problem)) throw error;
+    if (error.document.status === NOT_FOUND) close(); // it was deleted
+    else renew(); // the server is away: asked again
+    return;
+  }
   watch();
+  if (isOpen()) listen();
+  else close();
   await redraw(isOpen() ? ['history', 'convergence'] : undefined);
-  if (!isOpen()) close();
 }, 1000 + Number(runs) / 10); // the database looks at all runs of a sweep for its page
 
 function listen() {
   if (!isOpen() || (stream && stream.readyState !== EventSource.CLOSED)) return; // a finished job opens no stream
-  stream = new EventSource(`/v1/jobs/${encodeURIComponent(job)}/events`);
+  const opened = new EventSource(`/v1/jobs/${encodeURIComponent(job)}/events`);
+  stream = opened;
   // Of a resumed job the stream tells its earlier end, too: whether it is over, the page says.
-  for (const kind of ['message', 'state', 'progress', 'log', 'end']) stream.addEventListener(kind, renew);
+  for (const kind of ['message', 'state', 'progress', 'log', 'end']) opened.addEventListener(kind, renew);
+  // It comes again by itself, unless it was refused: the job is over, or the server is away.
+  opened.addEventListener('error', () => opened.readyState === EventSource.CLOSED && renew());
 }
 
 function close() {

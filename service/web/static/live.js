@@ -8,11 +8,16 @@ function takeRun(fresh) {
   if (shown && next && shown.dataset.run !== next.dataset.run) shown.replaceWith(document.adoptNode(next.cloneNode(true)));
 }
 
-/** Replace every live region whose content has changed; nothing else of the page moves. */
+const pageNow = latest(() => ask(location.href, { headers: { Accept: 'text/html' } }));
+
+/**
+ * Replace every live region whose content has changed; nothing else of the page moves.
+ * Of calls at once the answer to the last counts: an older one would bring back what was.
+ */
 export async function refresh() {
-  const answer = await fetch(location.href, { headers: { Accept: 'text/html' } });
-  if (!answer.ok) return null;
-  const fresh = new DOMParser().parseFromString(await answer.text(), 'text/html');
+  const text = await pageNow();
+  if (text === null) return;
+  const fresh = new DOMParser().parseFromString(text, 'text/html');
   takeRun(fresh);
   for (const region of document.querySelectorAll('[data-live]')) {
     const next = fresh.querySelector(`[data-live="${region.dataset.live}"]`);
@@ -25,7 +30,6 @@ export async function refresh() {
     region.scrollTop = scrolled;
     if (focused >= 0) focusable(region)[focused]?.focus({ preventScroll: true });
   }
-  return fresh;
 }
 
 const focusable = (region) => [...region.querySelectorAll('a[href], button, select, input')];
@@ -60,18 +64,21 @@ export function throttled(work, interval) {
 /** A request whose refusal becomes a Problem with the document's title, detail and errors. */
 export async function ask(url, options = {}) {
   let answer;
+  let text;
   try {
     answer = await fetch(url, options);
+    text = await answer.text();
   } catch {
     throw new Problem({ title: 'No answer', detail: 'the server cannot be reached' });
   }
-  const text = await answer.text();
   const type = answer.headers.get('Content-Type') ?? '';
   const isJson = type.includes('json');
   const body = isJson && text ? JSON.parse(text) : text;
   if (answer.ok) return body;
   throw new Problem(
-    type.startsWith(PROBLEM) ? body : { title: answer.statusText, detail: `status ${answer.status}` },
+    type.startsWith(PROBLEM)
+      ? body
+      : { title: answer.statusText, status: answer.status, detail: `status ${answer.status}` },
   );
 }
 
