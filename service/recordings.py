@@ -25,7 +25,7 @@ class _Kept:
             return self._found.get(sha256)
 
     def put(self, sha256: str, recording: Recording) -> None:
-        if sum(channel.times.size for channel in recording.channels) > LARGEST_KEPT:
+        if sum(channel.known_samples for channel in recording.channels) > LARGEST_KEPT:
             return
         with self._lock:
             self._found[sha256] = recording

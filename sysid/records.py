@@ -118,6 +118,11 @@ class Channel:
         """How this channel was sampled."""
         return sampling_of(self.times)
 
+    @property
+    def known_samples(self) -> int:
+        """How many samples it has, with those of its history."""
+        return self.times.size + (0 if self.history is None else self.history.times.size)
+
     def between(self, start: float, stop: float) -> "Channel":
         """Return the samples with `start` ≤ time ≤ `stop`; what was cut off before is lost.
 

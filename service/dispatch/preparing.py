@@ -186,7 +186,7 @@ class JobRuns:
             for record in records
             for channel in (*record.inputs, *record.outputs)
         )
-        return sum(channel.times.size for channel in channels)
+        return sum(channel.known_samples for channel in channels)
 
     def _from_store(self, key: str) -> Records:
         datasets, inputs, outputs, holds = self._data[key]

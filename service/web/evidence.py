@@ -38,7 +38,7 @@ class SoughtParameter:
 class Trace:
     """One signal on its own times (s); `is_held` if it keeps its value until the next sample.
 
-    `history` is the same signal before its first sample, as far as it is known.
+    `history` is the same signal up to its first sample, as far back as it is known.
     """
 
     name: str

@@ -124,6 +124,9 @@ def _records(
 
 
 def _trace(channel: Channel) -> Trace:
-    held, known = channel.hold == "zero", channel.history
-    before = None if known is None else Trace(channel.name, channel.unit, *known, held)
+    held, before = channel.hold == "zero", None
+    if channel.history is not None:  # as far as the first sample, so that the lines meet
+        pairs = zip(channel.history, (channel.times, channel.values), strict=True)
+        times, values = (np.append(known, own[0]) for known, own in pairs)
+        before = Trace(channel.name, channel.unit, times, values, held)
     return Trace(channel.name, channel.unit, channel.times, channel.values, held, before)

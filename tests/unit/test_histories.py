@@ -77,6 +77,7 @@ def test_by_rows_by_time_and_by_fraction_the_history_is_the_same() -> None:
         np.testing.assert_array_equal(values, whole.channel("u").values[:150])
         assert part.start == middle
         assert part.samples == 150
+        assert part.channel("u").known_samples == 300
 
 
 def test_a_part_from_the_beginning_has_no_history() -> None:
