@@ -8,7 +8,7 @@ import numpy as np
 from numpy.fft import irfft, rfft
 
 from sysid.records import Channel, Hold, sampling_of
-from sysid.types import BoolArray, FloatArray
+from sysid.types import BoolArray, FloatArray, IntArray
 
 MAX_LAG = 25
 FEWEST = 20
@@ -36,28 +36,52 @@ class Laid(NamedTuple):
         return min(MAX_LAG, int(np.count_nonzero(self.present)) // 4)
 
 
+class _Grid(NamedTuple):
+    """Places a period apart: their times (N,), and which of them (n,) the samples have."""
+
+    times: FloatArray
+    places: IntArray
+    period: float
+
+
 def laid_out(times: FloatArray, values: FloatArray) -> Laid:
     """Residuals (N,) in places a period apart, those between missing; irregular ones in order."""
-    steps = np.diff(times)
-    period = float(np.median(steps)) if steps.size else 0.0
-    if period > 0:
-        rounded = np.cumsum(np.maximum(np.rint(steps / period), 0.0))
-        period = float((times[-1] - times[0]) / rounded[-1])  # not off by the rounding of one step
-        exact = np.concatenate([[0.0], steps / period])
-        places = np.concatenate([[0.0], rounded])
-        far = np.abs(exact - np.rint(exact))
-        is_regular = bool(np.all(far <= _GRID) and np.all(np.rint(exact[1:]) >= 1))
-        n = int(places[-1]) + 1
-        if is_regular and values.size >= _GAPS * n:
-            index = places.astype(np.intp)
-            filled, present = np.zeros(n), np.zeros(n, dtype=np.bool_)
-            filled[index], present[index] = values, True
-            laid = times[0] + period * np.arange(n)
-            laid[index] = times
-            return Laid(laid, filled, present, period, is_regular=True)
+    grid = _grid_of(np.asarray(times, dtype=np.float64).tobytes())
+    if grid is not None:
+        filled, present = np.zeros(grid.times.size), np.zeros(grid.times.size, dtype=np.bool_)
+        filled[grid.places], present[grid.places] = values, True
+        return Laid(grid.times, filled, present, grid.period, is_regular=True)
     distinct = max(np.unique(times).size - 1, 1)
     spacing = float(times[-1] - times[0]) / distinct
     return Laid(times, values, np.ones(values.size, dtype=np.bool_), spacing, is_regular=False)
+
+
+@lru_cache(maxsize=2)
+def _grid_of(written: bytes) -> _Grid | None:
+    """The grid of some times (n,), given as their bytes; None if they lie on none.
+
+    Kept for the runs of a sweep, whose residuals alone differ.
+    """
+    times = np.frombuffer(written)
+    steps = np.diff(times)
+    period = float(np.median(steps)) if steps.size else 0.0
+    if not period > 0:
+        return None
+    rounded = np.cumsum(np.maximum(np.rint(steps / period), 0.0))
+    period = float((times[-1] - times[0]) / rounded[-1])  # not off by the rounding of one step
+    exact = np.concatenate([[0.0], steps / period])
+    places = np.concatenate([[0.0], rounded])
+    far = np.abs(exact - np.rint(exact))
+    is_regular = bool(np.all(far <= _GRID) and np.all(np.rint(exact[1:]) >= 1))
+    n = int(places[-1]) + 1
+    if not (is_regular and times.size >= _GAPS * n):
+        return None
+    taken = places.astype(np.intp)
+    laid = times[0] + period * np.arange(n)
+    laid[taken] = times
+    for array in (laid, taken):
+        array.flags.writeable = False
+    return _Grid(laid, taken, period)
 
 
 class Whiteness(NamedTuple):

@@ -17,6 +17,7 @@ spread evenly over the record and in step with no pattern in it, are enough for 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import inf, sqrt
 from typing import NamedTuple
 
@@ -239,7 +240,7 @@ def _crossing(
 
 def _events(channel: Channel) -> Iterator[_Event]:
     """The ends of the rests of an input, each with the time up to which its response is read."""
-    rests = _rests(channel.values)
+    rests = _rests_of(np.asarray(channel.values, dtype=np.float64).tobytes())
     times = channel.times
     for number, (start, stop) in enumerate(rests):
         if stop >= times.size:
@@ -248,6 +249,12 @@ def _events(channel: Channel) -> Iterator[_Event]:
         # Its last value at rest, for an onset may lie between that and the next sample.
         end = float(times[following - 1])
         yield _Event(float(times[start]), float(times[stop - 1]), end)
+
+
+@lru_cache(maxsize=2)
+def _rests_of(values: bytes) -> tuple[tuple[int, int], ...]:
+    """The rests of an input, of its values' bytes: kept for a sweep, whose outputs alone differ."""
+    return tuple(_rests(np.frombuffer(values)))
 
 
 def _rests(values: FloatArray) -> list[tuple[int, int]]:
