@@ -156,7 +156,8 @@ def _told(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:
 
 def _variances(columns: FloatArray) -> FloatArray:
     """Diagonal of (SᵀS)⁻¹, (D,); inf of what these rows leave open."""
-    singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
+    triangle = np.linalg.qr(columns, mode="r")  # of a long record in half the time
+    singular, rows = np.linalg.svd(triangle)[1:]
     kept = singular > RANK * max(float(singular[0]), np.finfo(float).tiny)
     found: FloatArray = np.sum((rows[kept].T / singular[kept]) ** 2, axis=1)
     is_open = np.max(np.abs(rows[~kept]), axis=0, initial=0.0) > RANK
