@@ -153,7 +153,7 @@ class Methods(ABC, Generic[One, Listed, Text, Content]):
         return self._one(calls.read("runs", run, "response", max_points=max_points))
 
     def simulate_run(self, run: str, body: Mapping[str, Any], max_points: int = 1000) -> One:
-        """Simulate the identified model on a new input or under proportional control."""
+        """Simulate the identified model on a new input or under P, PI or PID control."""
         return self._one(calls.act("runs", run, "simulate", body, max_points=max_points))
 
     def validate_run(

@@ -103,6 +103,12 @@ LATER_FIELDS = (
 """Fields that requests had not at first: at their defaults they ask for what was asked then."""
 
 
+_PI_CONTROL = {
+    "input": "u", "output": "y", "gain": 0.5, "integral_time": 1.0, "lower": 0, "upper": 0.7,
+    "reference": {"kind": "step", "amplitude": 1},
+}  # fmt: skip
+
+
 class RunSimulateIn(Body):
     """A run's model on new inputs or in a closed loop, from t = 0 on.
 
@@ -112,7 +118,7 @@ class RunSimulateIn(Body):
     """
 
     inputs: dict[str, RunInputIn] = Field(default={})
-    control: ControlIn | None = None
+    control: ControlIn | None = Field(default=None, examples=[_PI_CONTROL])
     parameters: dict[str, float] = Field(default={})
     samples: int = Field(ge=2, le=MAX_SIMULATED)
     sample_time: SampleTime | None = None

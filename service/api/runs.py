@@ -69,7 +69,7 @@ def export(
 def simulate(
     run_id: str, body: RunSimulateIn, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> RunSimulationOut:
-    """Simulate the identified model on new inputs or under proportional control."""
+    """Simulate the identified model on new inputs or under P, PI or PID control."""
     return run_simulations.simulate(parts.database, parts.store, run_id, body, max_points)
 
 
