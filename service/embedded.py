@@ -14,7 +14,8 @@ import httpx
 
 from service.errors import ServiceDidNotStart
 
-START_LIMIT_S = 90.0
+START_LIMIT_S = 240.0
+"""A first start compiles the loops, which takes minutes beside other work."""
 STOP_LIMIT_S = 20.0
 
 

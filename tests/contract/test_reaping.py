@@ -19,6 +19,7 @@ from service.storage.dispatchers import LEASE_SECONDS, DispatcherRepository
 from service.storage.ledger import Cell, RunLedger, RunOutcome
 from service.storage.queue import BESIDE_OTHERS, HUNG, Queue
 from service.storage.tables import State
+from tests.dispatching import until
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
 from workers.processes import standing
 
@@ -143,14 +144,10 @@ def test_the_web_process_reaps_too(database) -> None:
     reaper = Reaper(database, LEASE, stopping)
     reaper.start()
     try:
-        for _ in range(200):
-            if state_of(database, job) is State.QUEUED:
-                break
-            threading.Event().wait(0.05)
+        until(lambda: state_of(database, job) is State.QUEUED, "it was queued again")
     finally:
         stopping.set()
         reaper.join()
-    assert state_of(database, job) is State.QUEUED
 
 
 def expired(database, owner: str, details, seconds: float = 0.1) -> str:

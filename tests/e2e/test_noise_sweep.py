@@ -6,7 +6,7 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.e2e.conftest import Site
+from tests.e2e.conftest import LIMIT_SECONDS, Site
 from tests.identified import carried_out
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -26,7 +26,7 @@ PLOT = '[data-figure="summary"]'
 @pytest.fixture
 def job(own_site: Site) -> str:
     """A sweep of 52 runs that has ended."""
-    answer = httpx.post(f"{own_site.url}/v1/recipes/noise-sweep", json=BODY, timeout=60)
+    answer = httpx.post(f"{own_site.url}/v1/recipes/noise-sweep", json=BODY, timeout=LIMIT_SECONDS)
     assert answer.status_code == 202, answer.text
     name: str = answer.json()["id"]
     carried_out(own_site.parts, name)

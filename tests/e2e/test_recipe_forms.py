@@ -7,7 +7,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from service.storage.jobs import JobRepository
-from tests.e2e.conftest import Site
+from tests.e2e.conftest import LIMIT_SECONDS, Site
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -37,7 +37,7 @@ def test_a_sweep_tells_its_runs_before_it_is_submitted_and_makes_as_many(
             "samples": 50,
             "sample_time": 0.1,
         },
-        timeout=60,
+        timeout=LIMIT_SECONDS,
     )
     assert simulated.status_code == 201
     opened_sweep(own_site, page)
@@ -96,7 +96,9 @@ def test_a_sweep_of_a_recording_says_that_it_adds_the_runs_without_noise(
 def test_recordings_with_labels_become_a_batch_with_a_trend(own_site: Site, page: Page) -> None:
     for length in (5, 10):
         body = {"plant": "tube", "name": f"tube-{length}m", "parameters": {"length_m": length}}
-        answer = httpx.post(f"{own_site.url}/v1/datasets:simulate", json=body, timeout=60)
+        answer = httpx.post(
+            f"{own_site.url}/v1/datasets:simulate", json=body, timeout=LIMIT_SECONDS
+        )
         assert answer.status_code == 201, answer.text
     page.goto(f"{own_site.url}/new/reidentify")
     page.locator("[name=model]").select_option("tube")

@@ -4,7 +4,7 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.e2e.conftest import Site
+from tests.e2e.conftest import LIMIT_SECONDS, Site
 from tests.identified import carried_out
 from tests.integration.rest.test_rest_reidentify import BODY, LENGTHS, recorded
 from tests.rest import CSV
@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 def batch_of(site: Site) -> str:
     """A batch of four lengths that is over."""
-    with httpx.Client(base_url=site.url, timeout=60) as client:
+    with httpx.Client(base_url=site.url, timeout=LIMIT_SECONDS) as client:
         experiments = []
         for x in LENGTHS:
             stored = client.post(f"/v1/datasets?name=e2e-{x:g}", content=recorded(x), headers=CSV)
@@ -35,7 +35,9 @@ def test_the_trend_is_drawn_and_a_run_accepted(own_site: Site, page: Page) -> No
     trend.get_by_label("Accept the run").select_option(index=2)
     trend.get_by_role("button", name="Accept").click()
     expect(trend.locator("[data-accepted]")).to_contain_text("seen in a browser is run_")
-    told = httpx.get(f"{own_site.url}/v1/references/seen in a browser", timeout=60).json()
+    told = httpx.get(
+        f"{own_site.url}/v1/references/seen in a browser", timeout=LIMIT_SECONDS
+    ).json()
     assert told["labels"] == {"length_m": LENGTHS[2]}
     trend.get_by_label("as the reference").fill(" blank")
     trend.get_by_role("button", name="Accept").click()

@@ -14,9 +14,9 @@ from service.storage.columns import utc_now
 from service.storage.tables import Checkpoint, State
 from tests.dispatching import Place, until
 
-pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(600)]
 
-LONG = {"generations": 6000, "stop": {"settled": None}}
+LONG = {"generations": 30_000, "stop": {"settled": None}}  # seconds after its first checkpoint
 ENDLESS = {"generations": 10_000_000, "stop": {"settled": None}}
 
 
