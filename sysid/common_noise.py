@@ -62,8 +62,8 @@ def coloured_jointly(problem: Problem, seen: FloatArray, columns: FloatArray) ->
     columns : FloatArray, shape (n, D)
         Their sensitivities.
     """
-    whole = coloured(problem, seen, columns)
     pairs = list(_pairs(problem, seen)) if len(problem.model.outputs) > 1 else []
+    whole = coloured(problem, seen, columns, by_model=not pairs)  # of all by the same means
     if not pairs:
         return whole
     if whole is None:

@@ -4,7 +4,8 @@ s²(SᵀS)⁻¹ takes the residuals for white. Those of measured records seldom 
 small by as much as they are alike over the time in which the sensitivities change. Where they are
 clearly not white, the middle of the sandwich (SᵀS)⁻¹ Ω (SᵀS)⁻¹ becomes Ω = SᵀRS with the
 autocovariance R of each series of residuals (output errors: Ljung 1999, sec. 9.3), from a Parzen
-window as wide as their colour asks for, after they are prewhitened by a recursion (Andrews and
+window as wide as their colour asks for, or in short records from a model of it
+(`sysid.restricted`), after they are prewhitened by a recursion (Andrews and
 Monahan 1992). It is of first order, or of as many as Akaike's criterion takes (Burg's method; den
 Haan and Levin 1997): slow noise beside white has a correlation of neighbours that says too little.
 For free runs only: one step ahead the sensitivities are made of measured outputs and of the noise.
@@ -31,6 +32,7 @@ from sysid.lagged_sums import FEWEST, ROUNDING, Laid, colour_of, laid_out, padde
 from sysid.linear import RANK
 from sysid.past_outputs import reads_outputs
 from sysid.problem import Problem
+from sysid.restricted import STEEPEST, Modelled, modelled
 from sysid.types import FloatArray
 
 _CHANCE = 1e-3
@@ -41,8 +43,8 @@ And that those of one variance look as uneven."""
 QUANTILE = 3.841458820694124
 """95 % of χ² with one degree of freedom."""
 
-_STEEPEST = 0.97
-"""Of the recursion (Andrews and Monahan 1992): one nearer 1 would follow a single drift."""
+_SHORT = 400
+"""Samples: fewer tell their colour by a model of it, where one holds, and more by its window."""
 
 _LONGEST = 25  # of the recursion: past values
 
@@ -56,7 +58,8 @@ class Coloured(NamedTuple):
 
     `drifts` where that number is not known: the residuals wander over the whole record. `is_white`
     where they are of unequal size only. `series` has of each series its part of Ω and the degrees
-    of freedom that it tells that by; empty: all are of one.
+    of freedom that it tells that by; empty: all are of one. `models` has for each what tells the
+    degrees of freedom of one whose colour is modelled, else None.
     """
 
     middle: FloatArray
@@ -64,6 +67,7 @@ class Coloured(NamedTuple):
     drifts: bool
     is_white: bool = False
     series: tuple[tuple[FloatArray, float], ...] = ()
+    models: tuple[Modelled | None, ...] = ()
 
     @property
     def degrees(self) -> float:
@@ -76,6 +80,9 @@ class Coloured(NamedTuple):
         if not np.sum(each) > 0:
             return self.degrees
         degrees = np.array([one for _, one in self.series])
+        for i, known in enumerate(self.models):
+            if known is not None:
+                degrees[i] = 2.0 / known.variation(direction)
         return max(float(np.sum(each) ** 2 / np.sum(each**2 / degrees)), 1.0)
 
     def widening(self, direction: FloatArray, power: float, norm: float) -> float:
@@ -102,7 +109,9 @@ class Part(NamedTuple):
     size: float
 
 
-def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloured | None:
+def coloured(
+    problem: Problem, seen: FloatArray, columns: FloatArray, *, by_model: bool = True
+) -> Coloured | None:
     """The middle of the sandwich; None where the residuals may as well be one white noise.
 
     Parameters
@@ -111,6 +120,8 @@ def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloure
         Weighted residuals of the scored samples as the loss sees them.
     columns : FloatArray, shape (n, D)
         Their sensitivities.
+    by_model : bool
+        Whether short series may tell their colour by a model of it.
     """
     found = [(part, _in_order(part, seen[part.rows])) for part in parts(problem)]
     is_free = problem.prediction == "simulation" or not reads_outputs(problem.model)
@@ -121,7 +132,7 @@ def coloured(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloure
     for (part, _), has_colour in zip(found, told, strict=True):
         own, values = columns[part.rows], seen[part.rows]
         if has_colour:
-            each.append(_with_colour(laid_out(part.times, values), own))
+            each.append(_with_colour(laid_out(part.times, values), own, by_model))
         else:
             mean = float(np.mean(np.square(values)))
             each.append(Coloured(mean * (own.T @ own), float(values.size), drifts=False))
@@ -142,16 +153,18 @@ def _together(each: Sequence[Coloured], used: FloatArray) -> Coloured:
     """Ω of several series.
 
     Residuals of a series are smaller than its noise by the degrees of freedom that were taken from
-    it. What all have lost on average is not allowed for here.
+    it; a model allows for that. What all have lost on average is not allowed for here.
     """
     size, samples = len(each[0].middle), np.array([one.samples for one in each])
     degrees = np.maximum(samples - used, 1.0)
     total = float(np.sum(samples))
-    grown = samples / degrees * (max(total - size, 1.0) / total)
+    models = tuple(model for one in each for model in one.models or (None,))
+    lost = np.where([one is None for one in models], samples / degrees, 1.0)
+    grown = lost * (max(total - size, 1.0) / total)
     middles = [by * one.middle for one, by in zip(each, grown.tolist(), strict=True)]
     return Coloured(
         np.sum(middles, axis=0), total, any(one.drifts for one in each),
-        series=tuple(zip(middles, degrees.tolist(), strict=True)),
+        series=tuple(zip(middles, degrees.tolist(), strict=True)), models=models,
     )  # fmt: skip
 
 
@@ -203,21 +216,30 @@ def _is_coloured(laid: Laid, size: float) -> bool:
     n = np.count_nonzero(laid.present)
     if n < FEWEST or float(np.sqrt(laid.values @ laid.values / n)) <= ROUNDING * size:
         return False
-    return float(chdtrc(laid.lags, whiteness(laid).statistic)) < _CHANCE
+    found = whiteness(laid)
+    chance = float(chdtrc(laid.lags, found.statistic))
+    if n < _SHORT and found.values[0] > 0:  # there many lags hide what the first one says
+        chance = min(chance, float(chdtrc(1, (found.values[0] / found.deviation[0]) ** 2)))
+    return chance < _CHANCE
 
 
-def _with_colour(laid: Laid, columns: FloatArray) -> Coloured:
+def _with_colour(laid: Laid, columns: FloatArray, by_model: bool) -> Coloured:
     """Of one series SᵀRS."""
     root, pole = spectrum_root(laid)
+    is_short = np.count_nonzero(laid.present) < _SHORT
+    known = modelled(laid, columns) if by_model and is_short and pole <= STEEPEST else None
+    if known is not None:
+        samples = laid.present.sum() * known.share
+        return Coloured(known.middle, float(samples), drifts=False, models=(known,))
     moved = transformed(laid, columns, root)
-    slow = min(max(pole, 0.0), _STEEPEST)
+    slow = min(max(pole, 0.0), STEEPEST)
     share = (1.0 - slow) / (1.0 + slow)
     n = np.count_nonzero(laid.present)
     # The same of any colour: the mean of its spectrum over what it is at frequency 0.
     lowest = float(root[0] ** 2) * 2 * (root.size - 1)
     if lowest > 0:
         share = min(share, float(laid.values @ laid.values) / n / lowest)
-    return Coloured(np.asarray((moved @ moved.conj().T).real), n * share, pole > _STEEPEST)
+    return Coloured(np.asarray((moved @ moved.conj().T).real), n * share, pole > STEEPEST)
 
 
 def spectrum_root(laid: Laid) -> tuple[FloatArray, float]:
@@ -228,8 +250,8 @@ def spectrum_root(laid: Laid) -> tuple[FloatArray, float]:
     both = laid.present[1:] & laid.present[:-1]
     before, after = laid.values[:-1][both], laid.values[1:][both]
     found = float(before @ after / (before @ before))
-    weights = np.array([min(max(found, -_STEEPEST), _STEEPEST)])
-    if laid.present.all() and found <= _STEEPEST:  # a longer one takes a drift for oscillations
+    weights = np.array([min(max(found, -STEEPEST), STEEPEST)])
+    if laid.present.all() and found <= STEEPEST:  # a longer one takes a drift for oscillations
         longer = _recursion(laid.values)
         weights = weights if longer.size < 2 else longer
     kernel = np.concatenate([[1.0], -weights])
@@ -259,7 +281,7 @@ def _recursion(values: FloatArray) -> FloatArray:
         if told < least:
             least, best = told, weights
     steepest = float(np.max(np.abs(np.roots(np.append(1.0, -best))), initial=0.0))
-    return best * min(1.0, _STEEPEST / max(steepest, _STEEPEST)) ** np.arange(1, best.size + 1)
+    return best * min(1.0, STEEPEST / max(steepest, STEEPEST)) ** np.arange(1, best.size + 1)
 
 
 def white_root(laid: Laid) -> FloatArray:

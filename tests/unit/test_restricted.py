@@ -1,0 +1,135 @@
+"""The colour of short records by restricted likelihood, against dense matrices and repetition."""
+
+import numpy as np
+import pytest
+from scipy.linalg import toeplitz
+from scipy.signal import lfilter
+from scipy.special import chdtrc
+
+from sysid.lagged_sums import Laid, laid_out, whiteness
+from sysid.restricted import _deviance, _meant, _middle, _Series, modelled
+from sysid.serial import _is_coloured
+from sysid.types import FloatArray
+
+PLACES = [(0.5, -1.0), (1.3, 0.4), (-0.6, -3.0)]
+
+
+def slow(n: int, pole: float, seed: int, white: float = 0.0) -> FloatArray:
+    """First-order noise beside white noise of that share, of variance 1."""
+    own, other = np.random.default_rng(seed).standard_normal((2, n + 200))
+    found = lfilter([np.sqrt(1 - pole**2)], [1, -pole], own)[200:]
+    return np.asarray(np.sqrt(1 - white) * found + np.sqrt(white) * other[200:])
+
+
+def regressors(n: int) -> FloatArray:
+    """A level, a slope and a wave."""
+    x = np.linspace(-1, 1, n)
+    return np.column_stack([np.ones(n), x, np.sin(3 * x)])
+
+
+def residuals(values: FloatArray, columns: FloatArray) -> FloatArray:
+    return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
+
+
+def with_gaps(n: int = 60) -> tuple[Laid, FloatArray, FloatArray]:
+    """A series with samples missing, its sensitivities, and the times of the others."""
+    kept = np.sort(np.random.default_rng(2).permutation(n)[: n - 12])
+    columns = regressors(n)[kept]
+    values = residuals(slow(n, 0.7, 1)[kept], columns)
+    return laid_out(kept.astype(np.float64), values), columns, kept.astype(np.float64)
+
+
+def dense(place: tuple[float, float], times: FloatArray) -> FloatArray:
+    a, w = _meant(np.array(place))
+    gaps = np.abs(times[:, None] - times).astype(int)
+    return np.asarray(np.where(gaps == 0, 1.0, (1 - w) * a**gaps))
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_the_likelihood_is_that_of_combinations_without_the_parameters(
+    place: tuple[float, float],
+) -> None:
+    laid, columns, times = with_gaps()
+    basis = np.linalg.svd(columns, full_matrices=False)[0]
+    values = laid.values[laid.present]
+    series = _Series(values, basis, np.diff(times).astype(np.int64))
+    free = np.linalg.svd(columns)[0][:, 3:]  # orthogonal to all sensitivities
+
+    def expected(at: tuple[float, float]) -> float:
+        inner = free.T @ dense(at, times) @ free
+        told = free.T @ values
+        power = float(told @ np.linalg.solve(inner, told))
+        return float(free.shape[1] * np.log(power) + np.linalg.slogdet(inner)[1])
+
+    other = PLACES[1]
+    assert _deviance(np.array(place), series) - _deviance(np.array(other), series) == pytest.approx(
+        expected(place) - expected(other), abs=1e-8
+    )
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_the_middle_is_that_of_the_whole_matrix_over_gaps_too(place: tuple[float, float]) -> None:
+    laid, columns, times = with_gaps()
+    basis = np.linalg.svd(columns, full_matrices=False)[0]
+    values = laid.values[laid.present]
+    series = _Series(values, basis, np.diff(times).astype(np.int64))
+    matrix = dense(place, times)
+    inverse = np.linalg.inv(matrix)
+    gram = columns.T @ inverse @ columns
+    left = values - columns @ np.linalg.solve(gram, columns.T @ inverse @ values)
+    variance = float(left @ inverse @ left) / (values.size - 3)
+    np.testing.assert_allclose(
+        _middle(np.array(place), laid, columns, series),
+        variance * columns.T @ matrix @ columns, rtol=1e-8, atol=1e-10,
+    )  # fmt: skip
+
+
+def test_variances_are_on_average_those_of_the_noise_though_residuals_are_less() -> None:
+    """Of sixty samples with three parameters; from the residuals' own sums it would be half."""
+    n, pole = 60, 0.7
+    columns, times = regressors(n), np.arange(60.0)
+    truth = np.diag(columns.T @ toeplitz(pole ** np.arange(n)) @ columns)
+    found, plain = [], []
+    for seed in range(150):
+        left = residuals(slow(n, pole, seed), columns)
+        known = modelled(laid_out(times, left), columns)
+        if known is not None:
+            found.append(np.diag(known.middle) / truth)
+        sums = np.correlate(left, left, "full")[n - 1 :] / n
+        window = np.where(np.arange(n) < 15, 1 - np.arange(n) / 15, 0.0)
+        plain.append(np.diag(columns.T @ toeplitz(sums * window) @ columns) / truth)
+    assert len(found) > 130
+    assert np.all(np.abs(np.median(found, axis=0) - 1.0) < 0.3)
+    assert np.median(plain) < 0.6
+
+
+def test_what_is_no_first_order_noise_is_not_taken_for_one() -> None:
+    white = np.random.default_rng(0).standard_normal(400)
+    ringing = lfilter([1.0], [1.0, -1.4, 0.85], white)[200:]
+    columns = regressors(200)
+    laid = laid_out(np.arange(200.0), residuals(ringing, columns))
+    assert modelled(laid, columns) is None
+    assert modelled(laid_out(np.arange(4.0), slow(4, 0.5, 0)), regressors(4)) is None
+
+
+def test_the_slower_the_noise_the_fewer_degrees_of_freedom() -> None:
+    columns, times = regressors(100), np.arange(100.0)
+    degrees = []
+    for pole in (0.3, 0.8):
+        each = [modelled(laid_out(times, residuals(slow(100, pole, s), columns)), columns)
+                for s in range(30)]  # fmt: skip
+        level = np.array([1.0, 0.0, 0.0])
+        degrees.append(np.median([2 / one.variation(level) for one in each if one is not None]))
+    assert degrees[1] < 0.5 * degrees[0] < 50
+
+
+def test_short_slow_noise_is_recognised_by_its_neighbours_and_white_noise_no_more_often() -> None:
+    columns, times = regressors(100), np.arange(100.0)
+    counts = []
+    for pole in (0.5, 0.0):
+        every = [laid_out(times, residuals(slow(100, pole, s), columns)) for s in range(200)]
+        by_all = sum(chdtrc(one.lags, whiteness(one).statistic) < 1e-3 for one in every)
+        counts.append((sum(_is_coloured(one, 1.0) for one in every), by_all))
+    (slow_seen, slow_by_all), (white_seen, white_by_all) = counts
+    assert slow_seen > 160 > slow_by_all
+    assert white_seen <= white_by_all + 1
