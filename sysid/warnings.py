@@ -15,6 +15,7 @@ from sysid.result import Estimate, Group, NoiseColour, Uncertainty
 from sysid.settings import GeneticAlgorithm
 from sysid.signal_units import mixed_units, unread_units
 from sysid.ties import names_in
+from sysid.time_units import time_unit_notes
 from sysid.types import FloatArray
 from sysid.uncertainty import Analysis
 
@@ -51,6 +52,7 @@ def warnings_of(
     if limit is not None and rms > limit:
         found.append(f"the RMS error {rms:.4g} is above the safe limit {limit:g}: not valid")
     found += mixed_units(problem.model, problem.records)
+    found += time_unit_notes(problem.model)
     found += _held_back(analysis)
     found += _no_prediction(problem)
     found += _constant_outputs(problem)

@@ -1,0 +1,60 @@
+"""Time constants in other units than seconds, which the equations read in seconds, are told."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sysid.identify import identify
+from sysid.models.library import catalogue, load_model
+from sysid.models.model import Model
+from sysid.models.spec import parse_model
+from sysid.records import Channel, Record
+from sysid.settings import GeneticAlgorithm, Stop
+from sysid.time_units import time_unit_notes
+
+
+def model(equation: str, unit: str, **fields: Any) -> Model:
+    document = {
+        "name": "first", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "V"},
+        "parameters": {"T": {"lower": 0.01, "upper": 5, "unit": unit},
+                       "K": {"lower": 0.1, "upper": 5}},
+        "equations": {"x": equation}, "outputs": {"y": "x"}, "initial": {"x": 0},
+    }  # fmt: skip
+    return parse_model(document | fields)
+
+
+@pytest.mark.parametrize("equation", [
+    "(K*u - x)/T", "K*u/T - x/(60*T)", "(K*u - x)/(T + 1)", "K*u*exp(-T) - x", "(K*u - x)/-T",
+])  # fmt: skip
+def test_a_time_constant_in_minutes_that_is_read_as_it_stands_is_told(equation: str) -> None:
+    [note] = time_unit_notes(model(equation, "min"))
+    assert note.startswith("T has the unit min, but the equations read it as it stands")
+    assert note.endswith("give it in s, or write 60*T")
+    assert time_unit_notes(model(equation, "s")) == []
+    assert time_unit_notes(model(equation, "V")) == []
+
+
+@pytest.mark.parametrize("equation", [
+    "(K*u - x)/(60*T)", "(K*u - x)/T/60", "(K*u - x)/(60*T + 1)", "K*u*exp(-60*T) - x",
+])  # fmt: skip
+def test_one_that_is_converted_is_not(equation: str) -> None:
+    assert time_unit_notes(model(equation, "min")) == []
+
+
+def test_a_recursion_may_count_in_what_it_likes() -> None:
+    recursion = model("x(k-1)*T + K*u", "min", form="difference")
+    assert time_unit_notes(recursion) == []
+
+
+def test_no_model_of_the_catalogue_is_told() -> None:
+    assert [time_unit_notes(load_model(name)) for name in catalogue()] == [[]] * len(catalogue())
+
+
+def test_a_result_tells_it() -> None:
+    times = 0.1 * np.arange(60.0)
+    u = Channel("u", times, np.sign(np.sin(times)), "V", hold="zero")
+    y = Channel("y", times, np.sin(times - 0.5), "V")
+    settings = GeneticAlgorithm(islands=1, stop=Stop(evaluations=200))
+    found = identify(model("(K*u - x)/T", "ms"), Record((u,), (y,)), settings)
+    assert any("write 0.001*T" in text for text in found.warnings)
