@@ -1,0 +1,96 @@
+"""The noise model that is chosen where none is asked for, over REST."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import pytest
+from starlette.testclient import TestClient
+
+from service.api.deps import Parts
+from service.app import create_app
+from tests.identified import identified
+from tests.rest import CSV, refused, settings_of
+from tests.unit.test_noise_choice import LAG, STEP, TANK, disturbed, signal
+from tests.unit.test_noise_choice import T as TIME_CONSTANT
+
+SMALL = {"population": 24, "generations": 20, "islands": 1}
+
+
+class Served(NamedTuple):
+    """An application with a recording of a tank and one of a lag, both disturbed."""
+
+    server: TestClient
+    parts: Parts
+    tank: str
+    lag: str
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    app = create_app(settings_of(tmp_path_factory.mktemp("noise")))
+    with TestClient(app) as server:
+        parts = server.app.state.parts  # type: ignore[attr-defined]
+        names = []
+        for name, rate in (("tank", 0.0), ("lag", 1.0 / TIME_CONSTANT)):
+            pairs = zip(signal(), disturbed(2, rate), strict=True)
+            lines = [
+                "t,u,y",
+                *(f"{k * STEP:.6g},{u},{float(y)!r}" for k, (u, y) in enumerate(pairs)),
+            ]
+            text = "\n".join(lines)
+            answer = server.post(f"/v1/datasets?name={name}", content=text.encode(), headers=CSV)
+            names.append(answer.json()["id"])
+        yield Served(server, parts, *names)
+
+
+def run(served: Served, model: dict[str, Any], dataset: str, **more: Any) -> dict[str, Any]:
+    body = {"model": model, "datasets": [dataset], "algorithm": SMALL, "hold": {"u": "zero"}}
+    _, (name,) = identified(served.parts, {**body, **more})
+    document: dict[str, Any] = served.server.get(f"/v1/runs/{name}").json()
+    assert document["state"] == "succeeded", document["error"]
+    return document
+
+
+def values(document: dict[str, Any]) -> list[float]:
+    return [one["value"] for one in document["parameters"]]
+
+
+def notes(served: Served, *documents: dict[str, Any]) -> list[str]:
+    body = {"runs": [one["id"] for one in documents]}
+    told = served.server.post("/v1/runs:compare", json=body).json()["notes"]
+    return [text for text in told if "different losses" in text]
+
+
+def test_a_tank_has_generalised_least_squares_unless_squares_are_asked_for(served: Served) -> None:
+    auto, white, ar1 = (
+        run(served, TANK, served.tank, **({} if name is None else {"loss": {"noise_model": name}}))
+        for name in (None, "white", "ar1")
+    )
+    assert [one["noise_model"] for one in (auto, white, ar1)] == ["ar1", "white", "ar1"]
+    assert values(auto) == values(ar1) != values(white)
+    assert sum("use loss: {noise_model: white}" in text for text in auto["warnings"]) == 1
+    assert notes(served, auto, white)
+    assert not notes(served, auto, ar1)
+    faults = refused(
+        served.server.post(f"/v1/runs/{auto['id']}:profile", json={"parameters": ["K"]}),
+        422, "invalid",
+    )  # fmt: skip
+    assert faults[0]["pointer"] == "/loss/noise_model"
+
+
+def test_a_lag_has_squares_which_are_profiled_and_compared_as_such(served: Served) -> None:
+    auto = run(served, LAG, served.lag)
+    white = run(served, LAG, served.lag, loss={"noise_model": "white"})
+    assert auto["noise_model"] == white["noise_model"] == "white"
+    assert auto["reused_from"] is None
+    assert values(auto) == values(white)
+    assert auto["warnings"] == white["warnings"]
+    assert not notes(served, auto, white)
+    path, body = f"/v1/runs/{auto['id']}:profile", {"parameters": ["K"], "points": 5}
+    assert served.server.post(path, json=body).status_code == 200
+
+
+def test_predictions_and_robust_losses_need_no_noise_model_named(served: Served) -> None:
+    robust = run(served, TANK, served.tank, loss={"kind": "soft-l1", "scale": 1.0})
+    ahead = run(served, TANK, served.tank, prediction="one-step")
+    assert robust["noise_model"] == ahead["noise_model"] == "white"
