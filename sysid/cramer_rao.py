@@ -5,6 +5,10 @@ estimate of θ has a covariance below σ²(SᵀS)⁻¹ (Cramér 1946; Rao 1945).
 moves the response by σ√(r/n) in RMS, r the number of directions that the data tell. Both grow in
 proportion to σ, so they are given for σ = 1. Bounds on the parameters hold estimates below the
 floor where σ is large: it knows no bounds.
+
+It is the floor of the noise that a job adds, which `sysid.noise` draws for each output by itself:
+outputs are independent there, whatever noise a measured record has of its own. That one, which
+outputs may have in common (`sysid.common_noise`), is in the standard errors and not in the floor.
 """
 
 from dataclasses import dataclass

@@ -6,6 +6,7 @@ import pytest
 from sysid.cramer_rao import floor
 from sysid.errors import InvalidSettings
 from sysid.models.spec import parse_model
+from sysid.noise import Noise, with_noise
 from sysid.problem import Problem
 from sysid.records import Channel, Record
 
@@ -110,3 +111,25 @@ def test_what_few_samples_tell_by_itself_keeps_its_floor():
     found = dict(zip(["a", "b", "c"], floor(posed, np.array([1.0, 1.0, 2.0])).stderr, strict=True))
     assert found["a"] == pytest.approx(np.sqrt(1 / 2), rel=1e-6)
     assert np.isinf([found["b"], found["c"]]).all()
+
+
+def test_the_floor_of_two_outputs_is_that_of_the_noise_that_a_job_adds_to_them():
+    """It is drawn for each by itself: were it common, y and w would tell a no better than y."""
+    two = {**LINE, "outputs": {"y": "a*u(t) + b + x", "w": "a*u(t) - b + x"}}
+    model = parse_model(two)
+    u = Channel("u", TIMES, INPUT)
+    exact = (Channel("y", TIMES, 2.0 * INPUT + 1.0), Channel("w", TIMES, 2.0 * INPUT - 1.0))
+    weights = {"y": 1.0, "w": 1.0}
+    found = floor(
+        Problem.build(model, [Record((u,), exact)], weights=weights), np.array([2.0, 1.0])
+    )
+    noises, estimates = [], []
+    regressors = np.vstack([np.column_stack([INPUT, sign * np.ones(200)]) for sign in (1.0, -1.0)])
+    for seed in range(400):
+        outputs = with_noise(Record((u,), exact), Noise(0.1, seed=seed)).outputs
+        values = np.concatenate([one.values for one in outputs])
+        noises.append(values - regressors @ [2.0, 1.0])
+        estimates.append(np.linalg.lstsq(regressors, values, rcond=None)[0])
+    first, second = np.array(noises)[:, :200].ravel(), np.array(noises)[:, 200:].ravel()
+    assert abs(np.corrcoef(first, second)[0, 1]) < 4 / np.sqrt(first.size)
+    np.testing.assert_allclose(np.std(estimates, axis=0), 0.1 * found.stderr, rtol=0.12)
