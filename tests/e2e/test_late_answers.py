@@ -2,12 +2,13 @@
 
 import re
 
+import httpx
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
 from service.storage.jobs import JobRepository
-from tests.e2e.conftest import Site
-from tests.e2e.filled import end_running, progress
+from tests.e2e.conftest import LIMIT_SECONDS, Site
+from tests.e2e.filled import MODEL, end_running, progress
 from tests.e2e.test_form import EQUATIONS, opened, write_own
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -19,7 +20,8 @@ class Held:
     def __init__(self, page: Page, pattern: str) -> None:
         self._page = page
         self._routes: list[Route] = []
-        page.route(re.compile(pattern), self._hold)
+        self._pattern = re.compile(pattern)
+        page.route(self._pattern, self._hold)
 
     def _hold(self, route: Route) -> None:
         self._routes.append(route)
@@ -28,6 +30,10 @@ class Held:
         """Until a request is there."""
         while not self._routes:
             self._page.wait_for_timeout(10)
+
+    def stop(self) -> None:
+        """Hold no more."""
+        self._page.unroute(self._pattern)
 
     def let_go(self) -> None:
         """Answer the first request, and give the page the time to hear the answer."""
@@ -111,6 +117,32 @@ def test_bounds_that_were_typed_outlive_a_change_of_the_equations(site: Site, pa
     page.get_by_label("equations in YAML").fill(EQUATIONS.replace("K*u", "2*K*u"))
     expect(page.locator("#check")).to_have_text("the model can be used")
     expect(page.get_by_label("upper of L")).to_have_value("0.3")
+
+
+def test_a_cloned_request_cannot_be_sent_before_all_of_it_is_there(
+    own_site: Site, page: Page
+) -> None:
+    body = {
+        "model": MODEL, "datasets": [own_site.filled.dataset],
+        "channels": {"u": "P1", "p": "P2"}, "parameters": {"L": {"upper": 0.3}},
+    }  # fmt: skip
+    job = httpx.post(f"{own_site.url}/v1/jobs", json=body, timeout=LIMIT_SECONDS).json()["id"]
+    check = Held(page, r"/v1/models:check$")
+    page.goto(f"{own_site.url}/?clone={job}#new")
+    check.wait()
+    button = page.locator("#job-form [type=submit]")
+    button.scroll_into_view_if_needed()
+    place = button.bounding_box()
+    assert place is not None
+    page.mouse.click(place["x"] + place["width"] / 2, place["y"] + place["height"] / 2)
+    check.let_go()
+    expect(page.get_by_label("upper of L")).to_have_value("0.3")
+    check.stop()
+    button.click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    with own_site.parts.database.read() as session:
+        spec = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec
+    assert spec["parameters"] == body["parameters"]
 
 
 LIVE = "new URL('live.js', document.querySelector('script[type=module]').src)"

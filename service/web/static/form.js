@@ -14,6 +14,15 @@ const HOLDS = [['', 'as the recording says'], ['zero', 'held (zero)'], ['first',
 async function start() {
   if (state.started) return;
   state.started = true;
+  form.inert = true; // what was typed or sent before all is there would be lost, or lack what is taken over
+  try {
+    await fill();
+  } finally {
+    form.inert = false;
+  }
+}
+
+async function fill() {
   const [datasets, models] = await Promise.all([ask('/v1/datasets?limit=200'), ask('/v1/models')]);
   for (const one of datasets.items) {
     field('dataset').append(new Option(one.name, one.id));
