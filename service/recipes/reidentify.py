@@ -12,6 +12,7 @@ from service.schemas_jobs import PREVIOUS, REFERENCE, RUN, JobIn, JobOut
 from service.schemas_reidentify import ReidentifyIn
 from service.settings import Settings
 from service.storage.sessions import Database
+from service.storage.texts import fault_of
 
 FIRST_AXIS = "/sweep/axes/0"
 IN_DATASETS = re.compile(r"/datasets(?P<place>/\d+): ")
@@ -80,16 +81,20 @@ def job_of(body: ReidentifyIn, order: list[int]) -> JobIn:
         "x": body.label, "parameters": body.look_at, "predict": body.predict,
         "reference": reference,
     }  # fmt: skip
-    model = body.model["name"] if isinstance(body.model, dict) and "name" in body.model else "model"
-    name = body.model if isinstance(body.model, str) else model
     return JobIn.model_validate({
-        "name": f"{name} over {body.label}"[:200],
+        "name": f"{_model_name(body.model)} over {body.label}"[:200],
         **body.shared,
         "datasets": chosen[0].datasets,
         "sweep": {"axes": [axis]},
         "warm_start": _warm_start(body, reference),
         "trend": trend,
     })  # fmt: skip
+
+
+def _model_name(model: Any) -> str:
+    """What a batch of this model is called; a text that no text is, is told with the model."""
+    name = model.get("name") if isinstance(model, dict) else model
+    return name if isinstance(name, str) and fault_of(name) is None else "model"
 
 
 def _reference(given: str | None) -> str | None:

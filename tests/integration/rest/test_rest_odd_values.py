@@ -40,6 +40,10 @@ def test_a_batch_whose_recordings_are_no_names_is_refused(
         ("/v1/datasets:simulate", {"model": "fopdt", "parameters": {HALF: 1}, "samples": 9,
                                    "sample_time": 1, "inputs": {"u": {"kind": "step"}}}),
         ("/v1/runs:compare", {"runs": [HALF, "x"]}),
+        ("/v1/recipes/reidentify", {"model": HALF, "label": "n", "look_at": ["L"],
+                                    "batch": [{"x": 1, "datasets": ["steps"]}]}),
+        ("/v1/recipes/reidentify", {"model": {"name": HALF}, "label": "n", "look_at": ["L"],
+                                    "batch": [{"x": 1, "datasets": ["steps"]}]}),
     ],
 )  # fmt: skip
 def test_half_of_a_surrogate_pair_is_refused(
