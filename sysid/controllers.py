@@ -8,10 +8,13 @@ Control, ISA 2006, sections 3.3 to 3.5), y the controlled output:
 """
 
 from dataclasses import KW_ONLY, dataclass
-from math import isfinite, sqrt
+from math import sqrt
 from typing import Literal
 
 from sysid.errors import InvalidSettings
+
+LARGEST = 1e300
+"""What is as large is no number of a model; a time is infinite."""
 
 DerivativeOn = Literal["measurement", "error"]
 AntiWindup = Literal["back-calculation", "none"]
@@ -35,7 +38,7 @@ class Transport:
     def __post_init__(self) -> None:
         for name in ("gain", "time_constant", "delay"):
             value = getattr(self, name)
-            if not isfinite(value) or (name != "gain" and value < 0):
+            if not _is_number(value) or (name != "gain" and value < 0):
                 raise InvalidSettings(f"/transport/{name}", f"{value!r} is not a number 0 or more")
 
 
@@ -89,17 +92,17 @@ class PidControl:
 
     def __post_init__(self) -> None:
         for name in ("gain", "setpoint_weight"):
-            if not isfinite(getattr(self, name)):
+            if not _is_number(getattr(self, name)):
                 raise InvalidSettings(f"/{name}", f"{getattr(self, name)!r} is not a finite number")
         for name in ("limit", "tracking_time", "derivative_filter"):
             value = getattr(self, name)
-            if value is not None and not (isfinite(value) and value > 0):
+            if value is not None and not (_is_number(value) and value > 0):
                 raise InvalidSettings(f"/{name}", f"{value!r} is not a number above 0")
         if self.integral_time is not None and not self.integral_time > 0:
             raise InvalidSettings(
                 "/integral_time", f"{self.integral_time!r} is not a time above 0 s, or infinity"
             )
-        if not (isfinite(self.derivative_time) and self.derivative_time >= 0):
+        if not (_is_number(self.derivative_time) and self.derivative_time >= 0):
             raise InvalidSettings(
                 "/derivative_time", f"{self.derivative_time!r} is not a time of 0 s or more"
             )
@@ -108,7 +111,7 @@ class PidControl:
     def _check_limits(self) -> None:
         for name in ("lower", "upper"):
             value = getattr(self, name)
-            if value is not None and not isfinite(value):
+            if value is not None and not _is_number(value):
                 raise InvalidSettings(f"/{name}", f"{value!r} is not a finite number")
             if value is not None and self.limit is not None:
                 raise InvalidSettings(
@@ -122,7 +125,7 @@ class PidControl:
     @property
     def integrates(self) -> bool:
         """Whether there is integral action."""
-        return self.integral_time is not None and isfinite(self.integral_time)
+        return self.integral_time is not None and self.integral_time < LARGEST
 
     @property
     def differentiates(self) -> bool:
@@ -152,4 +155,8 @@ class PidControl:
         assert self.integral_time is not None
         if not self.differentiates:
             return self.integral_time
-        return sqrt(self.integral_time * self.derivative_time)
+        return sqrt(self.integral_time) * sqrt(self.derivative_time)
+
+
+def _is_number(value: float) -> bool:
+    return -LARGEST < value < LARGEST

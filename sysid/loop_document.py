@@ -5,7 +5,7 @@ or a state that follows it. What is written here is read by the model's own pars
 """
 
 from collections.abc import Callable, Mapping
-from math import ceil, floor, log2
+from math import ceil, floor, inf, log2
 from typing import Any
 
 from sysid.control_law import law_of
@@ -204,7 +204,7 @@ class LoopDocument:
         if control.tracking is not None:
             shortest.append((control.tracking, "tracking_time"))
         for time, name in shortest:
-            wanted = _STEPS * self.period / time
+            wanted = _STEPS * self.period / time if time > 0 else inf
             if wanted * self.model.solver.substeps > _MOST_SUBSTEPS:
                 raise InvalidSettings(f"/{name}", self._too_short(name, time))
             if wanted > 1:

@@ -15,6 +15,7 @@ from sysid.kernels.demand import is_difference
 from sysid.types import ComplexArray, FloatArray
 
 _DECADES = 3  # below the slowest and above the fastest part of the loop
+_FARTHEST = 1e8  # from the middle of what is in the loop: beyond, nothing of it is told
 _A_DECADE = 400  # frequencies
 _TURN = 0.05  # rad that dead times turn from one frequency to the next
 _MOST = 200_000
@@ -124,6 +125,8 @@ def _is_stable(loop: _Loop, omega: FloatArray) -> bool:
 def _frequencies(loop: _Loop, pair: Transfer, control: PidControl) -> tuple[FloatArray, float]:
     """Angular frequencies around all that the loop has, and beyond which its gain is gone."""
     scales = sorted(_scales(pair, control)) or [1.0]
+    middle = scales[len(scales) // 2]
+    scales = [min(max(one, middle / _FARTHEST), middle * _FARTHEST) for one in scales]
     low, high = scales[0] / 10**_DECADES, scales[-1] * 10**_DECADES
     decades = np.log10(high / low)
     coarse: FloatArray = np.geomspace(low, high, ceil(_A_DECADE * decades))

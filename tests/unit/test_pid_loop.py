@@ -199,6 +199,39 @@ def test_a_recursion_has_the_sampled_controller_of_the_textbook(control: PidCont
     np.testing.assert_allclose(found.channel(loop.command).values, commands, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.03])
+def test_where_the_output_answers_at_once_the_textbooks_controller_is_late(delay: float) -> None:
+    """By one step where nothing else is between them, by the transport's steps where it is."""
+    direct = parse_model({"name": "d", "form": "difference", "inputs": {"u": "V", "d": "V"},
+                          "states": {"x": "m"}, "outputs": {"y": "x"}, "initial": {"x": 0.0},
+                          "equations": {"x": "0.95*x(k-1) + 0.06*(u + d)"}})  # fmt: skip
+    control = replace(PID, gain=0.8, upper=0.9, transport=Transport(1.0, 0.0, delay))
+    loop, found = simulated(direct, control, {}, load=0.2)
+    late = max(round(delay / STEP), 1)
+    law, x, commands, outputs = Textbook(control, STEP), 0.0, [0.0] * late, []
+    for k, t in enumerate(TIMES):
+        if k:
+            load = 0.2 if t >= 4.0 - STEP / 9 else 0.0
+            x = 0.95 * x + 0.06 * (commands[-late] + load)
+        commands.append(law(1.0, x))
+        outputs.append(x)
+    assert loop.steps_late == (delay == 0.0)
+    np.testing.assert_allclose(found.channel("y").values, outputs, atol=1e-9)
+
+
+def test_a_polynomial_is_controlled_without_a_steady_error() -> None:
+    narx = parse_model({
+        "name": "n", "form": "polynomial", "output": "y", "inputs": {"u": "V"}, "degree": 2,
+        "lags": {"y": [1, 2], "u": [1]}, "coefficients": {"lower": -2, "upper": 2},
+        "terms": ["y(k-1)", "y(k-2)", "u(k-1)", "u(k-1)*y(k-1)"], "initial": {"y": 0},
+    })  # fmt: skip
+    values = dict(zip([p.name for p in narx.parameters], (1.1, -0.3, 0.1, 0.05), strict=True))
+    control = PidControl("u", "y", 0.5, integral_time=0.04, derivative_time=0.01, limit=3.0)
+    loop = close_loop(narx, control, STEP)
+    found = loop.simulate([stepped(loop.reference, 0.5)], values, times=TIMES)
+    assert found.channel("y").values[-1] == pytest.approx(0.5, abs=1e-6)
+
+
 @pytest.mark.parametrize("plant", [lag(), RECURSION], ids=["differential", "difference"])
 @pytest.mark.parametrize("limit", [None, 0.5])
 def test_without_integral_and_derivative_the_loop_is_the_proportional_one_bit_for_bit(
@@ -293,6 +326,7 @@ def test_steps_are_divided_where_the_filter_is_faster_than_they_are() -> None:
         ({"lower": 1.0, "upper": 1.0}, "/upper", "need more"),
         ({"limit": 1.0, "upper": 2.0}, "/upper", "the limit ± is given too"),
         ({"lower": -inf}, "/lower", "finite"),
+        ({"upper": 1e300}, "/upper", "finite"),
     ],
 )
 def test_numbers_that_make_no_controller_are_told(
