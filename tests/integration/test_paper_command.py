@@ -13,7 +13,7 @@ import pytest
 from service.client import Client
 from service.embedded import embedded_service
 
-pytestmark = [pytest.mark.slow, pytest.mark.ray, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.slow, pytest.mark.ray, pytest.mark.timeout(600)]
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 def lagid(*words: object, **environment: str) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
         [sys.executable, "-m", "service.cli.main", "paper", *map(str, words)],
-        capture_output=True, text=True, timeout=90, check=False,
+        capture_output=True, text=True, timeout=240, check=False,
         env={**os.environ, **environment},
     )  # fmt: skip
 
