@@ -17,9 +17,6 @@ likelihood; Kenward and Roger 1997). Where what it leaves is not white it is no 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cholesky_banded, solve_banded
-from scipy.optimize import minimize
-from scipy.signal import lfilter
 from scipy.special import chdtrc
 
 from sysid.lagged_sums import Laid, whiteness
@@ -83,6 +80,8 @@ def modelled(laid: Laid, columns: FloatArray) -> Modelled | None:
     columns : FloatArray, shape (n, D)
         Sensitivities of the samples that are present.
     """
+    from scipy.optimize import minimize  # late, as below: few runs need what takes long to load
+
     values = laid.values[laid.present]
     left, size, _ = np.linalg.svd(columns, full_matrices=False)
     basis = left[:, size > RANK * max(float(size[0]), np.finfo(float).tiny)]
@@ -115,6 +114,8 @@ def _meant(place: FloatArray) -> tuple[float, float]:
 
 def _solved(place: FloatArray, series: _Series) -> tuple[FloatArray, float]:
     """Basis and values (n, r + 1) as of white noise, and ln of the determinant of R."""
+    from scipy.linalg import cholesky_banded, solve_banded
+
     a, w = _meant(place)
     carried = a**series.gaps
     band = np.ones((2, series.values.size))
@@ -151,6 +152,8 @@ def _are_white(values: FloatArray) -> bool:
 
 def _middle(place: FloatArray, laid: Laid, columns: FloatArray, series: _Series) -> FloatArray:
     """SᵀRS (D, D)."""
+    from scipy.signal import lfilter
+
     a, w = _meant(place)
     n, r = series.basis.shape
     variance = _left(place, series)[1] / (n - r)
