@@ -17,7 +17,7 @@ likelihood; Kenward and Roger 1997). Where what it leaves is not white it is no 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, expit
 
 from sysid.lagged_sums import Laid, whiteness
 from sysid.linear import RANK
@@ -109,7 +109,7 @@ def modelled(laid: Laid, columns: FloatArray) -> Modelled | None:
 
 def _meant(place: FloatArray) -> tuple[float, float]:
     """Pole and share of white noise."""
-    return STEEPEST * float(np.tanh(place[0])), float(1.0 / (1.0 + np.exp(-place[1])))
+    return STEEPEST * float(np.tanh(place[0])), float(expit(place[1]))
 
 
 def _solved(place: FloatArray, series: _Series) -> tuple[FloatArray, float]:
