@@ -1,5 +1,6 @@
 """Small identifications for tests of workers and dispatcher."""
 
+import time
 from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
@@ -37,6 +38,7 @@ def step_record(n: int = 120, delay: float = 0.7, seed: int = 3) -> Record:
     return Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
 
 
+LIMIT_SECONDS = 240.0  # beside other work the search alone is compiled for two minutes
 RECORDS: Mapping[str, Records] = {"short": (step_record(),), "long": (step_record(4000),)}
 
 
@@ -104,11 +106,12 @@ class Notebook:
         return self.is_stopped
 
 
-def carry_out(crew: Crew, specs: Mapping[str, RunSpec], steps: int = 2000) -> Notebook:
+def carry_out(crew: Crew, specs: Mapping[str, RunSpec]) -> Notebook:
     """Feed one job of these runs to the crew until it has ended."""
     feeder, notebook = Feeder(crew), Notebook()
     feeder.add("job", ListedRuns(QueuedRun(run, one) for run, one in specs.items()), notebook)
-    for _ in range(steps):
+    limit = time.monotonic() + LIMIT_SECONDS
+    while time.monotonic() < limit:
         if feeder.step(0.05):
             return notebook
     raise AssertionError("the job did not end")
