@@ -131,7 +131,7 @@ def _feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -> li
     known = analysis.uncertainty
     if known is not None and known.noise_colour == "white":
         return []
-    advises = problem.prediction == "simulation" and problem.loss.noise_model == "white"
+    advises = problem.prediction == "simulation" and problem.loss.noise_model != "ar1"
     return feedback_notes(series_of(problem, simulated), advises_noise_model=advises)
 
 
@@ -248,7 +248,7 @@ def _under_noise(
     asked = problem.loss.noise_model
     if asked == "white" or not _polishes(algorithm, len(state.islands)):
         return Generalised(theta, {}, 0, asked != "ar1"), analysis
-    if asked == "auto" and not speaks_for_ar1(problem, theta, analysis.uncertainty):
+    if asked == "auto" and not speaks_for_ar1(problem, theta, analysis, deadline.is_past_grace):
         return Generalised(theta, {}, 0, True), analysis
     left = _left(algorithm, state, refined)
     kept = analysis.evaluations + analysis_budget(theta.size)

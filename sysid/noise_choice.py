@@ -10,6 +10,7 @@ The correlation time has to be known, too: where a record is not five times as l
 least squares was no better than squares.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -17,24 +18,32 @@ import numpy as np
 from sysid.forgetting import remembering
 from sysid.noise_model import Generalised, coloured_outputs
 from sysid.problem import Problem
-from sysid.result import Uncertainty
 from sysid.serial import parts
+from sysid.step_check import step_notes
 from sysid.types import FloatArray
+from sysid.uncertainty import Analysis
 
 _TIMES = 5.0  # correlation times that a record lasts at least
 
 
-def speaks_for_ar1(problem: Problem, theta: FloatArray, known: Uncertainty | None) -> bool:
+def speaks_for_ar1(
+    problem: Problem, theta: FloatArray, analysis: Analysis,
+    is_late: Callable[[], bool] | None = None,
+) -> bool:  # fmt: skip
     """Whether residuals of least squares at theta (D,) are coloured and none of it is forgotten.
 
-    `known` is the uncertainty of those estimates, which tells the colour: no more is looked at
-    where it is white.
+    The analysis of those estimates tells the colour: no more is looked at where it is white. What
+    comes of too long a step of the integration is no noise.
     """
+    known = analysis.uncertainty
     is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
     if not is_free or known is None or known.noise_colour == "white":
         return False
     coloured = coloured_outputs(problem, theta)
-    return bool(coloured) and coloured <= remembering(problem, theta)
+    if not coloured or not coloured <= remembering(problem, theta):
+        return False
+    simulated = problem.predictions(theta[None])[0]
+    return not step_notes(problem, theta, analysis.estimates, simulated, is_late)
 
 
 def settled(problem: Problem, theta: FloatArray, found: Generalised) -> Generalised:

@@ -39,7 +39,7 @@ def step_notes(
     is_late: Callable[[], bool] | None = None,
 ) -> list[str]:  # fmt: skip
     """Estimates (D,) that would be others with half the integration step; simulated (M,)."""
-    plain = problem.loss.noise_model == "white"
+    plain = problem.loss.noise_model != "ar1"
     if is_difference(problem.model) or not plain or _FINER * problem.n_steps > _MOST_STEPS:
         return []
     fine = _finer(problem)

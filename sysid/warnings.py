@@ -75,7 +75,7 @@ def warnings_of(
         found.append(_not_an_optimum(algorithm, analysis.possible_gain))
     elif tests is not None:
         loss = problem.loss
-        plain = loss.kind == "squares" and loss.noise_model == "white"
+        plain = loss.kind == "squares" and loss.noise_model != "ar1"
         found += _coloured(tests, lagged, analysis.uncertainty, may_be_noise=plain)
     return (*found, *unread_units(problem.model, problem.records))
 
@@ -320,7 +320,7 @@ def noise_notes(
     problem: Problem, correlation_times: Mapping[str, float], is_complete: bool
 ) -> tuple[str, ...]:
     """What a noise model did, or why it did nothing."""
-    if problem.loss.noise_model == "white":
+    if problem.loss.noise_model != "ar1":
         return ()
     found = [f"{name} {time:.3g} s" for name, time in correlation_times.items() if time > 0]
     notes = []

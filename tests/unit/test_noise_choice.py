@@ -177,6 +177,25 @@ def test_a_drift_as_slow_as_the_record_is_left_to_squares() -> None:
     assert auto.warnings == white.warnings
 
 
+def test_too_long_a_step_of_the_integration_is_told_and_not_taken_for_noise() -> None:
+    stiff = {
+        "name": "stiff", "form": "differential", "inputs": {"u": "1"},
+        "states": {"w": "1", "x": "1"},
+        "parameters": {"K": {"lower": 0.1, "upper": 10}, "o": {"lower": -10, "upper": 10},
+                       "T": {"lower": 0.5, "upper": 3}},
+        "equations": {"w": "(u - w)/(0.05*T)", "x": "K*w**3 - o"}, "outputs": {"y": "x"},
+        "initial": {"w": 0, "x": 0}, "solver": {"method": "rk4", "step": "sample"},
+    }  # fmt: skip
+    fine = {**stiff, "solver": {"method": "rk4", "step": "sample", "substeps": 40}}
+    true = Problem.build(load_model(fine), [record(np.zeros(N))])
+    y = true.predictions(np.array([[K, 3.0, 1.0]]))[0]
+    auto, white, ar1 = (found(stiff, y, loss) for loss in (AUTO, WHITE, AR1))
+    assert 0 < ar1.correlation_times["y"] < STEP * N / 5
+    assert same(auto, white)
+    assert auto.warnings == white.warnings
+    assert any("the integration step is too long" in text for text in auto.warnings)
+
+
 def test_a_budget_that_does_not_suffice_leaves_squares() -> None:
     tight = replace(SMALL, stop=Stop(evaluations=130, settled=None))
     auto, white = (found(TANK, disturbed(2), loss, settings=tight) for loss in (AUTO, WHITE))
