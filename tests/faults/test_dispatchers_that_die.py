@@ -52,7 +52,7 @@ def _fall_silent(database, lease):
 def _dispatch(url, owner, trouble, before, claimed, refused):
     """Claim and work for ever; the first claim comes after `before` and meets the trouble."""
     database = Database(url)
-    before.wait(60)
+    before.wait(180)
     while True:
         with database.write() as session:
             queue = Queue(session)
@@ -87,13 +87,13 @@ def test_each_run_has_one_result_though_dispatchers_die_and_stall(database):
     ]
     for process in processes:
         process.start()
-    limit = time.monotonic() + 60
+    limit = time.monotonic() + 180
     try:
         while not _finished(database, jobs) and time.monotonic() < limit:
             time.sleep(0.1)
-        owner, late = refused.get(timeout=20)
+        owner, late = refused.get(timeout=60)
         while owner != "stalling":  # on a busy machine others may be late as well
-            owner, late = refused.get(timeout=20)
+            owner, late = refused.get(timeout=60)
     finally:
         for process in processes:
             process.kill()

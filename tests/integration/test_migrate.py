@@ -85,7 +85,7 @@ def test_threads_that_upgrade_at_once_do_not_race(empty_database):
 
 
 def _start_service(url, start, results):
-    start.wait(60)
+    start.wait(180)
     database = Database(url)
     migrate.upgrade(database)
     migrate.check(database)
@@ -103,7 +103,7 @@ def test_processes_that_start_at_once_on_a_new_database_do_not_race(empty_databa
     ]
     for process in processes:
         process.start()
-    assert [results.get(timeout=60) for _ in processes] == ["up"] * 3
+    assert [results.get(timeout=180) for _ in processes] == ["up"] * 3
     for process in processes:
         process.join()
     assert migrate.differences(empty_database) == []
