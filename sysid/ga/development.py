@@ -12,19 +12,19 @@ from the best of fresh individuals, and take in the rest by and by.
 import numpy as np
 
 from sysid.ga.chromosome import coded, decoded, located
-from sysid.ga.cliffs import MOST, has_cliff
 from sysid.ga.far_away import is_behind, is_coloured
 from sysid.ga.gauss_newton import (
     damped_step,
     factored,
     normal_equations,
     partial_fitness,
+    slope_distance,
     spread,
 )
+from sysid.ga.hops import COUNTED, SINGLE, UNCOUNTED, hop
 from sysid.ga.operators import rank
-from sysid.ga.random import DEVELOPMENT, Draws, below, draws, unit
+from sysid.ga.random import DEVELOPMENT, Draws, below, draws, normal, unit
 from sysid.ga.state import (
-    CLIFFS,
     CONFIRMED,
     DAMPING,
     DEVELOPMENTS,
@@ -58,7 +58,6 @@ from sysid.kernels.evaluator import Evaluator
 from sysid.types import FloatArray, IntArray, WordArray
 
 TRIALS = 3
-FINE = 1e-6  # of the range: far above rounding, far below what curvature needs
 FACTOR = 10.0  # between the dampings of two trials
 FIRST_DAMPING = 1e-2
 EARLY_DAMPING = 1.0  # far from a minimum: a full step would leave the box
@@ -70,13 +69,9 @@ ENOUGH = 1e-4  # relative gain of a step below which a full-record search ends
 ENOUGH_PART = 1e-2
 EARLY = 4  # developments that follow each other at once and are cheap, before the long ones
 FAR = 1.1  # of the champion's fitness: above, a search ends at the first small gain
-SHORTEST_HOP, LONGEST_HOP = 0.3, 50.0  # standard errors
-COUNTED, UNCOUNTED = 1, 2  # hops: as evidence for the champion, or not
 TURNS = 8  # developments after which the kinds repeat where the fitness jumps
 SCATTERS, GROWS_BESIDE = 2, 4  # of four the one that spreads, of eight that grows from beside
 SHORT_GROWTH = 1.5  # doublings: beside the champion the later signs of velocities are right
-LOOKS = 4  # hops that also look for jumps of the fitness, as long as there is none
-LINES = 2  # on which each does
 
 
 @compiled
@@ -94,71 +89,6 @@ def _fresh(
     predicted = partial_predictions(evaluator, located(evaluator, places), horizon)
     reached = partial_fitness(evaluator, plan, predicted, horizon)
     return np.asarray(places[np.argmin(reached[: shape[0]])])
-
-
-@compiled
-def _difference(plan: Plan, counters: IntArray, memory: FloatArray) -> float:
-    """Distance (of the range) over which the next slopes are taken.
-
-    The first searches take derivatives, the others slopes over a distance that each step draws
-    anew: where switches (dry friction) make the fitness rough, these tell what lies behind the
-    next ripple, and no ripple stops them all.
-    """
-    if memory[ROUGH] == 0.0:
-        return FINE
-    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
-    return float(10.0 ** (-2.0 - 4.0 * unit(word[2])))
-
-
-@compiled
-def _normal(word: Draws) -> float:
-    """A normal number of standard deviation 1 from the first two of four drawn words."""
-    return float(np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(2.0 * np.pi * unit(word[1])))
-
-
-@compiled
-def _hop(evaluator: Evaluator, plan: Plan, counters: IntArray, memory: FloatArray) -> None:
-    """Move the point away, as the covariance of the estimate there spreads it."""
-    point = memory[POINT:]
-    counters[EVALUATIONS] += point.size + 1
-    difference = _difference(plan, counters, memory)
-    matrix, gradient, base = normal_equations(evaluator, plan, point, 1.0, difference)
-    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
-    size = base * SHORTEST_HOP * (LONGEST_HOP / SHORTEST_HOP) ** unit(word[0])
-    factor = factored(matrix, gradient, point, 0.0)
-    if counters[HOP] == COUNTED:
-        _look(evaluator, plan, factor, base, counters, memory)
-    spread(factor, point, _deviation(plan, counters, 0, size, point.size), point)
-
-
-@compiled
-def _deviation(plan: Plan, counters: IntArray, line: int, size: float, n: int) -> FloatArray:
-    """Normal numbers (n,) of that standard deviation."""
-    drawn = np.empty(n)
-    for d in range(n):
-        draw = 1 + line * n + d
-        word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
-        drawn[d] = size * _normal(word)
-    return drawn
-
-
-@compiled
-def _look(
-    evaluator: Evaluator, plan: Plan, factor: FloatArray, base: float, counters: IntArray,
-    memory: FloatArray,
-) -> None:  # fmt: skip
-    """Note whether the fitness jumps on lines through the point; not where a budget ends."""
-    point = memory[POINT:]
-    for line in range(1, LINES + 1):
-        if counters[EVALUATIONS] + MOST + point.size + 1 > plan.evaluations or not np.isfinite(
-            base
-        ):
-            return
-        if counters[CLIFFS] == 0 and counters[HOPS] < LOOKS:
-            direction = _deviation(plan, counters, line, base, point.size)
-            counters[CLIFFS] += has_cliff(evaluator, factor, point, direction, base, counters)
-            # A warm start settles by fewer searches, chosen with those of a smooth fitness.
-            counters[JUMPS] += counters[CLIFFS] if counters[WARMED] == 0 else 0
 
 
 @compiled
@@ -184,9 +114,10 @@ def _choose_beside(
 ) -> int:
     """The same where the fitness jumps: there most that is better lies beside the champion.
 
-    Of eight developments four are hops, two scatter, one grows from beside the champion and one
-    from far away: in two of three from fresh individuals, and so fast that it costs little. Where
-    the champion's errors are no noise, three of the hops give their turns to fresh individuals.
+    Of eight developments four are hops, two of them of one parameter, two scatter, one grows from
+    beside the champion (one parameter moved, too) and one from far away: in two of three from
+    fresh individuals. Both grow so fast that it costs little. Where the champion's errors are no
+    noise, three of the hops give their turns to fresh individuals.
     """
     turn = counters[DEVELOPMENTS] % TURNS
     memory[ROUGH] = 1.0
@@ -197,20 +128,22 @@ def _choose_beside(
         memory[GROWTH] = 2.0
         return -1
     if turn % 2 == 1:
-        counters[HOP] = COUNTED
+        counters[HOP] = COUNTED + SINGLE if turn % 4 == 3 else COUNTED
         return 0
     if scatters(counters):
         counters[PROBES] = size
         return 0
-    is_beside = turn == GROWS_BESIDE
-    memory[HORIZON] = 0.5 ** ((SHORT_GROWTH if is_beside else LONGEST_GROWTH) * unit(word[0]))
     memory[GROWTH] = 2.0
-    if not is_beside and below(word[1], 3) > 0:
+    if turn == GROWS_BESIDE:
+        counters[HOP] = UNCOUNTED + SINGLE
+        memory[HORIZON] = 0.5 ** (SHORT_GROWTH * unit(word[0]))
+        return 0
+    memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
+    if below(word[1], 3) > 0:
         return -1
     memory[GROWTH] = 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
     counters[PROBES] = size // 3
-    counters[HOP] = UNCOUNTED if is_beside else 0
-    return 0 if is_beside else below(word[2], size)
+    return below(word[2], size)
 
 
 @compiled
@@ -265,7 +198,7 @@ def start_development(
     for d in range(begin.size):
         memory[POINT + d] = begin[d]
     if counters[HOP]:
-        _hop(evaluator, plan, counters, memory)
+        hop(evaluator, plan, counters, memory)
 
 
 @compiled
@@ -313,7 +246,7 @@ def _next_part(counters: IntArray, memory: FloatArray, fitness: FloatArray) -> N
     counters[SEQUENCE], counters[STEP] = 0, 0
     if memory[OLD] == fitness[0] and counters[DEVELOPMENTS] > 1:
         counters[SETTLED] = 1
-    if counters[HOP] == COUNTED:
+    if counters[HOP] & COUNTED:
         counters[HOPS] += 1
         counters[RETURNED] += abs(memory[REACHED] - fitness[0]) <= fitness[0] * SAME
     if counters[FRESH]:
@@ -347,7 +280,7 @@ def _trials(plan: Plan, counters: IntArray, memory: FloatArray, matrix: FloatArr
         for d in range(point.size):
             draw = 1 + t * point.size + d
             word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
-            deviation[d] = base * 10.0 ** (1.5 - 2.5 * unit(word[2])) * _normal(word)
+            deviation[d] = base * 10.0 ** (1.5 - 2.5 * unit(word[2])) * normal(word)
         spread(factor, point, deviation, places[t])
     return places
 
@@ -361,7 +294,7 @@ def adaptive_sequence(
     point, horizon = memory[POINT:], memory[HORIZON]
     counters[STEP] += 1
     counters[EVALUATIONS] += point.size + 1 + TRIALS + counters[PROBES]
-    difference = _difference(plan, counters, memory)
+    difference = slope_distance(plan, counters, memory)
     matrix, gradient, base = normal_equations(evaluator, plan, point, horizon, difference)
     proposals = coded(_trials(plan, counters, memory, matrix, gradient, base), plan.bits)
     places = decoded(proposals, plan.bits)

@@ -7,11 +7,14 @@ soft-l1 loss the residuals are weighted by 1/√(1 + (we/s)²) (iteratively rewe
 import numpy as np
 
 from sysid.ga.chromosome import located
-from sysid.ga.state import Plan
+from sysid.ga.random import DEVELOPMENT, draws, unit
+from sysid.ga.state import GENERATION, ROUGH, Plan
 from sysid.kernels.caching import compiled
 from sysid.kernels.evaluation import partial_predictions
 from sysid.kernels.evaluator import Evaluator
-from sysid.types import FloatArray
+from sysid.types import FloatArray, IntArray
+
+FINE = 1e-6  # of the range: far above rounding, far below what curvature needs
 
 
 @compiled
@@ -51,6 +54,20 @@ def _sensed(
         steps[d] = difference if point[d] < 0.5 else -difference
         places[d + 1, d] += steps[d]
     return partial_predictions(evaluator, located(evaluator, places), horizon), steps
+
+
+@compiled
+def slope_distance(plan: Plan, counters: IntArray, memory: FloatArray) -> float:
+    """Distance (of the range) over which the next slopes are taken.
+
+    The first searches take derivatives, the others slopes over a distance that each step draws
+    anew: where switches (dry friction) make the fitness rough, these tell what lies behind the
+    next ripple, and no ripple stops them all.
+    """
+    if memory[ROUGH] == 0.0:
+        return FINE
+    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    return float(10.0 ** (-2.0 - 4.0 * unit(word[2])))
 
 
 @compiled

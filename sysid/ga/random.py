@@ -46,3 +46,9 @@ def unit(word: int) -> float:
 def below(word: int, n: int) -> int:
     """A drawn word as a whole number 0 … n − 1 (n is far below 2³², so the bias is nil)."""
     return (word * n) >> 32
+
+
+@compiled
+def normal(word: Draws) -> float:
+    """A normal number of standard deviation 1 from the first two of four drawn words."""
+    return float(np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(2.0 * np.pi * unit(word[1])))

@@ -1,0 +1,77 @@
+"""Where hops lead to: along the covariance of the estimate, or off its valley."""
+
+import numpy as np
+import pytest
+
+from sysid.ga.chromosome import placed
+from sysid.ga.gauss_newton import normal_equations
+from sysid.ga.hops import COUNTED, SINGLE, UNCOUNTED, hop
+from sysid.ga.state import CLIFFS, EVALUATIONS, GENERATION, HOP, HOPS, POINT, ROUGH
+from sysid.islands.archipelago import found, plans
+from sysid.kernels.evaluator import Evaluator
+from sysid.settings import GeneticAlgorithm, Stop
+from sysid.types import FloatArray
+from tests.searching import COULOMB, example
+
+ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
+PROBLEM = example("coulomb-eq16")
+(PLAN,) = plans(PROBLEM, ALONE, 3)
+BEGIN = placed(PROBLEM.evaluator, np.array([[COULOMB[p.name] for p in PROBLEM.space]]))[0]
+DRAWN = 400
+
+
+def moved(kind: int, evaluator: Evaluator = PROBLEM.evaluator) -> FloatArray:
+    """How far hops of that kind lead (DRAWN, D), each by its own draw."""
+    island = found(PROBLEM, ALONE, 3)[0]
+    ends = np.empty((DRAWN, BEGIN.size))
+    for k in range(DRAWN):
+        counters, memory = island.counters.copy(), island.memory.copy()
+        counters[[HOP, GENERATION, HOPS]] = kind, k, 4  # four hops have looked for jumps
+        memory[POINT:] = BEGIN
+        hop(evaluator, PLAN, counters, memory)
+        assert counters[EVALUATIONS] - island.counters[EVALUATIONS] == BEGIN.size + 1
+        ends[k] = memory[POINT:]
+    return ends - BEGIN
+
+
+@pytest.mark.parametrize("kind", [COUNTED + SINGLE, UNCOUNTED + SINGLE])
+def test_a_hop_of_one_parameter_moves_each_of_them_in_its_turn_and_no_other(kind: int) -> None:
+    moves = moved(kind)
+    assert np.all(np.sum(moves != 0.0, axis=1) == 1)
+    assert np.all(np.abs(np.sum(moves != 0.0, axis=0) - DRAWN / 4) < 5 * np.sqrt(DRAWN * 3 / 16))
+    assert np.all(np.sum(moved(kind - SINGLE) != 0.0, axis=1) == BEGIN.size)
+
+
+def test_it_leads_3_to_500_standard_errors_of_a_parameter_whose_fellows_are_held() -> None:
+    moves = moved(COUNTED + SINGLE)
+    memory = found(PROBLEM, ALONE, 3)[0].memory
+    assert memory[ROUGH] == 0.0  # hops take the same derivatives
+    matrix, _, base = normal_equations(PROBLEM.evaluator, PLAN, BEGIN, 1.0, 1e-6)
+    inside = np.all((moves + BEGIN > 0.0) & (moves + BEGIN < 1.0), axis=1)
+    assert np.mean(inside) > 0.8
+    errors = np.abs(moves[inside] * np.sqrt(np.diag(matrix)) / base).sum(axis=1)
+    # The logarithm of a normal number's size has a mean of -0.635, and is spread by 1.11.
+    wanted = 0.5 * (np.log(3.0) + np.log(500.0)) - 0.635
+    assert abs(np.mean(np.log(errors)) - wanted) < 0.5
+    assert np.max(errors) < 500.0 * 4.5
+    assert np.median(errors) > 10.0
+
+
+def test_a_parameter_that_changes_nothing_stays() -> None:
+    blind = PROBLEM.evaluator._replace(weight=np.zeros_like(PROBLEM.evaluator.weight))
+    assert np.all(moved(COUNTED + SINGLE, blind) == 0.0)
+
+
+@pytest.mark.parametrize(("kind", "looks"), [(COUNTED, True), (UNCOUNTED, False)])
+def test_hops_that_are_evidence_look_for_jumps_whichever_way_they_lead(
+    kind: int, looks: bool
+) -> None:
+    """Whether the fitness jumps decides what settles a search: all of the first hops have to."""
+    for one in (0, SINGLE):
+        island = found(PROBLEM, ALONE, 3)[0]
+        island.counters[HOP] = kind + one
+        island.memory[POINT:] = BEGIN
+        spent = island.counters[EVALUATIONS] + BEGIN.size + 1
+        hop(PROBLEM.evaluator, PLAN, island.counters, island.memory)
+        assert (island.counters[EVALUATIONS] > spent) == looks
+        assert island.counters[CLIFFS] == 0 or looks
