@@ -199,8 +199,8 @@ class TuningOut(Answer):
 class MarginsOut(Answer):
     """Stability and margins of the loop without limits, dead times as they are; null: none.
 
-    `gain_margin` is a factor, `phase_margin` in degrees, `delay_margin` in s,
-    `crossover_frequency` in rad/s, `sensitivity_peak` (M_s) usually 1.2 to 2.
+    `gain_margin` is a factor, below 1 of a loop that needs its gain, `phase_margin` in degrees,
+    `delay_margin` in s, `crossover_frequency` in rad/s, `sensitivity_peak` (M_s) usually 1.2 to 2.
     """
 
     is_stable: bool

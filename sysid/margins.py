@@ -20,7 +20,11 @@ _A_DECADE = 400  # frequencies
 _TURN = 0.05  # rad that dead times turn from one frequency to the next
 _MOST = 200_000
 _SMALL = 1e-3  # loop gain beyond which nothing is looked for: a gain margin of a thousand
-_SECANTS = 3  # of steps of a hundredth, that leaves nothing of them
+_SECANTS = 12  # that leaves nothing of steps of a hundredth, at sharp resonances too
+_ROUNDING = 1e-6  # rad
+_FAR = 0.5  # rad that roots near the axis turn from one frequency to the next
+_ROUNDS, _PARTS = 8, 10  # in which such a step is divided
+_FEW = 1000  # steps: where all turn far it is no root, but a dead time at frequencies of no account
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +39,10 @@ class Margins:
         Whether no root of the characteristic equation has a real part above 0. The margins of a
         loop that is unstable are those of its crossings and do not tell how to mend it.
     gain_margin : float
-        Factor of the gain at which the loop swings; ``inf`` if there is none.
+        Factor of the gain at which the loop swings, or drifts; below 1 of a loop that needs its
+        gain, ``inf`` if there is none.
     phase_margin : float
-        Degrees of further phase lag; ``inf`` if the loop gain is below 1 everywhere.
+        Degrees of further phase lag that the loop bears; ``inf`` if its gain is 1 nowhere.
     delay_margin : float
         Further dead time in s that the loop bears; ``inf`` as before, 0 if it is unstable.
     crossover_frequency : float
@@ -86,6 +91,12 @@ class _Loop:
         """L(iω): controller, transport and plant in a row."""
         above, below = self.parts(omega)
         return above / below
+
+    def at_rest(self) -> FloatArray:
+        """L(0), (1,), a real number; (0,) where something integrates."""
+        above, below = self.parts(np.zeros(1))
+        found: FloatArray = (above[below != 0] / below[below != 0]).real
+        return found[np.isfinite(found)]
 
     def parts(self, omega: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Numerator and denominator of L(iω), without the poles that they have."""
@@ -138,7 +149,25 @@ def _frequencies(loop: _Loop, pair: Transfer, control: PidControl) -> tuple[Floa
     delays += control.transport.delay if control.transport else 0.0
     count = min(ceil(end * delays / _TURN), _MOST)
     fine = end * np.arange(1, count + 1) / max(count, 1)
-    return np.unique(np.concatenate([coarse, fine])), end
+    return _resolved(loop, np.unique(np.concatenate([coarse, fine]))), end
+
+
+def _resolved(loop: _Loop, omega: FloatArray) -> FloatArray:
+    """With more frequencies where a root near the axis turns the loop, or its border, at once.
+
+    A root on the axis is never resolved, and one right of it by less than the last step is taken
+    for one left of it as often as not.
+    """
+    for _ in range(_ROUNDS):
+        above, below = loop.parts(omega)
+        steps = [np.diff(np.unwrap(np.angle(one))) for one in (below, above + below)]
+        far = np.flatnonzero(np.max(np.abs(steps), axis=0) > _FAR)
+        if not 0 < far.size <= _FEW:
+            break
+        parts = np.linspace(0.0, 1.0, _PARTS, endpoint=False)[1:, None]
+        more = omega[far] + parts * (omega[far + 1] - omega[far])
+        omega = np.unique(np.concatenate([omega, more.ravel()]))
+    return omega
 
 
 def _scales(pair: Transfer, control: PidControl) -> Iterable[float]:
@@ -157,17 +186,14 @@ def _scales(pair: Transfer, control: PidControl) -> Iterable[float]:
 
 def _margins(loop: _Loop, omega: FloatArray, *, is_stable: bool) -> Margins:
     gains = loop.gain(omega)
-    phases = np.unwrap(np.angle(gains))
-    # A large gain at rest leads by nothing: with the wrong sign it lags by more than half a turn.
-    if phases[0] > pi / 4 and abs(gains[0]) > 1.0:
-        phases -= 2 * pi
     crossings = _roots(lambda w: np.abs(loop.gain(w)) - 1.0, omega, np.abs(gains) - 1.0)
-    lags = np.interp(crossings, omega, phases)
-    lefts = pi + lags
-    turned = _roots(lambda w: loop.gain(w).imag, omega, gains.imag)
-    at_turned = loop.gain(turned).real
-    factors = -1.0 / at_turned[at_turned < 0]
+    lefts = np.angle(-loop.gain(crossings))
+    if is_stable:  # past half a turn it is stable since the next border is a turn away
+        lefts = np.where(lefts < -_ROUNDING, lefts + 2 * pi, lefts)
     nearest = int(np.argmin(np.abs(lefts))) if lefts.size else None
+    turned = _roots(lambda w: loop.gain(w).imag, omega, gains.imag)
+    at_turned = np.append(loop.gain(turned).real, loop.at_rest())
+    factors = -1.0 / at_turned[at_turned < 0]
     bears = float(np.min(np.maximum(lefts, 0.0) / crossings, initial=inf))
     return Margins(
         is_stable=is_stable,
