@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.controllers import Transport
+from sysid.controllers import LARGEST, Transport
 from sysid.errors import InvalidSettings
 from sysid.export.identified import Identified
 from sysid.export.linear import NotLinear
@@ -121,9 +121,23 @@ def tuned(
         )
     factors = factors_of(identified, input, output, transport)
     process = factors.reduced(2 if controller == "PID" and rule == "simc" else 1)
-    if rule == "amigo":
-        return _amigo(process, controller)
-    return _simc(process, controller, closed_loop_time_constant)
+    try:
+        found = (
+            _amigo(process, controller) if rule == "amigo"
+            else _simc(process, controller, closed_loop_time_constant)
+        )  # fmt: skip
+    except ZeroDivisionError:  # of numbers whose product is too small to be one
+        raise _refusal(_no_gain(inf, process)) from None
+    if not 0.0 < abs(found.gain) < LARGEST:
+        raise _refusal(_no_gain(found.gain, process))
+    return found
+
+
+def _no_gain(found: float, process: Process) -> str:
+    return (
+        f"the rule gives a gain of {found:g}, which no controller can have; the process has a gain "
+        f"of {process.gain:g} and a dead time of {process.delay:g} s"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +186,7 @@ def factors_of(
 
 
 def _factors(pair: Transfer, transport: Transport) -> Factors:
-    if not pair.numerator:
+    if not pair.numerator or transport.gain == 0.0:
         raise _refusal(f"{pair.input!r} has no effect on {pair.output!r}")
     delay, above = _one_delay(pair.numerator, "the model has more than one dead time in a row")
     _, below = _one_delay(pair.denominator, "the model has a dead time inside a loop of its own")
@@ -192,9 +206,9 @@ def _factors(pair: Transfer, transport: Transport) -> Factors:
             "the model oscillates by itself (a pair of complex poles); the rules are of models "
             "with real time constants"
         )
-    times = [1.0 / abs(pole) for pole in others]
+    times = [float(1.0 / abs(pole)) for pole in others]
     # What is left of numerator and denominator at low frequencies, s of the integrator apart.
-    gain = above[0] / below[0] * float(np.prod(times)) * transport.gain
+    gain = float(above[0] / below[0] * np.prod(times)) * transport.gain
     if transport.time_constant > 0:
         times.append(transport.time_constant)
     if not times and not integrators:

@@ -269,6 +269,12 @@ def test_what_a_rule_cannot_take_is_told() -> None:
         tuned(FOPDT, "u", "y", rule="amigo", closed_loop_time_constant=1.0)
     with pytest.raises(InvalidSettings, match="take rule 'simc'"):
         tuned(chain(1.0), "u", "y", rule="amigo")
+    with pytest.raises(InvalidSettings, match=r"^/tuning: 'u' has no effect on 'y'"):
+        tuned(FOPDT, "u", "y", transport=Transport(gain=0.0))
+    for gain, delay, slow in ((1e-310, 1.0, 1.0), (1e-300, 1e-30, 1e-30), (100.0, 1.0, 1e308)):
+        weak = chain(1.0, delay=delay, gain=gain)
+        with pytest.raises(InvalidSettings, match=r"^/tuning: the rule gives a gain of (inf|0)"):
+            tuned(weak, "u", "y", closed_loop_time_constant=slow)
 
 
 def test_the_gain_margin_is_found_beyond_many_turns_of_a_long_dead_time() -> None:
