@@ -76,7 +76,8 @@ class Channel:
     Raises
     ------
     InvalidRecord
-        If the arrays differ in length, are empty, or the times decrease or are not finite.
+        If the arrays differ in length, are empty, or the times decrease or are not finite; of the
+        history too.
     """
 
     name: str
@@ -95,12 +96,22 @@ class Channel:
         if not np.all(np.isfinite(self.times)) or np.any(np.diff(self.times) < 0):
             raise InvalidRecord(f"the times of channel {self.name!r} decrease or are not finite")
         if self.history is not None:
-            times = np.append(self.history.times, self.times[0])
-            if np.any(np.diff(times) < 0) or not np.all(np.isfinite(times)):
-                raise InvalidRecord(
-                    f"the history of channel {self.name!r} is not before its first sample, or its "
-                    "times decrease or are not finite"
-                )
+            self._check(self.history)
+
+    def _check(self, history: History) -> None:
+        before, values = history
+        if before.ndim != 1 or before.shape != values.shape or before.size == 0:
+            raise InvalidRecord(
+                f"the history of channel {self.name!r} has times of shape {before.shape} and "
+                f"values of shape {values.shape}; need two equal one-dimensional arrays with a "
+                "sample or more, or no history"
+            )
+        times = np.append(before, self.times[0])
+        if np.any(np.diff(times) < 0) or not np.all(np.isfinite(times)):
+            raise InvalidRecord(
+                f"the history of channel {self.name!r} is not before its first sample, or its "
+                "times decrease or are not finite"
+            )
 
     @property
     def whole(self) -> "Channel":

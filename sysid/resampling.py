@@ -79,7 +79,7 @@ def _grid(channels: list[Channel], period: float) -> FloatArray:
 def _between(channel: Channel, grid: FloatArray, period: float) -> FloatArray:
     if channel.hold == "zero":
         last = np.searchsorted(channel.times, grid + 1e-9 * period, side="right") - 1
-        return channel.values[last]
+        return channel.values[np.maximum(last, 0)]  # a history may begin by rounding before it
     return np.asarray(np.interp(grid, channel.times, channel.values), dtype=np.float64)
 
 

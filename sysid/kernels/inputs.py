@@ -101,7 +101,8 @@ def _with_usable_history(channel: Channel) -> Channel:
     expected = channel.times[0] - period * np.arange(times.size, 0, -1)
     off = np.flatnonzero(np.abs(times - expected) >= 0.5 * _OFF_PERIOD * period)
     first = int(off[-1]) + 1 if off.size else 0
-    return replace(channel, history=History(times[first:], values[first:])).whole
+    usable = History(times[first:], values[first:]) if first < times.size else None
+    return replace(channel, history=usable).whole
 
 
 def _points(channel: Channel, start: float, step: float) -> int:

@@ -164,6 +164,15 @@ def test_resampling_keeps_what_one_channel_recorded_before_the_others_began() ->
     assert made.channel("y").history is None
 
 
+def test_a_held_history_begins_with_what_was_recorded_first_however_times_are_rounded() -> None:
+    """The grid's first point may lie by rounding before the first sample, whose value it is."""
+    times = np.round(np.arange(200) / 610.35, 9)
+    whole = Recording(tuple(Channel(n, times, np.arange(200.0), hold="zero") for n in "uy"))
+    for row in range(20, 60):
+        steps = [{"trim": {"rows": [row, 200]}}, {"resample": {"sample_time": 1 / 610.35}}]
+        assert history(derive(whole, steps)).values[0] <= 1.0
+
+
 def segmented() -> Recording:
     """Three repeats of ten samples, u counting on over all of them."""
     times = np.concatenate([start + H * np.arange(10.0) for start in (0.0, 10.0, 20.0)])
@@ -236,8 +245,12 @@ def test_a_gap_in_the_history_leaves_a_band_limited_record_usable() -> None:
 
 
 @pytest.mark.parametrize(
-    ("times", "values"), [([0.5, 2.0], [1.0, 1.0]), ([0.5, 0.4], [1.0, 1.0]), ([np.nan], [1.0])]
-)
+    ("times", "values"),
+    [
+        ([0.5, 2.0], [1.0, 1.0]), ([0.5, 0.4], [1.0, 1.0]), ([np.nan], [1.0]),
+        ([0.5, 0.6], [1.0]), ([], []),
+    ],
+)  # fmt: skip
 def test_a_history_that_is_none_is_refused(times: list[float], values: list[float]) -> None:
     with pytest.raises(InvalidRecord, match="history of channel 'u'"):
         Channel("u", np.array([1.0]), np.array([0.0]),
