@@ -8,8 +8,9 @@ run drifts by its nature.
 It is looked at where the model is: the start of one state after the other is moved a little, and
 the free run made again. A model remembers where all through the last quarter of a record more than
 a twentieth is left of the largest change, with one sign: a first-order lag with a time constant of
-more than a third of the record, too. The phase of an oscillation that sustains itself, and chaos,
-are not forgotten either, but that is no drift.
+more than a third of the record, too. Of several experiments all have to say so: a lag of seconds is
+forgotten, though one of them may end before. The phase of an oscillation that sustains itself, and
+chaos, are not forgotten either, but that is no drift.
 """
 
 import numpy as np
@@ -83,14 +84,15 @@ def _moved(problem: Problem, theta: FloatArray, state: int, move: float) -> Floa
 
 
 def _lasting(problem: Problem, change: FloatArray) -> set[str]:
-    """Outputs shifted one way at the end of an experiment, beside its largest change of all."""
-    found = set()
+    """Outputs shifted one way at the end of every experiment, beside its largest change of all."""
+    lasts: dict[str, bool] = {}
     weights = problem.split(problem.evaluator.weight)
     for changes, weight in zip(problem.split(change), weights, strict=True):
         seen = {name: one[weight[name] > 0] for name, one in changes.items()}
         largest = max(float(np.max(np.abs(one), initial=0.0)) for one in seen.values())
         for name, one in seen.items():
             late = one[int(_LATE * one.size) :]
-            if late.size and max(np.min(late), np.min(-late)) > _LEFT * largest:
-                found.add(name)
-    return found
+            if late.size:
+                is_left = max(np.min(late), np.min(-late)) > _LEFT * largest
+                lasts[name] = lasts.get(name, True) and bool(is_left)
+    return {name for name, is_left in lasts.items() if is_left}

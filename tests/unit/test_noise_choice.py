@@ -107,6 +107,17 @@ def test_a_lag_is_forgotten_within_a_record_that_is_long_beside_it(
     assert remembers(model, (K, OFFSET)) is expected
 
 
+def test_a_short_experiment_beside_a_long_one_makes_no_lag_an_integrator() -> None:
+    """Of a fifth of the length: by itself it ends before the lag has forgotten its start."""
+    lag = load_model({**LAG, "constants": {"T": 0.1 * STEP * N}})
+    both = [record(plant(0.0, np.zeros(n))) for n in (N, N // 5)]
+    theta = np.array([K, OFFSET])
+    assert [remembering(Problem.build(lag, [one]), theta) for one in both] == [set(), {"y"}]
+    for records in (both, both[::-1]):
+        assert remembering(Problem.build(lag, records), theta) == set()
+        assert remembering(Problem.build(load_model(TANK), records), theta) == {"y"}
+
+
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_forgetting_does_not_depend_on_the_states_units(unit: float) -> None:
     hidden = {"states": {"w": "1", "x": "1"}, "initial": {"w": 0, "x": 0}}
