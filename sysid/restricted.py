@@ -152,15 +152,16 @@ def _are_white(values: FloatArray) -> bool:
 
 def _middle(place: FloatArray, laid: Laid, columns: FloatArray, series: _Series) -> FloatArray:
     """SᵀRS (D, D)."""
-    from scipy.signal import lfilter
+    from scipy.linalg import solve_banded
 
     a, w = _meant(place)
     n, r = series.basis.shape
     variance = _left(place, series)[1] / (n - r)
     spread = np.zeros((laid.values.size, columns.shape[1]))
     spread[laid.present] = columns
-    ahead = lfilter([1.0], [1.0, -a], spread, axis=0)
-    behind = lfilter([1.0], [1.0, -a], spread[::-1], axis=0)[::-1]
+    recursion = np.array([[1.0], [-a]]) * np.ones(laid.values.size)
+    ahead = solve_banded((1, 0), recursion, spread)
+    behind = solve_banded((1, 0), recursion, spread[::-1])[::-1]
     slow = spread.T @ (ahead + behind - spread)
     middle = variance * ((1.0 - w) * slow + w * (columns.T @ columns))
     return np.asarray(0.5 * (middle + middle.T))
