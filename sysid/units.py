@@ -129,8 +129,8 @@ _SPELLED = {
     "second": "s", "minute": "min", "hour": "h", "metre": "m", "meter": "m", "gram": "g",
     "ampere": "A", "amp": "A", "volt": "V", "watt": "W", "joule": "J", "newton": "N",
     "pascal": "Pa", "bars": "bar", "hertz": "Hz", "kelvin": "K", "liter": "L", "litre": "L",
-    "degree": "deg", "radian": "rad", "percent": "%", "foot": "ft", "feet": "ft", "mol": "mol",
-    "mole": "mol", "none": "1", "unitless": "1", "dimensionless": "1",
+    "degree": "deg", "radian": "rad", "percent": "%", "pct": "%", "foot": "ft", "feet": "ft",
+    "mol": "mol", "mole": "mol", "none": "1", "unitless": "1", "dimensionless": "1",
 }  # fmt: skip
 _COMMON = "µmckMh"  # prefixes of what is suggested
 _CLOSE = 0.6  # of the letters of a name, for which another is suggested

@@ -74,8 +74,12 @@ def _block(fields: list[list[str]], layout: Layout, numbers: NDArray[np.int64]) 
     width = len(layout.columns)
     for row, number in zip(fields, numbers, strict=True):
         if len(row) != width:
+            meant = ""
+            if layout.separator == "," and len(row) > width:
+                meant = "; if commas are decimal here, part the columns by semicolons"
             raise InvalidUpload(
-                f"this row has {len(row)} fields, but the header has {width}", row=int(number)
+                f"this row has {len(row)} fields, but the header has {width}{meant}",
+                row=int(number),
             )
     convert = _decimal_comma if layout.has_decimal_commas else _decimal_point
     return [

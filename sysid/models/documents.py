@@ -92,5 +92,7 @@ def _told(error: yaml.YAMLError) -> str:
     problem = str(getattr(error, "problem", None) or getattr(error, "reason", "unreadable"))
     if problem.startswith("but "):
         problem = f"{getattr(error, 'context', '')}, {problem}"
+    if "'\\t' that cannot start" in problem:
+        problem += "; indent with spaces, not tabs"
     place = "" if mark is None else f"line {mark.line + 1}, column {mark.column + 1}: "
     return f"the YAML cannot be read: {place}{' '.join(problem.split())}"

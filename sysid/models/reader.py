@@ -78,7 +78,10 @@ class Reader:
         fields: dict[str, Any] = {}
         for key, item in value.items():
             if not isinstance(key, str):
-                self.fault(place, f"the key {shown(key)} is not a text; put it in quotes")
+                # YAML takes {lower: 0,2} for lower: 0 and a key 2 without a value
+                comma = item is None and isinstance(key, int) and not isinstance(key, bool)
+                meant = f", or write 0.{key} where 0,{key} was meant" if comma else ""
+                self.fault(place, f"the key {shown(key)} is not a text; put it in quotes{meant}")
             elif names is not None and key not in names:
                 self.fault(place + pointer(key[:80]), f"unknown field{nearest(key, names)}")
             else:

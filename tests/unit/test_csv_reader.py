@@ -160,6 +160,7 @@ def test_repeated_and_decreasing_times_are_told_with_both_values(rows: str, word
         ("t,u,u\n0,1,2\n", "names must differ"),
         ("t,u\n0,1\n1\n", "has 1 fields, but the header has 2"),
         ("t,u\n0,1\n1,2,3\n", "has 3 fields, but the header has 2"),
+        ("t,u\n0,1,5\n2,2,5\n", "if commas are decimal here, part the columns by semicolons"),
         ("t,u\n0,nan\n1,\n", "every value is missing"),
         ("t,u\n0,1\nnan,2\n", "the time is missing"),
         ("t,u\n0,1\n,2\n", "the time is missing"),

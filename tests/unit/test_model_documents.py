@@ -6,6 +6,7 @@ import pytest
 
 from sysid.errors import InvalidModel
 from sysid.language.tree import Past
+from sysid.models.documents import read_yaml
 from sysid.models.model import (
     EstimatedInitial,
     FixedInitial,
@@ -105,6 +106,7 @@ def test_a_document_is_not_changed_by_reading_it() -> None:
         ({"name": "two words"}, "/name", "cannot be a model's name"),
         ({"equation": {}}, "/equation", "did you mean 'equations'?"),
         ({"title": 3}, "/title", "3 is not a text"),
+        ({"constants": {"m": 0, 2: None}}, "/constants", "write 0.2 where 0,2 was meant"),
         ({"inputs": ["q"]}, "/inputs", "is not a mapping"),
         ({"inputs": {"q": 7}}, "/inputs/q", "7 is not a text"),
         ({"inputs": {"x": "N", "q": "N"}}, "/inputs/x", "already declared in /states"),
@@ -291,3 +293,8 @@ def test_a_recursions_lag_in_seconds_is_not_read_in_samples(
     assert told == {"/parameters/d/unit": f"found {unit!r}, but this lag counts {right}"}
     fits = {"s": "k-1-d/h", "min": "k-1-60*d/h"}[unit]
     parse_model(DISCRETE | changed | {"equations": {"x": "w", "w": f"x({fits})"}})
+
+
+def test_a_tab_that_indents_is_called_that() -> None:
+    with pytest.raises(InvalidModel, match=r"line 2, column 1: .* indent with spaces, not tabs"):
+        read_yaml("parameters:\n\tK: {lower: 0, upper: 1}\n")

@@ -158,7 +158,8 @@ def test_a_derivation_converts_exactly_and_writes_down_a_unit_that_is_missing() 
 @pytest.mark.parametrize(
     ("unit", "meant"),
     [("bat", "bar"), ("m/sx", "m/s"), ("Kpa", "kPa"), ("Mpa", "MPa"), ("PA", "Pa"),
-     ("seconds", "s"), ("volt", "V"), ("N*meters", "N*m"), ("Hertz", "Hz"), ("mbat", "mbar")],
+     ("seconds", "s"), ("volt", "V"), ("N*meters", "N*m"), ("Hertz", "Hz"), ("mbat", "mbar"),
+     ("pct", "%"), ("pct/s", "%/s")],
 )  # fmt: skip
 def test_for_a_unit_that_nobody_knows_the_one_written_most_alike_is_suggested(
     unit: str, meant: str
