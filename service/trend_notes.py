@@ -1,7 +1,9 @@
 """What the laws and predictions of one quantity need beside them, in words."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
+from service.conversion import noise_model_of
+from service.storage.trends import TrendRow
 from service.trend_points import Quantity
 from sysid.trend import Place, Trend
 
@@ -11,6 +13,30 @@ REAL_SCATTER = 1.5  # Birge ratios below that happen by chance in small batches
 def quantity_notes(one: Quantity, fitted: Trend) -> list[str]:
     """All of them: of the points, of the laws, of what is predicted."""
     return [*_of_points(one), *_of_laws(one, fitted), *_of_predictions(one, fitted)]
+
+
+def noise_model_note(x: str, places: Mapping[float, Sequence[TrendRow]], reference: str) -> str:
+    """Which estimates are of another noise model than others; empty where all are of one.
+
+    Parameters
+    ----------
+    x : str
+        The label's name.
+    reference : str
+        Noise model of the reference run; empty where there is none.
+    """
+    found = {at: {noise_model_of(row._asdict()) for row in rows} for at, rows in places.items()}
+    if len({reference, *(one for models in found.values() for one in models)} - {""}) < 2:
+        return ""
+    whitened = [f"{at:g}" for at, models in found.items() if "ar1" in models]
+    where = f"{x} = {', '.join(whitened)}" if whitened else "the reference run"
+    if whitened and reference == "ar1":
+        where += " and of the reference run"
+    return (
+        f"estimates of {where} are of the noise model ar1 and others of squares: their RMS and fits "
+        "do not compare, and where the model lacks dynamics the estimates differ by that, too; "
+        "loss: {noise_model: white} has all of squares"
+    )
 
 
 def _of_points(one: Quantity) -> Iterator[str]:

@@ -5,6 +5,7 @@ from math import isfinite
 
 from sqlalchemy.orm import Session
 
+from service.conversion import noise_model_of
 from service.drifts import Reference, drifts_of
 from service.errors import Conflict, InvalidRequest
 from service.reference_differences import channels_of, differences
@@ -23,7 +24,7 @@ from service.storage.runs import RunRepository
 from service.storage.tables import Job
 from service.storage.trends import TrendRow, count_succeeded, trend_rows
 from service.sweeps import body_of
-from service.trend_notes import quantity_notes
+from service.trend_notes import noise_model_note, quantity_notes
 from service.trend_points import Point, Quantity, by_label, place, quantities
 from sysid.trend import Influence, Place, Trend, fit_trend
 from sysid.trend_laws import FORMULAS, Law
@@ -60,10 +61,13 @@ def trend(session: Session, job_id: str) -> TrendOut:
     known = channels_of(session, {one for many in datasets.values() for one in many})
     reference = _reference(session, job, asked.get("reference"))
     told = [_told(one, asked["predict"], reference, found) for one in found]
-    notes = [] if reference is None else [
-        reference.note(asked["x"], places),
-        differences(session, reference.run, list(bodies.values()), known),
-    ]  # fmt: skip
+    theirs = "" if reference is None else noise_model_of(reference.run.result or {})
+    notes = [noise_model_note(asked["x"], places, theirs)]
+    if reference is not None:
+        notes += [
+            reference.note(asked["x"], places),
+            differences(session, reference.run, list(bodies.values()), known),
+        ]
     return TrendOut(
         job=job.id, x=asked["x"],
         reference=None if reference is None else reference.run.id,

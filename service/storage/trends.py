@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 from service.storage.columns import Document
 from service.storage.tables import DEFAULT_PROJECT, Run, State
 
-PARTS = ("parameters", "onset_delays", "agreement", "warnings")
+PARTS = ("parameters", "onset_delays", "agreement", "warnings", "correlation_times")
 
 
 class TrendRow(NamedTuple):
@@ -24,6 +24,7 @@ class TrendRow(NamedTuple):
     onset_delays: list[Document]
     agreement: Document
     warnings: list[str]
+    correlation_times: Document
 
 
 def trend_rows(
@@ -39,7 +40,7 @@ def trend_rows(
         .where(Run.job_id == job_id, Run.project_id == project_id, Run.state == State.SUCCEEDED)
         .order_by(Run.number).limit(limit)
     )  # fmt: skip
-    empty: dict[str, Any] = {"agreement": {}}
+    empty: dict[str, Any] = {"agreement": {}, "correlation_times": {}}
     found = []
     for row in session.execute(query):
         values = dict(zip(names, row, strict=True))

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
@@ -10,19 +11,24 @@ from service.api.deps import Parts
 from service.app import create_app
 from tests.identified import identified
 from tests.rest import CSV, refused, settings_of
-from tests.unit.test_noise_choice import LAG, STEP, TANK, disturbed, signal
+from tests.unit.test_noise_choice import LAG, STEP, TANK, N, disturbed, plant, signal
 from tests.unit.test_noise_choice import T as TIME_CONSTANT
+from tests.unit.test_serial import coloured
 
 SMALL = {"population": 24, "generations": 20, "islands": 1}
 
 
 class Served(NamedTuple):
-    """An application with a recording of a tank and one of a lag, both disturbed."""
+    """An application with a recording of a tank and one of a lag, both disturbed.
+
+    And of a tank that nothing disturbs, whose level is measured with white noise.
+    """
 
     server: TestClient
     parts: Parts
     tank: str
     lag: str
+    quiet: str
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +37,12 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with TestClient(app) as server:
         parts = server.app.state.parts  # type: ignore[attr-defined]
         names = []
-        for name, rate in (("tank", 0.0), ("lag", 1.0 / TIME_CONSTANT)):
-            pairs = zip(signal(), disturbed(2, rate), strict=True)
+        quiet = plant(0.0, np.zeros(N)) + 0.05 * coloured(N, 0.0, 7)
+        outputs = {
+            "tank": disturbed(2), "lag": disturbed(2, 1.0 / TIME_CONSTANT), "quiet": quiet,
+        }  # fmt: skip
+        for name, output in outputs.items():
+            pairs = zip(signal(), output, strict=True)
             lines = [
                 "t,u,y",
                 *(f"{k * STEP:.6g},{u},{float(y)!r}" for k, (u, y) in enumerate(pairs)),
@@ -94,3 +104,22 @@ def test_predictions_and_robust_losses_need_no_noise_model_named(served: Served)
     robust = run(served, TANK, served.tank, loss={"kind": "soft-l1", "scale": 1.0})
     ahead = run(served, TANK, served.tank, prediction="one-step")
     assert robust["noise_model"] == ahead["noise_model"] == "white"
+
+
+def trend_notes(served: Served, datasets: list[str], **more: Any) -> list[str]:
+    labels = [{"level": k + 1} for k in range(len(datasets))]
+    axis = {"path": "/datasets", "values": [[one] for one in datasets], "labels": labels}
+    body = {"model": TANK, "algorithm": SMALL, "hold": {"u": "zero"}, "sweep": {"axes": [axis]}}
+    job, _ = identified(
+        served.parts, {**body, "datasets": datasets[:1], "trend": {"x": "level"}, **more}
+    )
+    told: list[str] = served.server.get(f"/v1/jobs/{job}/trend").json()["notes"]
+    return told
+
+
+def test_a_trend_tells_which_of_its_runs_are_of_another_noise_model(served: Served) -> None:
+    (note,) = trend_notes(served, [served.tank, served.quiet])
+    assert "estimates of level = 1 are of the noise model ar1 and others of squares" in note
+    assert "loss: {noise_model: white}" in note
+    assert not trend_notes(served, [served.tank, served.quiet], loss={"noise_model": "white"})
+    assert not trend_notes(served, [served.tank])
