@@ -283,13 +283,22 @@ def _coloured(
     A lag makes up for an order that is missing. Of whether the tests are passed the result tells
     by itself; a true model fails them often enough that a warning asks for more. Residuals that
     depend on an input contain dynamics, which no noise model is for; those that do not may be slow
-    noise (Ljung, System Identification, 2nd ed., ch. 16.6).
+    noise (Ljung, System Identification, 2nd ed., ch. 16.6). On validation data alone the errors of
+    the estimates do the same as dynamics that are missing: nothing is wrong with the standard
+    errors then.
     """
     if all(one.kind != "whiteness" or one.p is None or one.p > _CHANCE for one in tests.tests):
         return []
     colour = "white" if uncertainty is None else uncertainty.noise_colour
     depends = any(one.kind == "independence" and one.outcome == "failed" for one in tests.tests)
     advises = may_be_noise and colour in ("coloured", "drifting") and not depends
+    if lagged and uncertainty and (tests.data, colour) == ("validation", "white"):
+        return [
+            "the residuals on the validation data are not white, while those on the estimation "
+            "data may as well be white: the validation data show what the estimation data do not "
+            "tell, either dynamics that are not in the model or values that are known within their "
+            "standard errors only; estimate from data that cover both"
+        ]
     if lagged:
         suggestion = _SUGGESTION if advises else ""
         return [

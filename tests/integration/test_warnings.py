@@ -66,6 +66,23 @@ def test_a_model_of_too_low_an_order_is_told_that_its_lag_depends_on_it() -> Non
     assert told(found, "standard errors allow for the colour of the residuals")
 
 
+def test_a_true_model_that_misses_in_another_range_is_not_said_to_lack_dynamics() -> None:
+    # A twentieth of the input tells K to a few hundredths: enough to be seen with all of it.
+    model, truth = parse_model(FIRST), {"K": 1.5, "T": 0.3, "L": 0.2, "y0": 0.3}
+    small, large = 0.05 * steps(), steps(1)
+    kept = record(large, response(model, large, **truth))
+    found = identify(
+        model, record(small, response(model, small, **truth)), QUICK, validation=[kept]
+    )
+    assert found.residual_tests is not None
+    assert found.residual_tests.data == "validation"
+    assert told(found, "those on the estimation data may as well be white")
+    assert not told(found, "standard errors are too small")
+    poor = response(parse_model(SECOND), steps(), L=0.1)
+    lacking = identify(model, record(steps(), poor), QUICK, validation=[record(steps(), poor)])
+    assert told(lacking, "not white (on the validation data): something of the dynamics is not in")
+
+
 def test_an_estimate_that_may_as_well_be_zero_is_told() -> None:
     model = parse_model(FIRST)
     y = response(model, steps(), sd=0.05, K=1.5, T=0.3, L=0.2, y0=0.0)
