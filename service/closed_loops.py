@@ -82,7 +82,7 @@ def closed(
     found = loop.simulate([replace(reference, name=loop.reference), *inputs], values, times=times)
     margins = _margins(identified, used)
     outputs = [found.channel(one.name) for one in model.outputs]
-    _check_finite(outputs, times, used.gain, is_tuned=tuning is not None)
+    _check_finite(outputs, times, used.gain, step, margins, is_tuned=tuning is not None)
     command = found.channel(loop.command)
     metrics = _metrics(times, outputs, control)
     notes = [] if tuning is None or used.differentiates else list(_tuning_notes(tuning))
@@ -217,18 +217,25 @@ def _controller_told(used: "PidControl", command: FloatArray) -> ControllerOut:
 
 
 def _check_finite(
-    outputs: Sequence[Channel], times: FloatArray, gain: float, *, is_tuned: bool
-) -> None:
-    """Refuse a loop that diverges: its gain is to blame, not the parameters."""
+    outputs: Sequence[Channel], times: FloatArray, gain: float, step: float,
+    margins: MarginsOut | None, *, is_tuned: bool,
+) -> None:  # fmt: skip
+    """Refuse a loop that diverges: its gain is to blame, or steps (s) too long for a stable one."""
     try:
         check_finite(outputs, times)
     except InvalidRequest as error:
         [fault] = error.errors
         detail = fault.detail.removeprefix("with these values ").partition("; ")[0]
+        if margins is not None and margins.is_stable:
+            raise InvalidRequest.at(
+                "/sample_time",
+                f"{detail}: the loop is stable, but steps of {step:.4g} s are too long to simulate "
+                "it; give a smaller sample_time",
+            ) from None
         raise InvalidRequest.at(
             "/control/tuning" if is_tuned else "/control/gain",
             f"found {gain:g}; with it the loop runs away: {detail}; choose a smaller "
-            "gain, a limit, or another sign",
+            "gain, a longer integral_time, a limit, or another sign",
         ) from None
 
 

@@ -192,6 +192,21 @@ def test_what_cannot_control_is_told_where_it_is(
     assert any(part in fault["detail"] for fault in faults), faults
 
 
+def test_steps_that_are_too_long_for_a_stable_loop_are_not_blamed_on_its_gain(
+    served: Served,
+) -> None:
+    assert simulated(served)["margins"]["is_stable"]
+    body = {**BODY, "sample_time": 20, "control": CONTROL, "parameters": PLANT}
+    [fault] = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=body), 422,
+                      "invalid")  # fmt: skip
+    assert fault["pointer"] == "/sample_time"
+    assert "the loop is stable, but steps of 10 s are too long to simulate it" in fault["detail"]
+    wild = {**body, "control": {**CONTROL, "gain": 1e30}}
+    [fault] = refused(served.server.post(f"/v1/runs/{served.lag}:simulate", json=wild), 422,
+                      "invalid")  # fmt: skip
+    assert fault["pointer"] == "/control/gain"
+
+
 @pytest.mark.parametrize("zero", [0, 0.0, -0.02])
 def test_a_sampling_period_of_zero_is_refused(served: Served, zero: float) -> None:
     body = {**BODY, "sample_time": zero}
