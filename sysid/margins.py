@@ -12,17 +12,18 @@ from sysid.export.linear import NotLinear
 from sysid.export.quasi import Quasi, by_delay
 from sysid.export.transfer import Transfer, transfers
 from sysid.kernels.demand import is_difference
-from sysid.types import ComplexArray, FloatArray
+from sysid.types import BoolArray, ComplexArray, FloatArray
 
 _DECADES = 3  # below the slowest and above the fastest part of the loop
 _FARTHEST = 1e8  # from the middle of what is in the loop: beyond, nothing of it is told
 _A_DECADE = 400  # frequencies
 _TURN = 0.05  # rad that dead times turn from one frequency to the next
+_LOUD = 0.1  # loop gain below which they may turn farther: only gain margins are left there
 _MOST = 200_000
 _SMALL = 1e-3  # loop gain beyond which nothing is looked for: a gain margin of a thousand
 _SECANTS = 12  # that leaves nothing of steps of a hundredth, at sharp resonances too
 _ROUNDING = 1e-6  # rad
-_FAR = 0.5  # rad that roots near the axis turn from one frequency to the next
+_FAR = 0.5  # rad: what turns farther from one frequency to the next may be missed
 _ROUNDS, _PARTS = 8, 10  # in which such a step is divided
 _FEW = 1000  # steps: where all turn far it is no root, but a dead time at frequencies of no account
 
@@ -141,15 +142,27 @@ def _frequencies(loop: _Loop, pair: Transfer, control: PidControl) -> tuple[Floa
     low, high = scales[0] / 10**_DECADES, scales[-1] * 10**_DECADES
     decades = np.log10(high / low)
     coarse: FloatArray = np.geomspace(low, high, ceil(_A_DECADE * decades))
-    alive = np.flatnonzero(np.abs(loop.gain(coarse)) > _SMALL)
-    end = float(coarse[min(int(alive[-1]) + 2, coarse.size - 1)] if alive.size else coarse[-1])
+    size = np.abs(loop.gain(coarse))
+    loud, end = _last(coarse, size > _LOUD, low), _last(coarse, size > _SMALL, high)
     delays = sum(
         max((d for _, d in one), default=0.0) for one in (pair.numerator, pair.denominator)
     )
     delays += control.transport.delay if control.transport else 0.0
-    count = min(ceil(end * delays / _TURN), _MOST)
-    fine = end * np.arange(1, count + 1) / max(count, 1)
-    return _resolved(loop, np.unique(np.concatenate([coarse, fine]))), end
+    fine = (
+        [_turning(0.0, loud, _TURN / delays), _turning(loud, end, _FAR / delays)] if delays else []
+    )
+    return _resolved(loop, np.unique(np.concatenate([coarse, *fine]))), end
+
+
+def _last(omega: FloatArray, where: BoolArray, otherwise: float) -> float:
+    """The frequency behind the last one where something holds."""
+    found = np.flatnonzero(where)
+    return float(omega[min(int(found[-1]) + 2, omega.size - 1)]) if found.size else otherwise
+
+
+def _turning(start: float, stop: float, step: float) -> FloatArray:
+    count = min(ceil((stop - start) / step), _MOST) if stop > start else 0
+    return np.linspace(stop, start, count, endpoint=False)
 
 
 def _resolved(loop: _Loop, omega: FloatArray) -> FloatArray:
