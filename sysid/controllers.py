@@ -36,9 +36,11 @@ class Transport:
     delay: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("gain", "time_constant", "delay"):
+        if not _is_number(self.gain):
+            raise InvalidSettings("/transport/gain", _not_finite(self.gain))
+        for name in ("time_constant", "delay"):
             value = getattr(self, name)
-            if not _is_number(value) or (name != "gain" and value < 0):
+            if not _is_number(value) or value < 0:
                 raise InvalidSettings(f"/transport/{name}", f"{value!r} is not a number 0 or more")
 
 
@@ -93,7 +95,7 @@ class PidControl:
     def __post_init__(self) -> None:
         for name in ("gain", "setpoint_weight"):
             if not _is_number(getattr(self, name)):
-                raise InvalidSettings(f"/{name}", f"{getattr(self, name)!r} is not a finite number")
+                raise InvalidSettings(f"/{name}", _not_finite(getattr(self, name)))
         for name in ("limit", "tracking_time", "derivative_filter"):
             value = getattr(self, name)
             if value is not None and not (_is_number(value) and value > 0):
@@ -112,7 +114,7 @@ class PidControl:
         for name in ("lower", "upper"):
             value = getattr(self, name)
             if value is not None and not _is_number(value):
-                raise InvalidSettings(f"/{name}", f"{value!r} is not a finite number")
+                raise InvalidSettings(f"/{name}", _not_finite(value))
             if value is not None and self.limit is not None:
                 raise InvalidSettings(
                     f"/{name}", "the limit ± is given too; give that or lower and upper"
@@ -156,6 +158,10 @@ class PidControl:
         if not self.differentiates:
             return self.integral_time
         return sqrt(self.integral_time) * sqrt(self.derivative_time)
+
+
+def _not_finite(value: float) -> str:
+    return f"{value!r} is not a finite number between ±{LARGEST:g}"
 
 
 def _is_number(value: float) -> bool:

@@ -219,6 +219,7 @@ def test_the_loop_names_its_signals_anew_where_the_plant_has_those_names() -> No
         (lambda: PidControl("u", "y", float("nan")), "/gain", "finite"),
         (lambda: PidControl("u", "y", 1.0, 0.0), "/limit", "above 0"),
         (lambda: Transport(1.0, -1.0), "/transport/time_constant", "0 or more"),
+        (lambda: Transport(float("nan")), "/transport/gain", "finite"),
     ],
 )
 def test_what_cannot_be_controlled_is_told(make: Any, pointer: str, part: str) -> None:
