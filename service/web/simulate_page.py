@@ -54,7 +54,7 @@ from sysid.units import multiplied
 DATASETS_LISTED = 200
 RECORDS_LISTED = 50
 MOST_DEFAULT_SAMPLES = 5000
-TAKEN = {"amplitude": "1", "offset": "0"}
+TAKEN = {"amplitude": "1", "offset": "0", "time": "0"}
 """What an address without them means; a form that is still empty suggests others."""
 
 
@@ -136,7 +136,8 @@ def simulate_page(
         status = error.status if isinstance(error, Unavailable) else 422
     page = render(
         "simulate.html", known=known, kind=kind, kinds=KINDS, tunings=TUNINGS,
-        values={**known.defaults, **(TAKEN if is_asked(query) else {}), **query,
+        values={**known.defaults, **(_late(known.defaults) if kind == "loop" else {}),
+                **(TAKEN if is_asked(query) else {}), **query,
                 **_numbers(context.get("result"))},
         faults={f.pointer[1:]: f.detail for f in faults},
         lines=[_line(one) for one in faults], query=_address(query), label_of=label_of,
@@ -214,6 +215,14 @@ def _step(model: Model, run: Run) -> dict[str, str]:
         return {}
     low, high = min(span[0] for span in spans), max(span[1] for span in spans)
     return {"offset": _round(low + (high - low) / 4), "amplitude": _round((high - low) / 2)}
+
+
+def _late(defaults: Mapping[str, str]) -> dict[str, str]:
+    """The step one record later: the model starts at rest, not at the reference before the step."""
+    if defaults["offset"] == "0":
+        return {}
+    duration = float(defaults["duration"])
+    return {"time": f"{duration:.6g}", "duration": f"{2 * duration:.6g}"}
 
 
 def _round(value: float) -> str:

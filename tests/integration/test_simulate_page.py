@@ -143,7 +143,9 @@ def test_a_recording_without_the_output_is_refused(place: Place) -> None:
 def test_the_form_is_shown_with_the_values_of_the_run(place: Place) -> None:
     answer = place.client.get(place.page)
     assert answer.status_code == 200
-    assert 'name="duration" value="19.9"' in answer.text
+    assert 'name="duration" value="39.8"' in answer.text
+    signal = place.client.get(f"{place.page}?kind=signal").text
+    assert 'name="duration" value="19.9"' in signal
     assert 'name="sample_time" value="0.1"' in answer.text
     assert "figure-simulation" not in answer.text
     assert f'href="/runs/{place.run}/simulate"' in place.client.get(f"/runs/{place.run}").text
@@ -169,6 +171,18 @@ def test_the_form_suggests_a_step_within_what_was_measured(place: Place) -> None
     asked = place.client.get(f"{place.page}?gain=0.5&duration=5&sample_time=0.1").text
     assert 'name="offset" value="0"' in asked  # what was simulated, not what is suggested
     assert 'name="amplitude" value="1"' in asked
+    assert 'name="time" value="0"' in asked
+
+
+def test_the_suggested_step_comes_once_the_loop_rests(place: Place) -> None:
+    form = place.client.get(place.page).text
+    names = "offset|amplitude|time|duration|sample_time"
+    query = dict(re.findall(rf'name="({names})" value="([^"]*)"', form), tuning="simc PI")
+    shown = place.client.get(place.page, params=query).text
+    assert "Overshoot" in shown
+    assert "the measures tell of how it settles too" not in shown
+    early = place.client.get(place.page, params={**query, "time": "0"}).text
+    assert "the measures tell of how it settles too" in early
 
 
 @pytest.mark.parametrize(
