@@ -91,11 +91,9 @@ def closed(
             f"the output answers at once, so the controller acts {step:.4g} s late, as a sampled "
             "one does"
         )
-    notes += [*_start_notes(times, outputs, control), *_stability_notes(metrics, margins)]
-    return Loop(
-        outputs, found.channel(loop.input), command, notes, metrics,
-        _controller_told(used, command.values), tuning, margins,
-    )  # fmt: skip
+    told = _controller_told(used, command.values)
+    notes += [*_start_notes(times, outputs, control), *_stability_notes(metrics, margins, told)]
+    return Loop(outputs, found.channel(loop.input), command, notes, metrics, told, tuning, margins)
 
 
 def control_faults(model: Model, control: ControlIn) -> Iterator[FieldError]:
@@ -298,13 +296,17 @@ def _start_notes(
     )
 
 
-def _stability_notes(metrics: StepMetricsOut | None, margins: MarginsOut | None) -> Iterator[str]:
+def _stability_notes(
+    metrics: StepMetricsOut | None, margins: MarginsOut | None, controller: ControllerOut
+) -> Iterator[str]:
     """That a loop is unstable or keeps swinging, said plainly."""
     if metrics is not None and metrics.swing is not None:
         unit = "" if metrics.unit == "1" else f" {metrics.unit}"
+        decays = margins is not None and margins.is_stable and not controller.saturated_percent
         yield (
             f"{metrics.output} keeps swinging and does not settle: {metrics.swing:.4g}{unit} from "
             f"peak to peak, every {metrics.swing_period:.4g} s"
+            + ("; by its transfer function it decays, too slowly for this record" if decays else "")
         )
     if margins is not None and not margins.is_stable:
         yield (

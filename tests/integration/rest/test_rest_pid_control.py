@@ -154,6 +154,15 @@ def test_an_unstable_loop_and_a_limit_cycle_are_told_plainly(served: Served) -> 
     # A relay around a lag with dead time swings at about its ultimate period, 4 L and less.
     assert 1.2 < metrics["swing_period"] < 2.6
     assert any("keeps swinging and does not settle" in note for note in bounded["notes"])
+    assert not any("it decays" in note for note in bounded["notes"])
+
+
+def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(served: Served) -> None:
+    border = simulated(served, gain=1.0, integral_time=1.0)["margins"]["gain_margin"]
+    hardly = simulated(served, gain=0.999 * border, integral_time=1.0)
+    assert hardly["margins"]["is_stable"]
+    [note] = [one for one in hardly["notes"] if "keeps swinging" in one]
+    assert note.endswith("; by its transfer function it decays, too slowly for this record")
 
 
 @pytest.mark.parametrize(
