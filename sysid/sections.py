@@ -22,6 +22,10 @@ _EITHER_WAY = ("binary", "+"), ("binary", "*")
 
 _Names = Mapping[str, str]  # each name and what it is replaced by, both ways
 
+_MOST = 4000
+"""Nodes that are looked at for two states. Sections are told by some hundreds; where nothing fits,
+the ways to read sums of names either way double with each of them."""
+
 
 def alike(problem: Problem) -> Iterator[tuple[Unit, Unit]]:
     """Pairs of units, the place in one beside that in the other; units of several places only."""
@@ -40,9 +44,10 @@ def _section(model: Model, first: str, second: str) -> _Names | None:
     equations = dict(zip((one.name for one in model.states), model.equations, strict=True))
     names: _Names = {first: second, second: first}
     waiting, seen = [(first, second)], {first, second}
+    left = iter(range(_MOST))
     while waiting:
         one, other = waiting.pop()
-        found = next(_replaced(equations[one], equations[other], names), None)
+        found = next(_replaced(equations[one], equations[other], names, left), None)
         if found is None:
             return None
         names = found
@@ -54,15 +59,22 @@ def _section(model: Model, first: str, second: str) -> _Names | None:
     return names
 
 
-def _replaced(one: Expression, other: Expression, names: _Names) -> Iterator[_Names]:
-    """The ways to replace more names so that one tree becomes the other."""
+def _replaced(
+    one: Expression, other: Expression, names: _Names, left: Iterator[int]
+) -> Iterator[_Names]:
+    """The ways to replace more names so that one tree becomes the other.
+
+    `left` gives a number for each node that may still be looked at.
+    """
+    if next(left, None) is None:
+        return
     (kind, name, parts), (also, by, others) = _apart(one), _apart(other)
     if kind != also:
         return
     orders = [others, others[::-1]] if kind in _EITHER_WAY else [others]
     for known in _bound(name, by, names):
         for order in orders:
-            yield from _all_replaced(parts, order, known)
+            yield from _all_replaced(parts, order, known, left)
 
 
 def _apart(tree: Expression) -> tuple[tuple[object, ...], str, tuple[Expression, ...]]:
@@ -89,13 +101,14 @@ def _parts(lag: Expression | None) -> tuple[Expression, ...]:
 
 
 def _all_replaced(
-    ones: tuple[Expression, ...], others: tuple[Expression, ...], names: _Names
-) -> Iterator[_Names]:
+    ones: tuple[Expression, ...], others: tuple[Expression, ...], names: _Names,
+    left: Iterator[int],
+) -> Iterator[_Names]:  # fmt: skip
     if not ones:
         yield names
         return
-    for found in _replaced(ones[0], others[0], names):
-        yield from _all_replaced(ones[1:], others[1:], found)
+    for found in _replaced(ones[0], others[0], names, left):
+        yield from _all_replaced(ones[1:], others[1:], found, left)
 
 
 def _bound(one: str, other: str, names: _Names) -> list[_Names]:

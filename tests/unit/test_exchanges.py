@@ -5,8 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sysid import sections
 from sysid.exchanges import Exchanges, exchange_notes, exchanges, ordered
 from sysid.identify import identify
+from sysid.language.tree import Expression
 from sysid.models.model import Model
 from sysid.models.spec import parse_model
 from sysid.problem import Problem
@@ -195,6 +197,32 @@ def test_sections_that_are_not_alike_are_not_exchanged(
         changed = {**changed, "Ty": SPAN | {"fixed": 1.0}}
     posed = beside(written=written, **changed)
     assert exchanges(posed, drawn(posed))[0] == ()
+
+
+def test_sums_of_names_that_fit_either_way_round_are_not_all_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of ten factors 1024 ways; that the last one has another number is seen in each of them."""
+    letters = "abcdefghij"
+
+    def product(state: str, last: int) -> str:
+        factors = [f"({one}{state} + {one}{one}{state})" for one in letters]
+        return f"{'*'.join(factors)}*({last}*u - {state})"
+
+    names = [
+        f"{one}{state}" for letter in letters for one in (letter, 2 * letter) for state in "xy"
+    ]
+    written = {"x": product("x", 1), "y": product("y", 2)}
+    posed = beside(written=written, **dict.fromkeys(names, SPAN))
+    apart, looked_at = sections._apart, []
+
+    def counted(tree: Expression) -> Any:
+        looked_at.append(tree)
+        return apart(tree)
+
+    monkeypatch.setattr(sections, "_apart", counted)
+    assert list(sections.alike(posed)) == []
+    assert len(looked_at) < 10_000
 
 
 def test_three_sections_side_by_side_are_one_group_and_are_given_in_order() -> None:
