@@ -33,8 +33,8 @@ def noise_model_note(x: str, places: Mapping[float, Sequence[TrendRow]], referen
     if whitened and reference == "ar1":
         where += " and of the reference run"
     return (
-        f"estimates of {where} are of the noise model ar1 and others of squares: their RMS and fits "
-        "do not compare, and where the model lacks dynamics the estimates differ by that, too; "
+        f"estimates of {where} are of the noise model ar1 and others of squares: their RMS and "
+        "fits do not compare, and where the model lacks dynamics the estimates differ by that, too; "
         "loss: {noise_model: white} has all of squares"
     )
 

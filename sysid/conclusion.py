@@ -248,14 +248,13 @@ def _under_noise(
     asked = problem.loss.noise_model
     if asked == "white" or not _polishes(algorithm, len(state.islands)):
         return Generalised(theta, {}, 0, asked != "ar1"), analysis
-    if asked == "auto" and not speaks_for_ar1(problem, theta, analysis, deadline.is_past_grace):
+    in_time = deadline.simulations(state.seconds, state.evaluations, problem.n_steps)
+    late = deadline.is_past_grace
+    if asked == "auto" and not speaks_for_ar1(problem, theta, analysis, late, in_time):
         return Generalised(theta, {}, 0, True), analysis
     left = _left(algorithm, state, refined)
     kept = analysis.evaluations + analysis_budget(theta.size)
-    limits = (
-        None if left is None else max(0, left - kept),
-        deadline.simulations(state.seconds, state.evaluations, problem.n_steps),
-    )
+    limits = None if left is None else max(0, left - kept), in_time
     most = min((one for one in limits if one is not None), default=None)
     nothing = np.zeros((theta.size, theta.size))
     covariance = nothing if analysis.uncertainty is None else analysis.uncertainty.covariance

@@ -23,7 +23,8 @@ from sysid.types import FloatArray
 
 _MOVE = 1e-3  # of the outputs' size: the change that is looked at
 _NEAR = 3.0  # factor by which it may be another
-_TRIES = 8
+TRIES = 8
+"""Simulations for each state, at most."""
 _FARTHER = 1e4  # where a move shows nothing: states have units of their own
 _LEFT = 0.05  # of the largest change
 _LATE = 0.75  # of a record: behind it the change is looked for
@@ -51,7 +52,7 @@ def _change(
     """What a move of a state's start makes of the weighted outputs (M,); None: nothing."""
     size = problem.output_scale
     move, weight = _MOVE * size, problem.evaluator.weight
-    for _ in range(_TRIES):
+    for _ in range(TRIES):
         with np.errstate(all="ignore"):  # what diverges from where it is moved to
             change = weight * (_moved(problem, theta, state, move) - before)
             largest = float(np.max(np.abs(change)))

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sysid.forgetting import remembering
+from sysid.forgetting import TRIES, remembering
 from sysid.noise_model import Generalised, coloured_outputs
 from sysid.problem import Problem
 from sysid.serial import parts
@@ -28,16 +28,19 @@ _TIMES = 5.0  # correlation times that a record lasts at least
 
 def speaks_for_ar1(
     problem: Problem, theta: FloatArray, analysis: Analysis,
-    is_late: Callable[[], bool] | None = None,
+    is_late: Callable[[], bool] | None = None, most: int | None = None,
 ) -> bool:  # fmt: skip
     """Whether residuals of least squares at theta (D,) are coloured and none of it is forgotten.
 
     The analysis of those estimates tells the colour: no more is looked at where it is white. What
-    comes of too long a step of the integration is no noise.
+    comes of too long a step of the integration is no noise. `most` are the simulations that the
+    time leaves: where the look may take more there is none.
     """
     known = analysis.uncertainty
     is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
     if not is_free or known is None or known.noise_colour == "white":
+        return False
+    if most is not None and most < 2 + TRIES * len(problem.model.states):
         return False
     coloured = coloured_outputs(problem, theta)
     if not coloured or not coloured <= remembering(problem, theta):
@@ -79,8 +82,8 @@ def choice_notes(problem: Problem, noise: Generalised) -> tuple[str, ...]:
     found = problem.metrics(np.asarray(noise.instead_of))
     unit = "" if found.unit == "1" else f" {found.unit}"
     return (
-        "the noise model was chosen because the residuals of squares are not white and the model "
-        "does not forget where it began, as a drive or a tank, so that errors of a moment stay in "
-        f"all later outputs; squares gave {squares}, RMS {found.rms:.4g}{unit}; to have them, use "
-        "loss: {noise_model: white}",
+        "noise_model auto chose ar1: the residuals of squares are not white, and the model does "
+        "not forget where it began, as a drive or a tank (it integrates), so that errors of a "
+        f"moment stay in all later outputs; squares gave {squares}, RMS {found.rms:.4g}{unit}; to "
+        "have them, use loss: {noise_model: white}",
     )

@@ -9,12 +9,14 @@ import pytest
 from sysid.forgetting import remembering
 from sysid.identify import identify
 from sysid.models.library import load_model
+from sysid.noise_choice import speaks_for_ar1
 from sysid.problem import Problem
 from sysid.profiles import profile
 from sysid.records import Channel, Record
 from sysid.result import Identification
 from sysid.settings import GeneticAlgorithm, Loss, Stop
 from sysid.types import FloatArray
+from sysid.uncertainty import analyse
 from tests.unit.test_serial import coloured
 
 STEP, N = 0.1, 400
@@ -216,6 +218,16 @@ def test_a_budget_that_does_not_suffice_leaves_squares(most: int) -> None:
     assert auto.estimates == white.estimates
     assert auto.warnings == white.warnings
     assert auto.evaluations <= most
+
+
+@pytest.mark.parametrize(("most", "expected"), [(None, True), (1000, True), (9, False)])
+def test_a_time_that_leaves_no_room_for_the_look_leaves_squares(
+    most: int | None, expected: bool
+) -> None:
+    """Simulations of a long record: of each state eight, and two for the colour."""
+    problem = Problem.build(load_model(TANK), [record(disturbed(2))])
+    theta = np.array([one.value for one in found(TANK, disturbed(2), WHITE).estimates])
+    assert speaks_for_ar1(problem, theta, analyse(problem, theta), None, most) is expected
 
 
 @pytest.mark.parametrize(
