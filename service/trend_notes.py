@@ -34,7 +34,7 @@ def noise_model_note(x: str, places: Mapping[float, Sequence[TrendRow]], referen
         where += " and of the reference run"
     return (
         f"estimates of {where} are of the noise model ar1 and others of squares: their RMS and "
-        "fits do not compare, and where the model lacks dynamics the estimates differ by that, too; "
+        "fits do not compare, and where the model lacks dynamics the estimates differ, too; "
         "loss: {noise_model: white} has all of squares"
     )
 
