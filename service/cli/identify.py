@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from service.schemas_jobs import JobIn
     from sysid.models.model import Model
     from sysid.records import Record, Recording
+    from sysid.residuals import ResidualTests
     from sysid.result import Identification
 
 # Fields of a job body that mean nothing in one process, and what does their work here.
@@ -244,8 +245,25 @@ def tell(model: "Model", found: "Identification", seconds: float, json_file: str
     out.print(f"; {found.evaluations} simulations in {seconds:.2f} s", markup=False)
     if any(found.known_before):
         out.print(f"inputs known before the record: {_seconds(found.known_before)}", markup=False)
+    if found.residual_tests is not None and found.residual_tests.passed is not None:
+        out.print(_verdict(found.residual_tests), markup=False, soft_wrap=True)
     for warning in found.warnings:
         err.print(f"note: {PLACES.in_note(warning)}", markup=False)
+
+
+def _verdict(tests: "ResidualTests") -> str:
+    """Whether the residuals pass their tests, and which fail with what chance.
+
+    Warnings are for what is clear (p < 0.001), so most of what fails is told here only.
+    """
+    failed = [
+        f"{one.output} {'is not white' if one.input is None else f'depends on {one.input}'}"
+        + ("" if one.p is None else f" (p = {one.p:.2g})")
+        for one in tests.tests
+        if one.outcome == "failed"
+    ]
+    told = f"failed: {', '.join(dict.fromkeys(failed))}" if failed else "passed"
+    return f"residuals on {tests.data} data: {told}"
 
 
 def _seconds(known: Sequence[float]) -> str:

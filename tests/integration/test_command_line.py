@@ -235,6 +235,8 @@ def test_identify_finds_gain_lag_and_time_constant_in_this_process(
     for name, value in truth.items():
         assert np.isclose(found[name]["value"], value, atol=0.2)
     assert json.loads(result.read_text())["fit_percent"]["validation"] > 80
+    verdict = "passed" if json.loads(result.read_text())["residual_tests"]["passed"] else "failed"
+    assert f"residuals on validation data: {verdict}" in done.stdout
 
 
 @pytest.mark.parametrize(
