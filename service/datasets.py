@@ -164,13 +164,21 @@ def told_again(stored: Stored, name: str | None) -> DatasetOut:
 def _forgetful(row: Dataset) -> Iterator[str]:
     """What to say of a part that was derived before parts kept what was recorded before them."""
     steps = row.details.get("steps") or []
-    cut = {name for step in steps for name in step} & {"trim", "split"}
+    cut = {name for step in steps for name, given in step.items() if _begins_later(name, given)}
     if row.kind == "derive" and cut and HISTORY not in row.details:
         yield (
             "it was derived by an earlier version, and holds nothing of what was recorded before "
             f"its first sample; with history: true in {' and '.join(sorted(cut))} it is derived "
             "anew, with the input's past for lags to read"
         )
+
+
+def _begins_later(step: str, given: Mapping[str, Any]) -> bool:
+    """Whether a step cuts something off from the beginning."""
+    if step == "split":
+        return bool(given.get("part") == "validation")
+    rows = given.get("rows") or [0]
+    return step == "trim" and ("start" in given or rows[0] > 0)
 
 
 def _known_before(recording: Recording) -> float:

@@ -230,7 +230,25 @@ def test_a_part_that_was_derived_before_parts_kept_their_past_says_so() -> None:
     assert "history: true in trim" in warning
     row.details = {"steps": steps, "known_before": 0.0}
     assert told_again(Stored(row, is_new=False), None).warnings == []
-    row.details = {"steps": steps[:1]}
+    row.details = {"steps": [{"trim": {"rows": [1, 9]}}]}
+    assert len(told_again(Stored(row, is_new=False), None).warnings) == 1
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        {"offset": {"u": 1}},
+        {"trim": {"stop": 9}},
+        {"trim": {"rows": [0, 9]}},
+        {"split": {"fraction": 0.5, "part": "estimation"}},
+    ],
+)
+def test_a_part_from_the_beginning_has_no_past_to_be_derived_anew_for(step: dict[str, Any]) -> None:
+    row = Dataset(
+        id="ds_1", name="part", kind="derive", sha256="", source_key="", size_bytes=1, n_channels=0,
+        n_samples=1, duration=1.0, sample_time=None, channels=[], details={"steps": [step]},
+        created_at=utc_now(),
+    )  # fmt: skip
     assert told_again(Stored(row, is_new=False), None).warnings == []
 
 
