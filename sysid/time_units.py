@@ -2,12 +2,14 @@
 
 Units are labels to a model: dx/dt is per second, so ``(u - x)/T`` reads T in seconds, whatever its
 unit says. A time constant in minutes would be estimated in seconds and told in minutes. Equations
-that convert it, as ``(u - x)/(60*T)``, multiply it by a number wherever they read it; those that
-read it as it stands, or within a function, may do so on purpose: they are warned of, not refused.
+that convert it, as ``(u - x)/(60*T)``, multiply it by a number wherever they read it, or the sum in
+which it stands; those that read it as it stands, or within a function, may do so on purpose: they
+are warned of, not refused. Of a ratio of two such parameters nothing is to be converted.
 Lags, which have nothing but a time in them, are refused (`sysid.models.lag_units`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from math import isclose, prod
 
 from sysid.language.laurent import Monomial, collect
 from sysid.language.tree import Binary, Call, Expression, Symbol, Unary
@@ -21,7 +23,8 @@ def time_unit_notes(model: Model) -> list[str]:
         return []
     sizes = {one.name: factor(one.unit, "s") for one in model.parameters}
     units = {one.name: one.unit for one in model.parameters}
-    bare = {name for tree in model.equations for name in _bare(tree)}
+    known = {name: size for name, size in sizes.items() if size is not None}
+    bare = {name for tree in model.equations for name in _bare(tree, known)}
     return [
         f"{name} has the unit {units[name]}, but the equations read it as it stands, and their "
         f"rates are per second: unless that is meant, give it in s, or write {size:.12g}*{name}"
@@ -30,31 +33,35 @@ def time_unit_notes(model: Model) -> list[str]:
     ]
 
 
-def _bare(tree: Expression) -> Iterator[str]:
-    """Parameters that a term has without a number to multiply them."""
+def _bare(tree: Expression, sizes: Mapping[str, float]) -> Iterator[str]:
+    """Parameters that a term has without a number to multiply them; `sizes` in seconds."""
     for monomial, coefficient in collect(tree).items():
         if abs(coefficient) == 1.0:
-            yield from _names(monomial)
+            yield from _names(monomial, sizes)
         for one, _ in monomial:
             for part in _inside(one):
-                yield from _bare(part)
+                yield from _bare(part, sizes)
 
 
-def _names(monomial: Monomial) -> Iterator[str]:
-    for one, _ in monomial:
-        match one:
-            case Symbol(name, "parameter"):
-                yield name
+def _names(monomial: Monomial, sizes: Mapping[str, float]) -> list[str]:
+    """Parameters of a product, none where their units cancel out."""
+    found = {
+        one.name: power
+        for one, power in monomial
+        if isinstance(one, Symbol) and one.kind == "parameter" and one.name in sizes
+    }
+    cancel = isclose(prod(sizes[name] ** power for name, power in found.items()), 1.0)
+    return [] if cancel else list(found)
 
 
 def _inside(node: Expression) -> tuple[Expression, ...]:
-    """Of what is neither a sum nor a product, the terms inside."""
+    """Of what stands in a product as a whole, the terms inside."""
     match node:
         case Call(_, arguments):
             return arguments
         case Unary(_, operand):
             return (operand,)
-        case Binary(_, left, right):
-            return (left, right)
+        case Binary(_, left, right):  # a denominator has its own sum, with its factor in it
+            return (left, right) if collect(node) == {((node, 1),): 1.0} else (node,)
         case _:
             return ()

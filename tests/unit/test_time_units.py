@@ -37,9 +37,26 @@ def test_a_time_constant_in_minutes_that_is_read_as_it_stands_is_told(equation: 
 
 @pytest.mark.parametrize("equation", [
     "(K*u - x)/(60*T)", "(K*u - x)/T/60", "(K*u - x)/(60*T + 1)", "K*u*exp(-60*T) - x",
+    "(K*u - x)/(60*(T + 1))", "(K*u - x)/(60*(T + K*(T - 1)))",
 ])  # fmt: skip
 def test_one_that_is_converted_is_not(equation: str) -> None:
     assert time_unit_notes(model(equation, "min")) == []
+
+
+@pytest.mark.parametrize(("equation", "other", "told"), [
+    ("K*u*tanh(T/S) - x", "min", []),
+    ("K*u*tanh(T/S) - x", "s", ["T"]),
+    ("K*u*tanh(T*S) - x", "min", ["T", "S"]),
+    ("(K*u*T/S - x)/(T + S)", "min", ["T", "S"]),
+    ("(K*u*T/S - x)/(60*(T + S))", "min", []),
+])  # fmt: skip
+def test_of_a_ratio_of_two_times_nothing_is_to_be_converted(
+    equation: str, other: str, told: list[str]
+) -> None:
+    span = {"lower": 0.01, "upper": 5}
+    both = {"T": span | {"unit": "min"}, "S": span | {"unit": other}, "K": span}
+    notes = time_unit_notes(model(equation, "min", parameters=both))
+    assert [note.partition(" ")[0] for note in notes] == told
 
 
 def test_a_recursion_may_count_in_what_it_likes() -> None:
