@@ -2,13 +2,15 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
+import httpx
 import pytest
 import yaml
 from playwright.sync_api import Page, expect
 
 from service.storage.jobs import JobRepository
-from tests.e2e.conftest import Site
+from tests.e2e.conftest import LIMIT_SECONDS, Site
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -118,3 +120,26 @@ def test_a_clone_starts_from_the_request_of_the_job(own_site: Site, page: Page) 
             jobs.get(name).spec for name in (own_site.filled.finished, page.url.rsplit("/", 1)[1])
         ]
     assert specs[0] == specs[1]
+
+
+def test_a_clone_keeps_starts_scales_and_ties(own_site: Site, page: Page) -> None:
+    model = yaml.safe_load(EQUATIONS) | {"initial": {"y": {"lower": 0, "upper": 1}}}
+    asked: dict[str, Any] = {
+        "K": {"tied": "2*L"}, "T": {"scale": "log", "lower": 0.02},
+        "y(0)": {"upper": 900.0}, "y(0)[2]": {"fixed": 0.5},
+    }  # fmt: skip
+    data = own_site.filled.dataset
+    steps = {"steps": [{"offset": {"P2": 1}}]}
+    other = httpx.post(f"{own_site.url}/v1/datasets/{data}:derive", json=steps).json()["id"]
+    body = {"model": model, "datasets": [data, other], "channels": {"u": "P1", "y": "P2"},
+            "parameters": asked, "algorithm": {"generations": 2}}  # fmt: skip
+    answer = httpx.post(f"{own_site.url}/v1/jobs", json=body, timeout=LIMIT_SECONDS)
+    assert answer.status_code == 202, answer.text
+    opened(own_site, page, f"?clone={answer.json()['id']}")
+    expect(page.get_by_label("upper of y(0)", exact=True)).to_have_value("900")
+    page.get_by_label("lower of y(0)", exact=True).fill("-3")
+    page.get_by_role("button", name="Identify").click()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    with own_site.parts.database.read() as session:
+        spec = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec
+    assert spec["parameters"] == {**asked, "y(0)": {"lower": -3.0, "upper": 900.0}}

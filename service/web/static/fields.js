@@ -4,10 +4,27 @@ import { Problem, element, post } from './live.js';
 
 const COLUMNS = ['lower', 'upper', 'fixed'];
 const rows = document.getElementById('parameters');
+let kept = {}; // what was asked for and has no field
+
+/** What has bounds: parameters, and the starts that are estimated, of the first experiment. */
+function bounded(model) {
+  const starts = Object.entries(model.initial ?? {}).filter(([, start]) => start?.upper !== undefined);
+  const unit = (state) => model.states?.[state] ?? '–';
+  return { ...model.parameters, ...Object.fromEntries(starts.map(([state, start]) => [`${state}(0)`, { ...start, unit: unit(state) }])) };
+}
+
+/** Scales, ties, and starts of later experiments, as x(0)[2]: an earlier job may ask for them. */
+function withoutField(known, changes) {
+  const asked = Object.entries(changes).filter(([name]) => name.replace(/\[\d+\]$/, '') in known);
+  const left = asked.map(([name, fields]) => [name, Object.entries(fields).filter(([key]) => !(name in known && COLUMNS.includes(key)))]);
+  return Object.fromEntries(left.filter(([, fields]) => fields.length).map(([name, fields]) => [name, Object.fromEntries(fields)]));
+}
 
 /** One row per parameter of the model, with the bounds of the model or those that were asked for. */
 export function fillTable(model, changes) {
-  const made = Object.entries(model.parameters ?? {}).map(([name, known]) => {
+  const known = bounded(model);
+  kept = withoutField(known, changes);
+  const made = Object.entries(known).map(([name, own]) => {
     const row = document.createElement('tr');
     row.append(element('th', name));
     for (const column of COLUMNS) {
@@ -17,12 +34,12 @@ export function fillTable(model, changes) {
       input.dataset.parameter = name;
       input.dataset.column = column;
       input.dataset.pointer = `/parameters/${name}/${column}`;
-      input.dataset.known = known?.[column] ?? '';
+      input.dataset.known = own?.[column] ?? '';
       input.value = changes[name]?.[column] ?? input.dataset.known;
       row.append(document.createElement('td'));
       row.lastChild.append(input);
     }
-    row.append(element('td', known?.unit ?? '–', 'muted'));
+    row.append(element('td', own?.unit ?? '–', 'muted'));
     return row;
   });
   rows.replaceChildren(...made);
@@ -30,7 +47,7 @@ export function fillTable(model, changes) {
 
 /** What differs from the model, as the job body wants it. */
 export function overrides() {
-  const found = {};
+  const found = structuredClone(kept);
   for (const input of rows.querySelectorAll('input')) {
     const text = input.value.trim();
     if (text === '' || text === input.dataset.known) continue;
@@ -81,6 +98,16 @@ export function clearFaults(form) {
 /** What the form is about to do, or why it does not. */
 export const say = (form, text) => (form.querySelector('#form-state').textContent = text);
 
+/** Choices whose answers are still on their way: without them a request would lack what they bring. */
+let going = null;
+
+async function settled() {
+  for (let seen; seen !== going; ) {
+    seen = going;
+    await seen;
+  }
+}
+
 /** Send the body that `make` gives when a form that is ready is submitted; faults go to their fields. */
 export function submits(form, url, make, isReady = async () => true) {
   form.addEventListener('submit', async (event) => {
@@ -90,6 +117,7 @@ export function submits(form, url, make, isReady = async () => true) {
     button.disabled = true;
     say(form, 'submitting…');
     try {
+      await settled();
       if (!(await isReady())) {
         button.disabled = false;
         return;
@@ -107,8 +135,10 @@ export function submits(form, url, make, isReady = async () => true) {
 
 /** What a choice sets going may be refused; the refusal is shown, never lost. */
 export const shown = (form, work) => async (...given) => {
+  const done = work(...given);
+  going = Promise.allSettled([going, done]);
   try {
-    await work(...given);
+    await done;
   } catch (error) {
     if (!(error instanceof Problem)) throw error;
     showFaults(form, error);
