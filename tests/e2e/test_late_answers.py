@@ -4,7 +4,7 @@ import re
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page, Route, expect
+from playwright.sync_api import Browser, Page, Request, Route, expect
 
 from service.storage.jobs import JobRepository
 from tests.e2e.conftest import LIMIT_SECONDS, Site
@@ -143,6 +143,24 @@ def test_a_cloned_request_cannot_be_sent_before_all_of_it_is_there(
     with own_site.parts.database.read() as session:
         spec = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec
     assert spec["parameters"] == body["parameters"]
+
+
+def test_a_request_waits_for_the_model_that_was_chosen(own_site: Site, page: Page) -> None:
+    opened(own_site, page)
+    page.locator("[name=dataset]").select_option(own_site.filled.dataset)
+    expect(page.locator("[data-signal]").first).to_be_attached()
+    sent: list[Request] = []
+    page.on("request", lambda one: sent.append(one) if one.method == "POST" else None)
+    model = Held(page, r"/v1/models/fopdt$")
+    page.locator("[name=model]").select_option("fopdt")
+    model.wait()
+    page.locator("#job-form [type=submit]").click()
+    page.wait_for_timeout(200)
+    assert not sent
+    model.let_go()
+    page.wait_for_url(re.compile(r"/jobs/job_"))
+    assert sent[0].post_data_json["model"] == "fopdt"
+    assert set(sent[0].post_data_json["channels"]) == {"u", "y"}
 
 
 LIVE = "new URL('live.js', document.querySelector('script[type=module]').src)"
