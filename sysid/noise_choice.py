@@ -56,10 +56,11 @@ def settled(problem: Problem, theta: FloatArray, found: Generalised) -> Generali
         span = float(one.times[-1] - one.times[0])
         longest[one.output] = max(span, longest.get(one.output, 0.0))
     times = found.correlation_times
-    is_known = all(_TIMES * time <= longest[name] for name, time in times.items())
-    if found.is_complete and is_known and any(times.values()):
-        return found._replace(instead_of=theta)
-    return Generalised(theta, {}, found.evaluations, True)
+    squares = Generalised(theta, {}, found.evaluations, True)
+    if not found.is_complete or not any(times.values()):
+        return squares
+    slow = {name: time for name, time in times.items() if _TIMES * time > longest[name]}
+    return squares._replace(too_slow=slow) if slow else found._replace(instead_of=theta)
 
 
 def decided(problem: Problem, noise: Generalised) -> Problem:
@@ -72,18 +73,25 @@ def decided(problem: Problem, noise: Generalised) -> Problem:
 
 
 def choice_notes(problem: Problem, noise: Generalised) -> tuple[str, ...]:
-    """Why there is a noise model that nobody asked for, and what squares gave."""
+    """Why there is a noise model that nobody asked for, and what squares gave; or why not."""
+    if noise.too_slow:
+        found = ", ".join(f"{name} {time:.3g} s" for name, time in noise.too_slow.items())
+        return (
+            "noise_model auto keeps squares, though the residuals drift and the model does not "
+            "forget where it began: ar1 would have a correlation time of "
+            f"{found}, and the record is not {_TIMES:g} times as long",
+        )
     if noise.instead_of is None:
         return ()
     squares = ", ".join(
         f"{one.name} = {value:.4g}{'' if one.unit == '1' else f' {one.unit}'}"
         for one, value in zip(problem.space, noise.instead_of.tolist(), strict=True)
     )
-    found = problem.metrics(np.asarray(noise.instead_of))
-    unit = "" if found.unit == "1" else f" {found.unit}"
+    metrics = problem.metrics(np.asarray(noise.instead_of))
+    unit = "" if metrics.unit == "1" else f" {metrics.unit}"
     return (
         "noise_model auto chose ar1: the residuals of squares are not white, and the model does "
         "not forget where it began, as a drive or a tank (it integrates), so that errors of a "
-        f"moment stay in all later outputs; squares gave {squares}, RMS {found.rms:.4g}{unit}; to "
-        "have them, use loss: {noise_model: white}",
+        f"moment stay in all later outputs; squares gave {squares}, RMS {metrics.rms:.4g}{unit}; "
+        "to have them, use loss: {noise_model: white}",
     )

@@ -23,6 +23,7 @@ noise with a white part drifted away, and its offset with it.
 """
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -68,6 +69,8 @@ class Generalised(NamedTuple):
         Of the whitened residuals there.
     instead_of : FloatArray, shape (D,), or None
         Estimates of squares, where nobody asked for a noise model (`sysid.noise_choice`).
+    too_slow : mapping of str to float
+        Correlation times (s) for which the record is too short, so that squares stayed there.
     """
 
     theta: FloatArray
@@ -77,6 +80,7 @@ class Generalised(NamedTuple):
     minima: FloatArray = np.zeros((0, 0))
     rms: FloatArray = np.zeros(0)
     instead_of: FloatArray | None = None
+    too_slow: Mapping[str, float] = MappingProxyType({})
 
 
 def whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
