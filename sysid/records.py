@@ -318,7 +318,8 @@ def own_times(times: FloatArray, segment: Segment) -> FloatArray:
 
 
 def _begin(channel: Channel) -> float:
-    return float(channel.whole.times[0])
+    known = known_history(channel.history)
+    return float(channel.times[0] if known is None else known.times[0])
 
 
 def _on_own_times(channel: Channel, segment: Segment) -> Channel:
@@ -336,10 +337,10 @@ def _as_input(channel: Channel, role: str) -> Channel:
             f"the first at t = {channel.times[missing[0]]:g} s; an input must be known "
             "everywhere: trim the recording or fill the gaps"
         )
-    return replace(channel, name=role, history=_known(channel.history))
+    return replace(channel, name=role, history=known_history(channel.history))
 
 
-def _known(history: History | None) -> History | None:
+def known_history(history: History | None) -> History | None:
     """The history behind its last missing value: what lies before that may be of another test."""
     if history is None:
         return None

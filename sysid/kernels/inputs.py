@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from sysid.errors import InvalidRecord
-from sysid.records import Channel, History
+from sysid.records import Channel, History, known_history
 from sysid.types import FloatArray
 
 DENSE = 8
@@ -89,15 +89,17 @@ def fine_input(
 
 
 def _with_usable_history(channel: Channel) -> Channel:
-    """History and samples together; of a band-limited channel the history that keeps its period.
+    """Known history and samples together; of a band-limited channel what keeps its period.
 
     Between irregular samples nothing is band-limited, and a gap in what was recorded before must
     not make a record useless that is regular itself.
     """
-    if channel.history is None or channel.hold != "band-limited":
+    known = known_history(channel.history)
+    channel = replace(channel, history=known)
+    if known is None or channel.hold != "band-limited":
         return channel.whole
     period = (channel.times[-1] - channel.times[0]) / max(channel.times.size - 1, 1)
-    times, values = channel.history
+    times, values = known
     expected = channel.times[0] - period * np.arange(times.size, 0, -1)
     off = np.flatnonzero(np.abs(times - expected) >= 0.5 * _OFF_PERIOD * period)
     first = int(off[-1]) + 1 if off.size else 0

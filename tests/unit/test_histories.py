@@ -231,6 +231,24 @@ def test_a_history_ends_at_its_last_missing_value_and_outputs_have_none() -> Non
     assert bare.inputs[0].history is None
 
 
+@pytest.mark.parametrize("hold", HOLDS)
+def test_a_simulation_reads_a_history_from_behind_its_last_missing_value(hold: Hold) -> None:
+    """Given as it was recorded, the input's past may have a gap; its record must not suffer."""
+    part = derive(plant(hold=hold), [{"trim": {"rows": [CUT, 400]}}])
+    [u] = record_of(part).inputs
+    times, values = history(part)
+    gap = replace(u, history=History(times, np.where(np.arange(times.size) < 60, np.nan, values)))
+    behind = replace(u, history=History(times[60:], values[60:]))
+    found, expected = (
+        response(replace(record_of(part), inputs=(one,)), 0.0) for one in (gap, behind)
+    )
+    np.testing.assert_array_equal(found, expected)
+    unknown = replace(u, history=History(times, np.full(times.size, np.nan)))
+    none = response(replace(record_of(part), inputs=(replace(u, history=None),)), 0.0)
+    np.testing.assert_array_equal(response(replace(record_of(part), inputs=(unknown,)), 0.0), none)
+    assert replace(record_of(part), inputs=(unknown,)).known_before == 0.0
+
+
 def test_a_gap_in_the_history_leaves_a_band_limited_record_usable() -> None:
     whole = plant(hold="band-limited")
     kept = np.flatnonzero(np.arange(400) != 90)
