@@ -24,7 +24,7 @@ from sysid.histories import changed
 from sysid.language.checker import check
 from sysid.language.evaluation import values_at
 from sysid.language.scope import Scope
-from sysid.records import Channel, Hold
+from sysid.records import Channel, Hold, known_history
 from sysid.types import FloatArray
 from sysid.units import difference, factor
 
@@ -149,7 +149,7 @@ def hold_of(signal: RunInputIn) -> Hold:
 
 def sampled(channel: Channel, times: FloatArray) -> FloatArray:
     """Values of a channel at other times, in its history too; of a held one, those after jumps."""
-    channel = channel.whole
+    channel = replace(channel, history=known_history(channel.history)).whole
     if channel.hold != "zero":
         return np.interp(times, channel.times, channel.values)
     last = np.searchsorted(channel.times, times, side="right") - 1

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.inputs import sampled
 from sysid.derivations import derive
 from sysid.errors import InvalidRecord, InvalidSettings
 from sysid.histories import MORE
@@ -247,6 +248,14 @@ def test_a_simulation_reads_a_history_from_behind_its_last_missing_value(hold: H
     none = response(replace(record_of(part), inputs=(replace(u, history=None),)), 0.0)
     np.testing.assert_array_equal(response(replace(record_of(part), inputs=(unknown,)), 0.0), none)
     assert replace(record_of(part), inputs=(unknown,)).known_before == 0.0
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+def test_an_input_laid_on_times_before_a_gap_has_what_was_first_behind_it(hold: Hold) -> None:
+    past = History(np.arange(4.0), np.array([5.0, np.nan, 2.0, 3.0]))
+    channel = Channel("u", np.array([4.0, 5.0]), np.array([4.0, 5.0]), "V", hold, past)
+    found = sampled(channel, np.arange(6.0))
+    np.testing.assert_array_equal(found, [2.0, 2.0, 2.0, 3.0, 4.0, 5.0])
 
 
 def test_a_gap_in_the_history_leaves_a_band_limited_record_usable() -> None:
