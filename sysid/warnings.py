@@ -194,14 +194,16 @@ def _rms(values: FloatArray) -> float:
 
 
 def _of_estimate(estimate: Estimate) -> str:
+    low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
+    side, bound = ("lower", estimate.lower) if low else ("upper", estimate.upper)
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    place = f"lies at its {side} bound {bound:g}{unit}"
     match estimate.status:
         case "at bound":
-            low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
-            side, bound = ("lower", estimate.lower) if low else ("upper", estimate.upper)
-            unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-            return f"{estimate.name} lies at its {side} bound {bound:g}{unit}"
+            return f"{estimate.name} {place}"
         case "group" | "unidentifiable":
-            return f"{estimate.name} is not identified: {estimate.reason}"
+            also = f"; it {place}" if estimate.value == bound else ""
+            return f"{estimate.name} is not identified: {estimate.reason}{also}"
     return ""
 
 

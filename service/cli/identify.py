@@ -258,7 +258,7 @@ def _verdict(tests: "ResidualTests") -> str:
     """
     failed = [
         f"{one.output} {'is not white' if one.input is None else f'depends on {one.input}'}"
-        + ("" if one.p is None else f" (p = {one.p:.2g})")
+        + ("" if one.p is None else f" (p = {one.p:.2g})" if one.p >= 1e-3 else " (p < 0.001)")
         for one in tests.tests
         if one.outcome == "failed"
     ]

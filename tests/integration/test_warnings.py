@@ -139,6 +139,17 @@ def test_a_constant_output_is_told(level: float) -> None:
     assert not told(identify(parse_model(FIRST), record(steps(), moving), QUICK), "is constant")
 
 
+def test_what_is_not_identified_tells_the_bound_at_which_it_lies() -> None:
+    found = identify(parse_model(FIRST), record(steps(), np.full(N, 3.0)), QUICK)
+    open_ones = [e for e in found.estimates if e.status in ("group", "unidentifiable")]
+    at_bound = {e.name for e in open_ones if e.value in (e.lower, e.upper)}
+    assert at_bound
+    for one in open_ones:
+        words = f"{one.name} is not identified"
+        [note] = [note for note in found.warnings if note.startswith(words)]
+        assert ("; it lies at its " in note) == (one.name in at_bound)
+
+
 def test_one_step_ahead_without_an_output_that_is_a_state_is_told_to_be_the_free_run() -> None:
     hidden, y = parse_model(FIRST), response(parse_model(SECOND), steps(), L=0.1)
     free = identify(hidden, record(steps(), y), QUICK)
