@@ -35,12 +35,16 @@ class Held:
         """Hold no more."""
         self._page.unroute(self._pattern)
 
+    def answer(self) -> None:
+        """Answer the first request; the page may go elsewhere by it."""
+        self.wait()
+        self._routes.pop(0).continue_()
+
     def let_go(self) -> None:
         """Answer the first request, and give the page the time to hear the answer."""
         self.wait()
-        route = self._routes.pop(0)
-        with self._page.expect_response(route.request.url) as answered:
-            route.continue_()
+        with self._page.expect_response(self._routes[0].request.url) as answered:
+            self.answer()
         answered.value.finished()
         self._page.evaluate("() => new Promise((done) => setTimeout(done, 100))")
 
@@ -157,7 +161,7 @@ def test_a_request_waits_for_the_model_that_was_chosen(own_site: Site, page: Pag
     page.locator("#job-form [type=submit]").click()
     page.wait_for_timeout(200)
     assert not sent
-    model.let_go()
+    model.answer()
     page.wait_for_url(re.compile(r"/jobs/job_"))
     assert sent[0].post_data_json["model"] == "fopdt"
     assert set(sent[0].post_data_json["channels"]) == {"u", "y"}
