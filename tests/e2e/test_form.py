@@ -130,7 +130,8 @@ def test_a_clone_keeps_starts_scales_and_ties(own_site: Site, page: Page) -> Non
     }  # fmt: skip
     data = own_site.filled.dataset
     steps = {"steps": [{"offset": {"P2": 1}}]}
-    other = httpx.post(f"{own_site.url}/v1/datasets/{data}:derive", json=steps).json()["id"]
+    url = f"{own_site.url}/v1/datasets/{data}:derive"
+    other = httpx.post(url, json=steps, timeout=LIMIT_SECONDS).json()["id"]
     body = {"model": model, "datasets": [data, other], "channels": {"u": "P1", "y": "P2"},
             "parameters": asked, "algorithm": {"generations": 2}}  # fmt: skip
     answer = httpx.post(f"{own_site.url}/v1/jobs", json=body, timeout=LIMIT_SECONDS)

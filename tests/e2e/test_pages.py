@@ -181,8 +181,8 @@ def test_the_page_of_a_resumed_job_goes_on_after_its_earlier_end(
         };"""
     )
     page.goto(f"{own_site.url}/jobs/{job}")
-    page.wait_for_function("() => open_after_end.length === 1")
-    assert page.evaluate("open_after_end") == [True]
+    page.wait_for_function("() => open_after_end.length > 0")
+    assert page.evaluate("open_after_end[0]")
     with database.write() as session:
         claim = Queue(session).claim("test")
         assert claim is not None
