@@ -128,7 +128,7 @@ void coulomb(ARGUMENTS) {
   }
 }
 
-/* 13 terms of a cubic NARX: 1 u u1 y1 y2 y1^2 y1 y2 y1^3 y1^2 y2 y1 y2^2 y2^3 y1 u y1^2 u; the first two samples measured. */
+/* 13 terms of a cubic NARX: 1 u u1 y1 y2 y1^2 y1 y2 y1^3 y1^2 y2 y1 y2^2 y2^3 y1 u y1^2 u; the first two samples are its start and not scored. */
 void narx(ARGUMENTS) {
   (void)work, (void)points, (void)h;
   for (long p0 = 0; p0 < P; p0 += W) {
@@ -147,7 +147,7 @@ void narx(ARGUMENTS) {
         sum[j] += e * e;
       }
     }
-    LANES J[p0 + j] = sqrt(sum[j] / N);
+    LANES J[p0 + j] = sqrt(sum[j] / (N - 2));
   }
 }
 
