@@ -19,9 +19,8 @@ from service.dispatch.claiming import Leases
 from service.dispatch.floors import floors_for
 from service.dispatch.preparing import JobRuns
 from service.dispatch.recording import Recorder
-from service.dispatcher_process import LOG_FORMAT
 from service.errors import Misconfigured
-from service.settings import Settings
+from service.settings import LOG_FORMAT, Settings
 from service.storage import migrate
 from service.storage.admission import Admission
 from service.storage.errors import LeaseLost, StorageError

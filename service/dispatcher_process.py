@@ -8,11 +8,10 @@ import logging
 import sys
 import threading
 
-from service.settings import Settings
+from service.settings import LOG_FORMAT, Settings
 from workers.errors import ClusterUnavailable
 from workers.local_ray import LocalRay
 
-LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 _log = logging.getLogger("lagid.dispatcher")
 
 

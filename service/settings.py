@@ -9,6 +9,9 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.errors import Misconfigured
 
+LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+"""Of the lines that processes write about themselves."""
+
 
 class Settings(BaseSettings):
     """Where things are kept, where the service listens, and its limits.
