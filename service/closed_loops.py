@@ -110,7 +110,7 @@ def control_faults(model: Model, control: ControlIn) -> Iterator[FieldError]:
             yield FieldError("/control/gain", "is missing; give it, or a rule as tuning")
         return
     for name in ("gain", "integral_time", "derivative_time"):
-        if getattr(control, name):
+        if getattr(control, name) != ControlIn.model_fields[name].default:
             detail = "the rule of tuning chooses this; leave it out, or leave out tuning"
             yield FieldError(f"/control/{name}", detail)
 

@@ -179,6 +179,7 @@ def test_of_a_loop_that_is_hardly_stable_it_is_said_that_its_swing_decays(served
         ({"limit": 1.0, "lower": 0.0}, "/control/lower", "the limit ± is given too"),
         ({"gain": None}, "/control/gain", "is missing; give it, or a rule as tuning"),
         ({"tuning": {}}, "/control/gain", "leave it out, or leave out tuning"),
+        ({"tuning": {}, "gain": 0.0, "integral_time": None}, "/control/gain", "leave it out"),
         ({"tuning": {}, "gain": None}, "/control/integral_time", "the rule of tuning chooses"),
         ({"tuning": {"rule": "ziegler"}}, "/control/tuning/rule", "simc"),
         ({"tuning": {"controller": "PD"}}, "/control/tuning/controller", "PID"),
