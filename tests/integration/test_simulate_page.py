@@ -4,7 +4,7 @@ import html
 import json
 import re
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -374,7 +374,9 @@ def test_while_too_many_simulate_the_others_are_asked_to_come_again_and_nothing_
     with ExitStack() as others:
         for _ in range(AT_ONCE):
             others.enter_context(simulating.one())
-        others.enter_context(_all_places())
+        for _ in range(WAITING):
+            assert simulating._here.acquire(blocking=False)  # all that may wait are there
+            others.callback(simulating._here.release)
         for answer in (
             place.client.post(f"/v1/runs/{place.run}:simulate", json=step),
             place.client.post("/v1/datasets:simulate", json=made),
@@ -386,15 +388,3 @@ def test_while_too_many_simulate_the_others_are_asked_to_come_again_and_nothing_
         assert (page.status_code, "ask again" in page.text) == (503, True)
         assert place.client.get(place.page).status_code == 200
     assert place.client.get(place.page, params=query).status_code == 200
-
-
-@contextmanager
-def _all_places() -> Iterator[None]:
-    """All that may wait are there."""
-    here = simulating._here
-    for _ in range(WAITING):
-        assert here.acquire(blocking=False)
-    try:
-        yield
-    finally:
-        here.release(WAITING)
