@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.table import Row, parser, report
-from sysid.ga.chromosome import placed
-from sysid.identify import identify
-from sysid.models.library import load_model
+from sysid.data.records import Channel, Record
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.sensitivities import sensitivities
+from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import placed
+from sysid.uncertainty.sensitivities import sensitivities
 
 STEP, SAMPLES, SD = 0.02, 300, 0.01
 DRAWS, QUICK = 1000, 100

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from sysid import load_model
-from sysid.kernels.calls import LANES
-from sysid.kernels.emission import kernel_code
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Hold, Record
+from sysid.kernels.abi import LANES
+from sysid.kernels.kernel import kernel_code
 from sysid.kernels.layout import Layout, Variant
-from sysid.problem import Problem
-from sysid.records import Channel, Hold, Record
-from sysid.types import FloatArray
+from sysid.simulation.problem import Problem
 
 SOURCE = Path(__file__).parent / "c" / "equivalents.c"
 FLAGS = ("-O3", "-march=native", "-ffast-math", "-fopenmp-simd", f"-DW={LANES}", "-shared", "-fPIC")

@@ -25,15 +25,15 @@ from benchmarks.equivalents import (
     individuals as candidates,
 )
 from benchmarks.table import Row, Skipped, parser, report
-from sysid.kernels.compiler import kernel_key
-from sysid.kernels.emission import kernel_code
-from sysid.kernels.keeping import store, stored
+from sysid.core.code_cache import store, stored
+from sysid.data.records import Channel, Record
+from sysid.kernels.build import kernel_key
+from sysid.kernels.kernel import kernel_code
 from sysid.kernels.layout import Variant
-from sysid.kernels.machine import object_code
+from sysid.kernels.machine_code import object_code
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
 
 DATA = Path(os.environ.get("LAGID_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

@@ -13,17 +13,17 @@ from benchmarks import paper_example
 from benchmarks.table import Row, parser, report
 from service.client import Client
 from service.embedded import embedded_service
-from sysid.kernels.keeping import cache_folder
+from sysid.core.code_cache import cache_folder
 
 POLL_SECONDS = 0.004
 """Between two looks at the job; half of it is in every figure."""
 
 NEVER_SEEN = """
 import time, sys
-import sysid.identify, numpy as np
+import sysid.identification.identify, numpy as np
 from sysid import load_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
+from sysid.simulation.problem import Problem
+from sysid.data.records import Channel, Record
 t = 0.1 * np.arange(300)
 record = Record((Channel("u", t, np.cos(t), "1"),), (Channel("y", t, np.sin(t), "1"),))
 start = time.perf_counter()

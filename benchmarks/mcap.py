@@ -14,7 +14,7 @@ import numpy as np
 from benchmarks.table import Row, parser, report
 from service.signals.reader import read_recording
 from service.signals.writer import write_recording
-from sysid.records import Channel, Recording
+from sysid.data.records import Channel, Recording
 
 SAMPLES = 1_000_000
 WRITE_BAR_S, READ_BAR_S = 0.60, 0.15

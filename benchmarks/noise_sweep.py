@@ -20,12 +20,14 @@ from benchmarks.family import cpu_seconds
 from benchmarks.table import Row, parser, report
 from service.client import Client
 from service.embedded import embedded_service
-from sysid import least_squares, problem, sensitivities
-from sysid.identify import identify
-from sysid.islands import voyage
-from sysid.models.library import load_model
-from sysid.noise import Noise, with_noise
-from sysid.settings import GeneticAlgorithm
+from sysid.core.settings import GeneticAlgorithm
+from sysid.data.noise import Noise, with_noise
+from sysid.identification.identify import identify
+from sysid.islands import evolve as voyage
+from sysid.models.catalogue.load import load_model
+from sysid.search import least_squares
+from sysid.simulation import problem
+from sysid.uncertainty import sensitivities
 
 SIGMAS = [round(0.05 * i, 2) for i in range(21)]
 METHODS = ["simple", "improved"]

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from sysid import load_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.simulation import simulate
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
 
 TRUTH = {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0}
 SAMPLES, SAMPLE_TIME, SIGMA = 300, 0.02, 0.01

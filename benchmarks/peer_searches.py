@@ -17,8 +17,8 @@ from scipy.optimize import differential_evolution, dual_annealing, leastsq
 
 from benchmarks.searches import BUDGET, Goal
 from benchmarks.systems import STEP, System
-from sysid.problem import Problem
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.simulation.problem import Problem
 
 HAS_PYGMO = importlib.util.find_spec("pygmo") is not None
 _CAP = 1e3  # loss and residual of a diverged simulation

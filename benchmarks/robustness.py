@@ -29,7 +29,7 @@ from benchmarks.peer_searches import HAS_PYGMO, PEERS, run_peer
 from benchmarks.searches import NEAR, Goal, Search, search
 from benchmarks.systems import OTHERS, PAPER, System
 from benchmarks.table import Row, Skipped, parser, report
-from sysid.settings import METHODS
+from sysid.core.settings import METHODS
 
 FIRST_SEED = 95_000
 """No search with these seeds was looked at while the method was made."""

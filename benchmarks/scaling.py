@@ -20,7 +20,7 @@ from benchmarks.family import cpu_seconds
 from benchmarks.table import Row, Skipped, parser, report
 from service.client import Client
 from service.embedded import embedded_service
-from sysid.settings import GeneticAlgorithm, Stop
+from sysid.core.settings import GeneticAlgorithm, Stop
 from workers.cluster import ClusterSettings, RayCrew
 from workers.packing import PACK_SECONDS
 from workers.ports import Advance, ProblemSpec, RunSpec

@@ -12,13 +12,13 @@ import numpy as np
 from benchmarks import paper_example
 from benchmarks.kernels import microseconds, reference
 from benchmarks.table import Row, Skipped, parser, report
-from sysid.problem import Problem
-from sysid.refinement import refine
-from sysid.run import advance, begin
-from sysid.settings import GeneticAlgorithm
-from sysid.threads import one_thread
-from sysid.types import FloatArray
-from sysid.uncertainty import analyse
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.threads import one_thread
+from sysid.core.types import FloatArray
+from sysid.identification.run import advance, begin
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse
 
 GENERATIONS, POPULATION = 400, 50
 C_SHARE = 2.0 / 3.5

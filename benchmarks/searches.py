@@ -7,11 +7,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from benchmarks.systems import System
-from sysid.problem import Problem
-from sysid.result import Improvement
-from sysid.run import RunState, advance, begin, conclude
-from sysid.settings import GeneticAlgorithm, SearchMethod, Stop
-from sysid.types import FloatArray
+from sysid.core.settings import GeneticAlgorithm, SearchMethod, Stop
+from sysid.core.types import FloatArray
+from sysid.identification.conclude import conclude
+from sysid.identification.run import advance, begin
+from sysid.islands.state import RunState
+from sysid.search.state import Improvement
+from sysid.simulation.problem import Problem
 
 BUDGET = 20_000
 NEAR = 1e-4

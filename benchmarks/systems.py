@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from sysid.metrics import rms
-from sysid.models.library import load_model
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.types import FloatArray
+from sysid.models.parse import parse_model
+from sysid.simulation.metrics import rms
+from sysid.simulation.problem import Problem
 
 STEP = 0.02
 """Sample time of the paper's examples (s)."""

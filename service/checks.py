@@ -20,21 +20,14 @@ from service.record_checks import (
     unit_faults,
 )
 from service.schemas_jobs import JobIn
-from service.setting_checks import (
-    conversion_faults,
-    overridden,
-    signal_faults,
-    tried,
-)
+from service.setting_checks import conversion_faults, overridden, signal_faults, tried
 from service.storage.tables import Dataset
-from sysid.errors import SysidError
-from sysid.models.initial import initial_parameters
-from sysid.models.lags import check_lags
-from sysid.models.model import Model
+from sysid.core.errors import SysidError
+from sysid.models.delays import check_lags, unused
+from sysid.models.model import Model, initial_parameters
+from sysid.models.parameters import Parameter
 from sysid.models.polynomial import check_samples
-from sysid.parameters import Parameter
-from sysid.ties import tied_model, ties_of
-from sysid.unused import unused
+from sysid.models.ties import tied_model, ties_of
 
 Body = dict[str, Any]
 NOTHING: Set[str] = frozenset()

@@ -18,14 +18,14 @@ from service.schemas_simulations import (
     TuningOut,
 )
 from service.simulations import check_finite
-from sysid.errors import InvalidSettings, nearest
+from sysid.core.errors import InvalidSettings, nearest
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel
 from sysid.models.model import Model
-from sysid.records import Channel
-from sysid.types import FloatArray
 
 if TYPE_CHECKING:  # the compiler comes with these, and most requests never need it
-    from sysid.controllers import PidControl, Transport
-    from sysid.export.identified import Identified
+    from sysid.control.controllers import PidControl, Transport
+    from sysid.control.linear_form import Identified
 
 _SMALL = 0.02  # of a step: what moves or differs by less is at rest
 _AT_LIMIT = 1e-9  # of the limit
@@ -69,7 +69,7 @@ def closed(
     InvalidRequest
         If the controller cannot be, or the loop diverges.
     """
-    from sysid.closed_loop import close_loop
+    from sysid.control.closed_loop import close_loop
 
     solver = model.solver
     step = (solver.step or float(times[1] - times[0])) / solver.substeps
@@ -128,8 +128,8 @@ def check_transport(control: ControlIn | None, duration: float) -> None:
 
 
 def _identified(model: Model, values: Mapping[str, float]) -> "Identified":
-    from sysid.export.identified import Identified, Value
-    from sysid.simulation import completed
+    from sysid.control.linear_form import Identified, Value
+    from sysid.simulation.simulate import completed
 
     known = completed(model, values)
     return Identified(model, tuple(Value(name, value) for name, value in known.items()))
@@ -139,7 +139,7 @@ def _controller(
     identified: "Identified", control: ControlIn
 ) -> tuple["PidControl", TuningOut | None]:
     """The controller, its numbers given or by a rule."""
-    from sysid.controllers import PidControl, Transport
+    from sysid.control.controllers import PidControl, Transport
 
     transport = None if control.transport is None else Transport(**control.transport.model_dump())
     gain, integral_time, derivative_time = (
@@ -163,7 +163,7 @@ def _controller(
 def _tuned(
     identified: "Identified", control: ControlIn, tuning: TuningIn, transport: "Transport | None"
 ) -> tuple[float, float, float, TuningOut]:
-    from sysid.tuning import tuned
+    from sysid.control.tuning import tuned
 
     found = tuned(
         identified, control.input, control.output, rule=tuning.rule, controller=tuning.controller,
@@ -183,8 +183,8 @@ def _tuned(
 
 def _margins(identified: "Identified", control: "PidControl") -> MarginsOut | None:
     """Margins, where the model has a transfer function in s."""
-    from sysid.export.linear import NotLinear
-    from sysid.margins import margins
+    from sysid.control.linear_form import NotLinear
+    from sysid.control.margins import margins
 
     try:
         found = margins(identified, control)
@@ -241,7 +241,7 @@ def _metrics(
     times: FloatArray, outputs: Sequence[Channel], control: ControlIn
 ) -> StepMetricsOut | None:
     """Judge the controlled output, if the reference is a step."""
-    from sysid.step_response import step_metrics
+    from sysid.control.step_response import step_metrics
 
     if not isinstance(control.reference, StepInput):
         return None

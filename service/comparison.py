@@ -9,12 +9,7 @@ from sqlalchemy.orm import Session
 from service.conversion import noise_model_of
 from service.errors import FieldError, InvalidRequest
 from service.models import model_of_run
-from service.schemas_comparison import (
-    ComparedParameter,
-    ComparedRun,
-    ComparedValue,
-    ComparisonOut,
-)
+from service.schemas_comparison import ComparedParameter, ComparedRun, ComparedValue, ComparisonOut
 from service.storage.errors import NotFound
 from service.storage.jobs import JobRepository
 from service.storage.runs import RunRepository

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from service.errors import FieldError
-from sysid.errors import InvalidBounds, InvalidModel, InvalidSettings, SysidError, UnknownModel
-from sysid.settings import (
+from sysid.core.errors import InvalidBounds, InvalidModel, InvalidSettings, SysidError, UnknownModel
+from sysid.core.settings import (
     GeneticAlgorithm,
     IslandChange,
     Loss,

@@ -7,7 +7,7 @@ from math import isfinite
 
 import numpy as np
 
-from sysid.records import Channel, Recording
+from sysid.data.records import Channel, Recording
 
 BLOCK = 5000
 

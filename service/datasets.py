@@ -25,8 +25,8 @@ from service.storage.lineage import Relation
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
-from sysid.records import Channel, Recording
-from sysid.signal_units import unknown_units
+from sysid.data.records import Channel, Recording
+from sysid.models.units import unknown_units
 
 Kind = Literal["upload", "simulate", "derive"]
 Format = Literal["csv", "mcap"]
@@ -85,7 +85,7 @@ def derive(database: Database, store: ObjectStore, parent_id: str, body: DeriveI
         known = DatasetRepository(session).by_source(_derivation_key(parent, body))
     if known is not None:
         return Stored(known, is_new=False)
-    from sysid.derivations import derive as derived  # brings SciPy's signal processing
+    from sysid.data.derivations import derive as derived  # brings SciPy's signal processing
 
     recording = derived(recording_of(store, parent.sha256), body.steps)
     steps = ", ".join(next(iter(step), "?") for step in body.steps)

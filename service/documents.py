@@ -5,7 +5,7 @@ from typing import Any
 
 from service.errors import FieldError, InvalidRequest, TooLarge
 from service.storage.texts import fault_in_json
-from sysid.errors import InvalidModel
+from sysid.core.errors import InvalidModel
 from sysid.models import documents
 
 MAX_DOCUMENT_BYTES = 4 * 1024**2

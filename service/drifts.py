@@ -10,7 +10,7 @@ import numpy as np
 from service.schemas_trends import DriftOut
 from service.storage.tables import Run
 from service.trend_points import Quantity, onset_estimates
-from sysid.trend import Drift, Estimate, Trend, drift, drifts_from_law
+from sysid.trends.trend import Drift, Estimate, Trend, drift, drifts_from_law
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from sysid.onset import OnsetDelay
-from sysid.residuals import LEVEL, ResidualTest, ResidualTests
+from sysid.residuals.onset_delay import OnsetDelay
+from sysid.residuals.residual_tests import LEVEL, ResidualTest, ResidualTests
 
 
 def residual_document(found: ResidualTests | None) -> dict[str, Any]:

@@ -9,9 +9,8 @@ from sqlalchemy.orm import Session
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import StorageError
 from service.storage.tables import Dataset
-from sysid.models.initial import initial_parameters
-from sysid.models.model import Model
-from sysid.parameters import Parameter
+from sysid.models.model import Model, initial_parameters
+from sysid.models.parameters import Parameter
 
 _NUMBERED = re.compile(r"\(0\)\[(\d{1,6})\]$")
 

@@ -16,12 +16,11 @@ from service.storage.jobs import JobRepository
 from service.storage.runs import RunRepository
 from service.storage.tables import Dataset, Job, Run
 from service.sweeps import body_of
-from sysid.errors import InvalidSettings
-from sysid.export.exporting import Format, written
-from sysid.export.identified import Covariance, Identified, Value
-from sysid.export.linear import NotLinear
+from sysid.control.linear_form import Covariance, Identified, NotLinear, Value
+from sysid.core.errors import InvalidSettings
+from sysid.data.records import Hold
+from sysid.export.export import Format, written
 from sysid.models.model import Model
-from sysid.records import Hold
 
 Body = Mapping[str, Any]
 

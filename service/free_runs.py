@@ -29,16 +29,15 @@ from service.storage.sessions import Database
 from service.storage.tables import Dataset, Run
 from service.sweeps import body_of
 from service.turns import simulating
-from sysid.errors import InvalidRecord, RecordTooShort, nearest
-from sysid.metrics import Metrics
-from sysid.models.initial import initial_name, initial_parameters
-from sysid.models.model import Model
-from sysid.records import Channel, Record
-from sysid.signal_units import SignalUnits
-from sysid.types import FloatArray
+from sysid.core.errors import InvalidRecord, RecordTooShort, nearest
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.model import Model, initial_name, initial_parameters
+from sysid.models.units import SignalUnits
+from sysid.simulation.metrics import Metrics
 
 if TYPE_CHECKING:
-    from sysid.problem import Problem
+    from sysid.simulation.problem import Problem
 
 MOST_SAMPLES = 1_000_000
 MOST_RECORDS = 2000
@@ -193,7 +192,7 @@ def _problem(
 ) -> "Problem":
     """All that was identified fixed, so that at most starts of states are free."""
     # The compiler comes with this import, and most requests never need it.
-    from sysid.problem import Problem
+    from sysid.simulation.problem import Problem
 
     own = {one.name for one in model.parameters}
     values = {one["name"]: one for one in (run.result or {})["parameters"] if one["name"] in own}
@@ -245,7 +244,7 @@ def _alone(problem: "Problem") -> "Iterator[Problem]":
 
 
 def _searched(problem: "Problem", simulations: int) -> FloatArray:
-    from sysid.refinement import refine
+    from sysid.search.refine import refine
 
     if not problem.space:
         return np.zeros(0)
@@ -262,7 +261,7 @@ def _searched(problem: "Problem", simulations: int) -> FloatArray:
 
 
 def _judged(problem: "Problem", run: Run, row: Dataset) -> FreeRun:
-    from sysid.problem import metrics_of
+    from sysid.simulation.problem import metrics_of
 
     theta = _starts(problem)
     predicted = problem.predictions(theta[None])[0]

@@ -19,14 +19,14 @@ from service.schemas_datasets import (
 from service.schemas_simulations import RunInputIn, SeriesInput
 from service.storage.datasets import DatasetRepository
 from service.storage.objects import ObjectStore
-from sysid.errors import InvalidRecord
-from sysid.histories import changed
+from sysid.core.errors import InvalidRecord
+from sysid.core.types import FloatArray
+from sysid.core.units import difference, factor
+from sysid.data.history import changed
+from sysid.data.records import Channel, Hold, known_history
 from sysid.language.checker import check
 from sysid.language.evaluation import values_at
 from sysid.language.scope import Scope
-from sysid.records import Channel, Hold, known_history
-from sysid.types import FloatArray
-from sysid.units import difference, factor
 
 MOST_DRAWS = 10_000_000
 """Values of one random binary signal at most."""

@@ -14,10 +14,10 @@ from service.storage.models import ModelRepository
 from service.storage.tables import Job, Run
 from service.storage.tables import Model as StoredModel
 from service.sweeps import body_of
-from sysid.errors import SysidError, UnknownModel, nearest
-from sysid.models import library
+from sysid.core.errors import SysidError, UnknownModel, nearest
+from sysid.models.catalogue import load as library
 from sysid.models.model import Model
-from sysid.models.spec import parse_model, with_terms
+from sysid.models.parse import parse_model, with_terms
 
 
 def page(session: Session, cursor: str | None, limit: int) -> Page[ModelOut]:
@@ -79,7 +79,7 @@ def resolve(session: Session, reference: Any, *, is_new: bool = False) -> tuple[
     """The model that a job names, and what to store for it.
 
     A built-in model stays a name; an own one is stored as its document, so that a later version
-    does not change what was submitted. `is_new`: see `sysid.models.spec.parse_model`.
+    does not change what was submitted. `is_new`: see `sysid.models.parse.parse_model`.
 
     Raises
     ------

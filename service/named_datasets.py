@@ -6,7 +6,7 @@ from service.storage.datasets import DatasetRepository
 from service.storage.errors import NotFound
 from service.storage.lookups import dataset_names, datasets_named
 from service.storage.tables import Dataset
-from sysid.errors import nearest
+from sysid.core.errors import nearest
 
 
 def dataset_of(session: Session, reference: str) -> Dataset | str:

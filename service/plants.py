@@ -13,8 +13,8 @@ from service.schemas_datasets import SimulateIn
 from service.storage.datasets import DatasetRepository, Stored
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from sysid.errors import InvalidRecord, nearest
-from sysid.records import Channel, Recording
+from sysid.core.errors import InvalidRecord, nearest
+from sysid.data.records import Channel, Recording
 
 _SUPPLY = '{"kind": "binary", "amplitude": 12e3, "period": 0.2}'
 _TUBE_EXTRA = ("pattern", "gauges")
@@ -132,7 +132,7 @@ def _noisy(recording: Recording, body: SimulateIn) -> Recording:
     """Noise on the output: the angle of the actuator, the far end of the tube."""
     if body.noise.sigma == 0:
         return recording
-    from sysid.derivations import derive
+    from sysid.data.derivations import derive
 
     output = "theta" if body.plant == "actuator" else "P2"
     return derive(recording, [{"noise": {**body.noise.model_dump(), "channels": [output]}}])

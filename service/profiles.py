@@ -26,19 +26,18 @@ from service.storage.sessions import Database
 from service.storage.tables import Job, Run
 from service.sweeps import body_of
 from service.web.figures_profiles import profile as figure_of
-from sysid.errors import InvalidSettings, nearest
-from sysid.models.initial import initial_parameters
-from sysid.models.model import Model
-from sysid.noise import Noise, with_noise
-from sysid.records import Record
-from sysid.splitting import split_record
+from sysid.core.errors import InvalidSettings, nearest
+from sysid.data.noise import Noise, with_noise
+from sysid.data.records import Record
+from sysid.data.splitting import split_record
+from sysid.models.model import Model, initial_parameters
 
 if TYPE_CHECKING:
-    from sysid.problem import Problem
+    from sysid.simulation.problem import Problem
 
 MOST_WORK = 300_000_000  # measured values times parameters, points and profiles
 SECONDS = 45.0  # a client waits a minute
-QUANTILE = 3.841458820694124  # that of sysid.profiles, which would load the compiler
+QUANTILE = 3.841458820694124  # as in sysid.uncertainty.profile_likelihood, which needs a compiler
 
 _one_at_a_time = Lock()
 
@@ -64,7 +63,7 @@ def profiles(database: Database, store: ObjectStore, run_id: str, body: ProfileI
             "/parameters",
             f"{len(names)} profiles of {body.points} points are too much for this run: samples "
             f"times parameters, points and profiles is {work:.3g}; need at most {MOST_WORK:.3g}. "
-            "Ask for fewer, or use sysid.profiles.profile",
+            "Ask for fewer, or use sysid.uncertainty.profile_likelihood.profile",
         )
     if not _one_at_a_time.acquire(blocking=False):
         raise Conflict("another profile is being computed; ask again when it is done")
@@ -91,7 +90,7 @@ def _computed(
     problem: "Problem", theta: Any, names: list[str], points: int
 ) -> Iterator[ProfileOut]:
     # The compiler comes with this import, and most requests never need it.
-    from sysid.profiles import profile
+    from sysid.uncertainty.profile_likelihood import profile
 
     end = monotonic() + SECONDS
     for name in names:
@@ -100,7 +99,7 @@ def _computed(
             raise InvalidRequest.at(
                 "/parameters",
                 f"the profiles took more than {SECONDS:g} s and were stopped at {name!r}; ask for "
-                "fewer parameters or points, or use sysid.profiles.profile",
+                "fewer parameters or points, or use sysid.uncertainty.profile_likelihood.profile",
             )
         others = [p.name for p in problem.space if p.name != name]
         yield ProfileOut(
@@ -117,7 +116,7 @@ def _finite(values: Any) -> list[float | None]:
 
 def _problem(session: Session, store: ObjectStore, run_id: str) -> "tuple[Problem, Any]":
     """The problem that the run solved, and its estimate."""
-    from sysid.problem import Problem
+    from sysid.simulation.problem import Problem
 
     run = RunRepository(session).get(run_id)
     if run.result is None or not run.result.get("parameters"):

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 from service.errors import FieldError
 from service.storage.tables import Dataset
-from sysid.errors import RecordTooShort, nearest
-from sysid.models.lags import check_length, longest_lag, past_signals
+from sysid.core.errors import RecordTooShort, nearest
+from sysid.data.records import both_ways
+from sysid.models.delays import check_length, longest_lag, past_signals
 from sysid.models.model import Model
+from sysid.models.parameters import Parameter
 from sysid.models.sections import interval
-from sysid.parameters import Parameter
-from sysid.records import both_ways
-from sysid.signal_units import SignalUnits
+from sysid.models.units import SignalUnits
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from threading import Lock
 
 from service.signals.reader import read_recording
 from service.storage.objects import ObjectStore
-from sysid.records import Recording
+from sysid.data.records import Recording
 
 KEPT = 4
 LARGEST_KEPT = 2_000_000  # samples over all channels: 32 MB

@@ -12,9 +12,9 @@ from service.storage.jobs import JobRepository
 from service.storage.tables import Run
 from service.sweeps import body_of
 from service.trend_points import Channels
-from sysid.errors import SysidError
+from sysid.core.errors import SysidError
 from sysid.models.model import Model
-from sysid.parameters import override
+from sysid.models.parameters import override
 
 Body = Mapping[str, Any]
 Facts = Mapping[str, str]

@@ -13,7 +13,7 @@ from service.storage.errors import NotFound
 from service.storage.references import InUse, ReferenceRepository
 from service.storage.runs import RunRepository
 from service.storage.tables import AcceptedReference, Run, State
-from sysid.errors import nearest
+from sysid.core.errors import nearest
 
 MOST_NAME = 100
 

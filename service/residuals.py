@@ -25,12 +25,13 @@ from service.storage.objects import ObjectStore
 from service.storage.runs import RunRepository
 from service.storage.tables import Job, Run
 from service.sweeps import body_of
-from sysid.errors import SysidError
+from sysid.core.errors import SysidError
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel
 from sysid.models.model import Model
-from sysid.parameters import override
-from sysid.past_outputs import coefficients_on_past_outputs
-from sysid.records import Channel
-from sysid.residuals import (
+from sysid.models.parameters import override
+from sysid.residuals.past_outputs import coefficients_on_past_outputs
+from sysid.residuals.residual_tests import (
     LEVEL,
     Correlation,
     ResidualTests,
@@ -39,7 +40,6 @@ from sysid.residuals import (
     series,
     verdict,
 )
-from sysid.types import FloatArray
 
 Body = Mapping[str, Any]
 

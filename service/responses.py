@@ -11,7 +11,7 @@ from service.schemas_runs import ExperimentOut, ResponseOut
 from service.signals.writer import FittedOutput
 from service.storage.objects import ObjectStore
 from service.storage.runs import RunRepository
-from sysid.records import Channel
+from sysid.data.records import Channel
 
 
 def response(session: Session, store: ObjectStore, run_id: str, max_points: int) -> ResponseOut:

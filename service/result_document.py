@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 
 from service.evidence import onset_document, residual_document
-from sysid.metrics import ChannelMetrics
-from sysid.result import Criteria, Estimate, Group, Identification, Uncertainty
+from sysid.identifiability.combinations import Group
+from sysid.identification.result import Identification
+from sysid.simulation.metrics import ChannelMetrics
+from sysid.uncertainty.estimates import Criteria, Estimate, Uncertainty
 
 
 def result_document(found: Identification, seconds: float) -> dict[str, Any]:

@@ -9,10 +9,10 @@ from sqlalchemy.orm import Session
 
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import NotFound
-from sysid.errors import SysidError
-from sysid.models.library import load_model
+from sysid.core.errors import SysidError
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
+from sysid.models.parse import parse_model
 
 Body = Mapping[str, Any]
 

@@ -24,10 +24,10 @@ from service.storage.sessions import Database
 from service.storage.tables import Run
 from service.sweeps import body_of
 from service.turns import simulating
-from sysid.errors import nearest
+from sysid.core.errors import nearest
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Recording
 from sysid.models.model import FixedInitial, Model
-from sysid.records import Channel, Recording
-from sysid.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +182,7 @@ def _values(model: Model, run: Run, given: Mapping[str, float]) -> dict[str, flo
 
 def _open(asked: _Asked) -> list[Channel]:
     # The compiler comes with this import, and most requests never need it.
-    from sysid.simulation import simulate as simulated
+    from sysid.simulation.simulate import simulate as simulated
 
     found = simulated(asked.model, asked.inputs, asked.values, times=asked.times).channels
     check_finite(found, asked.times)

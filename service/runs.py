@@ -12,19 +12,13 @@ from service.experiments import parameters_of_job
 from service.models import model_of_run
 from service.rms_units import unit_of
 from service.schemas import Page
-from service.schemas_runs import (
-    HistoryOut,
-    ImprovementOut,
-    MigrantOut,
-    MigrationsOut,
-    RunOut,
-)
+from service.schemas_runs import HistoryOut, ImprovementOut, MigrantOut, MigrationsOut, RunOut
 from service.storage.jobs import JobRepository
 from service.storage.lookups import Reached, reached
 from service.storage.runs import RunOrder, RunRepository
 from service.storage.tables import Job, Run, State
 from service.sweeps import body_of
-from sysid.parameters import Parameter, override
+from sysid.models.parameters import Parameter, override
 
 ALMOST = 0.99  # what a run that is not over shows at most: refinement is still to come
 

@@ -8,7 +8,7 @@ from service import models
 from service.storage.jobs import JobRepository
 from service.storage.tables import Run
 from service.sweeps import body_of
-from sysid.errors import SysidError
+from sysid.core.errors import SysidError
 from sysid.models.model import Model
 
 _BESIDES = ("name", "title", "description", "source", "parameters", "initial", "solver")

@@ -1,7 +1,7 @@
 """The job body and what is told about a job.
 
-Defaults stand here a second time, beside those of `sysid.settings`, so that the OpenAPI document
-shows them and a client needs no NumPy; a test compares the two.
+Defaults stand here a second time, beside those of `sysid.core.settings`, so that the OpenAPI
+document shows them and a client needs no NumPy; a test compares the two.
 """
 
 from datetime import datetime
@@ -15,7 +15,7 @@ from service.schemas import Answer, Body, Pointer, not_too_deep
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Whole = Annotated[int, Field(gt=-(2**62), lt=2**62)]
-# The bounds are those of `sysid.settings`, which a client does not load.
+# The bounds are those of `sysid.core.settings`, which a client does not load.
 Count = Annotated[int, Field(ge=1, le=10**9)]
 Evaluations = Annotated[int, Field(ge=1, le=10**12)]
 Generation = Annotated[int, Field(ge=0, le=10**9)]

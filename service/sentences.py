@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 from pydantic_core.core_schema import ErrorType
 
-from sysid.errors import nearest
+from sysid.core.errors import nearest
 
 SHOWN = 80
 NOT_AN_OBJECT = ("model_type", "model_attributes_type", "dict_type", "mapping_type")

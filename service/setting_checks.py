@@ -8,9 +8,9 @@ from typing import Any
 
 from service.conversion import algorithm_of, faults_of, loss_of
 from service.errors import FieldError
-from sysid.errors import SysidError, nearest
+from sysid.core.errors import SysidError, nearest
 from sysid.models.model import Model
-from sysid.parameters import Parameter, override
+from sysid.models.parameters import Parameter, override
 
 Body = dict[str, Any]
 

@@ -18,11 +18,11 @@ from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from service.turns import simulating
-from sysid.errors import InvalidSettings, nearest
-from sysid.models.lags import check_lags
+from sysid.core.errors import InvalidSettings, nearest
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Recording
+from sysid.models.delays import check_lags
 from sysid.models.model import FixedInitial, Model
-from sysid.records import Channel, Recording
-from sysid.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +116,7 @@ def _simulated(
     model: Model, inputs: list[Channel], body: SimulateIn, times: FloatArray
 ) -> Recording:
     # The compiler comes with this import, and most requests never need it.
-    from sysid.simulation import simulate as outputs_of
+    from sysid.simulation.simulate import simulate as outputs_of
 
     rest = {
         f"{state.name}(0)": 0.0
@@ -129,7 +129,7 @@ def _simulated(
     recording = Recording((*inputs, *outputs))
     if body.noise.sigma == 0:
         return recording
-    from sysid.derivations import derive
+    from sysid.data.derivations import derive
 
     names = [channel.name for channel in outputs]
     return derive(recording, [{"noise": {**body.noise.model_dump(), "channels": names}}])

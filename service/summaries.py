@@ -14,7 +14,7 @@ from service.storage.jobs import JobRepository
 from service.storage.runs import RunRepository
 from service.storage.summaries import QUANTILES, Group, GroupKey, Quantity, groups
 from service.storage.tables import Job, Run, State
-from sysid.errors import nearest
+from sysid.core.errors import nearest
 
 MOST_GROUPS = 2_000
 MIDDLE = QUANTILES.index(500)

@@ -8,7 +8,7 @@ from typing import Any
 
 from service.errors import FieldError, InvalidRequest
 from service.schemas_jobs import Axis, JobIn
-from sysid.errors import nearest
+from sysid.core.errors import nearest
 
 # Fields that decide on the job as a whole; a cell of it cannot have its own.
 FIXED_FIELDS = ("name", "priority", "reuse", "sweep", "trend")

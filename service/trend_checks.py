@@ -7,7 +7,7 @@ from sqlalchemy.orm import Session
 from service import warm_starts
 from service.errors import FieldError
 from service.schemas_jobs import LEAST_PLACE, MOST_PLACE, PREVIOUS, JobIn, is_place
-from sysid.errors import nearest
+from sysid.core.errors import nearest
 from sysid.models.model import Model
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from service.conversion import noise_model_of
 from service.storage.trends import TrendRow
 from service.trend_points import Quantity
-from sysid.trend import Place, Trend
+from sysid.trends.trend import Place, Trend
 
 REAL_SCATTER = 1.5  # Birge ratios below that happen by chance in small batches
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from service.schemas_trends import BatchPlaceOut, SpanOut
 from service.storage.trends import TrendRow
-from sysid.trend import Estimate, pooled
+from sysid.trends.trend import Estimate, pooled
 
 Channels = Mapping[str, Mapping[str, Any]]
 """For each dataset, its channels by name."""
@@ -30,7 +30,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A parameter or an onset delay over the labels; `between` as of `sysid.trend.pooled`.
+    """A parameter or an onset delay over the labels; `between` as of `sysid.trends.trend.pooled`.
 
     `bounds` are the widest of its runs.
     """

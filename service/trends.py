@@ -26,8 +26,8 @@ from service.storage.trends import TrendRow, count_succeeded, trend_rows
 from service.sweeps import body_of
 from service.trend_notes import noise_model_note, quantity_notes
 from service.trend_points import Point, Quantity, by_label, place, quantities
-from sysid.trend import Influence, Place, Trend, fit_trend
-from sysid.trend_laws import FORMULAS, Law
+from sysid.trends.laws import FORMULAS, Law
+from sysid.trends.trend import Influence, Place, Trend, fit_trend
 
 MOST_RUNS = 5_000
 

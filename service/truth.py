@@ -7,8 +7,7 @@ from sqlalchemy.orm import Session
 
 from service import models
 from service.storage.tables import Dataset
-from sysid.models.initial import initial_name
-from sysid.models.model import EstimatedInitial, Model
+from sysid.models.model import EstimatedInitial, Model, initial_name
 
 
 def truth_of(session: Session, reference: Any, datasets: Sequence[Dataset]) -> (

@@ -1,63 +1,62 @@
 """Identification of nonlinear systems with unknown time lags: the numerical core.
 
-The public names are found in their modules when they are first asked for: `import sysid.errors`
-brings neither the compiler nor SciPy, so web process, command line and upload reader start fast.
+The public names are found in their modules when they are first asked for: `import
+sysid.core.errors` brings neither the compiler nor SciPy, so web process, command line and upload
+reader start fast.
 """
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sysid.errors import SysidError
-    from sysid.export.exporting import export
-    from sysid.identify import identify
-    from sysid.models.library import catalogue, load_model
-    from sysid.noise import Noise
-    from sysid.parameters import Parameter
-    from sysid.problem import Problem
-    from sysid.records import Channel, History, Record, Recording
-    from sysid.result import Estimate, Identification
-    from sysid.settings import GeneticAlgorithm, IslandChange, Loss, Migration, SequenceSearch, Stop
-    from sysid.simulation import simulate
+    from sysid.core.errors import SysidError
+    from sysid.core.settings import (
+        GeneticAlgorithm,
+        IslandChange,
+        Loss,
+        Migration,
+        SequenceSearch,
+        Stop,
+    )
+    from sysid.data.noise import Noise
+    from sysid.data.records import Channel, History, Record, Recording
+    from sysid.export.export import export_model
+    from sysid.identification.identify import identify
+    from sysid.identification.result import Identification
+    from sysid.models.catalogue.load import catalogue, load_model
+    from sysid.models.parameters import Parameter
+    from sysid.simulation.problem import Problem
+    from sysid.simulation.simulate import simulate
+    from sysid.uncertainty.estimates import Estimate
 
 __all__ = [
     "Channel", "Estimate", "GeneticAlgorithm", "History", "Identification", "IslandChange", "Loss",
     "Migration", "Noise", "Parameter", "Problem", "Record", "Recording", "SequenceSearch", "Stop",
-    "SysidError", "catalogue", "export", "identify", "load_model", "simulate",
+    "SysidError", "catalogue", "export_model", "identify", "load_model", "simulate",
 ]  # fmt: skip
 
 _PLACES = {
-    "errors": ("SysidError",),
-    "export.exporting": ("export",),
-    "identify": ("identify",),
-    "models.library": ("catalogue", "load_model"),
-    "noise": ("Noise",),
-    "parameters": ("Parameter",),
-    "problem": ("Problem",),
-    "records": ("Channel", "History", "Record", "Recording"),
-    "result": ("Estimate", "Identification"),
-    "settings": ("GeneticAlgorithm", "IslandChange", "Loss", "Migration", "SequenceSearch", "Stop"),
-    "simulation": ("simulate",),
-}
+    "core.errors": ("SysidError",),
+    "core.settings": (
+        "GeneticAlgorithm", "IslandChange", "Loss", "Migration", "SequenceSearch", "Stop",
+    ),
+    "data.noise": ("Noise",),
+    "data.records": ("Channel", "History", "Record", "Recording"),
+    "export.export": ("export_model",),
+    "identification.identify": ("identify",),
+    "identification.result": ("Identification",),
+    "models.catalogue.load": ("catalogue", "load_model"),
+    "models.parameters": ("Parameter",),
+    "simulation.problem": ("Problem",),
+    "simulation.simulate": ("simulate",),
+    "uncertainty.estimates": ("Estimate",),
+}  # fmt: skip
 _MODULE_OF = {name: module for module, names in _PLACES.items() for name in names}
 
 
-class _Face(ModuleType):
-    """The package, whose `identify` is the function and not the module of that name."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in _MODULE_OF:
-            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
-        found = getattr(import_module(f"{self.__name__}.{_MODULE_OF[name]}"), name)
-        self.__dict__[name] = found
-        return found
-
-    def __setattr__(self, name: str, value: object) -> None:
-        # The import system sets every submodule as an attribute of its package.
-        if name not in _MODULE_OF or not isinstance(value, ModuleType):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Face
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    globals()[name] = value
+    return value

@@ -5,13 +5,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sysid.models.library import load_model
+from sysid.core.settings import Prediction
+from sysid.core.types import FloatArray
+from sysid.data.noise import Noise, with_noise
+from sysid.data.records import Channel, Hold, Record
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.noise import Noise, with_noise
-from sysid.records import Channel, Hold, Record
-from sysid.settings import Prediction
-from sysid.simulation import simulate
-from sysid.types import FloatArray
+from sysid.simulation.simulate import simulate
 
 Signal = Callable[[FloatArray], FloatArray]
 

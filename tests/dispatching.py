@@ -23,7 +23,7 @@ from service.storage.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import OPEN, Job, Run, State
 from service.supervision import clear_family, environment_of
-from sysid.records import Recording
+from sysid.data.records import Recording
 from tests.database import migrated_sqlite
 from tests.runs import step_record
 from workers.ports import Crew

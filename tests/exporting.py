@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Hold
 from sysid.models.model import Model
-from sysid.records import Channel, Hold
-from sysid.simulation import simulate
-from sysid.types import FloatArray
+from sysid.simulation.simulate import simulate
 
 REQUIRED = "LAGID_REQUIRE_COMPILER"
 FLAGS = ("-O1", "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC")

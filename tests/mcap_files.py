@@ -7,7 +7,7 @@ from io import BytesIO
 from mcap.writer import CompressionType, Writer
 
 from service.signals.writer import write_recording
-from sysid.records import Recording
+from sysid.data.records import Recording
 
 
 def recorded(recording: Recording, **metadata: str) -> bytes:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from sysid.core.types import FloatArray
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
 from sysid.models.model import FixedInitial, Model
-from sysid.types import FloatArray
 
 Read = Callable[[Past, float], float]
 

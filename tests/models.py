@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Hold, Record
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.records import Channel, Hold, Record
-from sysid.types import FloatArray
+from sysid.models.parse import parse_model
 
 PARAMETERS = {
     "c": {"lower": 0, "upper": 1},

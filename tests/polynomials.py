@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from sysid.models.spec import parse_model
-from sysid.records import Channel, Hold, Record
-from sysid.simulation import simulate
+from sysid.data.records import Channel, Hold, Record
+from sysid.models.parse import parse_model
+from sysid.simulation.simulate import simulate
 
 PERIOD = 0.1
 TRUTH = {

@@ -9,13 +9,12 @@ from math import floor
 
 import numpy as np
 
-from sysid.experiments import Experiment
-from sysid.kernels.inputs import FineInput
+from sysid.core.types import FloatArray
+from sysid.data.interpolation import FineInput
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
-from sysid.models.initial import initial_name
-from sysid.models.model import EstimatedInitial, MeasuredInitial, Model
-from sysid.problem import Problem
-from sysid.types import FloatArray
+from sysid.models.model import EstimatedInitial, MeasuredInitial, Model, initial_name
+from sysid.simulation.experiments import Experiment
+from sysid.simulation.problem import Problem
 
 _FUNCTIONS = {
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,

@@ -5,14 +5,14 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from sysid.models.library import document
-from sysid.records import Channel, Record
-from sysid.result import Identification
-from sysid.run import RunState
-from sysid.settings import GeneticAlgorithm, Stop
-from sysid.types import FloatArray
+from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identification.result import Identification
+from sysid.islands.state import RunState
+from sysid.models.catalogue.load import document
 from workers.feeding import Feeder
-from workers.ports import (
+from workers.ports import (  # fmt: skip
     Concluded,
     Crew,
     Failure,
@@ -21,7 +21,7 @@ from workers.ports import (
     Records,
     RefusedRun,
     RunSpec,
-)  # fmt: skip
+)
 
 
 def step_record(n: int = 120, delay: float = 0.7, seed: int = 3) -> Record:

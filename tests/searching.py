@@ -4,12 +4,12 @@ from functools import cache
 
 import numpy as np
 
-from sysid.ga.island import Island
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.run import RunState
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.islands.state import RunState
+from sysid.models.catalogue.load import load_model
+from sysid.search.island import Island
+from sysid.simulation.problem import Problem
 
 STEP = 0.02
 DUFFING = {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0}

@@ -6,19 +6,11 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
-from sysid.islands.run_state import RunState
-from sysid.run import begin
+from sysid.identification.run import begin
+from sysid.islands.state import RunState
 from tests.runs import RECORDS, ListedRuns, Notebook, spec
 from workers.feeding import Feeder
-from workers.ports import (
-    Advance,
-    Advanced,
-    Done,
-    Failure,
-    Item,
-    QueuedRun,
-    Records,
-)  # fmt: skip
+from workers.ports import Advance, Advanced, Done, Failure, Item, QueuedRun, Records  # fmt: skip
 from workers.tasks import build
 
 

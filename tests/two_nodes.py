@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from sysid.kernels.keeping import cache_folder
+from sysid.core.code_cache import cache_folder
 from workers.processes import kill, of_session
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sysid.program import program
+from sysid.identification.fingerprint import program
 from workers.errors import ClusterLost, ClusterUnavailable, PackCancelled, PackFailed, WorkerDied
 from workers.joining import check_address, reason
 from workers.limits import advance_within, memory_for_each

@@ -9,7 +9,7 @@
         - PackCancelled        it was cancelled, as asked
         - PackFailed           a programming error, with the worker's traceback
 
-What is wrong with a run itself (`sysid.errors`) is no error here but its outcome.
+What is wrong with a run itself (`sysid.core.errors`) is no error here but its outcome.
 """
 
 

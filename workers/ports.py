@@ -8,13 +8,14 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
-from sysid.ga.island import Island
-from sysid.islands.run_state import RunState
-from sysid.noise import Noise
-from sysid.program import program
-from sysid.records import Record
-from sysid.result import Identification, Improvement, Migrant
-from sysid.settings import GeneticAlgorithm, Loss, Prediction
+from sysid.core.settings import GeneticAlgorithm, Loss, Prediction
+from sysid.data.noise import Noise
+from sysid.data.records import Record
+from sysid.identification.fingerprint import program
+from sysid.identification.result import Identification
+from sysid.islands.state import RunState
+from sysid.search.island import Island
+from sysid.search.state import Improvement, Migrant
 
 Records: TypeAlias = tuple[Record, ...]
 Warm: TypeAlias = tuple[Mapping[str, float], ...]

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field, replace
 
-from sysid.ga.island import Island
-from sysid.islands.run_state import RunState
-from sysid.run import border, exchange, is_finished
+from sysid.identification.run import border, exchange, is_finished
+from sysid.islands.state import RunState
+from sysid.search.island import Island
 from workers.packing import Cost, is_worth_spreading, slice_seconds
 from workers.ports import Advance, Evolve, Evolved, Handle, Item, QueuedRun, RunSpec
 

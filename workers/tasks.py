@@ -9,17 +9,18 @@ from dataclasses import replace
 from functools import lru_cache, partial
 from typing import TypeAlias
 
-from sysid.errors import SysidError
-from sysid.ga.island import Island
+from sysid.core.errors import SysidError
+from sysid.data.noise import Noise, with_noise
+from sysid.data.splitting import split_record, start_of_validation
+from sysid.identification.conclude import conclude
+from sysid.identification.run import CALL_SECONDS, advance_island, begin, is_finished
+from sysid.identification.run import advance as advance_run
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.noise import Noise, with_noise
-from sysid.problem import Problem, rms_against
-from sysid.run import CALL_SECONDS, advance_island, begin, conclude, is_finished
-from sysid.run import advance as advance_run
-from sysid.selection import selected
-from sysid.splitting import split_record, start_of_validation
-from workers.ports import (
+from sysid.models.parse import parse_model
+from sysid.search.island import Island
+from sysid.selection.select import selected
+from sysid.simulation.problem import Problem, rms_against
+from workers.ports import (  # fmt: skip
     Advance,
     Advanced,
     Concluded,
@@ -31,7 +32,7 @@ from workers.ports import (
     Outcome,
     ProblemSpec,
     Records,
-)  # fmt: skip
+)
 
 _log = logging.getLogger(__name__)
 

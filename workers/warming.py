@@ -4,13 +4,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.program import program
-from sysid.records import Channel, Record
-from sysid.run import advance, begin, conclude
-from sysid.settings import METHODS, GeneticAlgorithm
-from sysid.types import FloatArray
+from sysid.core.settings import METHODS, GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identification.conclude import conclude
+from sysid.identification.fingerprint import program
+from sysid.identification.run import advance, begin
+from sysid.models.catalogue.load import load_model
+from sysid.simulation.problem import Problem
 
 
 def warm() -> str:
@@ -19,7 +20,7 @@ def warm() -> str:
     Returns
     -------
     str
-        Names the program that this process runs, as `sysid.program` does.
+        Names the program that this process runs, as `sysid.identification.fingerprint` does.
     """
     times: FloatArray = np.arange(40, dtype=np.float64) * 0.5
     values = 1.0 - np.exp(-times)

@@ -30,7 +30,7 @@ from service.sentences import detail_of
 from service.storage.errors import StorageError
 from service.storage.patience import PASSING, is_passing
 from service.storage.texts import HALF_A_PAIR
-from sysid.errors import SysidError
+from sysid.core.errors import SysidError
 
 log = logging.getLogger(__name__)
 

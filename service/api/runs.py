@@ -15,7 +15,7 @@ from service.schemas_simulations import RunSimulateIn, RunSimulationOut
 from service.storage.runs import RunRepository
 from service.web.figures import in_theme
 from service.web.theme import Theme
-from sysid.export.exporting import MOST_PADE, Format
+from sysid.export.export import MOST_PADE, Format
 
 router = APIRouter(prefix="/v1/runs", tags=["runs"])
 

@@ -26,15 +26,15 @@ from service.cli.common import (
     usage,
 )
 from service.cli.places import Places
-from sysid.errors import nearest
+from sysid.core.errors import nearest
 
 if TYPE_CHECKING:
     from service.errors import FieldError
     from service.schemas_jobs import JobIn
+    from sysid.data.records import Record, Recording
+    from sysid.identification.result import Identification
     from sysid.models.model import Model
-    from sysid.records import Record, Recording
-    from sysid.residuals import ResidualTests
-    from sysid.result import Identification
+    from sysid.residuals.residual_tests import ResidualTests
 
 # Fields of a job body that mean nothing in one process, and what does their work here.
 ELSEWHERE = {
@@ -133,7 +133,7 @@ def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
     from service.partial import beside
     from service.pointers import explained
     from service.schemas_jobs import JobIn
-    from sysid.errors import SysidError
+    from sysid.core.errors import SysidError
 
     job, model = None, None
     unread: list[FieldError] = []
@@ -161,7 +161,7 @@ def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
 
 def _meant(job: "JobIn", model: "Model", pieces: int) -> "list[FieldError]":
     from service.setting_checks import setting_faults
-    from sysid.models.initial import initial_parameters
+    from sysid.models.model import initial_parameters
 
     parameters = (*model.parameters, *initial_parameters(model, pieces))
     return setting_faults(job.normal_form(), model, parameters)
@@ -171,7 +171,7 @@ def _meant(job: "JobIn", model: "Model", pieces: int) -> "list[FieldError]":
 def _told_at_options() -> Iterator[None]:
     """End the command with what the core refuses, at the user's places."""
     from service.conversion import faults_of
-    from sysid.errors import SysidError
+    from sysid.core.errors import SysidError
 
     try:
         yield
@@ -196,7 +196,7 @@ def _refuse_same(data: Path, validation: Path | None) -> None:
 def read(path: Path, reading: Reading) -> "Recording":
     """A recording from a file; notes about it go to stderr."""
     from service.signals.csv_reader import read_csv
-    from sysid.signal_units import unknown_units
+    from sysid.models.units import unknown_units
 
     if not path.is_file():
         fail(f"there is no file {path}")
@@ -282,8 +282,8 @@ def _identified(
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from service.conversion import algorithm_of, loss_of
-    from sysid.identify import identify as identified
-    from sysid.noise import Noise
+    from sysid.data.noise import Noise
+    from sysid.identification.identify import identify as identified
 
     document = body.normal_form()
     algorithm = algorithm_of(document["algorithm"])
@@ -308,7 +308,7 @@ def _identified(
 
 
 def _model(name: str) -> "Model":
-    from sysid.models.library import load_model
+    from sysid.models.catalogue.load import load_model
 
     return load_model(Path(name) if name.endswith(MODEL_SUFFIXES) else name)
 

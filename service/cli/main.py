@@ -9,17 +9,7 @@ import typer
 from typer.exceptions import TyperException
 
 from service.calls import ClientError, NotFinite, ProblemError
-from service.cli import (
-    datasets,
-    exporting,
-    jobs,
-    models,
-    references,
-    runs,
-    serving,
-    sweeps,
-    upkeep,
-)
+from service.cli import datasets, exporting, jobs, models, references, runs, serving, sweeps, upkeep
 from service.cli.common import err, out
 from service.cli.identify import identify
 from service.cli.paper import paper
@@ -121,7 +111,7 @@ def _end(message: str, code: int = 1) -> None:
 def _sentence(error: Exception) -> str | None:
     """What is told of a user's mistake that the core, the storage or a text's encoding finds."""
     from service.storage.errors import StorageError
-    from sysid.errors import SysidError
+    from sysid.core.errors import SysidError
 
     if isinstance(error, UnicodeEncodeError) and error.reason == NO_TEXT:
         return f"{error.object[:200]!r} is not UTF-8 text; write it in UTF-8"

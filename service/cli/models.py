@@ -5,8 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
+from service.calls import DEFAULT_URL
 from service.cli.common import (
-    DEFAULT_URL,
     AsJson,
     Key,
     Url,
@@ -68,7 +68,7 @@ def show(
     """Print a model's document as YAML, to be copied and changed."""
     import yaml
 
-    from sysid.models import library
+    from sysid.models.catalogue import load as library
 
     document: dict[str, Any]
     if url is None or name in library.catalogue():

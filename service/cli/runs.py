@@ -6,8 +6,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from service.calls import DEFAULT_URL
 from service.cli.common import (
-    DEFAULT_URL,
     AsJson,
     Key,
     Url,
@@ -22,7 +22,7 @@ from service.cli.common import (
 from service.cli.jobs import runs as listing
 from service.cli.places import Places, told_at
 from service.documents import read_yaml
-from sysid.units import multiplied
+from sysid.core.units import multiplied
 
 LISTING = "list"
 PROFILE = Places({"/parameters": "PARAMETER", "/points": "--points"})

@@ -120,9 +120,9 @@ def _kernels() -> str:
     """Compile a model and simulate it: the harmonic oscillator without force rests."""
     import numpy as np
 
-    from sysid.models.library import load_model
-    from sysid.records import Channel
-    from sysid.simulation import simulate
+    from sysid.data.records import Channel
+    from sysid.models.catalogue.load import load_model
+    from sysid.simulation.simulate import simulate
 
     model = load_model("duffing-eq16")
     times = np.arange(20, dtype=np.float64) * 0.02

@@ -4,7 +4,7 @@ import pickle
 import zlib
 from importlib.metadata import version
 
-from sysid.islands.run_state import RunState
+from sysid.islands.state import RunState
 
 _HEADER = f"lagid {version('lagid')} run state 4\n".encode()
 

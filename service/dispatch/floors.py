@@ -30,13 +30,13 @@ from service.storage.summaries import Group, GroupKey, groups, quietest_run
 from service.storage.tables import Job, Run
 from service.sweeps import body_of
 from service.truth import truth_of
-from sysid.cramer_rao import Floor, floor
-from sysid.errors import SysidError
-from sysid.models.spec import parse_model
-from sysid.noise import Noise
-from sysid.problem import Problem
-from sysid.threads import one_thread
-from sysid.types import FloatArray
+from sysid.core.errors import SysidError
+from sysid.core.threads import one_thread
+from sysid.core.types import FloatArray
+from sysid.data.noise import Noise
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.cramer_rao import Floor, floor
 from workers.errors import RecordsUnavailable
 from workers.ports import ProblemSpec
 from workers.tasks import prepared

@@ -29,12 +29,12 @@ from service.storage.statements import CHUNK
 from service.storage.tables import Dataset, Run
 from service.storage.tally import forget_progress
 from service.sweeps import Steps, body_of
-from sysid.errors import SysidError
-from sysid.islands.run_state import RunState
+from sysid.core.errors import SysidError
+from sysid.data.noise import Noise
+from sysid.data.records import Hold
+from sysid.identification.result import Identification
+from sysid.islands.state import RunState
 from sysid.models.model import Model
-from sysid.noise import Noise
-from sysid.records import Hold
-from sysid.result import Identification
 from workers.errors import RecordsUnavailable
 from workers.ports import (
     Coming,

@@ -20,8 +20,9 @@ from service.storage.reuse import take_over
 from service.storage.sessions import Database
 from service.storage.tables import State
 from service.storage.tally import tally
-from sysid.islands.run_state import RunState
-from sysid.result import Identification, Improvement, Migrant
+from sysid.identification.result import Identification
+from sysid.islands.state import RunState
+from sysid.search.state import Improvement, Migrant
 from workers.errors import RecordsUnavailable
 from workers.ports import Concluded, Failure
 

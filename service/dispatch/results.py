@@ -7,7 +7,7 @@ from service.result_document import finite, result_document
 from service.storage.ledger import RunOutcome
 from service.storage.points import HistoryPoint, MigrantPoint
 from service.storage.tables import State
-from sysid.result import Improvement, Migrant
+from sysid.search.state import Improvement, Migrant
 from workers.ports import Concluded
 
 

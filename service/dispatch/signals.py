@@ -9,8 +9,8 @@ from weakref import WeakSet
 from service.signals.writer import FittedOutput, write_fit
 from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import ObjectStore
-from sysid.records import Record
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.records import Record
 from workers.ports import Records
 
 PARCEL_BYTES = 4 << 20

@@ -18,7 +18,7 @@ from service.storage.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import OPEN, Job, Run, State
 from service.sweeps import positions_of
-from sysid.result import Identification
+from sysid.identification.result import Identification
 from workers.ports import Warm
 
 PATH = "/warm_start"

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from sysid.data.records import Channel
 from sysid.models.model import Model
-from sysid.records import Channel
-from sysid.simulation import simulate
+from sysid.simulation.simulate import simulate
 
 STEP = 1e-4
 

@@ -13,8 +13,8 @@ from service.paper.parts import Check, Plot, Section, Table
 from service.paper.published import Columns
 from service.web import formats
 from service.web.evidence import Floats
-from sysid.models.library import load_model
-from sysid.records import Channel
+from sysid.data.records import Channel
+from sysid.models.catalogue.load import load_model
 
 
 @dataclass(frozen=True, slots=True)

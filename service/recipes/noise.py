@@ -25,7 +25,7 @@ from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from service.truth import truth_of
-from sysid.errors import SysidError
+from sysid.core.errors import SysidError
 
 UNSTORED = "the simulated record"
 """Stands for its identifier until it has one."""

@@ -8,8 +8,8 @@ from service.errors import InvalidRequest
 from service.recordings import recording_of
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
+from sysid.data.records import Recording
 from sysid.models.model import Model
-from sysid.records import Recording
 
 MOST_VALUES = 10_000_000
 """Values that are read for it, over all channels: a request must not take minutes."""

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
 
 Rule = Literal["nanoseconds", "regular", "field"]
 Nanoseconds = NDArray[np.uint64]

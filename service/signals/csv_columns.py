@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from service.signals.csv_layout import Column, Layout
 from service.signals.errors import InvalidUpload
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
 
 BLOCK_ROWS = 50_000
 Values = FloatArray | NDArray[np.str_]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.signals.errors import InvalidUpload
-from sysid.errors import nearest
-from sysid.units import factor
+from sysid.core.errors import nearest
+from sysid.core.units import factor
 
 SEPARATORS = ("\t", ";", ",")
 TIME_NAMES = ("t", "t_s", "time", "time_s")

@@ -22,8 +22,8 @@ from service.signals.csv_columns import Table, Values, read_columns
 from service.signals.csv_layout import Layout, find_layout, seconds_in
 from service.signals.errors import InvalidUpload
 from service.signals.segments import Labels, lay_out
-from sysid.records import Channel, Recording, Segment, sampling_of
-from sysid.types import FloatArray, IntArray
+from sysid.core.types import FloatArray, IntArray
+from sysid.data.records import Channel, Recording, Segment, sampling_of
 
 PEEK_LINES = 200
 LONGEST_LINE = 1_000_000

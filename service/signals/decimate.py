@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sysid.types import FloatArray, IntArray
+from sysid.core.types import FloatArray, IntArray
 
 
 def decimate(

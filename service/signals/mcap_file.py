@@ -41,7 +41,7 @@ from service.signals.protobuf import (
     schema_of,
     tag_value,
 )
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 CHUNK_SAMPLES: Final = 16_384

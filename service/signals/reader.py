@@ -16,9 +16,9 @@ from service.signals.limits import DEFAULT_LIMITS, Limits
 from service.signals.mcap_content import Content, Source, no_signals, read_content, sorted_columns
 from service.signals.topics import DATASET, ChannelEntry, Manifest, parse_manifest
 from service.signals.writer import FittedOutput
-from sysid.errors import InvalidRecord
-from sysid.records import Channel, History, Recording
-from sysid.types import FloatArray
+from sysid.core.errors import InvalidRecord
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, History, Recording
 
 CLOCK_FROM_NS = 10**17
 """Log times from here on (three years) are a clock's: they are counted from the first."""

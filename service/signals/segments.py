@@ -5,8 +5,8 @@ from math import floor, log10
 
 import numpy as np
 
-from sysid.records import Segment
-from sysid.types import FloatArray, IntArray
+from sysid.core.types import FloatArray, IntArray
+from sysid.data.records import Segment
 
 Labels = Mapping[str, float | str]
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from service.signals.clock import TIME_FIELD, Clock, Nanoseconds, clock_for
 from service.signals.protobuf import identifiers
-from sysid.records import HOLDS, Channel, Recording, Segment
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.records import HOLDS, Channel, Recording, Segment
 
 DATASET = "lagid.dataset"
 """Name of the metadata record that says what a file of ours holds."""

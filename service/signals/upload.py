@@ -20,7 +20,7 @@ from service import temporary
 from service.signals.errors import InvalidUpload
 from service.signals.limits import DEFAULT_LIMITS, MIB, Limits
 from service.signals.reader import read_recording
-from sysid.records import Recording
+from sysid.data.records import Recording
 
 Kind = Literal["csv", "mcap"]
 

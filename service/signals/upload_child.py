@@ -14,7 +14,7 @@ from service.signals.errors import InvalidUpload
 from service.signals.limits import MIB, Limits
 from service.signals.reader import read_mcap
 from service.signals.writer import write_recording
-from sysid.records import Recording
+from sysid.data.records import Recording
 
 
 def main() -> int:

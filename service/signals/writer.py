@@ -15,8 +15,8 @@ from service.signals.topics import (
     manifest_of,
     topics_of,
 )
-from sysid.records import Channel, Recording
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Recording
 
 
 class Writable(Protocol):

@@ -9,7 +9,7 @@ from service.web import formats
 from service.web.evidence import CorrelationTrace
 from service.web.figures import Figure
 from service.web.figures_residuals import residuals
-from sysid.residuals import Correlation
+from sysid.residuals.residual_tests import Correlation
 
 Document = Mapping[str, Any]
 

@@ -13,7 +13,7 @@ from service.storage.runs import RunRepository
 from service.storage.tables import Job, Run
 from service.sweeps import body_of
 from service.web.evidence import Improvement, RunEvidence, SoughtParameter
-from sysid.parameters import Parameter, Scale, override
+from sysid.models.parameters import Parameter, Scale, override
 
 __all__ = ["Body", "evidence_of", "fitness_of", "model_of", "run_body", "sought_parameters",
            "unit_of"]  # fmt: skip

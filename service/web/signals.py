@@ -9,16 +9,17 @@ from sqlalchemy.orm import Session
 
 from service.fitted import fits_of
 from service.recordings import recording_of
+from service.rms_units import model_of
 from service.signals.writer import FittedOutput
 from service.storage.datasets import DatasetRepository
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset, Job, Run
 from service.web.evidence import Experiment, Floats, OutputTraces, Trace
-from service.web.reading import model_of, run_body
-from sysid.errors import SysidError
+from service.web.reading import run_body
+from sysid.core.errors import SysidError
+from sysid.data.records import Channel, Recording
 from sysid.models.model import Model
-from sysid.records import Channel, Recording
 
 
 def traces_of(store: ObjectStore, dataset: Dataset) -> list[Trace]:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from service.errors import FieldError, InvalidRequest
 from service.record_checks import signals_of
 from service.schemas_simulations import MAX_SIMULATED
-from sysid.errors import nearest
+from sysid.core.errors import nearest
 from sysid.models.model import Model
 
 Kind = Literal["loop", "recording", "signal"]

@@ -46,10 +46,10 @@ from service.web.simulate_form import (
     kind_of,
     label_of,
 )
-from sysid.errors import SysidError
+from sysid.core.errors import SysidError
+from sysid.core.units import multiplied
+from sysid.data.records import Record
 from sysid.models.model import Model
-from sysid.records import Record
-from sysid.units import multiplied
 
 DATASETS_LISTED = 200
 RECORDS_LISTED = 50

@@ -1,1 +1,1 @@
-"""An identified model as text for other programs: JSON, Python, C99, python-control."""
+"""An identified model as JSON, Python, C, python-control (last two optional)."""

@@ -3,10 +3,10 @@
 import textwrap
 from collections.abc import Sequence
 
+from sysid.control.linear_form import Identified
 from sysid.export.c_helpers import HELPERS, CLanguage, with_needed
 from sysid.export.description import facts, unit_text, value_lines, wrapped
 from sysid.export.expressions import number, source
-from sysid.export.identified import Identified
 from sysid.export.identifiers import Identifiers, in_c_comment
 from sysid.export.program import Kind, Place, Program, lag_steps
 from sysid.models.model import MeasuredInitial

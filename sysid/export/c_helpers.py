@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from sysid.control.linear_form import Identified, variants_of
 from sysid.export.expressions import ATOM, WIDTHS, Language
-from sysid.export.identified import Identified, variants_of
 
 _FUNCTIONS = {
     "sin": "sin", "cos": "cos", "tan": "tan", "exp": "exp", "log": "log", "sqrt": "sqrt",

@@ -9,15 +9,14 @@ from dataclasses import dataclass, field
 from math import ceil
 from typing import Literal
 
-from sysid.errors import InvalidSettings
+from sysid.control.linear_form import Identified
+from sysid.core.errors import InvalidSettings
+from sysid.data.interpolation import DENSE, MOST_POINTS
 from sysid.export.expressions import Language, Scope, number, source
-from sysid.export.identified import Identified
 from sysid.export.identifiers import Identifiers
-from sysid.kernels.demand import averaged_inputs, is_difference
-from sysid.kernels.inputs import DENSE, MOST_POINTS
+from sysid.kernels.reads import averaged_inputs, is_difference
 from sysid.language.tree import Expression, Past, Symbol
-from sysid.models.initial import initial_name
-from sysid.models.model import FixedInitial, MeasuredInitial
+from sysid.models.model import FixedInitial, MeasuredInitial, initial_name
 
 Kind = Literal["slope", "update", "recursion", "output"]
 

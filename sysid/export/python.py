@@ -3,9 +3,9 @@
 import textwrap
 from collections.abc import Sequence
 
+from sysid.control.linear_form import Identified
 from sysid.export.description import facts, unit_text, value_lines, wrapped
 from sysid.export.expressions import number, source
-from sysid.export.identified import Identified
 from sysid.export.identifiers import Identifiers, in_docstring
 from sysid.export.program import Kind, Place, Program, lag_steps
 from sysid.export.python_helpers import HELPERS, PythonLanguage, with_needed

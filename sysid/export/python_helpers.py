@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable, Mapping
 
+from sysid.control.linear_form import Identified, variants_of
 from sysid.export.expressions import ATOM, WIDTHS, Language
-from sysid.export.identified import Identified, variants_of
 
 _FUNCTIONS = {
     "sin": "np.sin", "cos": "np.cos", "tan": "np.tan", "exp": "np.exp", "log": "np.log",

@@ -1,1 +1,1 @@
-"""Islands, their topologies and migration."""
+"""Archipelago: topology, migration, packed compiled evolution, stopping."""

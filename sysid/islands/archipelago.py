@@ -1,18 +1,17 @@
 """The islands of one run: how many individuals each has, how each searches, how all begin."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
-from sysid.errors import InvalidSettings
-from sysid.ga.chromosome import coded, placed
-from sysid.ga.development import TRIALS
-from sysid.ga.evolution import initial_places
-from sysid.ga.island import Island
-from sysid.ga.random import WARM, draws, unit
-from sysid.ga.state import (
+from sysid.core.errors import InvalidSettings
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.search.evolution import initial_places
+from sysid.search.island import NEVER, Island, _island_budget, of_island, sizes
+from sysid.search.operators import WARM, coded, draws, unit
+from sysid.search.state import (
     EVALUATIONS,
     IMPROVED,
     IMPROVED_PAPER_STEPS,
@@ -21,93 +20,12 @@ from sysid.ga.state import (
     POINT,
     SIMPLE,
     Plan,
-)  # fmt: skip
-from sysid.kernels.calls import LANES
-from sysid.problem import Problem
-from sysid.settings import GeneticAlgorithm, Loss
-from sysid.types import FloatArray
+)
+from sysid.simulation.problem import Problem, loss_scale, record_progress
+from sysid.simulation.scaling import placed
 
-_UNLIMITED = 2**62
-NEVER = -1.0
 _WARM_SHARE = 4  # one individual in four of a warm start comes from the given values
 _WARM_SPREAD = 0.1  # of the range
-
-
-def sizes(algorithm: GeneticAlgorithm) -> tuple[int, ...]:
-    """Individuals of each island: the population dealt as evenly as possible."""
-    each, more = divmod(algorithm.population, algorithm.n_islands)
-    return tuple(each + (i < more) for i in range(algorithm.n_islands))
-
-
-def of_island(algorithm: GeneticAlgorithm, index: int) -> GeneticAlgorithm:
-    """The settings of one island, where islands differ."""
-    if not isinstance(algorithm.islands, tuple):
-        return algorithm
-    change = algorithm.islands[index]
-    return replace(
-        algorithm,
-        method=change.method or algorithm.method,
-        bits=change.bits or algorithm.bits,
-        mutation=change.mutation or algorithm.mutation,
-    )
-
-
-def search_budget(algorithm: GeneticAlgorithm, n: int) -> int:
-    """Simulations that the islands may run: all but a tenth kept for the refinement.
-
-    At least a few steps of the refinement (of n + 1 simulations) and at most half are kept, and
-    what the last step of each island may take beyond its share.
-    """
-    limit = algorithm.stop.evaluations
-    if limit is None:
-        return _UNLIMITED
-    if not algorithm.refine:
-        return limit
-    beyond = algorithm.n_islands * (n + LANES)
-    return limit - min(max(limit // 10, 4 * (n + 2)) + beyond, limit // 2)
-
-
-def analysis_budget(n: int) -> int:
-    """Simulations kept for the standard errors of n parameters.
-
-    They take two a parameter, beside jumps of the output ten more, and a look at what cannot be
-    told two more.
-    """
-    return 14 * n + 1
-
-
-def _island_budget(algorithm: GeneticAlgorithm, n: int, size: int) -> int:
-    """Simulations from which on an island begins no other generation.
-
-    Its share of `search_budget`; of a tiny budget less, so that its last generation does not take
-    it beyond its share of what the standard errors leave.
-    """
-    limit = algorithm.stop.evaluations
-    if limit is None:
-        return _UNLIMITED
-    share = search_budget(algorithm, n) * size // algorithm.population
-    left = max(limit - analysis_budget(n), algorithm.population) * size // algorithm.population
-    return max(1, min(share, left - _generation(n, size) + 1))
-
-
-def _generation(n: int, size: int) -> int:
-    """Simulations of one generation of an island at most."""
-    return size + n + 1 + TRIALS
-
-
-def budget_before(algorithm: GeneticAlgorithm, n: int) -> int:
-    """What the islands and the standard errors leave of the budget to the finding of starts.
-
-    It counts as the first island's work, which may be less than its share for that.
-    """
-    limit = algorithm.stop.evaluations
-    if limit is None:
-        return _UNLIMITED
-    taken = 0
-    for size in sizes(algorithm)[1:]:
-        rests = _island_budget(algorithm, n, size)
-        taken += size if rests <= size else rests - 1 + _generation(n, size)
-    return max(0, limit - (2 * n + 1) - sizes(algorithm)[0] - taken)
 
 
 def plans(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> tuple[Plan, ...]:
@@ -147,12 +65,6 @@ def shared_plans(algorithm: GeneticAlgorithm, n: int, scale: float) -> tuple[Pla
     return tuple(made)
 
 
-def loss_scale(problem: Problem) -> float:
-    """Scale of the soft-l1 loss, 0 for squares: what compiled code is told."""
-    loss = next(a for a in problem.arguments if isinstance(a, Loss))
-    return float(loss.scale) if loss.kind == "soft-l1" else 0.0
-
-
 def _method(algorithm: GeneticAlgorithm) -> int:
     match algorithm.method:
         case "simple":
@@ -161,14 +73,6 @@ def _method(algorithm: GeneticAlgorithm) -> int:
             return PAPER
         case "improved":
             return IMPROVED if algorithm.sequence.kind == "adaptive" else IMPROVED_PAPER_STEPS
-
-
-def record_progress(problem: Problem) -> FloatArray:
-    """Part of its experiment (0 … 1) that has to be simulated for each of the M measured values."""
-    return np.concatenate([
-        np.ceil(samples.places) / max(experiment.grid.points - 1, 1)
-        for experiment in problem.experiments for samples in experiment.outputs
-    ])  # fmt: skip
 
 
 def found(

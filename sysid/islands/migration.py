@@ -5,10 +5,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.ga.chromosome import coded, decoded
-from sysid.ga.island import Island
-from sysid.ga.operators import rank
-from sysid.ga.state import (
+from sysid.core.jit import compiled
+from sysid.core.settings import Migration
+from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.islands.packed import Fleet, News, dealt, empty_news, gathered, migrations
+from sysid.islands.topology import edges
+from sysid.search.island import Island
+from sysid.search.operators import coded, decoded, rank
+from sysid.search.state import (
     AT_EVALUATIONS,
     AT_GENERATION,
     CLIFFS,
@@ -25,13 +29,8 @@ from sysid.ga.state import (
     SETTLED,
     STAGNATION,
     VALUES,
-)  # fmt: skip
-from sysid.islands.fleet import Fleet, News, dealt, empty_news, gathered, migrations
-from sysid.islands.topology import edges
-from sysid.kernels.caching import compiled
-from sysid.result import Migrant
-from sysid.settings import Migration
-from sysid.types import FloatArray, IntArray, WordArray
+    Migrant,
+)
 
 
 class Routes(NamedTuple):

@@ -2,7 +2,7 @@
 
 from typing import TypeAlias
 
-from sysid.settings import TopologyName
+from sysid.core.settings import TopologyName
 
 Edge: TypeAlias = tuple[int, int]
 """Source and destination."""

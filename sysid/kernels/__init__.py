@@ -1,1 +1,1 @@
-"""From a checked model to machine code that simulates a population."""
+"""`Model` → LLVM: vectorised simulation and loss of a population."""

@@ -2,7 +2,7 @@
 
 from typing import Protocol
 
-from sysid.kernels.lanes import Lanes, Value
+from sysid.kernels.vectors import Lanes, Value
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
 
 LARGEST_POWER = 64

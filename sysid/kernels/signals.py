@@ -1,14 +1,70 @@
-"""The signals of one block of individuals: states in registers and history, inputs, lags."""
+"""The signals of one block of individuals: states in registers and history, inputs, lags.
+
+What a kernel knows of the experiment it simulates: the numbers of its head, once loaded.
+"""
 
 from dataclasses import dataclass
 
-from sysid.kernels import demand
-from sysid.kernels.experiment import Experiment
+from sysid.kernels import reads as demand
+from sysid.kernels.delayed_reads import (
+    FreshReader,
+    History,
+    InputReader,
+    LinearReader,
+    Reader,
+    Turn,
+)
 from sysid.kernels.expressions import Scope, emit
-from sysid.kernels.lanes import DOUBLE, Lanes, Loop, Value
-from sysid.kernels.past import FreshReader, History, InputReader, LinearReader, Reader, Turn
+from sysid.kernels.layout import HEAD, INPUT, NUMBERS, OUTPUT, STATE, Layout
+from sysid.kernels.vectors import DOUBLE, Lanes, Loop, Value
 from sysid.language.tree import Expression, Past, Symbol
 from sysid.models.model import Model
+
+
+class Experiment:
+    """The head of an experiment's numbers, loaded where it is made: at the kernel's entry."""
+
+    def __init__(self, lanes: Lanes, layout: Layout, ints: Value, floats: Value) -> None:
+        self.ints, self.floats = ints, floats
+        self._head = {name: lanes.load_int(ints, lanes.integer(i)) for i, name in enumerate(HEAD)}
+        self._numbers = {
+            name: lanes.load(floats, lanes.integer(i)) for i, name in enumerate(NUMBERS)
+        }
+        self._states = [
+            {f: lanes.load_int(ints, lanes.integer(layout.state(i, f))) for f in STATE}
+            for i in range(layout.states)
+        ]
+        self._inputs = [
+            {f: lanes.load_int(ints, lanes.integer(layout.input(i, f))) for f in INPUT}
+            for i in range(layout.inputs)
+        ]
+        self._outputs = [
+            {f: lanes.load_int(ints, lanes.integer(layout.output(i, f))) for f in OUTPUT}
+            for i in range(layout.outputs)
+        ]
+        self.initial = [
+            lanes.load(floats, lanes.integer(layout.initial(i))) for i in range(layout.states)
+        ]
+
+    def head(self, field: str) -> Value:
+        """A number of the experiment as a whole."""
+        return self._head[field]
+
+    def number(self, field: str) -> Value:
+        """A real number of the experiment as a whole."""
+        return self._numbers[field]
+
+    def state(self, i: int, field: str) -> Value:
+        """A number of the i-th state."""
+        return self._states[i][field]
+
+    def input(self, i: int, field: str) -> Value:
+        """A number of the i-th input."""
+        return self._inputs[i][field]
+
+    def output(self, i: int, field: str) -> Value:
+        """A number of the i-th output."""
+        return self._outputs[i][field]
 
 
 @dataclass(frozen=True, slots=True)

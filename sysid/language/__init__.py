@@ -1,1 +1,1 @@
-"""The model language: grammar, checks, expression trees."""
+"""Equation text → checked tree: grammar, scopes, delays, intervals, printing."""

@@ -2,21 +2,21 @@
 
 from typing import Any, NamedTuple, cast
 
-from sysid.errors import nearest
-from sysid.language.lags import delay
-from sysid.language.parser import parse
-from sysid.language.scope import FUNCTIONS, Scope
-from sysid.language.syntax import (
+from sysid.core.errors import nearest
+from sysid.language.delays import delay
+from sysid.language.parser import (
     MAX_DEPTH,
     Apply,
     Infix,
-    Literal,
     Name,
+    NumberSyntax,
     Prefix,
     Syntax,
     SyntaxFault,
     TextFault,
+    parse,
 )
+from sysid.language.scope import FUNCTIONS, Scope
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
 
 _COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
@@ -75,7 +75,7 @@ class _Checker:
         if depth > MAX_DEPTH:
             raise SyntaxFault(node.column, f"the expression is deeper than {MAX_DEPTH} levels")
         match node:
-            case Literal(value):
+            case NumberSyntax(value):
                 return Number(value)
             case Name():
                 return self._name(node)

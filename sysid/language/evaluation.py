@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from sysid.core.types import FloatArray
 from sysid.language.tree import Binary, Call, Expression, Number, Symbol, Unary
-from sysid.types import FloatArray
 
 _OPERATORS: Mapping[str, Callable[..., Any]] = {
     "+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide, "**": np.power,

@@ -1,23 +1,160 @@
 """Tokens to syntax, by operator precedence. No text ever reaches Python's own parser.
 
 From loose to tight: ``or``, ``and``, ``not``, comparison, ``+ -``, ``* /``, unary ``-``, ``**``.
+
+What the parser makes of a text: nodes that still carry names, and the column each came from.
+
+Text to tokens. What is not in the grammar is told apart, so that the message can say why.
 """
 
+import re
 from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isinf
+from typing import Literal, NamedTuple, TypeAlias
 
-from sysid.language.lexer import Token, tokens
-from sysid.language.syntax import (
-    MAX_DEPTH,
-    MAX_LENGTH,
-    Apply,
-    Infix,
-    Literal,
-    Name,
-    Prefix,
-    Syntax,
-    SyntaxFault,
-    TextFault,
+MAX_LENGTH = 4000
+"""Characters of one equation."""
+
+MAX_DEPTH = 64
+"""Nesting of one equation; long sums and products are folded, so they do not count as deep."""
+
+
+class TextFault(NamedTuple):
+    """One thing wrong with a text.
+
+    Attributes
+    ----------
+    column : int
+        From 1.
+    detail : str
+        What was wrong, and what would be right.
+    """
+
+    column: int
+    detail: str
+
+
+class SyntaxFault(Exception):
+    """A text cannot be parsed further. Does not leave this package."""
+
+    def __init__(self, column: int, detail: str) -> None:
+        super().__init__(detail)
+        self.fault = TextFault(column, detail)
+
+
+@dataclass(frozen=True, slots=True)
+class NumberSyntax:
+    """A number as written."""
+
+    value: float
+    column: int
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    """A name as written, not yet resolved."""
+
+    name: str
+    column: int
+
+
+@dataclass(frozen=True, slots=True)
+class Prefix:
+    """``-a`` or ``not a``."""
+
+    operator: str
+    operand: "Syntax"
+    column: int
+
+
+@dataclass(frozen=True, slots=True)
+class Infix:
+    """``a operator b``; the column is the operator's."""
+
+    operator: str
+    left: "Syntax"
+    right: "Syntax"
+    column: int
+
+
+@dataclass(frozen=True, slots=True)
+class Apply:
+    """``name(a, b, …)``: a function, or a signal at another time."""
+
+    name: str
+    arguments: "tuple[Syntax, ...]"
+    column: int
+
+
+Syntax: TypeAlias = NumberSyntax | Name | Prefix | Infix | Apply
+
+Kind = Literal["number", "name", "operator", "end"]
+
+_TOKEN = re.compile(
+    r"""
+      (?P<space>\s+)
+    | (?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)
+    | (?P<name>[^\W\d]\w*)
+    | (?P<operator>\*\*|<=|>=|==|!=|[-+*/<>(),])
+    | (?P<string>"[^"]*"?|'[^']*'?)
+    | (?P<attribute>\.\s*[^\W\d]\w*)
+    | (?P<other>.)
+    """,
+    re.VERBOSE | re.DOTALL,
 )
+
+_HINTS = {
+    "^": "write ** for a power",
+    "=": "write == to compare, inside where(…)",
+    "−": "write the ASCII minus sign -",
+    "·": "write * for a product",
+    "×": "write * for a product",
+    "[": "write a past value with parentheses, such as x(k-1)",
+    "&": "write 'and' inside where(…)",
+    "|": "write 'or' inside where(…)",
+    "!": "write 'not' inside where(…)",
+}
+
+
+class Token(NamedTuple):
+    """One word of the text; `column` counts from 1."""
+
+    kind: Kind
+    text: str
+    column: int
+
+
+def tokens(text: str) -> tuple[list[Token], list[TextFault]]:
+    """Tokens of a text, the last being its end, and what in it is no token of the language."""
+    found: list[Token] = []
+    faults: list[TextFault] = []
+    for match in _TOKEN.finditer(text):
+        kind, word, column = match.lastgroup, match.group(), match.start() + 1
+        if kind == "name":
+            found.append(Token("name", word, column))
+        elif kind == "operator":
+            found.append(Token("operator", word, column))
+        elif kind == "number":
+            found.append(Token("number", word, column))
+            if isinf(float(word)):
+                faults.append(TextFault(column, f"the number {word[:20]} is too large"))
+        elif kind != "space":
+            faults.append(TextFault(column, _foreign(kind, word)))
+            if kind == "string":  # stands for a number, so that the rest can be checked as well
+                found.append(Token("number", "0", column))
+    found.append(Token("end", "", len(text) + 1))
+    return found, faults
+
+
+def _foreign(kind: str | None, word: str) -> str:
+    if kind == "string":
+        return "strings are not part of the language; it has numbers, names and operators"
+    if kind == "attribute":
+        return f"{word!r}: attributes are not part of the language"
+    hint = f"; {_HINTS[word]}" if word in _HINTS else ""
+    return f"{word!r} is not part of the language{hint}"
+
 
 _OR, _AND, _NOT, _COMPARE, _SUM, _PRODUCT, _SIGN, _POWER = range(1, 9)
 
@@ -90,7 +227,7 @@ class _Parser:
     def _operand(self) -> Syntax:
         word = self._advance()
         if word.kind == "number":
-            return Literal(float(word.text), word.column)
+            return NumberSyntax(float(word.text), word.column)
         if word.text == "-":
             return Prefix("-", self._expression(_SIGN), word.column)
         if word.text == "not":

@@ -1,6 +1,6 @@
 """Checked trees back to text, with no more parentheses than needed."""
 
-from sysid.language.laurent import CONSTANT, add, collect, rebuild
+from sysid.language.monomials import CONSTANT, add, collect, rebuild
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
 
 _LEVEL = {

@@ -1,1 +1,1 @@
-"""Models as data: documents, the catalogue, polynomial expansion."""
+"""Model document → `Model`: parameters, equations, initial states, polynomial models, catalogue."""

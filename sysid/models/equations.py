@@ -3,14 +3,14 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from sysid.errors import nearest
+from sysid.core.errors import nearest
 from sysid.language.checker import Checked, check
+from sysid.language.delays import past_values
 from sysid.language.intervals import bounds
-from sysid.language.lags import past_values
 from sysid.language.scope import Scope
 from sysid.language.tree import Expression, Number, Past
+from sysid.models.documents import Reader, pointer
 from sysid.models.model import Output, Quantity
-from sysid.models.reader import Reader, pointer
 from sysid.models.sections import MAX_EQUATIONS
 
 _ZERO = Number(0.0)

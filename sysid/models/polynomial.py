@@ -10,17 +10,17 @@ from itertools import combinations_with_replacement
 from math import comb
 from typing import Any, NamedTuple, cast
 
-from sysid.errors import InvalidBounds, InvalidSettings, nearest
+from sysid.core.errors import InvalidBounds, InvalidSettings, nearest
 from sysid.language.checker import check
-from sysid.language.lags import delay
+from sysid.language.delays import delay
 from sysid.language.printer import text
 from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Expression, Number, Past, Symbol
+from sysid.models.documents import Reader, pointer, shown
 from sysid.models.equations import note
-from sysid.models.reader import Reader, pointer, shown
+from sysid.models.model import Criterion, ErrorKind, Term, TermRule
+from sysid.models.parameters import Parameter, Scale
 from sysid.models.sections import MAX_PARAMETERS
-from sysid.models.terms import Criterion, ErrorKind, Term, TermRule
-from sysid.parameters import Parameter, Scale
 
 FIELDS = ("output", "degree", "lags", "coefficients", "constant", "terms")
 

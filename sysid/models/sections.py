@@ -4,8 +4,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
-from sysid.errors import InvalidBounds, nearest
+from sysid.core.errors import InvalidBounds, nearest
 from sysid.language.scope import Timing, reserved
+from sysid.models.documents import Reader, pointer, shown
 from sysid.models.model import (
     EstimatedInitial,
     FixedInitial,
@@ -15,8 +16,7 @@ from sysid.models.model import (
     Quantity,
     Solver,
 )
-from sysid.models.reader import Reader, pointer, shown
-from sysid.parameters import Parameter, Scale
+from sysid.models.parameters import Parameter, Scale
 
 MAX_EQUATIONS = 64
 MAX_PARAMETERS = 256

@@ -1,1 +1,1 @@
-"""Reference plants: systems simulated finer than any model of them, to identify and compare."""
+"""Reference plants that generate data (tube, actuator); optional."""

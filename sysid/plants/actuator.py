@@ -11,9 +11,9 @@ from math import copysign, isfinite, pi
 import numpy as np
 from scipy.linalg import expm
 
-from sysid.errors import InvalidRecord, InvalidSettings
-from sysid.records import Channel, Recording
-from sysid.types import FloatArray
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Recording
 
 MOST_SAMPLES = 200_000
 """Samples of one simulation at most: about ten seconds of work."""

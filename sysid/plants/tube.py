@@ -15,10 +15,10 @@ from math import ceil, isfinite, pi, sqrt
 import numpy as np
 from scipy.special import jn_zeros
 
-from sysid.errors import InvalidRecord, InvalidSettings
-from sysid.kernels.caching import compiled
-from sysid.records import Channel, Recording
-from sysid.types import FloatArray
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.jit import compiled
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Recording
 
 ATMOSPHERE = 100_000.0
 """Pa; pressures of the records are above it."""

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.models.terms import TermRule
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.models.model import TermRule
 
 _DEPENDENT = 1e-20  # of a column's squares: less is rounding, the column depends on the others
 _EXPLAINED = 1e-24  # of the output's squares: less is rounding, nothing is left to explain

@@ -12,17 +12,15 @@ from math import ceil
 
 import numpy as np
 
-from sysid.experiments import Experiment, lay_out
-from sysid.kernels.inputs import FineInput
+from sysid.core.types import FloatArray, IntArray
+from sysid.data.interpolation import FineInput
+from sysid.data.records import Record
 from sysid.language.intervals import bounds
 from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary
-from sysid.models.initial import initial_parameters
-from sysid.models.model import Model
+from sysid.models.model import Model, Term, initial_parameters
+from sysid.models.parameters import Parameter
 from sysid.models.sections import interval
-from sysid.models.terms import Term
-from sysid.parameters import Parameter
-from sysid.records import Record
-from sysid.types import FloatArray, IntArray
+from sysid.simulation.experiments import Experiment, lay_out
 
 BLOCK = 4096
 """Rows folded in at once."""

@@ -4,18 +4,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from sysid.errors import InvalidSettings
-from sysid.models.model import Model
+from sysid.core.errors import InvalidSettings
+from sysid.core.threads import one_thread
+from sysid.data.records import Record
+from sysid.models.model import Model, SelectedTerm, Selection, TermRule
+from sysid.models.parameters import Parameter, override
+from sysid.models.parse import with_terms
 from sysid.models.polynomial import check_samples
-from sysid.models.spec import with_terms
-from sysid.models.terms import SelectedTerm, Selection, TermRule
-from sysid.parameters import Parameter, override
-from sysid.records import Record
+from sysid.selection.free_run import reselected
 from sysid.selection.frols import Forward, forward, select, solved
-from sysid.selection.lagsearch import affordable, lag_values, search
+from sysid.selection.lag_search import affordable, lag_values, search
 from sysid.selection.regression import Regression
-from sysid.selection.simulated import reselected
-from sysid.threads import one_thread
 
 Changes = Mapping[str, Mapping[str, Any]]
 

@@ -13,14 +13,14 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sysid.islands.archipelago import budget_before, of_island
-from sysid.problem import Problem
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.threads import one_thread
+from sysid.core.types import FloatArray
+from sysid.search.island import budget_before, of_island
 from sysid.selection.frols import forward, solved
-from sysid.selection.lagsearch import affordable, lag_values, search
+from sysid.selection.lag_search import affordable, lag_values, search
 from sysid.selection.regression import Regression, lag_parameters
-from sysid.settings import GeneticAlgorithm
-from sysid.threads import one_thread
-from sysid.types import FloatArray
+from sysid.simulation.problem import Problem
 
 _RIDGES = (1e-8, 1e-6, 1e-4, 1e-2)  # of the sum of the scaled columns' squares, which is one
 _COUNTS = (1, 2, 3, 4, 6, 9, 13, 20, 32, 64)  # terms of the nested solutions

@@ -11,7 +11,7 @@ from service.storage.points import HistoryPoint
 from service.storage.queue import Queue
 from service.storage.runs import RunRepository
 from service.storage.tables import Checkpoint, State
-from sysid.run import begin
+from sysid.identification.run import begin
 from tests.dispatching import Place
 from tests.runs import RECORDS, spec
 from workers.ports import Failure, QueuedRun

@@ -127,7 +127,7 @@ def test_a_run_that_failed_is_tried_again(place, monkeypatch):
 
     with monkeypatch.context() as patched:
         patched.setattr("service.dispatch.preparing.prepared", lambda *_: ((), None))
-        patched.setattr("sysid.run.conclude", broken)
+        patched.setattr("sysid.identification.run.conclude", broken)
         patched.setattr("workers.tasks.conclude", broken)
         _, (run,), _ = carried_out(place, **sweep(1))
     assert run.state is State.FAILED

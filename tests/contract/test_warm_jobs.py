@@ -13,7 +13,7 @@ from service.schemas_references import ReferenceIn
 from service.storage.ledger import RunLedger
 from service.storage.queue import Queue
 from service.storage.tables import State
-from sysid.errors import InvalidSettings
+from sysid.core.errors import InvalidSettings
 from tests.dispatching import Place, carry_out
 from workers.inline import InlineCrew
 from workers.ports import NotYet

@@ -23,7 +23,7 @@ from service.storage.queue import Claim, Progress, Queue
 from service.storage.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import State
-from sysid.records import Channel, Recording
+from sysid.data.records import Channel, Recording
 
 MODEL = {
     "name": "lagged-tube", "title": "First-order lag behind a dead time", "form": "differential",

@@ -21,7 +21,7 @@ from service.signals.errors import InvalidUpload
 from service.signals.limits import DEFAULT_LIMITS, Limits
 from service.signals.mcap_file import MAGIC
 from service.signals.reader import read_mcap
-from sysid.records import Channel, Recording
+from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
 
 TIMES = np.arange(50) * 0.1

@@ -10,7 +10,7 @@ import pytest
 from service.signals.errors import InvalidUpload
 from service.signals.limits import DEFAULT_LIMITS, MIB
 from service.signals.upload import Kind, read_untrusted
-from sysid.records import Channel, Recording
+from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
 
 TIMES = np.arange(200) * 0.01

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from sysid.identify import identify
-from sysid.models.library import load_model
-from sysid.records import Channel, Record
-from sysid.result import Identification
-from sysid.settings import GeneticAlgorithm
-from sysid.simulation import simulate
+from sysid.core.settings import GeneticAlgorithm
+from sysid.data.records import Channel, Record
+from sysid.identification.identify import identify
+from sysid.identification.result import Identification
+from sysid.models.catalogue.load import load_model
+from sysid.simulation.simulate import simulate
 
 QUICK = GeneticAlgorithm(population=60, generations=40, islands=2)
 TRUTH = {"K": 2.0, "T": 0.6, "L": 0.3, "y0": 0.0, "x(0)": 0.0}

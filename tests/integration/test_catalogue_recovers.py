@@ -2,12 +2,12 @@
 
 import pytest
 
-from sysid.identify import identify
-from sysid.models.library import catalogue, load_model
+from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.data.records import Record
+from sysid.identification.identify import identify
+from sysid.identification.result import Identification
+from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
-from sysid.records import Record
-from sysid.result import Identification
-from sysid.settings import GeneticAlgorithm, Stop
 from tests.catalogue_cases import CASES, Case, made
 
 

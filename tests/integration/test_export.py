@@ -12,12 +12,12 @@ import pytest
 import yaml
 
 import sysid
-from sysid.errors import InvalidSettings
-from sysid.models.library import catalogue, load_model
+from sysid.core.errors import InvalidSettings
+from sysid.core.types import FloatArray
+from sysid.data.records import Hold
+from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model, with_terms
-from sysid.records import Hold
-from sysid.types import FloatArray
+from sysid.models.parse import parse_model, with_terms
 from tests.exporting import compiled, in_c, in_python, simulated, with_entry
 
 N = 240
@@ -148,7 +148,7 @@ def built(
     sources = {}
     for name, (model, case) in MODELS.items():
         holds = {one.name: hold for one in model.inputs}
-        text = sysid.export(model, case.values, "c", hold=holds)
+        text = sysid.export_model(model, case.values, "c", hold=holds)
         plain = with_entry(text, f"run_{name}", len(model.inputs), len(model.outputs))
         stem = text.split("_identified(void)")[0].split()[-1]
         sources[name] = plain.replace(f"{stem}_", f"{name}_own_")
@@ -164,7 +164,7 @@ def test_exported_programs_compute_what_the_simulation_does(
     model, case = MODELS[name]
     times, inputs = excitation(model, case)
     expected = simulated(model, case.values, times, inputs, hold)
-    text = sysid.export(model, case.values, "python", hold=dict.fromkeys(inputs, hold))
+    text = sysid.export_model(model, case.values, "python", hold=dict.fromkeys(inputs, hold))
     python = in_python(text, times, list(inputs.values()))
     c = in_c(library, f"run_{name}", times, list(inputs.values()), len(model.outputs))
     for told, *found in zip(expected, python, c, strict=True):
@@ -179,7 +179,7 @@ def case_of(name: str) -> tuple[Model, Case]:
 
 def test_the_document_has_all_that_is_needed_to_simulate_again() -> None:
     model, case = MODELS["rk4"]
-    text = sysid.export(model, case.values, "json", sample_time=0.05, hold={"i": "zero"})
+    text = sysid.export_model(model, case.values, "json", sample_time=0.05, hold={"i": "zero"})
     document = json.loads(text)
     again = parse_model(document["model"])
     values = {one["name"]: one["value"] for one in document["values"]}
@@ -207,8 +207,8 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
         (sysid.Channel("u", times, u, hold="zero"),), (sysid.Channel("y", times, y),)
     )
     small = sysid.GeneticAlgorithm(population=16, generations=20, islands=1)
-    found = sysid.identify(model, [record], small, parameters={"L": {"upper": 1.0}})
-    document = json.loads(sysid.export(model, found, "json", provenance={"made": "here"}))
+    found = sysid.identification.identify(model, [record], small, parameters={"L": {"upper": 1.0}})
+    document = json.loads(sysid.export_model(model, found, "json", provenance={"made": "here"}))
     stderr = {one["name"]: one["stderr"] for one in document["values"]}
     covariance = document["covariance"]
     variances = dict(zip(covariance["names"], np.diag(covariance["matrix"]), strict=True))
@@ -216,7 +216,7 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
         assert stderr[name] ** 2 == pytest.approx(variance)
     assert document["provenance"] == {"made": "here"}
     assert document["data"] == {"sample_time": pytest.approx(0.05), "hold": {"u": "zero"}}
-    text = sysid.export(model, found, "python")  # held as the data of the result were
+    text = sysid.export_model(model, found, "python")  # held as the data of the result were
     assert f"standard error {stderr['T']:.3g}" in text
     # The tube starts where it was measured, so that is to be given.
     expected = simulated(
@@ -241,7 +241,7 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
 )
 def test_an_option_that_cannot_be_used_is_named(change: dict[str, Any], pointer: str) -> None:
     with pytest.raises(InvalidSettings) as caught:
-        sysid.export(*case_of("tube")[:1], CASES["tube"].values, **change)
+        sysid.export_model(*case_of("tube")[:1], CASES["tube"].values, **change)
     assert caught.value.pointer == pointer
 
 
@@ -254,14 +254,14 @@ def test_a_value_that_is_missing_unknown_or_not_finite_is_named(
     values: dict[str, float], name: str
 ) -> None:
     with pytest.raises(InvalidSettings) as caught:
-        sysid.export(load_model("tube"), values, "python")
+        sysid.export_model(load_model("tube"), values, "python")
     assert caught.value.pointer == f"/values/{name}"
 
 
 def test_a_model_whose_terms_are_not_selected_yet_is_refused() -> None:
     model = parse_model(LINEAR_NARX)
     with pytest.raises(InvalidSettings, match="not selected"):
-        sysid.export(model, {one.name: 0.1 for one in model.parameters}, "c")
+        sysid.export_model(model, {one.name: 0.1 for one in model.parameters}, "c")
 
 
 HOSTILE = (
@@ -283,15 +283,15 @@ def test_no_text_of_a_model_gets_out_of_comments(text: str, tmp_path: Path) -> N
     plain, model, values = load_model("tube"), parse_model(document), CASES["tube"].values
     provenance = {text: text, "list": [text, {"a": text}]}
     for format in ("python", "control"):
-        found = sysid.export(model, values, format, provenance=provenance)
+        found = sysid.export_model(model, values, format, provenance=provenance)
         # As a tree, the program is that of the model without these texts.
         told, expected = (
-            without_docstrings(one) for one in (found, sysid.export(plain, values, format))
+            without_docstrings(one) for one in (found, sysid.export_model(plain, values, format))
         )
         assert told == expected
-    found = sysid.export(model, values, "c", provenance=provenance)
-    assert without_comments(found) == without_comments(sysid.export(plain, values, "c"))
-    assert json.loads(sysid.export(model, values, "json"))["model"]["title"] == model.title
+    found = sysid.export_model(model, values, "c", provenance=provenance)
+    assert without_comments(found) == without_comments(sysid.export_model(plain, values, "c"))
+    assert json.loads(sysid.export_model(model, values, "json"))["model"]["title"] == model.title
 
 
 def without_docstrings(source: str) -> str:

@@ -8,12 +8,12 @@ import yaml
 from scipy.signal import lfilter
 
 import sysid
-from sysid.errors import InvalidSettings
-from sysid.export.linear import NotLinear
-from sysid.models.library import load_model
+from sysid.control.linear_form import NotLinear
+from sysid.core.errors import InvalidSettings
+from sysid.data.records import Hold
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.records import Hold
+from sysid.models.parse import parse_model
 from tests.exporting import in_control, simulated
 
 N = 240
@@ -53,7 +53,7 @@ def test_a_transfer_function_is_that_of_the_equations(name: str) -> None:
         model, values = parse_model(DELAYED_DAMPER), {"L": 0.3, "c": 0.4}
     else:
         model, values = load_model(name), VALUES[name]
-    script = in_control(sysid.export(model, values, "control", pade_order=4))
+    script = in_control(sysid.export_model(model, values, "control", pade_order=4))
     assert set(script["pairs"]) == set(script["systems"]) == set(EXPECTED[name])
     for pair, expected in EXPECTED[name].items():
         exact = script["response"](script["pairs"][pair], OMEGA)
@@ -64,7 +64,7 @@ def test_a_transfer_function_is_that_of_the_equations(name: str) -> None:
 
 def test_the_frequency_response_is_that_of_the_simulation() -> None:
     model, values = parse_model(DELAYED_DAMPER), {"L": 0.3, "c": 0.4}
-    script = in_control(sysid.export(model, values, "control"))
+    script = in_control(sysid.export_model(model, values, "control"))
     times, omega = 0.01 * np.arange(12_000), 1.0
     inputs = {"q": np.sin(omega * times), "r": np.zeros(times.size)}
     outputs = simulated(model, values, times, inputs, "first")
@@ -102,7 +102,7 @@ def test_a_recursion_filters_as_its_transfer_function_in_z(
 ) -> None:
     model = recursion_with(interpolation=interpolation, substeps=substeps)
     values, h = {"L": lag, "d": 1.3}, 0.05
-    text = sysid.export(model, values, "control", sample_time=h, hold={"u": hold})
+    text = sysid.export_model(model, values, "control", sample_time=h, hold={"u": hold})
     script = in_control(text)
     assert script["period"] == h / substeps
     times = h * np.arange(N)
@@ -119,7 +119,7 @@ def test_a_recursion_filters_as_its_transfer_function_in_z(
 
 def refused(model: Model, values: dict[str, float], **given: Any) -> str:
     with pytest.raises((NotLinear, InvalidSettings)) as caught:
-        sysid.export(model, values, "control", **given)
+        sysid.export_model(model, values, "control", **given)
     return str(caught.value)
 
 

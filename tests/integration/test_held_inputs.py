@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from sysid import Channel, Record, identify, load_model, simulate
-from sysid.kernels.inputs import fine_input
-from sysid.models.library import document
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.interpolation import fine_input
+from sysid.models.catalogue.load import document
 
 T, K = 4.0, 2.0  # s, 1; sampled once a second
 

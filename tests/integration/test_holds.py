@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidRecord
-from sysid.identify import identify
-from sysid.models.library import load_model
-from sysid.records import Channel, Recording
-from sysid.result import Identification
-from sysid.settings import GeneticAlgorithm
+from sysid.core.errors import InvalidRecord
+from sysid.core.settings import GeneticAlgorithm
+from sysid.data.records import Channel, Recording
+from sysid.identification.identify import identify
+from sysid.identification.result import Identification
+from sysid.models.catalogue.load import load_model
 
 PERIOD, LAG = 0.5, 3.2
 

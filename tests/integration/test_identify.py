@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from sysid.errors import DivergedEverywhere, InvalidSettings
-from sysid.identify import identify
-from sysid.models.library import load_model
-from sysid.noise import Noise
-from sysid.records import Channel, Record
-from sysid.refinement import refine
-from sysid.result import Identification
-from sysid.run import RunState
-from sysid.settings import GeneticAlgorithm, Loss, Stop
+from sysid.core.errors import DivergedEverywhere, InvalidSettings
+from sysid.core.settings import GeneticAlgorithm, Loss, Stop
+from sysid.data.noise import Noise
+from sysid.data.records import Channel, Record
+from sysid.identification.identify import identify
+from sysid.identification.result import Identification
+from sysid.islands.state import RunState
+from sysid.models.catalogue.load import load_model
+from sysid.search.refine import refine
 from tests.searching import COULOMB, DUFFING, clean, example, noisy, record
 
 DUFFING_MODEL = load_model("duffing-eq16")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from service.signals.csv_reader import read_csv
-from sysid.derivations import derive
-from sysid.records import Recording
+from sysid.data.derivations import derive
+from sysid.data.records import Recording
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("LAGID_DATA", ROOT.parent / "shared" / "data"))

@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.models.library import load_model
+from sysid.data.records import Channel
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.records import Channel
-from sysid.simulation import simulate as simulate_compiled
+from sysid.models.parse import parse_model
+from sysid.simulation.simulate import simulate as simulate_compiled
 from tests.meaning import simulate as simulate_plainly
 
 H, N = 0.02, 150

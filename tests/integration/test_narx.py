@@ -6,18 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.export.exporting import export
-from sysid.identify import identify
-from sysid.models.library import load_model
+from sysid.core.settings import GeneticAlgorithm, IslandChange, Stop
+from sysid.data.records import Channel, Record
+from sysid.export.export import export_model
+from sysid.identification.identify import identify
+from sysid.identification.result import Identification
+from sysid.identification.run import begin
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.result import Identification
-from sysid.run import begin
-from sysid.selection import equation_error_starts
-from sysid.settings import GeneticAlgorithm, IslandChange, Stop
-from sysid.simulation import simulate
+from sysid.models.parse import parse_model
+from sysid.selection.starts import equation_error_starts
+from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
 from tests.polynomials import LAGGED, TRUTH, document, frols, lagged, record_of
 
 NARX = {
@@ -240,7 +240,7 @@ def test_selected_terms_are_exported_as_the_result_has_them() -> None:
     model = parse_model(document(frols(5)))
     found = identify(model, record, SMALL)
     program: dict[str, Any] = {}
-    exec(compile(export(model, found, "python"), "exported", "exec"), program)
+    exec(compile(export_model(model, found, "python"), "exported", "exec"), program)
     times, u = record.inputs[0].times, record.inputs[0].values
     start = record.outputs[0].values[:2]
     again = np.asarray(program["simulate"](times, u, y_0=start)).ravel()

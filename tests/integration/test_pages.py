@@ -14,7 +14,7 @@ from service.datasets import add_recording
 from service.settings import Settings
 from service.storage.tables import Job
 from service.web import assets
-from sysid.records import Channel, Recording
+from sysid.data.records import Channel, Recording
 from tests.e2e.filled import Filled, fill
 
 

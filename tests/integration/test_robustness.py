@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.refinement import refine
-from sysid.run import advance, begin, conclude
-from sysid.settings import GeneticAlgorithm, Stop
+from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.identification.conclude import conclude
+from sysid.identification.run import advance, begin
+from sysid.models.catalogue.load import load_model
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
 from tests.searching import COULOMB, noisy, record
 
 

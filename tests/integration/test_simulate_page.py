@@ -17,10 +17,10 @@ from service.app import create_app
 from service.storage.tables import Dataset
 from service.turns import AT_ONCE, WAITING, simulating
 from service.web.simulate_page import _defaults, _Known
-from sysid import refinement
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.refinement import refine
+from sysid.models.catalogue.load import load_model
+from sysid.search import refine as refinement
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
 from tests.identified import identified
 from tests.rest import refused, settings_of
 

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from sysid.threads import _libraries, one_thread
+from sysid.core.threads import _libraries, one_thread
 
 CONCLUDED = """
 import hashlib
 import numpy as np
-from sysid.identify import identify
-from sysid.models.library import load_model
-from sysid.records import Channel, Record
-from sysid.settings import GeneticAlgorithm
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import load_model
+from sysid.data.records import Channel, Record
+from sysid.core.settings import GeneticAlgorithm
 
 times = 0.01 * np.arange(20_000)
 random = np.random.default_rng(1)
@@ -70,7 +70,7 @@ sys.argv = ["lagid", "--help"]
 try:
     main()
 except SystemExit:
-    from sysid.threads import _libraries
+    from sysid.core.threads import _libraries
 
     print([library.threads() for library in _libraries()], file=sys.stderr)
 """

@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidSettings
-from sysid.identify import identify
-from sysid.models.library import load_model
-from sysid.models.spec import parse_model
-from sysid.noise import Noise, with_noise
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.result import Identification
-from sysid.settings import GeneticAlgorithm
-from sysid.splitting import split_record
+from sysid.core.errors import InvalidSettings
+from sysid.core.settings import GeneticAlgorithm
+from sysid.data.noise import Noise, with_noise
+from sysid.data.records import Channel, Record
+from sysid.data.splitting import split_record
+from sysid.identification.identify import identify
+from sysid.identification.result import Identification
+from sysid.models.catalogue.load import load_model
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
 from tests.searching import DUFFING, force
 from workers.ports import ProblemSpec
 from workers.tasks import build, prepared

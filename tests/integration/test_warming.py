@@ -1,10 +1,10 @@
 """What workers do before their first task."""
 
-from sysid.identify import identify
-from sysid.islands.voyage import _sail
-from sysid.models.library import load_model
-from sysid.settings import GeneticAlgorithm
-from sysid.warming import warm_up
+from sysid.core.settings import GeneticAlgorithm
+from sysid.identification.identify import identify
+from sysid.identification.warmup import warm_up
+from sysid.islands.evolve import _sail
+from sysid.models.catalogue.load import load_model
 from tests.searching import noisy, record
 
 

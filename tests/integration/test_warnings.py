@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.errors import NothingIdentifiable
-from sysid.identify import identify
-from sysid.models.library import load_model
+from sysid.core.errors import NothingIdentifiable
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identification.identify import identify
+from sysid.identification.result import Identification
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.records import Channel, Record
-from sysid.result import Identification
-from sysid.settings import GeneticAlgorithm
-from sysid.simulation import simulate
-from sysid.types import FloatArray
+from sysid.models.parse import parse_model
+from sysid.simulation.simulate import simulate
 
 QUICK = GeneticAlgorithm(population=30, generations=120)
 STEP, N = 0.02, 300

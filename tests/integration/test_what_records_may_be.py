@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.derivations import derive
-from sysid.errors import InvalidSettings
-from sysid.ga.chromosome import located
-from sysid.identify import identify
+from sysid.core.errors import InvalidSettings
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.data.derivations import derive
+from sysid.data.records import Channel, Record, Recording
+from sysid.identification.identify import identify
+from sysid.identification.result import Identification
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record, Recording
-from sysid.result import Identification
-from sysid.settings import GeneticAlgorithm
-from sysid.simulation import simulate
-from sysid.types import FloatArray
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import located
+from sysid.simulation.simulate import simulate
 
 TRUTH = {"K": 2.0, "T": 0.6, "L": 0.37}
 QUICK = GeneticAlgorithm(generations=40)

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.identify import identify
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.result import Identification
-from sysid.settings import GeneticAlgorithm
-from sysid.types import FloatArray
-from sysid.warnings import _correlated
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identification.identify import identify
+from sysid.identification.result import Identification
+from sysid.identification.warnings import _correlated
+from sysid.models.catalogue.load import load_model
+from sysid.simulation.problem import Problem
 from tests.searching import DUFFING as TRUTH
 from tests.searching import noisy, record
 

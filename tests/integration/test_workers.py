@@ -90,6 +90,6 @@ def workers_of(pid: int) -> list[int]:
 
 
 def every(generations: int):
-    from sysid.settings import Migration
+    from sysid.core.settings import Migration
 
     return Migration(every=generations)

@@ -5,13 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sysid.errors import InvalidSettings
-from sysid.identify import identify
-from sysid.models.library import load_model
+from sysid.core.errors import InvalidSettings
+from sysid.core.settings import METHODS, GeneticAlgorithm, SearchMethod, Stop
+from sysid.data.records import Channel, Record
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.records import Channel, Record
-from sysid.settings import METHODS, GeneticAlgorithm, SearchMethod, Stop
+from sysid.models.parse import parse_model
 
 TIMES = 0.05 * np.arange(120.0)
 LAG = load_model("fopdt")

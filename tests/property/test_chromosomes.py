@@ -4,9 +4,19 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sysid.ga import random
-from sysid.ga.chromosome import coded, decoded, located, placed
-from sysid.ga.operators import cross, flip, rank, reflected, scheduled, stepped, two_of
+from sysid.search import operators as random
+from sysid.search.operators import (
+    coded,
+    cross,
+    decoded,
+    flip,
+    rank,
+    reflected,
+    scheduled,
+    stepped,
+    two_of,
+)
+from sysid.simulation.scaling import located, placed
 from tests.searching import example
 
 BITS = st.integers(1, 32)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sysid.models.model import Model
-from sysid.problem import Problem
+from sysid.simulation.problem import Problem
 from tests import reference
 from tests.models import difference, differential, individuals, record
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from sysid.language.checker import check
 from sysid.language.intervals import bounds
-from sysid.language.laurent import collect, rebuild
+from sysid.language.monomials import collect, rebuild
 from sysid.language.printer import text
 from sysid.language.scope import FUNCTIONS, Scope
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary

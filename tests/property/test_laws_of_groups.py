@@ -5,14 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sysid.directions import untold, weighed
-from sysid.groups import blocks, written
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.refinement import refine
-from sysid.types import FloatArray
-from sysid.uncertainty import analyse
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identifiability.combinations import blocks, untold, weighed, written
+from sysid.models.catalogue.load import load_model
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse
 
 NAMES = "abcdef"
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from sysid.data.records import Channel, Record
 from sysid.models.model import Model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.simulation import simulate
+from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
 from tests.models import (
     difference,
     differential,

@@ -7,15 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.models.initial import initial_name, initial_parameters
-from sysid.models.library import load_model
-from sysid.models.model import EstimatedInitial, Model
-from sysid.models.spec import parse_model
-from sysid.parameters import Parameter
-from sysid.records import Channel
-from sysid.simulation import simulate
-from sysid.symmetries import scalings
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel
+from sysid.identifiability.scaling import scalings
+from sysid.models.catalogue.load import load_model
+from sysid.models.model import EstimatedInitial, Model, initial_name, initial_parameters
+from sysid.models.parameters import Parameter
+from sysid.models.parse import parse_model
+from sysid.simulation.simulate import simulate
 from tests.catalogue_cases import CASES
 
 FACTOR = 2.0

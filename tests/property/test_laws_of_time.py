@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sysid.models.library import load_model
-from sysid.records import Channel, Hold
-from sysid.simulation import simulate
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Hold
+from sysid.models.catalogue.load import load_model
+from sysid.simulation.simulate import simulate
 
 PERIOD, SAMPLES, QUIET = 0.05, 120, 40
 SYSTEMS: dict[str, dict[str, float]] = {

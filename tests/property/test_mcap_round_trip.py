@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from service.signals import mcap_file
 from service.signals.clock import clock_for
 from service.signals.reader import read_recording
-from sysid.records import HOLDS, Channel, History, Recording
+from sysid.data.records import HOLDS, Channel, History, Recording
 from tests.mcap_files import recorded
 
 NUMBERS = st.floats(allow_nan=True, allow_infinity=False)

@@ -5,10 +5,10 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sysid.errors import InvalidModel
+from sysid.core.errors import InvalidModel
+from sysid.models.catalogue.load import catalogue, document
 from sysid.models.documents import read_yaml
-from sysid.models.library import catalogue, document
-from sysid.models.spec import parse_model
+from sysid.models.parse import parse_model
 
 junk = st.recursive(
     st.one_of(

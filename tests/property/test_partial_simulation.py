@@ -5,15 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sysid.ga.chromosome import located
-from sysid.ga.gauss_newton import partial_fitness
-from sysid.islands.archipelago import plans, record_progress
-from sysid.kernels.evaluation import partial_predictions
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.settings import GeneticAlgorithm
-from sysid.types import FloatArray
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.islands.archipelago import plans
+from sysid.models.catalogue.load import load_model
+from sysid.search.slopes import partial_fitness
+from sysid.simulation.evaluator import partial_predictions
+from sysid.simulation.problem import Problem, record_progress
+from sysid.simulation.scaling import located
 from tests.searching import example, record
 
 

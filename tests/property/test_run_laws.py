@@ -7,23 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sysid import run
-from sysid.ga.chromosome import decoded, located
-from sysid.ga.island import Island, evolve
-from sysid.islands.archipelago import found, plans
-from sysid.islands.settling import searches
-from sysid.problem import Problem
-from sysid.run import (
-    RunState,
-    advance,
-    advance_island,
-    begin,
-    border,
-    exchange,
-    is_finished,
-    is_resting,
-)  # fmt: skip
-from sysid.settings import (
+from sysid.core.settings import (  # fmt: skip
     METHODS,
     GeneticAlgorithm,
     IslandChange,
@@ -31,7 +15,24 @@ from sysid.settings import (
     SearchMethod,
     SequenceSearch,
     Stop,
-)  # fmt: skip
+)
+from sysid.identification import run
+from sysid.identification.run import (  # fmt: skip
+    advance,
+    advance_island,
+    begin,
+    border,
+    exchange,
+    is_finished,
+    is_resting,
+)
+from sysid.islands.archipelago import found, plans
+from sysid.islands.state import RunState
+from sysid.islands.stopping import searches
+from sysid.search.island import Island, evolve
+from sysid.search.operators import decoded
+from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import located
 from tests.searching import bits, example
 
 METHOD = st.sampled_from(METHODS)

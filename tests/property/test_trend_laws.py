@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sysid.trend import (
+from sysid.trends.laws import Law, fit_line, fit_power
+from sysid.trends.trend import (  # fmt: skip
     Estimate,
     drift,
     drift_from_law,
@@ -19,8 +20,7 @@ from sysid.trend import (
     pooled,
     prediction,
     predictions,
-)  # fmt: skip
-from sysid.trend_laws import Law, fit_line, fit_power
+)
 
 X = np.array([5.0, 10.0, 20.0, 40.0, 80.0])
 NUMBER = st.floats(-10, 10).filter(lambda v: v == 0 or abs(v) > 1e-3)
@@ -148,7 +148,7 @@ def test_the_deleted_residual_is_that_of_a_fit_without_the_point() -> None:
 
 
 def fit_trend_by_line(x, y, stderr):  # type: ignore[no-untyped-def]
-    from sysid.trend import _influences
+    from sysid.trends.trend import _influences
 
     return _influences(fit_line(x, y, stderr), x, y, stderr)
 

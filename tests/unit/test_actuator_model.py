@@ -5,13 +5,13 @@ from math import copysign, pi
 import numpy as np
 import pytest
 
-from sysid.identify import identify
-from sysid.models.library import document, load_model
-from sysid.models.spec import parse_model
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import document, load_model
+from sysid.models.parse import parse_model
 from sysid.plants.actuator import Actuator, simulate_actuator
-from sysid.records import Channel, Record
-from sysid.simulation import simulate
-from sysid.types import FloatArray
+from sysid.simulation.simulate import simulate
 
 PUBLISHED = {
     "J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3,

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidRecord, InvalidSettings
-from sysid.models.library import document
-from sysid.models.spec import parse_model
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Hold
+from sysid.models.catalogue.load import document
+from sysid.models.parse import parse_model
 from sysid.plants.actuator import MOST_SAMPLES, Actuator, simulate_actuator
-from sysid.records import Channel, Hold
-from sysid.simulation import simulate
-from sysid.types import FloatArray
+from sysid.simulation.simulate import simulate
 
 TIMES = 0.01 * np.arange(400)
 ARM = Actuator()

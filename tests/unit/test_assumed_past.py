@@ -6,17 +6,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.assumed_past import past_notes, reads_assumed
-from sysid.derivations import derive
-from sysid.identify import identify
-from sysid.models.library import load_model
+from sysid.core.settings import GeneticAlgorithm
+from sysid.data.derivations import derive
+from sysid.data.records import Channel, Recording
+from sysid.identification.identify import identify
+from sysid.identification.unrecorded_input import past_notes, reads_assumed
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import FixedInitial, Model
-from sysid.problem import Problem
-from sysid.records import Channel, Recording
-from sysid.refinement import refine
-from sysid.settings import GeneticAlgorithm
-from sysid.simulation import simulate
-from sysid.uncertainty import Analysis, analyse
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
+from sysid.uncertainty.analysis import Analysis, analyse
 
 H, CUT = 0.1, 120
 TRUE = {"K": 2.0, "T": 0.6, "L": 0.73, "y0": 0.5}

@@ -3,20 +3,11 @@
 from functools import cache
 from itertools import pairwise
 
-from sysid.ga.hops import COUNTED, SINGLE, UNCOUNTED
-from sysid.ga.island import Island, evolve
-from sysid.ga.state import (
-    CLIFFS,
-    DEVELOPMENTS,
-    FRESH,
-    HOP,
-    HOPS,
-    JUMPS,
-    SEQUENCE,
-    STEP,
-)
+from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.islands.archipelago import found, plans
-from sysid.settings import GeneticAlgorithm, Stop
+from sysid.search.basin_hopping import COUNTED, SINGLE, UNCOUNTED
+from sysid.search.island import Island, evolve
+from sysid.search.state import CLIFFS, DEVELOPMENTS, FRESH, HOP, HOPS, JUMPS, SEQUENCE, STEP
 from tests.searching import bits, example
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))

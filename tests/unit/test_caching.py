@@ -18,19 +18,20 @@ from numba.core.compiler import CompileResult
 from numba.core.runtime import nrt
 from packaging.requirements import Requirement
 
-from sysid.kernels import caching, keeping
+from sysid.core import code_cache as keeping
+from sysid.core import jit as caching
 
 ROOT = Path(caching.__file__).parents[2]
 PROGRAM = """
 import sys
 sys.path.insert(0, sys.argv[1])
-from sysid.kernels import caching
+from sysid.core import jit as caching
 caching.fingerprint = lambda: sys.argv[2]
 from module import doubled
 print(doubled(2.0), sum(doubled.stats.cache_hits.values()))
 """
 MODULE = """
-from sysid.kernels.caching import compiled
+from sysid.core.jit import compiled
 
 @compiled
 def doubled(x):
@@ -111,7 +112,7 @@ def test_the_fingerprint_covers_all_that_compiled_functions_take_values_from() -
     package = ROOT / "sysid"
     covered = {path for pattern in caching._SOURCES for path in package.glob(pattern)}
     frozen = frozen_by_compiled(package.rglob("*.py"))
-    assert {package / "kernels" / "layout.py", package / "ga" / "state.py"} <= frozen
+    assert {package / "kernels" / "layout.py", package / "search" / "state.py"} <= frozen
     assert frozen <= covered
     assert len(caching.fingerprint()) == 64
 
@@ -136,7 +137,7 @@ UPDATED = """
 import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from sysid.ga import operators
+from sysid.search import operators
 source = Path(operators.__file__)
 source.write_text(source.read_text() + "\\n# another version\\n")
 from module import doubled
@@ -343,7 +344,7 @@ def test_numba_is_bounded_where_its_insides_are_known() -> None:
 
 WARM = """
 import sys
-from sysid.warming import warm_up
+from sysid.identification.warmup import warm_up
 warm_up()
 loaded = ("numba.np.arraymath", "numba.np.npyimpl", "scipy.linalg")
 print([name for name in loaded if name in sys.modules])

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sysid.ga.cliffs import most_unlike
-from sysid.islands.settling import searches
-from sysid.run import advance, begin
-from sysid.settings import GeneticAlgorithm
+from sysid.core.settings import GeneticAlgorithm
+from sysid.identification.run import advance, begin
+from sysid.islands.stopping import searches
+from sysid.search.basin_hopping import most_unlike
 from tests.searching import example
 
 

@@ -6,18 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.closed_loop import close_loop
-from sysid.controllers import PidControl, Transport
-from sysid.errors import InvalidRecord, InvalidSettings
-from sysid.kernels.compiler import kernel_key
+from sysid.control.closed_loop import close_loop
+from sysid.control.controllers import PidControl, Transport
+from sysid.control.step_response import StepMetrics, step_metrics
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel
+from sysid.kernels.build import kernel_key
 from sysid.kernels.layout import Variant
-from sysid.models.library import load_model
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.records import Channel
-from sysid.simulation import simulate
-from sysid.step_response import StepMetrics, step_metrics
-from sysid.types import FloatArray
+from sysid.models.parse import parse_model
+from sysid.simulation.simulate import simulate
 
 ACTUATOR = {
     "J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_c": 456.99e3,

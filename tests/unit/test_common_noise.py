@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from sysid.common_noise import coloured_jointly
-from sysid.models.spec import parse_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.refinement import refine
-from sysid.simulation import simulate
-from sysid.types import FloatArray
-from sysid.uncertainty import Analysis, analyse
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.parse import parse_model
+from sysid.residuals.correlated_outputs import coloured_jointly
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
+from sysid.uncertainty.analysis import Analysis, analyse
 
 TIMES = 0.05 * np.arange(300.0)
 TRUTH = {"a": 2.0, "b": 1.5, "T": 0.6, "L": 0.3}

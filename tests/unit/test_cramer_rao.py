@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from sysid.cramer_rao import floor
-from sysid.errors import InvalidSettings
-from sysid.models.spec import parse_model
-from sysid.noise import Noise, with_noise
-from sysid.problem import Problem
-from sysid.records import Channel, Record
+from sysid.core.errors import InvalidSettings
+from sysid.data.noise import Noise, with_noise
+from sysid.data.records import Channel, Record
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.cramer_rao import floor
 
 TIMES = np.arange(200) * 0.1
 INPUT = np.sin(1.3 * TIMES) + 0.2 * TIMES

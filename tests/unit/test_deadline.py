@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid import refinement
-from sysid.conclusion import conclude
-from sysid.deadline import Deadline
-from sysid.least_squares import TRIED
-from sysid.refinement import refine
-from sysid.run import advance, begin
-from sysid.settings import GeneticAlgorithm, Stop
+from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.identification.conclude import conclude
+from sysid.identification.deadline import Deadline
+from sysid.identification.run import advance, begin
+from sysid.search import refine as refinement
+from sysid.search.least_squares import TRIED
+from sysid.search.refine import refine
 from tests.searching import example
 
 NEAR = np.array([0.22, 0.52, 5.1, 1.1])

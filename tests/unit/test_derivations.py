@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.derivations import derive
-from sysid.errors import InvalidSettings
-from sysid.models.library import load_model
-from sysid.noise import Noise, with_noise
-from sysid.problem import Problem
-from sysid.records import Channel, Hold, Recording, Segment
-from sysid.refinement import refine
-from sysid.simulation import simulate
+from sysid.core.errors import InvalidSettings
+from sysid.data.derivations import derive
+from sysid.data.noise import Noise, with_noise
+from sysid.data.records import Channel, Hold, Recording, Segment
+from sysid.models.catalogue.load import load_model
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
 
 
 def recording(samples: int = 100) -> Recording:

@@ -6,8 +6,8 @@ import pytest
 from sysid.language.checker import check
 from sysid.language.evaluation import values_at
 from sysid.language.scope import Scope
-from sysid.models.spec import parse_model
-from sysid.simulation import simulate
+from sysid.models.parse import parse_model
+from sysid.simulation.simulate import simulate
 
 TIMES = np.arange(400) / 16  # exact, so that comparisons with them are
 

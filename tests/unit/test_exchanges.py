@@ -5,18 +5,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid import sections
-from sysid.exchanges import Exchanges, exchange_notes, exchanges, ordered
-from sysid.identify import identify
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identifiability import subsystems as sections
+from sysid.identifiability.exchange import Exchanges, exchange_notes, exchanges, ordered
+from sysid.identification.identify import identify
 from sysid.language.tree import Expression
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.problem import Problem
-from sysid.profiles import profile
-from sysid.records import Channel, Record
-from sysid.settings import GeneticAlgorithm
-from sysid.simulation import simulate
-from sysid.types import FloatArray
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
+from sysid.uncertainty.profile_likelihood import profile
 
 TIMES = 0.1 * np.arange(300.0)
 U = Channel("u", TIMES, np.repeat(np.random.default_rng(3).normal(size=30), 10), hold="zero")

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from sysid.ga.chromosome import coded
-from sysid.ga.development import start_development
-from sysid.ga.far_away import is_behind, is_coloured
-from sysid.ga.gauss_newton import partial_fitness
-from sysid.ga.state import DEVELOPMENTS, EVALUATIONS, FRESH, HOP, HORIZON, JUMPS, SETTLED, Plan
+from sysid.core.settings import GeneticAlgorithm, Migration, Stop
+from sysid.core.types import WordArray
+from sysid.identification.run import advance, begin
 from sysid.islands.archipelago import found, plans
 from sysid.islands.migration import migrate
-from sysid.kernels.evaluation import partial_predictions
-from sysid.run import advance, begin
-from sysid.settings import GeneticAlgorithm, Migration, Stop
-from sysid.types import WordArray
+from sysid.search.adaptive_search import start_development
+from sysid.search.basin_hopping import is_behind, is_coloured
+from sysid.search.operators import coded
+from sysid.search.slopes import partial_fitness
+from sysid.search.state import DEVELOPMENTS, EVALUATIONS, FRESH, HOP, HORIZON, JUMPS, SETTLED, Plan
+from sysid.simulation.evaluator import partial_predictions
 from tests.searching import COULOMB, example
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))

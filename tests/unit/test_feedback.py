@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from sysid import Channel, Record, identify, load_model
-from sysid.feedback import feedback_notes, share_told
-from sysid.problem import Loss
-from sysid.residuals import Series
-from sysid.types import FloatArray
+from sysid.core.settings import Loss
+from sysid.core.types import FloatArray
+from sysid.residuals.feedback import feedback_notes, share_told
+from sysid.residuals.residual_tests import Series
 
 N, STEP, LATE = 1500, 0.1, 20  # samples, s, samples of dead time
 TIMES = STEP * np.arange(N)

@@ -5,15 +5,15 @@ from typing import Any
 
 import pytest
 
-from sysid.errors import InvalidSettings
-from sysid.run import begin
+from sysid.core.errors import InvalidSettings
+from sysid.identification.run import begin
 from tests.runs import RECORDS, ListedRuns, Notebook, bits, carry_out, spec
 from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
 from workers.feeding import Feeder
 from workers.inline import InlineCrew
 from workers.jobwork import JobWork
 from workers.packing import PACKS_PER_CPU
-from workers.ports import (
+from workers.ports import (  # fmt: skip
     Advance,
     Advanced,
     Done,
@@ -24,7 +24,7 @@ from workers.ports import (
     QueuedRun,
     Records,
     RefusedRun,
-)  # fmt: skip
+)
 from workers.tasks import build
 
 pytestmark = pytest.mark.usefixtures("time_to_read")

@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.models.library import load_model
-from sysid.models.spec import parse_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.result import Group
-from sysid.symmetries import scalings
-from sysid.types import FloatArray
-from sysid.uncertainty import Analysis, analyse
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identifiability.combinations import Group
+from sysid.identifiability.scaling import scalings
+from sysid.models.catalogue.load import load_model
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis, analyse
 
 STEP = 0.05
 

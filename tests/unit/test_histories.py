@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from service.inputs import sampled
-from sysid.derivations import derive
-from sysid.errors import InvalidRecord, InvalidSettings
-from sysid.histories import MORE
-from sysid.identify import identify
-from sysid.models.library import load_model
-from sysid.records import HOLDS, Channel, History, Hold, Record, Recording, Segment
-from sysid.settings import GeneticAlgorithm
-from sysid.simulation import simulate
-from sysid.splitting import split_record
-from sysid.types import FloatArray
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.data.derivations import derive
+from sysid.data.history import MORE
+from sysid.data.records import HOLDS, Channel, History, Hold, Record, Recording, Segment
+from sysid.data.splitting import split_record
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import load_model
+from sysid.simulation.simulate import simulate
 
 H = 0.1
 CUT = 120

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from sysid.ga.chromosome import placed
-from sysid.ga.gauss_newton import normal_equations
-from sysid.ga.hops import COUNTED, SINGLE, UNCOUNTED, hop
-from sysid.ga.state import CLIFFS, EVALUATIONS, GENERATION, HOP, HOPS, POINT, ROUGH
+from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.core.types import FloatArray
 from sysid.islands.archipelago import found, plans
-from sysid.kernels.evaluator import Evaluator
-from sysid.settings import GeneticAlgorithm, Stop
-from sysid.types import FloatArray
+from sysid.search.basin_hopping import COUNTED, SINGLE, UNCOUNTED, hop
+from sysid.search.slopes import normal_equations
+from sysid.search.state import CLIFFS, EVALUATIONS, GENERATION, HOP, HOPS, POINT, ROUGH
+from sysid.simulation.evaluator import Evaluator
+from sysid.simulation.scaling import placed
 from tests.searching import COULOMB, example
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))

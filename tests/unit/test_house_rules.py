@@ -90,4 +90,4 @@ def test_the_core_never_runs_text_as_code(call: str) -> None:
 
 def test_pickles_are_read_only_from_the_private_cache_of_compiled_code() -> None:
     """Numba's form of machine code holds pickles; only files of this user are read back."""
-    assert users_of("numba.core.serialize import loads") == ["sysid/kernels/caching.py"]
+    assert users_of("numba.core.serialize import loads") == ["sysid/core/jit.py"]

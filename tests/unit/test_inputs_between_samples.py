@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidRecord
-from sysid.kernels.inputs import between_samples, fine_input
-from sysid.records import Channel, Hold
+from sysid.core.errors import InvalidRecord
+from sysid.data.interpolation import between_samples, fine_input
+from sysid.data.records import Channel, Hold
 
 TIMES = 0.1 * np.arange(400)
 

@@ -12,8 +12,8 @@ import yaml
 
 from service.schemas_datasets import DeriveIn
 from service.schemas_jobs import JobIn
-from sysid.derivations import STEPS, derive
-from sysid.records import Channel, Recording, Segment
+from sysid.data.derivations import STEPS, derive
+from sysid.data.records import Channel, Recording, Segment
 
 PAGE = (Path(__file__).parents[2] / "docs/job.md").read_text(encoding="utf-8")
 EXAMPLES = [yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)]

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sysid.kernels import compiler, keeping
+from sysid.core import code_cache as keeping
+from sysid.kernels import build as compiler
 from sysid.kernels.layout import Variant
-from sysid.problem import Problem
+from sysid.simulation.problem import Problem
 from tests.models import difference, duffing, individuals, record
 
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from sysid.kernels import apart
-from sysid.kernels.emission import kernel_code
+from sysid.kernels import machine_code as apart
+from sysid.kernels.kernel import kernel_code
 from sysid.kernels.layout import Variant
-from sysid.kernels.machine import object_code
+from sysid.kernels.machine_code import object_code
 from tests.models import duffing
 
 VARIANT = Variant(one_step=False, soft=False, on_grid=True, weighted=False)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from sysid.least_squares import TRIED, Scored, Solution, solve
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.catalogue.load import load_model
+from sysid.search.least_squares import TRIED, Scored, Solution, solve
+from sysid.simulation.problem import Problem
 
 TIMES = np.linspace(0.0, 4.0, 60)
 DECAY = "2*a*exp(-4*p*t) + 2*b*exp(-0.5*q*t)"

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sysid.controllers import PidControl
-from sysid.export.identified import Identified, Value
-from sysid.margins import margins
-from sysid.models.spec import parse_model
+from sysid.control.controllers import PidControl
+from sysid.control.linear_form import Identified, Value
+from sysid.control.margins import margins
+from sysid.models.parse import parse_model
 
 
 def resonant(delay: float) -> Identified:

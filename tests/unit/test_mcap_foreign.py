@@ -11,7 +11,7 @@ from mcap.writer import CompressionType
 from service.signals.errors import InvalidUpload
 from service.signals.limits import DEFAULT_LIMITS
 from service.signals.reader import read_mcap
-from sysid.records import Recording
+from sysid.data.records import Recording
 from tests.mcap_files import foreign, json_messages
 
 KINDS = {

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from service.signals import mcap_file
 from service.signals.reader import read_fit, read_metadata, read_recording
 from service.signals.writer import FittedOutput, write_fit, write_recording
-from sysid.records import Channel, History, Recording, Segment
+from sysid.data.records import Channel, History, Recording, Segment
 from tests.mcap_files import recorded
 
 TIMES = np.arange(40) * 0.01

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sysid.islands.archipelago import sizes
+from sysid.core.settings import TOPOLOGIES, GeneticAlgorithm, Migration, TopologyName
+from sysid.identification.run import advance, begin
 from sysid.islands.migration import migrate
 from sysid.islands.topology import edges
-from sysid.run import advance, begin
-from sysid.settings import TOPOLOGIES, GeneticAlgorithm, Migration, TopologyName
+from sysid.search.island import sizes
 from tests.searching import bits, example
 
 ALGORITHM = GeneticAlgorithm(

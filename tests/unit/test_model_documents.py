@@ -4,18 +4,12 @@ from typing import Any
 
 import pytest
 
-from sysid.errors import InvalidModel
+from sysid.core.errors import InvalidModel
 from sysid.language.tree import Past
 from sysid.models.documents import read_yaml
-from sysid.models.model import (
-    EstimatedInitial,
-    FixedInitial,
-    MeasuredInitial,
-    Quantity,
-    Solver,
-)
-from sysid.models.spec import parse_model
-from sysid.parameters import Parameter, override
+from sysid.models.model import EstimatedInitial, FixedInitial, MeasuredInitial, Quantity, Solver
+from sysid.models.parameters import Parameter, override
+from sysid.models.parse import parse_model
 
 CONTINUOUS: dict[str, Any] = {
     "name": "delayed-duffing",

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidModel, InvalidSettings, UnknownModel
+from sysid.core.errors import InvalidModel, InvalidSettings, UnknownModel
 from sysid.models import catalogue as folder
+from sysid.models.catalogue.load import catalogue, document, load_model
+from sysid.models.delays import check_lags
 from sysid.models.documents import MAX_CHARACTERS, read_yaml
-from sysid.models.lags import check_lags
-from sysid.models.library import catalogue, document, load_model
-from sysid.models.spec import parse_model
-from sysid.parameters import override
+from sysid.models.parameters import override
+from sysid.models.parse import parse_model
 from tests.meaning import simulate
 
 BUILT_IN = (

@@ -7,7 +7,7 @@ import pytest
 
 from sysid.language.scope import FUNCTIONS
 from sysid.models.documents import read_yaml
-from sysid.models.spec import parse_model
+from sysid.models.parse import parse_model
 
 PAGE = (Path(__file__).parents[2] / "docs/model.md").read_text(encoding="utf-8")
 SOLVER = ("method", "step", "substeps", "history", "interpolation")

@@ -4,11 +4,11 @@ from typing import Any
 
 import pytest
 
-from sysid.errors import InvalidModel
-from sysid.language.lags import past_values
+from sysid.core.errors import InvalidModel
+from sysid.language.delays import past_values
 from sysid.language.tree import Binary, Past, Symbol
 from sysid.models.model import FixedInitial, MeasuredInitial
-from sysid.models.spec import parse_model
+from sysid.models.parse import parse_model
 
 NARX: dict[str, Any] = {
     "name": "narx",

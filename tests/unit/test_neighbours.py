@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from sysid.identify import identify
-from sysid.linear import drawn_along, linear_model, moves_of
-from sysid.models.library import load_model
-from sysid.neighbours import Neighbourhood, affordable, neighbourhood, widened
-from sysid.noise import Noise, noise_samples
-from sysid.problem import Problem
-from sysid.refinement import refine
-from sysid.result import Estimate
-from sysid.run import advance, begin, conclude
-from sysid.settings import GeneticAlgorithm, Stop
-from sysid.uncertainty import analyse
+from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.data.noise import Noise, noise_samples
+from sysid.identification.conclude import conclude
+from sysid.identification.identify import identify
+from sysid.identification.local_minima import Neighbourhood, affordable, neighbourhood, widened
+from sysid.identification.run import advance, begin
+from sysid.models.catalogue.load import load_model
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.estimates import Estimate
+from sysid.uncertainty.linear_model import drawn_along, linear_model, moves_of
 from tests.searching import COULOMB, clean, example, noisy, record
 
 TRUTH = np.array([0.2, 0.5, 5.0, 1.0])  # of Example 1
@@ -104,7 +105,7 @@ def lasting(steps: int) -> Problem:
 
 
 def test_a_run_out_of_time_says_that_it_has_not_looked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sysid.neighbours._LATE", 0)
+    monkeypatch.setattr("sysid.identification.local_minima._LATE", 0)
     problem = example()
     algorithm = GeneticAlgorithm(generations=20, stop=Stop(seconds=1e9))
     state = advance(problem, algorithm, begin(problem, algorithm, 1))

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidSettings
-from sysid.noise import Noise, noise_samples, with_noise
+from sysid.core.errors import InvalidSettings
+from sysid.data.noise import Noise, noise_samples, with_noise
 from tests.searching import clean, record
 
 

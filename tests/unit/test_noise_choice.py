@@ -6,17 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.forgetting import remembering
-from sysid.identify import identify
-from sysid.models.library import load_model
-from sysid.noise_choice import speaks_for_ar1
-from sysid.problem import Problem
-from sysid.profiles import profile
-from sysid.records import Channel, Record
-from sysid.result import Identification
-from sysid.settings import GeneticAlgorithm, Loss, Stop
-from sysid.types import FloatArray
-from sysid.uncertainty import analyse
+from sysid.core.settings import GeneticAlgorithm, Loss, Stop
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identification.identify import identify
+from sysid.identification.noise_model_choice import remembering, speaks_for_ar1
+from sysid.identification.result import Identification
+from sysid.models.catalogue.load import load_model
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.profile_likelihood import profile
 from tests.unit.test_serial import coloured
 
 STEP, N = 0.1, 400

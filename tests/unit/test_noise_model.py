@@ -5,19 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidSettings
-from sysid.identify import identify
-from sysid.models.library import load_model
-from sysid.noise_model import generalised, whitening
-from sysid.problem import Problem
-from sysid.profiles import profile
-from sysid.records import Channel, Record
-from sysid.refinement import refine
-from sysid.run import advance, begin, conclude
-from sysid.settings import GeneticAlgorithm, Loss, Stop
-from sysid.types import FloatArray
-from sysid.uncertainty import analyse
-from sysid.whitening import Whitening, owed
+from sysid.core.errors import InvalidSettings
+from sysid.core.settings import GeneticAlgorithm, Loss, Stop
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identification.conclude import conclude
+from sysid.identification.generalised_least_squares import generalised, whitening
+from sysid.identification.identify import identify
+from sysid.identification.run import advance, begin
+from sysid.models.catalogue.load import load_model
+from sysid.residuals.whitening import Whitening, owed
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.profile_likelihood import profile
 from tests import searching
 from tests.unit.test_serial import coloured
 
@@ -195,7 +196,7 @@ def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
     timed = replace(SMALL, stop=Stop(seconds=100.0, settled=None))
     state = advance(problem, timed, begin(problem, timed, 1))
     whole = conclude(problem, timed, replace(state, seconds=1.0))
-    monkeypatch.setattr("sysid.deadline._LATE", 30 * problem.n_steps)
+    monkeypatch.setattr("sysid.identification.deadline._LATE", 30 * problem.n_steps)
     late = conclude(problem, timed, replace(state, seconds=100.0))
     soon = conclude(problem, timed, replace(state, seconds=99.0))  # time for a hundredth more
     said = "not estimated to its end"

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from service.signals.csv_reader import read_csv
-from sysid import onset
-from sysid.models.library import load_model
-from sysid.onset import OnsetDelay, moves_alone, onset_delays
-from sysid.records import Channel, Hold, Record
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Hold, Record
+from sysid.models.catalogue.load import load_model
+from sysid.residuals import onset_delay as onset
+from sysid.residuals.onset_delay import OnsetDelay, moves_alone, onset_delays
 
 STEP, HOLD = 0.01, 300
 LEVELS = np.array([0.0, 1.0, 0.4, 0.9, 0.1, 0.6])

@@ -9,9 +9,9 @@ from service.paper.bound import cramer_rao
 from service.paper.parts import Check, Section, Table, markdown
 from service.schemas_datasets import SimulateIn
 from service.schemas_jobs import JobIn
-from sysid.models.library import document, load_model
-from sysid.models.spec import parse_model
-from sysid.records import Channel
+from sysid.data.records import Channel
+from sysid.models.catalogue.load import document, load_model
+from sysid.models.parse import parse_model
 
 
 def point(generation: int, rms: float, value: float) -> dict[str, object]:

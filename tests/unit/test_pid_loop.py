@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.closed_loop import ClosedLoop, close_loop
-from sysid.controllers import PidControl, Transport
-from sysid.errors import InvalidSettings
-from sysid.kernels.compiler import kernel_key
+from sysid.control.closed_loop import ClosedLoop, close_loop
+from sysid.control.controllers import PidControl, Transport
+from sysid.control.step_response import step_metrics
+from sysid.core.errors import InvalidSettings
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Recording
+from sysid.kernels.build import kernel_key
 from sysid.kernels.layout import Variant
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.records import Channel, Recording
-from sysid.step_response import step_metrics
-from sysid.types import FloatArray
+from sysid.models.parse import parse_model
 
 STEP = 0.01
 TIMES: FloatArray = STEP * np.arange(901.0)

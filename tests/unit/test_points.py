@@ -15,7 +15,7 @@ from service.storage.points import (
     migrant_parts,
     migrants_of,
 )
-from sysid.result import Phase
+from sysid.search.state import Phase
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 points = st.builds(

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidBounds, InvalidRecord, InvalidSettings, RecordTooShort
-from sysid.kernels.caching import compiled
-from sysid.kernels.evaluation import population_fitness
-from sysid.kernels.evaluator import Evaluator
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.settings import Loss
-from sysid.types import FloatArray
+from sysid.core.errors import InvalidBounds, InvalidRecord, InvalidSettings, RecordTooShort
+from sysid.core.jit import compiled
+from sysid.core.settings import Loss
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.simulation.evaluator import Evaluator, population_fitness
+from sysid.simulation.problem import Problem
 from tests.models import difference, differential, duffing, individuals, lag_element, record
 
 

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidRecord, InvalidSettings
-from sysid.models.library import load_model
-from sysid.models.spec import parse_model
-from sysid.problem import Problem
-from sysid.profiles import profile
-from sysid.records import Channel, Record
-from sysid.refinement import refine
-from sysid.serial import QUANTILE
-from sysid.settings import Loss
-from sysid.types import FloatArray
-from sysid.uncertainty import analyse
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.settings import Loss
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.catalogue.load import load_model
+from sysid.models.parse import parse_model
+from sysid.residuals.coloured import QUANTILE
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.profile_likelihood import profile
 from tests.searching import DUFFING, STEP, example, noisy, record
 
 TRUTH = np.array([DUFFING[name] for name in ("c", "L", "b", "a")])

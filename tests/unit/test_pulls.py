@@ -5,16 +5,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.identifiability.active_bounds import Pull, is_pulled, pulls
+from sysid.identifiability.bound_limits import reach
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.parameters import Parameter
-from sysid.problem import Problem
-from sysid.pulls import Pull, is_pulled, pulls
-from sysid.reaches import reach
-from sysid.records import Channel, Record
-from sysid.simulation import simulate
-from sysid.types import FloatArray
-from sysid.uncertainty import analyse
+from sysid.models.parameters import Parameter
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
+from sysid.uncertainty.analysis import analyse
 
 TIMES = 0.05 * np.arange(400.0)
 ANYWHERE = (-np.inf, np.inf)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidRecord, InvalidSettings, nearest
-from sysid.records import Channel, Record, Recording, Segment, sampling_of
-from sysid.splitting import split_record
+from sysid.core.errors import InvalidRecord, InvalidSettings, nearest
+from sysid.data.records import Channel, Record, Recording, Segment, sampling_of
+from sysid.data.splitting import split_record
 
 
 def ramp(name: str, samples: int = 10, period: float = 0.1) -> Channel:

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid import least_squares, refinement
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.refinement import refine
-from sysid.settings import Loss
+from sysid.core.settings import Loss
+from sysid.data.records import Channel, Record
+from sysid.models.catalogue.load import load_model
+from sysid.search import least_squares
+from sysid.search import refine as refinement
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
 from tests.searching import example, force, noisy, record
 
 NEAR = np.array([0.22, 0.52, 5.1, 1.1])

@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.models.library import load_model
-from sysid.parameters import override
-from sysid.past_outputs import coefficients_on_past_outputs
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.residuals import (
+from sysid.core.settings import Loss
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.catalogue.load import load_model
+from sysid.models.parameters import override
+from sysid.residuals.past_outputs import coefficients_on_past_outputs
+from sysid.residuals.residual_tests import (
     Correlation,
     ResidualTests,
     correlations,
@@ -19,8 +20,7 @@ from sysid.residuals import (
     series,
     verdict,
 )
-from sysid.settings import Loss
-from sysid.types import FloatArray
+from sysid.simulation.problem import Problem
 
 N, STEP = 400, 0.1
 TIMES = np.arange(N) * STEP

@@ -6,10 +6,10 @@ from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 from scipy.special import chdtrc
 
-from sysid.lagged_sums import Laid, laid_out, whiteness
-from sysid.restricted import _deviance, _meant, _middle, _Series, modelled
-from sysid.serial import _is_coloured
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.residuals.autocorrelation import Laid, laid_out, whiteness
+from sysid.residuals.coloured import _is_coloured
+from sysid.residuals.restricted_likelihood import _deviance, _meant, _middle, _Series, modelled
 
 PLACES = [(0.5, -1.0), (1.3, 0.4), (-0.6, -3.0)]
 

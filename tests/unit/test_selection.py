@@ -8,16 +8,16 @@ import pytest
 
 from service.models import resolved
 from service.web.findings import findings_of
-from sysid.errors import InvalidSettings
-from sysid.models.spec import parse_model
-from sysid.models.terms import TermRule
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.selection import selected
+from sysid.core.errors import InvalidSettings
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.model import TermRule
+from sysid.models.parse import parse_model
 from sysid.selection.frols import exchanged, forward, merit, solved
-from sysid.selection.lagsearch import search
+from sysid.selection.lag_search import search
 from sysid.selection.regression import Regression
-from sysid.types import FloatArray
+from sysid.selection.select import selected
+from sysid.simulation.problem import Problem
 from tests.polynomials import LAGGED, TRUTH, document, frols, lagged, record_of
 
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from sysid.lagged_sums import laid_out
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.refinement import refine
-from sysid.serial import spectrum_root
-from sysid.settings import Loss
-from sysid.types import FloatArray
-from sysid.uncertainty import Analysis, analyse
+from sysid.core.settings import Loss
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.catalogue.load import load_model
+from sysid.residuals.autocorrelation import laid_out
+from sysid.residuals.coloured import spectrum_root
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis, analyse
 from tests.searching import DUFFING, noisy, record
 
 STEADY = {
@@ -138,6 +138,6 @@ def test_a_drift_has_a_recursion_of_first_order(monkeypatch: pytest.MonkeyPatch)
         for pole in (0.999, 0.9)
     )
     before = spectrum_root(wander)[0], spectrum_root(slow)[0]
-    monkeypatch.setattr("sysid.serial._recursion", lambda values: np.array([0.5, 0.2]))
+    monkeypatch.setattr("sysid.residuals.coloured._recursion", lambda values: np.array([0.5, 0.2]))
     np.testing.assert_array_equal(spectrum_root(wander)[0], before[0])
     assert np.max(np.abs(spectrum_root(slow)[0] - before[1])) > 0

@@ -11,8 +11,8 @@ from service.conversion import algorithm_of, loss_of
 from service.errors import Misconfigured
 from service.schemas_jobs import JobIn
 from service.settings import Settings, is_loopback
-from sysid.errors import InvalidSettings
-from sysid.settings import GeneticAlgorithm, IslandChange, Loss, Migration, Stop
+from sysid.core.errors import InvalidSettings
+from sysid.core.settings import GeneticAlgorithm, IslandChange, Loss, Migration, Stop
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.ga.state import CONFIRMED, GENERATION, HOPS, RETURNED, TRIED
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.run import RunState, advance, begin, conclude, exchange
-from sysid.settings import GeneticAlgorithm, Migration, Stop
+from sysid.core.settings import GeneticAlgorithm, Migration, Stop
+from sysid.identification.conclude import conclude
+from sysid.identification.run import advance, begin, exchange
+from sysid.islands.state import RunState
+from sysid.models.catalogue.load import load_model
+from sysid.search.state import CONFIRMED, GENERATION, HOPS, RETURNED, TRIED
+from sysid.simulation.problem import Problem
 from tests.searching import DUFFING, example, noisy, record
 
 ALONE = GeneticAlgorithm(islands=1, migration=Migration(every=1))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidRecord, InvalidSettings
-from sysid.records import Channel
-from sysid.simulation import simulate
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.data.records import Channel
+from sysid.simulation.simulate import simulate
 from tests.models import differential, lag_element, record
 
 TIMES = 0.05 * np.arange(60)

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sysid.models.library import load_model
+from sysid.data.records import Record
+from sysid.identification.integration_step import step_notes
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.problem import Problem
-from sysid.records import Record
-from sysid.refinement import refine
-from sysid.step_check import step_notes
-from sysid.uncertainty import Analysis, analyse
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis, analyse
 from tests.catalogue_cases import CASES, made
 
 FINE = 16

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import workers.tasks
-from sysid.identify import identify
-from sysid.models.library import document
-from sysid.models.spec import parse_model
-from sysid.noise import Noise
-from sysid.problem import Problem
-from sysid.settings import GeneticAlgorithm, Loss
+from sysid.core.settings import GeneticAlgorithm, Loss
+from sysid.data.noise import Noise
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import document
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
 from tests.polynomials import frols, lagged
 from tests.runs import RECORDS, bits, carry_out, spec
 from workers.inline import InlineCrew
@@ -175,9 +175,15 @@ def interrupts() -> Iterator[None]:
 @pytest.mark.usefixtures("interrupts")
 @pytest.mark.parametrize(
     "part",
-    ["conclusion.refine", "conclusion.analyse", "conclusion.residual_tests",
-     "conclusion.onset_delays", "noise_model._correlation_times", "noise_model._proposals"],
-)  # fmt: skip
+    [
+        "conclude.refine",
+        "conclude.analyse",
+        "conclude.residual_tests",
+        "conclude.onset_delays",
+        "generalised_least_squares._correlation_times",
+        "generalised_least_squares._proposals",
+    ],
+)
 def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_later_one(
     part: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -194,7 +200,7 @@ def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_l
         os.kill(os.getpid(), signal.SIGINT)  # as Ray does to a worker
 
     with monkeypatch.context() as patched:
-        patched.setattr(f"sysid.{part}", cancelled)
+        patched.setattr(f"sysid.identification.{part}", cancelled)
         with pytest.raises(KeyboardInterrupt):
             workers.tasks.advance(pack, ["drifting"], records)
     (again,) = workers.tasks.advance(pack, ["drifting"], records)

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.errors import InvalidSettings
-from sysid.identify import identify
-from sysid.models.library import load_model
-from sysid.problem import Problem
-from sysid.result import Estimate
-from sysid.settings import GeneticAlgorithm
-from sysid.uncertainty import analyse
+from sysid.core.errors import InvalidSettings
+from sysid.core.settings import GeneticAlgorithm
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import load_model
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.estimates import Estimate
 from tests.models import difference, differential, individuals, lag_element, record
 from tests.searching import DUFFING, noisy
 from tests.searching import record as duffing_record

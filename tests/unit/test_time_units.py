@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.identify import identify
-from sysid.models.library import catalogue, load_model
+from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.data.records import Channel, Record
+from sysid.identification.identify import identify
+from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.records import Channel, Record
-from sysid.settings import GeneticAlgorithm, Stop
-from sysid.time_units import time_unit_notes
+from sysid.models.parse import parse_model
+from sysid.models.units import time_unit_notes
 
 
 def model(equation: str, unit: str, **fields: Any) -> Model:

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.real_data.emps import asymmetric
-from sysid.models.library import document
-from sysid.models.spec import parse_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.types import FloatArray
-from sysid.uncertainty import analyse
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.catalogue.load import document
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import analyse
 
 TRUTH = {"M": 95.0, "Fv": 200.0, "o": -3.0, "Fp": 24.0, "Fn": 19.0}
 TIMES: FloatArray = 0.001 * np.arange(3000, dtype=np.float64)

@@ -6,7 +6,7 @@ import pytest
 
 from service.trend_notes import quantity_notes
 from service.trend_points import Point, Quantity
-from sysid.trend import Estimate, fit_trend
+from sysid.trends.trend import Estimate, fit_trend
 
 BOUNDS = (0.0, 1.0)
 

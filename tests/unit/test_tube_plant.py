@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from scipy.special import ive
 
-from sysid.errors import InvalidRecord, InvalidSettings
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel
 from sysid.plants.tube import (
     GAMMA,
     GAS,
@@ -18,8 +20,6 @@ from sysid.plants.tube import (
     simulate_tube,
     tube_record,
 )
-from sysid.records import Channel
-from sysid.types import FloatArray
 
 PERIOD = 1e-3
 AMBIENT = 1e5

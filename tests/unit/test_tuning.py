@@ -7,18 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sysid.closed_loop import close_loop
-from sysid.controllers import PidControl, Transport
-from sysid.errors import InvalidSettings
-from sysid.export.identified import Identified, Value
-from sysid.export.linear import NotLinear
-from sysid.margins import Margins, margins
-from sysid.models.library import load_model
+from sysid.control.closed_loop import close_loop
+from sysid.control.controllers import PidControl, Transport
+from sysid.control.linear_form import Identified, NotLinear, Value
+from sysid.control.margins import Margins, margins
+from sysid.control.step_response import step_metrics
+from sysid.control.tuning import Tuning, factors_of, tuned
+from sysid.core.errors import InvalidSettings
+from sysid.data.records import Channel
+from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.records import Channel
-from sysid.step_response import step_metrics
-from sysid.tuning import Tuning, factors_of, tuned
+from sysid.models.parse import parse_model
 
 
 def identified(model: Model, **values: float) -> Identified:

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from sysid.models.library import load_model
-from sysid.models.spec import parse_model
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.refinement import refine
-from sysid.result import Estimate
-from sysid.settings import Loss
-from sysid.simulation import simulate
-from sysid.types import FloatArray
-from sysid.uncertainty import analyse
+from sysid.core.settings import Loss
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.catalogue.load import load_model
+from sysid.models.parse import parse_model
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.simulation.simulate import simulate
+from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.estimates import Estimate
 from tests.searching import COULOMB, DUFFING, example, force, noisy, record
 
 # Cramér-Rao bound of Example 1, measurement noise of sd 0.01, 300 samples (from theory).

@@ -7,15 +7,15 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sysid.derivations import derive
-from sysid.errors import InvalidRecord, InvalidSettings
-from sysid.identify import identify
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.units import difference, factor, is_read, suggestion
+from sysid.data.derivations import derive
+from sysid.data.records import Channel, Record, Recording
+from sysid.identification.identify import identify
 from sysid.models.model import Model
-from sysid.models.spec import parse_model
-from sysid.records import Channel, Record, Recording
-from sysid.settings import GeneticAlgorithm
-from sysid.signal_units import mixed_units, unknown_units
-from sysid.units import difference, factor, is_read, suggestion
+from sysid.models.parse import parse_model
+from sysid.models.units import mixed_units, unknown_units
 
 TINY = GeneticAlgorithm(population=8, generations=2, islands=1)
 

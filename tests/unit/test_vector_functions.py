@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from sysid import load_model
-from sysid.kernels import lanes, machine
-from sysid.kernels.vectormath import VectorFunctions, vector_functions
-from sysid.problem import Problem
-from sysid.records import Channel, Record
-from sysid.types import FloatArray
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.kernels import machine_code as machine
+from sysid.kernels import vectors as lanes
+from sysid.kernels.vectors import VectorFunctions, vector_functions
+from sysid.simulation.problem import Problem
 
 FUNCTIONS = {
     "exp": np.exp, "log": np.log, "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh,

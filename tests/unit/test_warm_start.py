@@ -7,10 +7,10 @@ from functools import cache
 import pytest
 
 from sysid import Identification, identify, load_model
-from sysid.ga.state import CONFIRMED, GENERATION, HOPS, RETURNED, TRIED
-from sysid.records import Record
-from sysid.run import advance, begin, border, exchange
-from sysid.settings import GeneticAlgorithm
+from sysid.core.settings import GeneticAlgorithm
+from sysid.data.records import Record
+from sysid.identification.run import advance, begin, border, exchange
+from sysid.search.state import CONFIRMED, GENERATION, HOPS, RETURNED, TRIED
 from tests.runs import step_record
 from tests.searching import DUFFING, bits, example, noisy, record
 

@@ -30,8 +30,8 @@ def test_identify_imports_nothing_that_it_does_not_need(tmp_path: Path) -> None:
 SHORT = """
 import sys
 import numpy as np
-from sysid.lagged_sums import laid_out
-from sysid.restricted import modelled
+from sysid.residuals.autocorrelation import laid_out
+from sysid.residuals.restricted_likelihood import modelled
 
 walk = np.cumsum(np.random.default_rng(0).standard_normal(60))
 assert modelled(laid_out(np.arange(60.0), walk), np.ones((60, 1))) is not None

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from service.cli import datasets as program
 from service.client import Client
 from service.signals.reader import read_recording
-from sysid.records import Recording
+from sysid.data.records import Recording
 from tests.integration.rest.test_client import Through
 from tests.rest import refused
 

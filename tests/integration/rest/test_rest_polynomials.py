@@ -7,7 +7,7 @@ from starlette.testclient import TestClient
 
 from service.models import model_of_run
 from service.storage.tables import Job, Run, State
-from sysid.models.spec import parse_model, with_terms
+from sysid.models.parse import parse_model, with_terms
 from tests.polynomials import document, frols
 from tests.rest import CSV, recording, refused
 

@@ -15,11 +15,12 @@ from typer.testing import CliRunner
 
 from service.api.deps import Parts
 from service.app import create_app
+from service.async_client import AsyncClient
 from service.cli.runs import app as runs_app
-from service.client import AsyncClient, Client
+from service.client import Client
 from service.storage.errors import ObjectMissing
 from service.storage.objects import ObjectStore
-from sysid.records import Recording
+from sysid.data.records import Recording
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
 from tests.rest import CSV, awaited, refused, settings_of

@@ -1,0 +1,1 @@
+"""Controllers, linearisation, margins, tuning, closed loop."""

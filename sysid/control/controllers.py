@@ -1,0 +1,168 @@
+"""Controllers by their numbers, and what lies between a controller and the plant.
+
+The standard (ISA) form with two weights of the reference r (Åström and Hägglund, Advanced PID
+Control, ISA 2006, sections 3.3 to 3.5), y the controlled output:
+
+    v = K [ (b r - y) + 1/T_i ∫(r - y) dt + T_d s/(1 + s T_d/N) (c r - y) ]
+    u = min(upper, max(lower, v))
+"""
+
+from dataclasses import KW_ONLY, dataclass
+from math import sqrt
+from typing import Literal
+
+from sysid.core.errors import InvalidSettings
+
+LARGEST = 1e300
+"""What is as large is no number of a model; a time is infinite."""
+
+DerivativeOn = Literal["measurement", "error"]
+AntiWindup = Literal["back-calculation", "none"]
+
+
+@dataclass(frozen=True, slots=True)
+class Transport:
+    """What lies between controller and plant: gain · e^(-delay s) / (time_constant s + 1).
+
+    Attributes
+    ----------
+    gain : float
+    time_constant, delay : float
+        In s, 0 or more. Without time constant it is a pure delay.
+    """
+
+    gain: float = 1.0
+    time_constant: float = 0.0
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not _is_number(self.gain):
+            raise InvalidSettings("/transport/gain", _not_finite(self.gain))
+        for name in ("time_constant", "delay"):
+            value = getattr(self, name)
+            if not _is_number(value) or value < 0:
+                raise InvalidSettings(f"/transport/{name}", f"{value!r} is not a number 0 or more")
+
+
+@dataclass(frozen=True, slots=True)
+class PidControl:
+    """Control of one output by one input: P, PI, PD or PID.
+
+    Attributes
+    ----------
+    input, output : str
+        Signals of the model.
+    gain : float
+        K, unit of the input per unit of the output.
+    limit : float or None
+        Largest absolute value that the controller gives, in the unit of the input.
+    transport : Transport or None
+        What its signal passes before it enters the plant.
+    integral_time : float or None
+        T_i in s; None or infinite: no integral action.
+    derivative_time : float
+        T_d in s; 0: no derivative action.
+    derivative_filter : float
+        N: the derivative is filtered by a lag of T_d/N, so its gain is N K at most.
+    derivative_on : {"measurement", "error"}
+        c = 0 or c = 1: whether steps of the reference are differentiated.
+    setpoint_weight : float
+        b, the part of the reference in the proportional action.
+    lower, upper : float or None
+        Least and largest value that the controller gives; instead of `limit`.
+    anti_windup : {"back-calculation", "none"}
+        At a limit the integral is led back by (u - v)/T_t, or not at all.
+    tracking_time : float or None
+        T_t in s; None: √(T_i T_d), without derivative action T_i.
+    """
+
+    input: str
+    output: str
+    gain: float
+    limit: float | None = None
+    transport: Transport | None = None
+    _: KW_ONLY
+    integral_time: float | None = None
+    derivative_time: float = 0.0
+    derivative_filter: float = 10.0
+    derivative_on: DerivativeOn = "measurement"
+    setpoint_weight: float = 1.0
+    lower: float | None = None
+    upper: float | None = None
+    anti_windup: AntiWindup = "back-calculation"
+    tracking_time: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "setpoint_weight"):
+            if not _is_number(getattr(self, name)):
+                raise InvalidSettings(f"/{name}", _not_finite(getattr(self, name)))
+        for name in ("limit", "tracking_time", "derivative_filter"):
+            value = getattr(self, name)
+            if value is not None and not (_is_number(value) and value > 0):
+                raise InvalidSettings(f"/{name}", f"{value!r} is not a number above 0")
+        if self.integral_time is not None and not self.integral_time > 0:
+            raise InvalidSettings(
+                "/integral_time", f"{self.integral_time!r} is not a time above 0 s, or infinity"
+            )
+        if not (_is_number(self.derivative_time) and self.derivative_time >= 0):
+            raise InvalidSettings(
+                "/derivative_time", f"{self.derivative_time!r} is not a time of 0 s or more"
+            )
+        self._check_limits()
+
+    def _check_limits(self) -> None:
+        for name in ("lower", "upper"):
+            value = getattr(self, name)
+            if value is not None and not _is_number(value):
+                raise InvalidSettings(f"/{name}", _not_finite(value))
+            if value is not None and self.limit is not None:
+                raise InvalidSettings(
+                    f"/{name}", "the limit ± is given too; give that or lower and upper"
+                )
+        if self.lower is not None and self.upper is not None and self.lower >= self.upper:
+            raise InvalidSettings(
+                "/upper", f"found {self.upper:g}, and {self.lower:g} as lower limit; need more"
+            )
+
+    @property
+    def integrates(self) -> bool:
+        """Whether there is integral action."""
+        return self.integral_time is not None and self.integral_time < LARGEST
+
+    @property
+    def differentiates(self) -> bool:
+        """Whether there is derivative action."""
+        return self.derivative_time > 0
+
+    @property
+    def filter_time(self) -> float:
+        """Time constant T_d/N of the derivative's filter in s."""
+        return self.derivative_time / self.derivative_filter
+
+    @property
+    def range(self) -> tuple[float | None, float | None]:
+        """Least and largest value that the controller gives; None where there is no limit."""
+        if self.limit is not None:
+            return -self.limit, self.limit
+        return self.lower, self.upper
+
+    @property
+    def tracking(self) -> float | None:
+        """T_t in s; None where nothing winds up, or nothing is done about it."""
+        is_limited = any(one is not None for one in self.range)
+        if not (self.integrates and is_limited and self.anti_windup == "back-calculation"):
+            return None
+        if self.tracking_time is not None:
+            return self.tracking_time
+        assert self.integral_time is not None
+        if not self.differentiates:
+            return self.integral_time
+        return sqrt(self.integral_time) * sqrt(self.derivative_time)
+
+
+def _not_finite(value: float) -> str:
+    return f"{value!r} is not a finite number between ±{LARGEST:g}"
+
+
+def _is_number(value: float) -> bool:
+    return -LARGEST < value < LARGEST

@@ -1,0 +1,232 @@
+"""Stability and margins of a loop around a linear model, with its dead times as they are."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from math import ceil, inf, pi
+
+import numpy as np
+
+from sysid.control.controllers import PidControl, Transport
+from sysid.control.linear_form import Identified, NotLinear
+from sysid.control.transfer import Quasi, Transfer, by_delay, transfers
+from sysid.core.types import BoolArray, ComplexArray, FloatArray
+from sysid.kernels.reads import is_difference
+
+_DECADES = 3  # below the slowest and above the fastest part of the loop
+_FARTHEST = 1e8  # from the middle of what is in the loop: beyond, nothing of it is told
+_A_DECADE = 400  # frequencies
+_TURN = 0.05  # rad that dead times turn from one frequency to the next
+_LOUD = 0.1  # loop gain below which they may turn farther: only gain margins are left there
+_MOST = 200_000
+_SMALL = 1e-3  # loop gain beyond which nothing is looked for: a gain margin of a thousand
+_SECANTS = 12  # that leaves nothing of steps of a hundredth, at sharp resonances too
+_ROUNDING = 1e-6  # rad
+_FAR = 0.5  # rad: what turns farther from one frequency to the next may be missed
+_ROUNDS, _PARTS = 8, 10  # in which such a step is divided
+_FEW = 1000  # steps: where all turn far it is no root, but a dead time at frequencies of no account
+
+
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """How far a loop is from instability (Åström and Hägglund, Advanced PID Control, section 4.6).
+
+    Of several crossings each margin is that of the one nearest to instability.
+
+    Attributes
+    ----------
+    is_stable : bool
+        Whether no root of the characteristic equation has a real part above 0. The margins of a
+        loop that is unstable are those of its crossings and do not tell how to mend it.
+    gain_margin : float
+        Factor of the gain at which the loop swings, or drifts; below 1 of a loop that needs its
+        gain, ``inf`` if there is none.
+    phase_margin : float
+        Degrees of further phase lag that the loop bears; ``inf`` if its gain is 1 nowhere.
+    delay_margin : float
+        Further dead time in s that the loop bears; ``inf`` as before, 0 if it is unstable.
+    crossover_frequency : float
+        Where the loop gain is 1, in rad/s, at the phase margin; ``nan`` if nowhere.
+    sensitivity_peak : float
+        M_s, the largest |1/(1 + L)|; 1.2 to 2 is usual. Of an unstable loop it says nothing.
+    """
+
+    is_stable: bool
+    gain_margin: float
+    phase_margin: float
+    delay_margin: float
+    crossover_frequency: float
+    sensitivity_peak: float
+
+
+def margins(identified: Identified, control: PidControl) -> Margins:
+    """Margins of the loop that a controller closes around a model, its limits left out.
+
+    Raises
+    ------
+    NotLinear
+        If the model is not linear, or a recursion.
+    """
+    if is_difference(identified.model):
+        raise NotLinear("margins are of models in the differential form; this one is a recursion")
+    signals = (control.input, control.output)
+    pairs = transfers(identified).pairs
+    [pair] = [one for one in pairs if (one.input, one.output) == signals]
+    loop = _Loop(pair, control)
+    omega, end = _frequencies(loop, pair, control)
+    return _margins(loop, omega[omega <= end], is_stable=_is_stable(loop, omega))
+
+
+class _Loop:
+    """L(s) on the imaginary axis; weights of the reference are outside the loop."""
+
+    def __init__(self, pair: Transfer, control: PidControl) -> None:
+        self._pair, self._control = pair, control
+        self._transport = control.transport or Transport()
+        self.order = max(power for power, _ in pair.denominator)
+        self.order += control.integrates + control.differentiates
+        self.order += self._transport.time_constant > 0
+
+    def gain(self, omega: FloatArray) -> ComplexArray:
+        """L(iω): controller, transport and plant in a row."""
+        above, below = self.parts(omega)
+        return above / below
+
+    def at_rest(self) -> FloatArray:
+        """L(0), (1,), a real number; (0,) where something integrates."""
+        above, below = self.parts(np.zeros(1))
+        found: FloatArray = (above[below != 0] / below[below != 0]).real
+        return found[np.isfinite(found)]
+
+    def parts(self, omega: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """Numerator and denominator of L(iω), without the poles that they have."""
+        control, transport = self._control, self._transport
+        s: ComplexArray = np.asarray(1j * omega, dtype=np.complex128)
+        late: ComplexArray = np.exp(-s * transport.delay)
+        below: ComplexArray = 1.0 + s * transport.time_constant
+        filtered: ComplexArray = 1.0 + s * control.filter_time
+        actions = filtered + s * control.derivative_time
+        if control.integrates and control.integral_time is not None:
+            actions = actions * s + filtered / control.integral_time
+            below = below * s
+        given = control.gain * transport.gain * late * actions
+        above: ComplexArray = given * _value(self._pair.numerator, s)
+        return above, below * filtered * _value(self._pair.denominator, s)
+
+
+def _value(quasi: Quasi, s: ComplexArray) -> ComplexArray:
+    total = np.zeros_like(s)
+    for delay, powers in by_delay(quasi):
+        total += np.polyval(powers, s) * np.exp(-s * delay)
+    return total
+
+
+def _is_stable(loop: _Loop, omega: FloatArray) -> bool:
+    """By Mikhailov's criterion: the sum of both parts turns by a quarter for each of its roots.
+
+    Divided by as many stable roots it does not turn at all if all roots are stable, and by half a
+    turn back for each that is not.
+    """
+    above, below = loop.parts(omega)
+    middle = float(np.sqrt(omega[0] * omega[-1]))
+    turned = np.unwrap(np.angle((above + below) / (1j * omega / middle + 1.0) ** loop.order))
+    return bool(abs(turned[-1] - turned[0]) < pi / 2)
+
+
+def _frequencies(loop: _Loop, pair: Transfer, control: PidControl) -> tuple[FloatArray, float]:
+    """Angular frequencies around all that the loop has, and beyond which its gain is gone."""
+    scales = sorted(_scales(pair, control)) or [1.0]
+    middle = scales[len(scales) // 2]
+    scales = [min(max(one, middle / _FARTHEST), middle * _FARTHEST) for one in scales]
+    low, high = scales[0] / 10**_DECADES, scales[-1] * 10**_DECADES
+    decades = np.log10(high / low)
+    coarse: FloatArray = np.geomspace(low, high, ceil(_A_DECADE * decades))
+    size = np.abs(loop.gain(coarse))
+    loud, end = _last(coarse, size > _LOUD, low), _last(coarse, size > _SMALL, high)
+    delays = sum(
+        max((d for _, d in one), default=0.0) for one in (pair.numerator, pair.denominator)
+    )
+    delays += control.transport.delay if control.transport else 0.0
+    fine = (
+        [_turning(0.0, loud, _TURN / delays), _turning(loud, end, _FAR / delays)] if delays else []
+    )
+    return _resolved(loop, np.unique(np.concatenate([coarse, *fine]))), end
+
+
+def _last(omega: FloatArray, where: BoolArray, otherwise: float) -> float:
+    """The frequency behind the last one where something holds."""
+    found = np.flatnonzero(where)
+    return float(omega[min(int(found[-1]) + 2, omega.size - 1)]) if found.size else otherwise
+
+
+def _turning(start: float, stop: float, step: float) -> FloatArray:
+    count = min(ceil((stop - start) / step), _MOST) if stop > start else 0
+    return np.linspace(stop, start, count, endpoint=False)
+
+
+def _resolved(loop: _Loop, omega: FloatArray) -> FloatArray:
+    """With more frequencies where a root near the axis turns the loop, or its border, at once.
+
+    A root on the axis is never resolved, and one right of it by less than the last step is taken
+    for one left of it as often as not.
+    """
+    for _ in range(_ROUNDS):
+        above, below = loop.parts(omega)
+        steps = [np.diff(np.unwrap(np.angle(one))) for one in (below, above + below)]
+        far = np.flatnonzero(np.max(np.abs(steps), axis=0) > _FAR)
+        if not 0 < far.size <= _FEW:
+            break
+        parts = np.linspace(0.0, 1.0, _PARTS, endpoint=False)[1:, None]
+        more = omega[far] + parts * (omega[far + 1] - omega[far])
+        omega = np.unique(np.concatenate([omega, more.ravel()]))
+    return omega
+
+
+def _scales(pair: Transfer, control: PidControl) -> Iterable[float]:
+    """Frequencies in rad/s at which something changes."""
+    for quasi in (pair.numerator, pair.denominator):
+        for delay, powers in by_delay(quasi):
+            yield from (abs(root) for root in np.roots(powers) if root != 0)
+            if delay > 0:
+                yield 1.0 / delay
+    transport = control.transport or Transport()
+    times = [transport.delay, transport.time_constant, control.filter_time, control.derivative_time]
+    if control.integrates and control.integral_time is not None:
+        times.append(control.integral_time)
+    yield from (1.0 / time for time in times if time > 0)
+
+
+def _margins(loop: _Loop, omega: FloatArray, *, is_stable: bool) -> Margins:
+    gains = loop.gain(omega)
+    crossings = _roots(lambda w: np.abs(loop.gain(w)) - 1.0, omega, np.abs(gains) - 1.0)
+    lefts = np.angle(-loop.gain(crossings))
+    if is_stable:  # past half a turn it is stable since the next border is a turn away
+        lefts = np.where(lefts < -_ROUNDING, lefts + 2 * pi, lefts)
+    nearest = int(np.argmin(np.abs(lefts))) if lefts.size else None
+    turned = _roots(lambda w: loop.gain(w).imag, omega, gains.imag)
+    at_turned = np.append(loop.gain(turned).real, loop.at_rest())
+    factors = -1.0 / at_turned[at_turned < 0]
+    bears = float(np.min(np.maximum(lefts, 0.0) / crossings, initial=inf))
+    return Margins(
+        is_stable=is_stable,
+        gain_margin=float(factors[np.argmin(np.abs(np.log(factors)))]) if factors.size else inf,
+        phase_margin=inf if nearest is None else float(np.degrees(lefts[nearest])),
+        delay_margin=bears if is_stable else 0.0,
+        crossover_frequency=np.nan if nearest is None else float(crossings[nearest]),
+        sensitivity_peak=float(np.max(1.0 / np.abs(1.0 + gains))),
+    )
+
+
+def _roots(
+    function: Callable[[FloatArray], FloatArray], omega: FloatArray, values: FloatArray
+) -> FloatArray:
+    """Where a function changes its sign, by secants of the steps in which it does."""
+    at = np.flatnonzero(values[:-1] * values[1:] < 0)
+    low, high, below, above = omega[at], omega[at + 1], values[at], values[at + 1]
+    for _ in range(_SECANTS):
+        middle = low - below * (high - low) / (above - below)
+        value = function(middle)
+        is_before = value * below > 0
+        low, below = np.where(is_before, middle, low), np.where(is_before, value, below)
+        high, above = np.where(is_before, high, middle), np.where(is_before, above, value)
+    found: FloatArray = low - below * (high - low) / (above - below)
+    return found

@@ -1,0 +1,223 @@
+"""What a step response is judged by: rise time, overshoot, settling, and integrals of the error."""
+
+from dataclasses import dataclass
+from math import isfinite, nan
+
+import numpy as np
+
+from sysid.core.errors import InvalidRecord
+from sysid.core.types import FloatArray
+
+_RISE = (0.1, 0.9)
+_BAND = 0.02
+_TAIL = 0.1
+_WINDOWS = 3  # the last quarters of the record: what comes first, the step itself makes
+_GROWTH = 1.03  # a limit cycle's peaks differ by less, by where the samples lie
+_SWING_GROWTH = 1.01  # the same of swings between turning points that are interpolated
+_LASTING = 0.9  # of the swing two quarters before: one that decays faster will settle
+_STEADY = 0.99  # of the last increment: from there on, growth does not slow down
+_ROUNDING = 1e-9  # of the step: an output that moves less has not answered
+_BEYOND = 1e100  # steps away from the reference: not to be squared
+
+
+@dataclass(frozen=True, slots=True)
+class StepMetrics:
+    """Measures of a step response; times in s after the step, ``nan`` where there is none.
+
+    Attributes
+    ----------
+    rise_time : float
+        From 10 % to 90 % of the way from where the output stood to the final value.
+    overshoot_percent : float
+        Farthest way beyond the reference, in per cent of the step; 0 if it is not passed.
+    overshoot_of_final_percent : float
+        Farthest way beyond the final value, in per cent of the way to it from where the output
+        stood: what is left of the overshoot where a steady error keeps it from the reference.
+    settling_time : float
+        From when on the output stays within `band` of its mean over the last tenth of the record;
+        ``nan`` if it leaves it in that tenth still.
+    band : float
+        2 % of the step, in the unit of the output.
+    steady_error : float
+        Reference minus that mean, in the unit of the output.
+    final_value : float
+        That mean.
+    runs_away : bool
+        The output is not finite, or its deviation from the reference, or its swing, grows from
+        each quarter of the record to the next without slowing down: the loop is unstable, and
+        there is no overshoot, settling time or final value; they are ``nan``.
+    is_settled : bool
+        There is a settling time. A response that neither runs away nor has settled still moves at
+        the end of the record: its final value and overshoot are those of the record.
+    iae, itae : float
+        ∫|e| dt and ∫t |e| dt of the error e = reference - output, from the step to the end of the
+        record; in the unit of the output times s and s². A steady error makes both grow with it.
+    swing, swing_period : float
+        Of an output that keeps swinging with the same size, as in a limit cycle: from peak to
+        peak, in its unit, and the period in s. ``nan`` where it settles or runs away, or where
+        the record is too short to tell.
+    """
+
+    rise_time: float
+    overshoot_percent: float
+    overshoot_of_final_percent: float
+    settling_time: float
+    band: float
+    steady_error: float
+    final_value: float
+    runs_away: bool = False
+    is_settled: bool = True
+    iae: float = nan
+    itae: float = nan
+    swing: float = nan
+    swing_period: float = nan
+
+
+def step_metrics(
+    times: FloatArray, values: FloatArray, *, at: float, before: float, after: float
+) -> StepMetrics:
+    """Judge the response to a reference that steps once.
+
+    Parameters
+    ----------
+    times, values : FloatArray, shape (N,)
+        The output; times in s.
+    at : float
+        Time of the step in s.
+    before, after : float
+        The reference on either side of it, in the unit of the output.
+
+    Raises
+    ------
+    InvalidRecord
+        If no two samples follow the step, or the reference does not change.
+    """
+    later = times >= at
+    if np.count_nonzero(later) < 2:
+        raise InvalidRecord(f"the record has no two samples after the step at {at:g} s")
+    height = after - before
+    if height == 0:
+        raise InvalidRecord(f"the reference does not change at {at:g} s")
+    t, y = times[later] - at, values[later]
+    band = _BAND * abs(height)
+    if _runs_away(t, y - after, abs(height)):
+        return StepMetrics(nan, nan, nan, nan, band, nan, nan, runs_away=True, is_settled=False)
+    tail = t >= t[-1] - _TAIL * (t[-1] - t[0])
+    final = float(np.mean(y[tail]))
+    # A steady error keeps the output from the reference before the step as after it.
+    start = float(values[~later][-1]) if not later.all() else float(y[0])
+    if abs(final - start) <= _ROUNDING * abs(height):
+        start = final
+    settling = _settled(t, np.abs(y - final), band, float(t[tail][0]))
+    error = np.abs(after - y)
+    swing, period = (nan, nan) if isfinite(settling) else _lasting_swing(t, y - after, band)
+    return StepMetrics(
+        rise_time=_rise_time(t, y, start, final),
+        overshoot_percent=_overshoot(y, before, after),
+        overshoot_of_final_percent=_overshoot(y, start, final),
+        settling_time=settling,
+        band=band,
+        steady_error=after - final,
+        final_value=final,
+        is_settled=isfinite(settling),
+        iae=float(np.trapezoid(error, t)),
+        itae=float(np.trapezoid(t * error, t)),
+        swing=swing,
+        swing_period=period,
+    )
+
+
+def _rise_time(t: FloatArray, y: FloatArray, before: float, final: float) -> float:
+    if final == before:
+        return nan
+    low, high = (_first_passing(t, (y - before) / (final - before), level) for level in _RISE)
+    return high - low
+
+
+def _overshoot(y: FloatArray, before: float, end: float) -> float:
+    """Farthest way beyond `end` in per cent of the way there; ``nan`` if there is no way."""
+    if end == before:
+        return nan
+    return 100.0 * max(float(np.max((y - before) / (end - before))) - 1.0, 0.0)
+
+
+def _runs_away(t: FloatArray, deviation: FloatArray, height: float) -> bool:
+    """Whether the output is not finite, or goes or swings farther and farther from the reference.
+
+    A response that is only late, slow, or far off in the end slows down or turns towards its end.
+    """
+    with np.errstate(over="ignore"):
+        away = np.abs(deviation)
+    if not np.all(away < _BEYOND * height):
+        return True
+    edges = _edges(t)
+    farthest = _greatest(t, away, edges)
+    before = max(float(np.max(away[t <= edges[-2]])), height)
+    if float(farthest[-1]) > _GROWTH * before and _grows(farthest, 1.0):
+        return True
+    swings = _greatest(*_swings(t, deviation), edges)
+    return float(swings[-1]) > _BAND * height and _grows(swings, _SWING_GROWTH)
+
+
+def _lasting_swing(t: FloatArray, deviation: FloatArray, band: float) -> tuple[float, float]:
+    """Size and period of a swing that neither grows nor decays; ``nan`` if there is none."""
+    ends, sizes = _swings(t, deviation)
+    first, *_, last = _greatest(ends, sizes, _edges(t))
+    if not last > 2.0 * band or not last > _LASTING * first > 0.0:
+        return nan, nan
+    later = ends[ends > 0.5 * (t[0] + t[-1])]
+    return (float(last), 2.0 * float(np.mean(np.diff(later)))) if later.size > 2 else (nan, nan)
+
+
+def _edges(t: FloatArray) -> FloatArray:
+    """Ends of the quarters of the record, from that of the first on."""
+    edges: FloatArray = t[0] + (t[-1] - t[0]) * np.arange(1, _WINDOWS + 2) / (_WINDOWS + 1)
+    return edges
+
+
+def _greatest(t: FloatArray, values: FloatArray, edges: FloatArray) -> FloatArray:
+    """The greatest value in each window (_WINDOWS,); 0 where there is none."""
+    which = np.searchsorted(edges, t, side="left")  # 0: before the first window
+    return np.array([np.max(values[which == i], initial=0.0) for i in range(1, _WINDOWS + 1)])
+
+
+def _grows(sizes: FloatArray, least: float) -> bool:
+    """Whether each of the sizes is `least` times the one before, and growth does not slow down."""
+    if not np.all(sizes[:-1] > 0.0) or not np.all(sizes[1:] > least * sizes[:-1]):
+        return False
+    more = np.diff(sizes)
+    return bool(np.all(more[1:] >= _STEADY * more[:-1]))
+
+
+def _swings(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """When each way from a turning point to the next ends, and how long it is.
+
+    The values there are those of parabolas through three samples: of the samples alone, those of
+    a limit cycle would seem to grow.
+    """
+    slope = np.diff(y)
+    at = np.flatnonzero(slope[:-1] * slope[1:] < 0.0) + 1
+    bend = slope[at] - slope[at - 1]
+    peaks = y[at] - (slope[at] + slope[at - 1]) ** 2 / (8.0 * bend)
+    return t[at[1:]], np.abs(np.diff(peaks))
+
+
+def _first_passing(t: FloatArray, way: FloatArray, level: float) -> float:
+    """When the way first reaches a level, on a line between samples."""
+    reached = np.flatnonzero(way >= level)
+    if reached.size == 0:
+        return nan
+    i = int(reached[0])
+    if i == 0:
+        return float(t[0])
+    part = (level - way[i - 1]) / (way[i] - way[i - 1])
+    return float(t[i - 1] + part * (t[i] - t[i - 1]))
+
+
+def _settled(t: FloatArray, away: FloatArray, band: float, latest: float) -> float:
+    """From when on it stays inside the band; ``nan`` if that is later than `latest`."""
+    outside = np.flatnonzero(away > band)
+    if outside.size == 0:
+        return 0.0
+    last = int(outside[-1])
+    return nan if last + 1 >= t.size or t[last + 1] > latest else float(t[last + 1])

@@ -1,0 +1,297 @@
+"""Tuning rules for a linear model with a dead time: SIMC and AMIGO.
+
+A rule needs the plant as k e^(-θs)/((T1 s + 1)(T2 s + 1)); time constants beyond these are halved
+between the last one that is kept and the dead time (Skogestad's half rule). An integrating plant,
+k' e^(-θs)/(s (T2 s + 1)), is the limit of an infinite T1 with k/T1 = k'.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import inf, isfinite
+from typing import Literal
+
+import numpy as np
+
+from sysid.control.controllers import LARGEST, Transport
+from sysid.control.linear_form import Identified, NotLinear
+from sysid.control.transfer import Quasi, Transfer, by_delay, transfers
+from sysid.core.errors import InvalidSettings
+from sysid.core.types import ComplexArray
+from sysid.kernels.reads import is_difference
+
+Rule = Literal["simc", "amigo"]
+Kind = Literal["PI", "PID"]
+
+REFERENCES: Mapping[Rule, str] = {
+    "simc": "S. Skogestad, Simple analytic rules for model reduction and PID controller tuning, "
+    "J. Process Control 13 (2003) 291-309",
+    "amigo": "K. J. Åström and T. Hägglund, Revisiting the Ziegler-Nichols step response method "
+    "for PID control, J. Process Control 14 (2004) 635-650",
+}
+_SAME = 1e-6  # of a root: a zero so close to a pole takes it away
+_AT_ZERO = 1e-9  # of the fastest root: a pole there integrates
+_REAL = 1e-3  # of a root: the parts of a fourfold pole are less far apart by rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """k e^(-θs)/((T1 s + 1)(T2 s + 1)), or k' e^(-θs)/(s (T2 s + 1)).
+
+    Attributes
+    ----------
+    gain : float
+        k; of an integrating process k', per s.
+    delay : float
+        θ in s.
+    time_constant : float
+        T1 in s; ``inf`` of an integrating process.
+    second_time_constant : float
+        T2 in s, 0 of a first-order one.
+    """
+
+    gain: float
+    delay: float
+    time_constant: float
+    second_time_constant: float = 0.0
+
+    @property
+    def rate(self) -> float:
+        """k/T1, or k': what the slope of the step response begins with."""
+        return self.gain / self.time_constant if isfinite(self.time_constant) else self.gain
+
+
+@dataclass(frozen=True, slots=True)
+class Tuning:
+    """What a rule gives for a controller in the standard form, and what it was given.
+
+    Attributes
+    ----------
+    gain, integral_time, derivative_time : float
+        K in units of input per output, T_i and T_d in s.
+    process : Process
+        The model as the rule takes it.
+    closed_loop_time_constant : float or None
+        τ_c in s, of SIMC.
+    formulas : tuple of str
+    """
+
+    rule: Rule
+    controller: Kind
+    gain: float
+    integral_time: float
+    derivative_time: float
+    process: Process
+    closed_loop_time_constant: float | None
+    formulas: tuple[str, ...]
+
+    @property
+    def reference(self) -> str:
+        """Where the rule was published."""
+        return REFERENCES[self.rule]
+
+
+def tuned(
+    identified: Identified, input: str, output: str, *, rule: Rule = "simc",
+    controller: Kind = "PI", closed_loop_time_constant: float | None = None,
+    transport: Transport | None = None,
+) -> Tuning:  # fmt: skip
+    """A controller of one output by one input by a rule.
+
+    Parameters
+    ----------
+    identified : Identified
+        A linear model in the differential form.
+    rule : {"simc", "amigo"}
+    controller : {"PI", "PID"}
+    closed_loop_time_constant : float, optional
+        τ_c of SIMC in s; the effective dead time θ if not given, which Skogestad advises.
+    transport : Transport, optional
+        What lies between controller and plant: a part of what is to be controlled.
+
+    Raises
+    ------
+    InvalidSettings
+        If the rule has no answer for this model; the message tells why.
+    """
+    if closed_loop_time_constant is not None and rule != "simc":
+        raise InvalidSettings(
+            "/tuning/closed_loop_time_constant", f"rule {rule!r} has none; leave it out"
+        )
+    factors = factors_of(identified, input, output, transport)
+    process = factors.reduced(2 if controller == "PID" and rule == "simc" else 1)
+    try:
+        found = (
+            _amigo(process, controller) if rule == "amigo"
+            else _simc(process, controller, closed_loop_time_constant)
+        )  # fmt: skip
+    except ZeroDivisionError:  # of numbers whose product is too small to be one
+        raise _refusal(_no_gain(inf, process)) from None
+    if not 0.0 < abs(found.gain) < LARGEST:
+        raise _refusal(_no_gain(found.gain, process))
+    return found
+
+
+def _no_gain(found: float, process: Process) -> str:
+    return (
+        f"the rule gives a gain of {found:g}, which no controller can have; the process has a gain "
+        f"of {process.gain:g} and a dead time of {process.delay:g} s"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Factors:
+    """gain · e^(-delay s) / Π (T s + 1), over s where it integrates."""
+
+    gain: float
+    delay: float
+    time_constants: tuple[float, ...]
+    integrates: bool
+
+    def reduced(self, order: int) -> Process:
+        """The process of first or second order by the half rule."""
+        times = [inf, *self.time_constants] if self.integrates else list(self.time_constants)
+        times += [0.0] * (order + 1 - len(times))
+        kept, lost = times[:order], times[order:]
+        half = lost[0] / 2
+        last = kept[-1] + half
+        delay = self.delay + half + sum(lost[1:])
+        if order == 1:
+            return Process(self.gain, delay, last)
+        return Process(self.gain, delay, kept[0], last)
+
+
+def factors_of(
+    identified: Identified, input: str, output: str, transport: Transport | None
+) -> Factors:
+    """The transfer function from the controller to the output as gain, lags and dead time.
+
+    Raises
+    ------
+    InvalidSettings
+        If it is not of that form.
+    """
+    if is_difference(identified.model):
+        raise _refusal(
+            "a tuning rule needs a model in the differential form; this one is a recursion, so "
+            "give gain, integral_time and derivative_time yourself"
+        )
+    try:
+        pairs = transfers(identified).pairs
+    except NotLinear as error:
+        raise _refusal(f"a tuning rule needs a linear model: {error}") from None
+    [pair] = [one for one in pairs if (one.input, one.output) == (input, output)]
+    return _factors(pair, transport or Transport())
+
+
+def _factors(pair: Transfer, transport: Transport) -> Factors:
+    if not pair.numerator or transport.gain == 0.0:
+        raise _refusal(f"{pair.input!r} has no effect on {pair.output!r}")
+    delay, above = _one_delay(pair.numerator, "the model has more than one dead time in a row")
+    _, below = _one_delay(pair.denominator, "the model has a dead time inside a loop of its own")
+    zeros, poles = _without_common(_roots(above), _roots(below))
+    if zeros.size:
+        where = ", ".join(f"{zero:.4g}" for zero in np.sort_complex(zeros))
+        raise _refusal(f"the model has a zero at s = {where}; the rules are of models without one")
+    scale = max((abs(pole) for pole in poles), default=0.0)
+    integrators = [pole for pole in poles if abs(pole) <= _AT_ZERO * scale or pole == 0]
+    others = [pole for pole in poles if abs(pole) > _AT_ZERO * scale and pole != 0]
+    if len(integrators) > 1:
+        raise _refusal("the model integrates twice; the rules are of models that do so once")
+    if any(pole.real > 0 for pole in others):
+        raise _refusal("the model is unstable by itself; the rules are of stable models")
+    if any(abs(pole.imag) > _REAL * abs(pole) for pole in others):
+        raise _refusal(
+            "the model oscillates by itself (a pair of complex poles); the rules are of models "
+            "with real time constants"
+        )
+    times = [float(1.0 / abs(pole)) for pole in others]
+    # What is left of numerator and denominator at low frequencies, s of the integrator apart.
+    gain = float(above[0] / below[0] * np.prod(times)) * transport.gain
+    if transport.time_constant > 0:
+        times.append(transport.time_constant)
+    if not times and not integrators:
+        raise _refusal("the model has no time constant; the rules are of models with one")
+    ordered = tuple(sorted(times, reverse=True))
+    return Factors(gain, delay + transport.delay, ordered, bool(integrators))
+
+
+def _one_delay(quasi: Quasi, fault: str) -> tuple[float, list[float]]:
+    parts = by_delay(quasi)
+    if len(parts) > 1:
+        raise _refusal(f"{fault}; the rules know one between input and output")
+    delay, powers = parts[0]
+    return delay, powers
+
+
+def _roots(powers: list[float]) -> ComplexArray:
+    return np.asarray(np.roots(powers), dtype=np.complex128)
+
+
+def _without_common(zeros: ComplexArray, poles: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Roots without those that numerator and denominator share: of states that have no effect."""
+    left, kept = list(poles), []
+    for zero in zeros:
+        near = [i for i, pole in enumerate(left) if abs(pole - zero) <= _SAME * abs(pole)]
+        if near:
+            left.pop(near[0])
+        else:
+            kept.append(zero)
+    return np.array(kept, dtype=np.complex128), np.array(left, dtype=np.complex128)
+
+
+def _simc(process: Process, controller: Kind, wanted: float | None) -> Tuning:
+    theta = process.delay
+    if wanted is None and theta == 0.0:
+        raise InvalidSettings(
+            "/tuning/closed_loop_time_constant",
+            "is missing; the model has no dead time to take instead, so give it in s",
+        )
+    tau = theta if wanted is None else wanted
+    if not (isfinite(tau) and tau > 0):
+        raise InvalidSettings(
+            "/tuning/closed_loop_time_constant", f"{tau!r} is not a time above 0 s"
+        )
+    series_gain = 1.0 / (process.rate * (tau + theta))
+    series_time = min(process.time_constant, 4.0 * (tau + theta))
+    derivative = process.second_time_constant
+    # From the series form, in which the rule is written, to the standard one.
+    factor = 1.0 + derivative / series_time
+    formulas = ["K' = T1/(k (τ_c + θ))", "T_i' = min(T1, 4 (τ_c + θ))"]
+    if controller == "PID":
+        formulas += ["T_d' = T2", "f = 1 + T_d'/T_i'", "K = K' f, T_i = T_i' f, T_d = T_d'/f"]
+    else:
+        formulas += ["K = K', T_i = T_i'"]
+    return Tuning(
+        "simc", controller, series_gain * factor, series_time * factor, derivative / factor,
+        process, tau, tuple(formulas),
+    )  # fmt: skip
+
+
+def _amigo(process: Process, controller: Kind) -> Tuning:
+    theta, t, rate = process.delay, process.time_constant, process.rate
+    if theta == 0.0:
+        raise _refusal("AMIGO needs a dead time, and the model has none; take rule 'simc'")
+    ratio = theta / t  # 0 of an integrating process
+    if controller == "PI":
+        part = 0.35 - ratio / (1.0 + ratio) ** 2
+        gain = (0.15 * ratio + part) / (rate * theta)
+        integral = 0.35 * theta + 13.0 * theta / (1.0 + 12.0 * ratio + 7.0 * ratio**2)
+        derivative = 0.0
+        formulas: tuple[str, ...] = (
+            "K = 0.15/k + (0.35 - θ T1/(θ + T1)²) T1/(k θ)",
+            "T_i = 0.35 θ + 13 θ T1²/(T1² + 12 θ T1 + 7 θ²)",
+        )
+    else:
+        gain = (0.2 * ratio + 0.45) / (rate * theta)
+        integral = (0.4 * ratio + 0.8) / (ratio + 0.1) * theta
+        derivative = 0.5 * theta / (0.3 * ratio + 1.0)
+        formulas = (
+            "K = (0.2 + 0.45 T1/θ)/k",
+            "T_i = (0.4 θ + 0.8 T1)/(θ + 0.1 T1) θ",
+            "T_d = 0.5 θ T1/(0.3 θ + T1)",
+        )
+    return Tuning("amigo", controller, gain, integral, derivative, process, None, formulas)
+
+
+def _refusal(detail: str) -> InvalidSettings:
+    return InvalidSettings("/tuning", detail)

@@ -1,0 +1,206 @@
+"""Settings of a search and of the problem it solves, as frozen values.
+
+The field names are those of the job body; defaults are defined here once.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from sysid.core.errors import InvalidSettings
+
+SearchMethod = Literal["simple", "improved-paper", "improved"]
+TopologyName = Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"]
+Prediction = Literal["simulation", "one-step"]
+NoiseModel = Literal["auto", "white", "ar1"]
+NOISE_MODELS: tuple[NoiseModel, ...] = ("auto", "white", "ar1")
+METHODS: tuple[SearchMethod, ...] = ("simple", "improved-paper", "improved")
+# What the compiled search counts in 64 bits, with room to add; no run of years comes near them.
+MOST_GENERATIONS = 10**9
+MOST_EVALUATIONS = 10**12
+Schedule = tuple[tuple[int, float], ...]
+TOPOLOGIES: tuple[TopologyName, ...] = (
+    "one-way-ring", "ring", "fully-connected", "star", "unconnected",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceSearch:
+    """The paper's sequence search (Eq. 11, 12).
+
+    ``kind`` ``"paper"``: the step stays fixed; ``"adaptive"``: it learns step sizes and
+    directions. `beta` is the step, relative to the value (`relative`, Eq. 12) or to the range.
+    """
+
+    kind: Literal["paper", "adaptive"] = "adaptive"
+    beta: float = 0.01
+    relative: bool = True
+
+    def __post_init__(self) -> None:
+        _require(self.kind in ("paper", "adaptive"), "sequence/kind", self.kind, "paper, adaptive")
+        _require(0 < self.beta < 1, "sequence/beta", self.beta, "between 0 and 1")
+
+
+@dataclass(frozen=True, slots=True)
+class Migration:
+    """Every how many generations, along which topology, how many migrants (pagmo's words)."""
+
+    every: int = 25
+    topology: TopologyName = "one-way-ring"
+    migrants: int = 2
+
+    def __post_init__(self) -> None:
+        _require_count(self.every, "migration/every")
+        _require(self.topology in TOPOLOGIES, "migration/topology", self.topology,
+                 ", ".join(TOPOLOGIES))  # fmt: skip
+        _require(0 <= self.migrants <= MOST_GENERATIONS, "migration/migrants", self.migrants,
+                 f"0 to {MOST_GENERATIONS}")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """End conditions besides the generations; whichever comes first. None: not used.
+
+    `settled`: the best individual was found again by two searches more than that, half of that
+    at least from new random places and half from beside it, and by a third of all searches; where
+    fewer than half of those from random places agree, only after two and a half times as many.
+    Where the fitness jumps nearby, by that many of either kind, by two thirds of those from random
+    places and nine of ten from beside it. Only the adaptive sequence search makes these, so that
+    the paper's methods never end by it.
+    """
+
+    evaluations: int | None = None
+    seconds: float | None = None
+    rms: float | None = None
+    settled: int | None = 6
+
+    def __post_init__(self) -> None:
+        for name in ("evaluations", "seconds", "rms", "settled"):
+            value = getattr(self, name)
+            _require(value is None or value > 0, f"stop/{name}", value, "positive")
+        _require(self.evaluations is None or self.evaluations <= MOST_EVALUATIONS,
+                 "stop/evaluations", self.evaluations, f"1 to {MOST_EVALUATIONS}")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class IslandChange:
+    """What one island does otherwise; None: as the archipelago."""
+
+    method: SearchMethod | None = None
+    bits: int | None = None
+    mutation: Schedule | None = None
+
+    def __post_init__(self) -> None:
+        if self.mutation is not None:
+            _require_schedule(self.mutation, "islands")
+
+
+@dataclass(frozen=True, slots=True)
+class GeneticAlgorithm:
+    """A whole search: the paper's genetic algorithm, its improvement, and the islands.
+
+    Attributes
+    ----------
+    population : int
+        Individuals in all, dealt over the islands as evenly as possible, so that the budget of
+        evaluations does not depend on the number of islands.
+    mutation : tuple of (generation, rate)
+        Schedule: from that generation on, that probability of one flipped bit in a child.
+    stagnation : int
+        Generations without a better champion before the sequence search begins.
+    islands : int or tuple of IslandChange or None
+        None: 4 for ``improved``, 1 for the two methods of the paper, which knows no islands.
+    safe_limit : float or None
+        Fitness above which an individual is invalid (section 3), in the output's unit.
+    """
+
+    method: SearchMethod = "improved"
+    population: int = 50
+    generations: int = 400
+    bits: int = 24
+    selection_rate: float = 0.5
+    mutation: Schedule = ((0, 0.2), (50, 0.8))
+    stagnation: int = 30
+    sequence: SequenceSearch = field(default_factory=SequenceSearch)
+    islands: int | tuple[IslandChange, ...] | None = None
+    migration: Migration = field(default_factory=Migration)
+    refine: bool = True
+    safe_limit: float | None = None
+    stop: Stop = field(default_factory=Stop)
+
+    def __post_init__(self) -> None:
+        _require(self.method in METHODS, "method", self.method, ", ".join(METHODS))
+        _require(self.population >= 4, "population", self.population, "4 or more")
+        _require_count(self.generations, "generations")
+        _require(1 <= self.bits <= 32, "bits", self.bits, "1 to 32")
+        _require(0 < self.selection_rate < 1, "selection_rate", self.selection_rate,
+                 "between 0 and 1")  # fmt: skip
+        _require_count(self.stagnation, "stagnation")
+        _require_schedule(self.mutation, "mutation")
+        _require(self.safe_limit is None or self.safe_limit > 0, "safe_limit", self.safe_limit,
+                 "positive")  # fmt: skip
+        _require(self.n_islands >= 1, "islands", self.islands, "1 or more")
+        budget = self.stop.evaluations
+        _require(budget is None or budget >= self.population, "stop/evaluations", budget,
+                 f"{self.population} or more, the simulations of one population of "
+                 f"{self.population} individuals")  # fmt: skip
+        _require(self.population >= 4 * self.n_islands, "population", self.population,
+                 f"4 or more for each of the {self.n_islands} islands")  # fmt: skip
+
+    @property
+    def n_islands(self) -> int:
+        """Number of islands."""
+        if self.islands is None:
+            return 4 if self.method == "improved" and self.population >= 16 else 1
+        return self.islands if isinstance(self.islands, int) else len(self.islands)
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """What is minimised: squares (Eq. 10), or soft-l1 with a scale in the output's unit.
+
+    With the noise model ``ar1`` the search minimises squares; from its end on the estimates are
+    those of generalised least squares under first-order noise
+    (`sysid.identification.generalised_least_squares`). ``auto`` is that for free runs by squares
+    whose residuals are coloured and whose model does not forget where it began
+    (`sysid.identification.noise_model_choice`), else ``white``.
+    """
+
+    kind: Literal["squares", "soft-l1"] = "squares"
+    scale: float = 1.0
+    noise_model: NoiseModel = "auto"
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("squares", "soft-l1"):
+            raise InvalidSettings("/loss/kind", f"{self.kind!r} is not 'squares' or 'soft-l1'")
+        if not self.scale > 0:
+            raise InvalidSettings("/loss/scale", f"{self.scale!r} is not a positive number")
+        if self.noise_model not in NOISE_MODELS:
+            raise InvalidSettings(
+                "/loss/noise_model",
+                f"{self.noise_model!r} is not {', '.join(NOISE_MODELS[:-1])} or {NOISE_MODELS[-1]}",
+            )
+        if self.noise_model == "ar1" and self.kind != "squares":
+            raise InvalidSettings(
+                "/loss/noise_model",
+                f"{self.noise_model} is not available with {self.kind}; need the loss 'squares'",
+            )
+
+
+def _require(holds: bool, pointer: str, found: object, right: str) -> None:
+    if not holds:
+        raise InvalidSettings(f"/algorithm/{pointer}", f"found {found!r}; need {right}")
+
+
+def _require_count(found: int, pointer: str) -> None:
+    _require(1 <= found <= MOST_GENERATIONS, pointer, found, f"1 to {MOST_GENERATIONS}")
+
+
+def _require_schedule(found: Schedule, pointer: str) -> None:
+    generations = [generation for generation, _ in found]
+    holds = (
+        bool(generations) and generations[0] == 0 and generations[-1] <= MOST_GENERATIONS
+        and generations == sorted(set(generations))
+        and all(0 <= rate <= 1 for _, rate in found)
+    )  # fmt: skip
+    right = f"[generation, rate] pairs from generation 0 up to {MOST_GENERATIONS}, rates 0 to 1"
+    _require(holds, pointer, found, right)

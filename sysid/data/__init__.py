@@ -1,0 +1,1 @@
+"""Recordings: records, holds, initial history, resampling, splitting, derivation, noise."""

@@ -1,0 +1,78 @@
+"""Noise added to a record before fitting, for studies of sensitivity (Eq. 19, 20).
+
+Reading of Eq. 19: φ = χ + σξ, so `sigma` is a standard deviation. Reading of Eq. 20: ψ is uniform
+in (0, 1), so that ξ = (Σψ − N/2)/√(N/12) has mean 0, variance 1 and excess kurtosis −1.2/N.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from sysid.core.errors import InvalidSettings
+from sysid.core.types import FloatArray
+from sysid.data.records import Record
+
+NoiseKind = Literal["gaussian", "uniform-sum"]
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Measurement noise of every output.
+
+    Attributes
+    ----------
+    sigma : float
+        Standard deviation, in the output's unit.
+    seed : int
+    kind : {"gaussian", "uniform-sum"}
+        ``uniform-sum``: Eq. 20 with N = `terms`.
+    terms : int
+        N ≥ 3 of Eq. 20.
+    mean : float
+        χ of Eq. 19.
+    """
+
+    sigma: float = 0.0
+    seed: int = 0
+    kind: NoiseKind = "gaussian"
+    terms: int = 12
+    mean: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sigma < np.inf:
+            raise InvalidSettings("/noise/sigma", f"found {self.sigma!r}; need 0 or more")
+        if self.seed < 0:
+            raise InvalidSettings("/noise/seed", f"found {self.seed!r}; need 0 or more")
+        if self.kind not in ("gaussian", "uniform-sum"):
+            raise InvalidSettings(
+                "/noise/kind", f"{self.kind!r} is not 'gaussian' or 'uniform-sum'"
+            )
+        if self.terms < 3:
+            raise InvalidSettings("/noise/terms", f"found {self.terms!r}; need 3 or more")
+
+
+def noise_samples(noise: Noise, n: int, stream: int = 0) -> FloatArray:
+    """`n` samples of φ (Eq. 19); `stream` tells channels apart."""
+    generator = np.random.Generator(np.random.Philox(key=[noise.seed, stream]))
+    if noise.kind == "gaussian":
+        unit = generator.standard_normal(n)
+    else:
+        total = generator.random((n, noise.terms)).sum(axis=1)
+        unit = (total - noise.terms / 2) / np.sqrt(noise.terms / 12)
+    return np.asarray(noise.mean + noise.sigma * unit)
+
+
+def with_noise(record: Record, noise: Noise, experiment: int = 0) -> Record:
+    """The record with noise on every output; inputs stay."""
+    if noise.sigma == 0 and noise.mean == 0:
+        return record
+    outputs = tuple(
+        replace(
+            channel,
+            values=channel.values
+            + noise_samples(noise, channel.values.size, 1000 * experiment + number),
+        )
+        for number, channel in enumerate(record.outputs)
+    )
+    return replace(record, outputs=outputs)

@@ -1,0 +1,397 @@
+"""Recordings: channels on their own times, segments, and the record a model is compared with."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from sysid.core.errors import InvalidRecord, nearest
+from sysid.core.types import FloatArray
+
+Hold = Literal["zero", "first", "band-limited"]
+HOLDS: tuple[Hold, ...] = ("zero", "first", "band-limited")
+
+REGULAR_WITHIN = 1e-2
+"""Times are regular when none is further than this part of a period from its place.
+
+Files print times with few digits: 610.35 Hz to 10 µs is off by 0.3 % of a period.
+"""
+
+
+_SAME_PERIOD = 1e-6  # of a period: how far those of one clock may differ
+
+
+class Sampling(NamedTuple):
+    """How a signal was sampled; `period` (s) is the median distance where it is irregular."""
+
+    samples: int
+    period: float
+    is_regular: bool
+
+    def __str__(self) -> str:
+        if self.samples < 2:
+            return "one sample"
+        kind = "every" if self.is_regular else "irregular, median"
+        return f"{self.samples} samples, {kind} {self.period:.6g} s"
+
+
+def sampling_of(times: FloatArray) -> Sampling:
+    """How times (s) are spaced."""
+    if times.size < 2:
+        return Sampling(times.size, float("nan"), is_regular=False)
+    period = float(times[-1] - times[0]) / (times.size - 1)
+    grid = times[0] + period * np.arange(times.size)
+    if period > 0 and float(np.max(np.abs(times - grid))) <= REGULAR_WITHIN * period:
+        return Sampling(times.size, period, is_regular=True)
+    return Sampling(times.size, float(np.median(np.diff(times))), is_regular=False)
+
+
+class History(NamedTuple):
+    """Samples from before a channel's first: times (s, not decreasing) and values."""
+
+    times: FloatArray
+    values: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channel:
+    """One measured signal on its own times.
+
+    Attributes
+    ----------
+    name, unit : str
+    times : FloatArray, shape (N,)
+        Seconds from the start of the recording, not decreasing. Samples pooled from several
+        repeats may share a time.
+    values : FloatArray, shape (N,)
+        In `unit`; ``nan`` is a missing value.
+    hold : {"zero", "first", "band-limited"}
+        What an input does between its samples.
+    history : History or None
+        What was recorded before the first sample. A lag reads an input there; nothing else does:
+        simulation and comparison begin where the samples do. None: nothing is known, and the
+        first value is taken to have stood all the time before.
+
+    Raises
+    ------
+    InvalidRecord
+        If the arrays differ in length, are empty, or the times decrease or are not finite; of the
+        history too.
+    """
+
+    name: str
+    times: FloatArray
+    values: FloatArray
+    unit: str = "1"
+    hold: Hold = "first"
+    history: History | None = None
+
+    def __post_init__(self) -> None:
+        if self.times.ndim != 1 or self.times.shape != self.values.shape or self.times.size == 0:
+            raise InvalidRecord(
+                f"channel {self.name!r} has times of shape {self.times.shape} and values of shape "
+                f"{self.values.shape}; need two equal one-dimensional arrays with a sample or more"
+            )
+        if not np.all(np.isfinite(self.times)) or np.any(np.diff(self.times) < 0):
+            raise InvalidRecord(f"the times of channel {self.name!r} decrease or are not finite")
+        if self.history is not None:
+            self._check(self.history)
+
+    def _check(self, history: History) -> None:
+        before, values = history
+        if before.ndim != 1 or before.shape != values.shape or before.size == 0:
+            raise InvalidRecord(
+                f"the history of channel {self.name!r} has times of shape {before.shape} and "
+                f"values of shape {values.shape}; need two equal one-dimensional arrays with a "
+                "sample or more, or no history"
+            )
+        times = np.append(before, self.times[0])
+        if np.any(np.diff(times) < 0) or not np.all(np.isfinite(times)):
+            raise InvalidRecord(
+                f"the history of channel {self.name!r} is not before its first sample, or its "
+                "times decrease or are not finite"
+            )
+
+    @property
+    def whole(self) -> "Channel":
+        """History and samples as samples of one channel."""
+        if self.history is None:
+            return self
+        times, values = (
+            np.concatenate(pair)
+            for pair in zip(self.history, (self.times, self.values), strict=True)
+        )
+        return replace(self, times=times, values=values, history=None)
+
+    @property
+    def sampling(self) -> Sampling:
+        """How this channel was sampled."""
+        return sampling_of(self.times)
+
+    @property
+    def known_samples(self) -> int:
+        """How many samples it has, with those of its history."""
+        return self.times.size + (0 if self.history is None else self.history.times.size)
+
+    def between(self, start: float, stop: float) -> "Channel":
+        """Return the samples with `start` ≤ time ≤ `stop`; what was cut off before is lost.
+
+        Raises
+        ------
+        InvalidRecord
+            If there is none.
+        """
+        first, last = np.searchsorted(self.times, [start, np.nextafter(stop, np.inf)])
+        if first == last:
+            raise InvalidRecord(
+                f"channel {self.name!r} has no sample from {start:g} to {stop:g} s; "
+                f"its samples are from {self.times[0]:g} to {self.times[-1]:g} s"
+            )
+        kept = self.history if first == 0 else None
+        return replace(
+            self, times=self.times[first:last], values=self.values[first:last], history=kept
+        )
+
+    def cut(self, start: float, stop: float) -> "Channel":
+        """Return the same samples as `between`, with all that was before them as their history."""
+        return self.between(start, stop).after(self)
+
+    def after(self, other: "Channel") -> "Channel":
+        """Return this channel with what another was before it as its history."""
+        whole = other.whole
+        count = int(np.searchsorted(whole.times, self.times[0]))
+        history = History(whole.times[:count], whole.values[:count]) if count else None
+        return replace(self, history=history)
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A part of a recording that was measured on its own, such as one repeat of a test.
+
+    Segments lie one behind the other on the recording's time axis: a segment's own time is the
+    recording's time minus `start`, plus `origin`.
+    """
+
+    start: float
+    stop: float
+    origin: float = 0.0
+    labels: Mapping[str, float | str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """All channels of one dataset, without roles. No segments: it was measured in one piece."""
+
+    channels: tuple[Channel, ...]
+    segments: tuple[Segment, ...] = ()
+
+    def channel(self, name: str) -> Channel:
+        """The channel of that name.
+
+        Raises
+        ------
+        InvalidRecord
+            If there is none; the message names the nearest.
+        """
+        for channel in self.channels:
+            if channel.name == name:
+                return channel
+        raise InvalidRecord(f"the recording has no channel {name!r}{nearest(name, self.names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the channels, in their order."""
+        return tuple(channel.name for channel in self.channels)
+
+    @property
+    def start(self) -> float:
+        """First time of any channel, in s."""
+        return min(float(channel.times[0]) for channel in self.channels)
+
+    @property
+    def stop(self) -> float:
+        """Last time of any channel, in s."""
+        return max(float(channel.times[-1]) for channel in self.channels)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last sample of any channel."""
+        return self.stop - self.start
+
+    @property
+    def samples(self) -> int:
+        """Samples of the longest channel."""
+        return max(channel.times.size for channel in self.channels)
+
+    @property
+    def sampling(self) -> Sampling:
+        """How the longest channel was sampled."""
+        return max(self.channels, key=lambda channel: channel.times.size).sampling
+
+    def held(self, holds: Mapping[str, Hold]) -> "Recording":
+        """Return the recording with other intersample behaviour of some channels.
+
+        Raises
+        ------
+        InvalidRecord
+            If there is no channel of that name.
+        """
+        for name in holds:
+            self.channel(name)
+        return replace(
+            self,
+            channels=tuple(
+                replace(one, hold=holds.get(one.name, one.hold)) for one in self.channels
+            ),
+        )
+
+    def record(
+        self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
+    ) -> "Record":
+        """Return the recording as one experiment of a model.
+
+        Parameters
+        ----------
+        inputs, outputs : mapping of str to str
+            Which channel is which signal of the model: model's name → channel's name.
+
+        Raises
+        ------
+        InvalidRecord
+            If a channel is not there or both an input and an output, an input has missing
+            values, an output has no value, or the recording consists of several segments.
+        """
+        for fault in both_ways(inputs, outputs).values():
+            raise InvalidRecord(fault)
+        if len(self.segments) > 1:
+            raise InvalidRecord(
+                f"the recording has {len(self.segments)} segments, each measured on its own; "
+                "derive one record with 'pool' or 'select', or use every segment as an experiment"
+            )
+        return Record(
+            tuple(_as_input(self.channel(ours), role) for role, ours in inputs.items()),
+            tuple(_as_output(self.channel(ours), role) for role, ours in outputs.items()),
+            name,
+        )
+
+    def records(
+        self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
+    ) -> tuple["Record", ...]:
+        """Return every segment as one experiment, on its own times; without segments, one."""
+        return tuple(part.record(inputs, outputs, name) for part in self.pieces())
+
+    def pieces(self) -> tuple["Recording", ...]:
+        """Return every segment as a recording on its own times; without segments, this one."""
+        if not self.segments:
+            return (self,)
+        return tuple(self._piece(segment) for segment in self.segments)
+
+    def _piece(self, segment: Segment) -> "Recording":
+        cut = [channel.between(segment.start, segment.stop) for channel in self.channels]
+        return Recording(tuple(_on_own_times(one, segment) for one in cut))
+
+
+def both_ways(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> dict[str, str]:
+    """Inputs whose channel is that of an output as well, and what is wrong with that.
+
+    Parameters
+    ----------
+    inputs, outputs : mapping of str to str
+        Model's name → channel's name.
+    """
+    measured = {channel: name for name, channel in outputs.items()}
+    return {
+        name: f"channel {channel!r} is given to input {name!r} and to output "
+        f"{measured[channel]!r}: an output that is its own input tells nothing"
+        for name, channel in inputs.items()
+        if channel in measured
+    }
+
+
+def own_times(times: FloatArray, segment: Segment) -> FloatArray:
+    """Times of a segment as they were measured, to the nanosecond.
+
+    The rounding takes away what the place on the recording's axis added to the last digits.
+    """
+    return np.round(times - segment.start + segment.origin, 9)
+
+
+def _begin(channel: Channel) -> float:
+    known = known_history(channel.history)
+    return float(channel.times[0] if known is None else known.times[0])
+
+
+def _on_own_times(channel: Channel, segment: Segment) -> Channel:
+    history = channel.history
+    if history is not None:
+        history = history._replace(times=own_times(history.times, segment))
+    return replace(channel, times=own_times(channel.times, segment), history=history)
+
+
+def _as_input(channel: Channel, role: str) -> Channel:
+    missing = np.flatnonzero(~np.isfinite(channel.values))
+    if missing.size:
+        raise InvalidRecord(
+            f"input {role!r} (channel {channel.name!r}) has {missing.size} missing values (NaN), "
+            f"the first at t = {channel.times[missing[0]]:g} s; an input must be known "
+            "everywhere: trim the recording or fill the gaps"
+        )
+    return replace(channel, name=role, history=known_history(channel.history))
+
+
+def known_history(history: History | None) -> History | None:
+    """The history behind its last missing value: what lies before that may be of another test."""
+    if history is None:
+        return None
+    missing = np.flatnonzero(~np.isfinite(history.values))
+    first = int(missing[-1]) + 1 if missing.size else 0
+    if first == history.values.size:
+        return None
+    return History(history.times[first:], history.values[first:])
+
+
+def _as_output(channel: Channel, role: str) -> Channel:
+    if not np.any(np.isfinite(channel.values)):
+        raise InvalidRecord(
+            f"output {role!r} (channel {channel.name!r}) has no value: all are missing (NaN)"
+        )
+    return replace(channel, name=role, history=None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Record:
+    """One experiment as a model sees it: channels carry the model's signal names."""
+
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    name: str = ""
+
+    @property
+    def known_before(self) -> float:
+        """For how long (s) before the start all inputs are known; 0 if one is not."""
+        return max(self.start - max((_begin(one) for one in self.inputs), default=np.inf), 0.0)
+
+    @property
+    def start(self) -> float:
+        """First time of any channel, in s."""
+        return min(float(one.times[0]) for one in (*self.inputs, *self.outputs))
+
+    @property
+    def stop(self) -> float:
+        """Last time of any channel, in s."""
+        return max(float(one.times[-1]) for one in (*self.inputs, *self.outputs))
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last sample of any channel."""
+        return self.stop - self.start
+
+
+def common_sample_time(records: Sequence[Record]) -> float | None:
+    """Period (s) with which all outputs of all records are sampled; None if there is none."""
+    found = [channel.sampling for record in records for channel in record.outputs]
+    periods = [one.period for one in found]
+    if not all(one.is_regular for one in found) or np.ptp(periods) > _SAME_PERIOD * min(periods):
+        return None
+    return periods[0]

@@ -1,0 +1,65 @@
+"""A record cut in two: the part a model is fitted to, and the last part, kept for validation."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.core.errors import InvalidRecord, InvalidSettings
+from sysid.core.types import FloatArray
+from sysid.data.records import Record
+
+
+def split_record(record: Record, fraction: float) -> tuple[Record, Record]:
+    """Split a record in time: first the part for estimation, then `fraction` for validation.
+
+    The cut lies at a sample of the longest output, which begins the validation part. What the
+    inputs were before it is that part's history.
+
+    Raises
+    ------
+    InvalidSettings
+        If the fraction is not between 0 and 1, or leaves a channel of a part without samples.
+    """
+    cut = start_of_validation(record, fraction)
+    parts = []
+    for start, stop in ((-np.inf, np.nextafter(cut, -np.inf)), (cut, np.inf)):
+        try:
+            parts.append(
+                replace(
+                    record,
+                    inputs=tuple(one.cut(start, stop) for one in record.inputs),
+                    outputs=tuple(one.between(start, stop) for one in record.outputs),
+                )
+            )
+        except InvalidRecord as error:
+            raise InvalidSettings("/validation/fraction", f"found {fraction!r}: {error}") from None
+    return parts[0], parts[1]
+
+
+def start_of_validation(record: Record, fraction: float) -> float:
+    """Time (s) at which the last `fraction` of a record begins, a sample of the longest output.
+
+    Raises
+    ------
+    InvalidSettings
+        If the fraction is not between 0 and 1, or one part would be empty.
+    """
+    return time_of_cut(max((one.times for one in record.outputs), key=len), fraction)
+
+
+def time_of_cut(times: FloatArray, fraction: float, pointer: str = "/validation/fraction") -> float:
+    """Time (s) of the sample at which the last `fraction` of the samples begins.
+
+    Raises
+    ------
+    InvalidSettings
+        If the fraction is not between 0 and 1, or one part would be empty.
+    """
+    if not 0 < fraction < 1:
+        raise InvalidSettings(pointer, f"found {fraction!r}; need a number between 0 and 1")
+    first = times.size - round(fraction * times.size)
+    if not 0 < first < times.size:
+        raise InvalidSettings(
+            pointer, f"found {fraction!r}: one part of {times.size} samples would be empty"
+        )
+    return float(times[first])

@@ -1,0 +1,155 @@
+"""`sysid.export`: an identified model in a format for other programs."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from sysid.control.linear_form import Covariance, Identified, Value
+from sysid.core.errors import InvalidSettings, nearest
+from sysid.data.records import HOLDS, Hold
+from sysid.export.c import c_source
+from sysid.export.description import json_source
+from sysid.export.python import python_source
+from sysid.export.python_control import control_source
+from sysid.identification.result import Identification
+from sysid.language.evaluation import value as value_of
+from sysid.models.model import Model, initial_name
+from sysid.models.parse import with_terms
+from sysid.models.ties import ties_of
+
+Format = Literal["json", "python", "c", "control"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+MOST_PADE = 20
+
+_WRITERS: Mapping[str, Callable[[Identified], str]] = {
+    "json": json_source, "python": python_source, "c": c_source,
+}  # fmt: skip
+
+
+def export_model(
+    model: Model,
+    found: Identification | Mapping[str, float],
+    format: Format = "python",
+    *,
+    sample_time: float | None = None,
+    hold: Mapping[str, Hold] | None = None,
+    version: str = "",
+    provenance: Mapping[str, Any] | None = None,
+    pade_order: int = 3,
+) -> str:
+    """An identified model as text.
+
+    Parameters
+    ----------
+    model : Model
+        As it was identified; terms that were selected on the way are taken from the result.
+    found : Identification or mapping of str to float
+        A result, or every parameter's value; with initial values such as ``x(0)`` where the
+        model estimates them. One that is tied to others may be left out.
+    format : {"json", "python", "c", "control"}
+    sample_time : float, optional
+        Sampling period of the data in s; a transfer function in z needs it. A result knows its.
+    hold : mapping of str to {"zero", "first", "band-limited"}, optional
+        How inputs are held between their samples; where nothing is said as in the data of the
+        result, ``first`` without one.
+    version, provenance : optional
+        Told in the text: version of the program, run, data sets.
+    pade_order : int
+        Order of the approximation of dead times in format ``control``, 1 to 20.
+
+    Raises
+    ------
+    InvalidSettings
+        If a value is missing or unknown, or an option cannot be used.
+    NotLinear
+        If the format is ``control`` and the model has no transfer function.
+    """
+    holds = dict(hold or {})
+    if isinstance(found, Identification):
+        if model.rule is not None and found.selection:
+            model = with_terms(model, [one.term for one in found.selection])
+        known = {one.name for one in model.inputs}
+        holds = {**{k: v for k, v in found.holds.items() if k in known}, **holds}
+        sample_time = found.sample_time if sample_time is None else sample_time
+    values, covariance = _values(model, found)
+    _check(model, values, sample_time, holds)
+    identified = Identified(
+        model, values, covariance, sample_time, holds, version, dict(provenance or {})
+    )
+    return written(identified, format, pade_order)
+
+
+def written(identified: Identified, format: str, pade_order: int = 3) -> str:
+    """An identified model in one of `FORMATS`.
+
+    Raises
+    ------
+    InvalidSettings
+        If there is no such format, or the order is out of its range.
+    NotLinear
+        If the format is ``control`` and the model has no transfer function.
+    """
+    if format not in FORMATS:
+        detail = f"{format!r} is not a format{nearest(format, FORMATS)}"
+        raise InvalidSettings("/format", detail)
+    if not 1 <= pade_order <= MOST_PADE:
+        raise InvalidSettings(
+            "/pade_order", f"{pade_order!r} is not an order from 1 to {MOST_PADE}"
+        )
+    if identified.model.rule is not None:
+        raise InvalidSettings("/model/terms", "the terms are not selected yet; there is no model")
+    if format == "control":
+        return control_source(identified, pade_order)
+    return _WRITERS[format](identified)
+
+
+def _values(
+    model: Model, found: Identification | Mapping[str, float]
+) -> tuple[tuple[Value, ...], Covariance | None]:
+    if isinstance(found, Identification):
+        values = tuple(
+            Value(one.name, one.value, one.unit, one.stderr, one.status) for one in found.estimates
+        )
+        known = found.uncertainty
+        return values, None if known is None else Covariance(known.names, known.covariance)
+    units = {one.name: one.unit for one in model.parameters}
+    units |= {initial_name(state.name, 0): state.unit for state in model.states}
+    numbers = _with_ties(model, found)
+    return tuple(Value(n, float(v), units.get(n, "1")) for n, v in numbers.items()), None
+
+
+def _with_ties(model: Model, found: Mapping[str, float]) -> dict[str, float]:
+    """The values, and those of tied parameters that are not among them."""
+    free = [replace(p, tied=None) if p.name in found else p for p in model.parameters]
+    for one in free:
+        if one.tied is None and one.name not in found:
+            raise InvalidSettings(f"/values/{one.name}", "a value is missing")
+    return {**{name: value_of(tie, found) for name, tie in ties_of(model, free).items()}, **found}
+
+
+def _check(
+    model: Model, values: tuple[Value, ...], sample_time: float | None, hold: Mapping[str, Hold]
+) -> None:
+    _check_values(model, {one.name: one.value for one in values})
+    if sample_time is not None and not 0.0 < sample_time < float("inf"):
+        raise InvalidSettings("/sample_time", f"{sample_time!r} is not a period in s")
+    inputs = [one.name for one in model.inputs]
+    for name, kind in hold.items():
+        if name not in inputs:
+            detail = f"the model has no input {name!r}{nearest(name, inputs)}"
+            raise InvalidSettings(f"/hold/{name}", detail)
+        if kind not in HOLDS:
+            raise InvalidSettings(f"/hold/{name}", f"{kind!r} is not one of {', '.join(HOLDS)}")
+
+
+def _check_values(model: Model, numbers: Mapping[str, float]) -> None:
+    names = [one.name for one in model.parameters]
+    starts = {state.name for state in model.states}
+    for name, value in numbers.items():
+        if name not in names and name.partition("(0)")[0] not in starts:
+            detail = f"the model has no parameter {name!r}{nearest(name, names)}"
+            raise InvalidSettings(f"/values/{name}", detail)
+        if not np.isfinite(value):
+            raise InvalidSettings(f"/values/{name}", f"{value!r} is not a finite number")

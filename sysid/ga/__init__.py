@@ -1,1 +1,0 @@
-"""The genetic algorithm of the paper and its improvement, one island at a time."""

@@ -1,0 +1,326 @@
+"""Generalised least squares: estimates under first-order noise.
+
+Least squares takes every residual for news. Where the noise changes slowly, neighbouring residuals
+tell the same thing twice, and a slow disturbance outweighs what the fast part of the record says.
+So residuals are whitened by a first-order noise (`sysid.residuals.whitening`), the parameters
+estimated from what is left, and the noise from the new residuals, until it stays (feasible
+generalised least squares; Cochrane and Orcutt, J. Am. Stat. Assoc. 44 (1949) 32).
+
+What is estimated of the noise is its *correlation time* τ, at which the residuals' autocorrelation
+has fallen to 1/e. Of first-order noise it says as much as the correlation of neighbours does. Of
+smooth disturbances, whose neighbours are equal to many digits, that one leads to a model of
+differences, in which rounding and sensor noise outweigh all else; τ does not. The first-order
+noise is a working correlation: where it is not the true one the estimates keep their meaning and
+lose some efficiency, and the covariance is that of what the whitening leaves, by a sandwich where
+that is coloured (Liang and Zeger, Biometrika 73 (1986) 13; `sysid.residuals.coloured`).
+
+Where switches make the loss rough, the minimum beside that of least squares need not be the lowest:
+of places drawn along the covariance of least squares, those that lie lowest are starts as well.
+
+Estimated parameters take a part of the noise with them. At last it is put back, as the covariance
+of the fitted outputs, S C Sᵀ, added to the autocovariance of the residuals. Once only: repeated,
+noise with a white part drifted away, and its offset with it.
+"""
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.fft import irfft, rfft
+
+from sysid.core.types import FloatArray
+from sysid.residuals.autocorrelation import laid_out
+from sysid.residuals.coloured import Part, is_coloured, parts
+from sysid.residuals.whitening import Whitening, owed
+from sysid.search.levenberg_marquardt import damped_step
+from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import located, placed
+from sysid.uncertainty.linear_model import drawn_along, moves_of
+
+_ROUNDS = 12
+_SAME = 1e-3  # relative: correlation times that differ by less
+_STEPS = 40  # of least squares in a round
+_DIFFERENCE = 1e-6  # of the range
+_DAMPINGS = np.array([0.0, 1e-4, 1e-2, 1.0, 1e2])
+_LEAST, _MOST = 1e-11, 1e12
+_TOLERANCE = 1e-10  # of the sum: the part that a step must promise
+_SIZES = np.array([0.3, 1.0, 2.0])  # standard errors by which drawn places are off
+_DRAWN, _STARTS = 96, 6
+_WORK = 50_000_000  # steps of integration or recursion: no places are drawn on longer records
+_FALLEN = float(np.exp(-1.0))
+_WHITE = 0.1  # correlation of neighbours: below, it is not worth a model
+
+
+class Generalised(NamedTuple):
+    """Estimates under coloured noise.
+
+    Attributes
+    ----------
+    theta : FloatArray, shape (D,)
+    correlation_times : mapping of str to float
+        Of each output's noise, s; 0 where its residuals may as well be white.
+    evaluations : int
+    is_complete : bool
+        False where the simulations that were left did not suffice.
+    minima : FloatArray, shape (m, D)
+        Where least squares ended from all starts, the estimate among them.
+    rms : FloatArray, shape (m,)
+        Of the whitened residuals there.
+    instead_of : FloatArray, shape (D,), or None
+        Estimates of squares, where nobody asked for a noise model
+        (`sysid.identification.noise_model_choice`).
+    too_slow : mapping of str to float
+        Correlation times (s) for which the record is too short, so that squares stayed there.
+    """
+
+    theta: FloatArray
+    correlation_times: Mapping[str, float]
+    evaluations: int
+    is_complete: bool
+    minima: FloatArray = np.zeros((0, 0))
+    rms: FloatArray = np.zeros(0)
+    instead_of: FloatArray | None = None
+    too_slow: Mapping[str, float] = MappingProxyType({})
+
+
+def whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
+    """The whitening of a problem's scored samples."""
+    each = [owed(one.times, correlation_times.get(one.output, 0.0)) for one in parts(problem)]
+    return Whitening(
+        np.concatenate([np.zeros(0), *each]), sum(time > 0 for time in correlation_times.values())
+    )
+
+
+def generalised(
+    problem: Problem, theta: FloatArray, covariance: FloatArray, seed: int,
+    most: int | None = None,
+) -> Generalised:  # fmt: skip
+    """Estimates under first-order noise, from those of least squares (D,).
+
+    With no more than `most` simulations. Where all residuals may as well be white the estimates
+    stay as they are.
+
+    Parameters
+    ----------
+    covariance : FloatArray, shape (D, D)
+        Of the estimates of least squares.
+    seed : int
+        Of the places that are drawn along it.
+    """
+    search = _Search(problem, 2**62 if most is None else most)
+    if search.left < 1:
+        return Generalised(theta, {}, 0, False)
+    place = placed(problem.evaluator, theta[None])[0]
+    error = search.errors(place[None])[0]
+    coloured = _coloured(problem, error)
+    known: Mapping[str, float] = {}
+    random = moves_of(seed)
+    for i in range(_ROUNDS if coloured else 0):
+        found = _correlation_times(problem, coloured, error, None)
+        is_last = i == _ROUNDS - 1 or _are_alike(found, known)
+        if search.left < search.round:
+            return _told(problem, theta, place, known, search, False)
+        if is_last:
+            spread = _spread(search.slopes(place, error), error, whitening(problem, known))
+            found = _correlation_times(problem, coloured, error, spread)
+        known, white = found, whitening(problem, found)
+        starts = _starts(search, place, white, covariance, random) if i == 0 or is_last else ()
+        place, error = search.lowest((place, error), starts, white)
+        if is_last:
+            break
+    return _told(problem, theta, place, known, search, not search.is_cut)
+
+
+def coloured_outputs(problem: Problem, theta: FloatArray) -> set[str]:
+    """Outputs whose residuals at theta (D,) are clearly not white."""
+    place = placed(problem.evaluator, theta[None])
+    return _coloured(problem, _Search(problem, 1).errors(place)[0])
+
+
+def _coloured(problem: Problem, error: FloatArray) -> set[str]:
+    return {one.output for one in parts(problem) if is_coloured(one, error[one.rows])}
+
+
+def _told(
+    problem: Problem, theta: FloatArray, place: FloatArray, known: Mapping[str, float],
+    search: "_Search", is_complete: bool,
+) -> Generalised:  # fmt: skip
+    """The estimates at a place, those there were where no correlation was found."""
+    if any(known.values()):
+        theta = located(problem.evaluator, place[None])[0]
+    minima = located(problem.evaluator, search.ends)
+    return Generalised(theta, known, search.evaluations, is_complete, minima, search.rms)
+
+
+def _starts(
+    search: "_Search", place: FloatArray, white: Whitening, covariance: FloatArray,
+    random: np.random.Generator,
+) -> list[tuple[FloatArray, FloatArray]]:  # fmt: skip
+    """Places around one (D,), and their residuals, those that lie lowest of some that are drawn."""
+    count = _DRAWN + _STARTS * search.round
+    if search.left < count or count * search.problem.n_steps > _WORK:
+        return []
+    evaluator = search.problem.evaluator
+    moves = _SIZES[np.arange(_DRAWN) % _SIZES.size, None]
+    moves = moves * random.standard_normal((_DRAWN, place.size)) @ drawn_along(covariance).T
+    theta = located(evaluator, place[None]) + moves
+    places = placed(evaluator, np.clip(theta, evaluator.lower, evaluator.upper))
+    errors = search.errors(places)
+    best = np.argsort(_sums(white.of(errors)), kind="stable")[:_STARTS]
+    return [(places[i], errors[i]) for i in best]
+
+
+def _are_alike(found: Mapping[str, float], known: Mapping[str, float]) -> bool:
+    return bool(known) and all(
+        abs(found[name] - known[name]) <= _SAME * known[name] for name in found
+    )
+
+
+def _spread(columns: FloatArray, error: FloatArray, white: Whitening) -> FloatArray:
+    """L (n, D) of the covariance LLᵀ of fitted outputs with slopes (n, D)."""
+    seen, left = white.of(columns.T).T, white.of(error)
+    singular, rows = np.linalg.svd(seen, full_matrices=False)[1:]
+    kept = singular > 1e-7 * max(float(singular[0]), np.finfo(float).tiny)
+    deviation = np.sqrt(float(left @ left) / max(error.size - columns.shape[1], 1))
+    return np.asarray(deviation * columns @ (rows[kept].T / singular[kept]))
+
+
+def _correlation_times(
+    problem: Problem, coloured: set[str], error: FloatArray, spread: FloatArray | None
+) -> dict[str, float]:
+    """Of each output in s: the mean over its series, by their samples."""
+    found: dict[str, list[tuple[float, int]]] = {}
+    for one in parts(problem):
+        if one.output in coloured:
+            also = None if spread is None else spread[one.rows]
+            time = _correlation_time(one, error[one.rows], also)
+            found.setdefault(one.output, []).append((time, one.times.size))
+    return {
+        name: sum(time * n for time, n in each) / sum(n for _, n in each)
+        for name, each in found.items()
+    }
+
+
+def _correlation_time(part: Part, error: FloatArray, spread: FloatArray | None) -> float:
+    """Time (s) at which the autocorrelation of one series has fallen to 1/e, half of it at most."""
+    laid = laid_out(part.times, error)
+    present = laid.present.astype(np.float64)
+    covariance = _lagged(laid.values)
+    for column in () if spread is None else spread.T:
+        values = np.zeros(laid.values.size)
+        values[laid.present] = column
+        covariance += _lagged(values)
+    n = laid.values.size
+    pairs = np.maximum(np.rint(_lagged(present)), 1.0)
+    covariance *= np.arange(n, n - pairs.size, -1.0) / pairs  # as if no sample were missing
+    if not covariance.size or not covariance[0] > 0:
+        return 0.0
+    return laid.period * _fallen(covariance / covariance[0])
+
+
+def _lagged(values: FloatArray) -> FloatArray:
+    """Σ v(t) v(t + k) for k from 0 up to half the values' number."""
+    n = values.size
+    length = 1 << (2 * n - 1).bit_length()
+    return np.asarray(irfft(np.square(np.abs(rfft(values, length))), length)[: n // 2])
+
+
+def _fallen(correlation: FloatArray) -> float:
+    """Lag at which a correlation function has fallen to 1/e, by a line between two lags."""
+    below = np.flatnonzero(correlation <= _FALLEN)
+    if not below.size:
+        return float(correlation.size)
+    k = int(below[0])
+    if k == 1:  # faster than the samples: what is left of the first-order noise after one of them
+        return -1.0 / float(np.log(correlation[1])) if correlation[1] > _WHITE else 0.0
+    before, after = correlation[k - 1], correlation[k]
+    return k - 1 + float((before - _FALLEN) / (before - after))
+
+
+class _Search:
+    """Least squares of whitened residuals over places in [0, 1], counting simulations."""
+
+    def __init__(self, problem: Problem, budget: int) -> None:
+        self.problem, self._budget, self.evaluations = problem, budget, 0
+        self.is_cut = False  # whether a minimum was left before its end for want of simulations
+        self.ends, self.rms = np.zeros((0, len(problem.space))), np.zeros(0)  # of the last round
+        self._rows = np.flatnonzero(problem.evaluator.weight > 0)
+        self._weight = problem.evaluator.weight[self._rows]
+        self._measured = problem.evaluator.measured[self._rows]
+        self._step = len(problem.space) + _DAMPINGS.size
+        self.round = len(problem.space) + self._step  # simulations without which no round begins
+
+    @property
+    def left(self) -> int:
+        """Simulations that may still be run."""
+        return self._budget - self.evaluations
+
+    def errors(self, places: FloatArray) -> FloatArray:
+        """Weighted residuals (P, n) of places (P, D)."""
+        self.evaluations += places.shape[0]
+        predicted = self.problem.predictions(located(self.problem.evaluator, places))
+        return np.asarray(self._weight * (predicted[:, self._rows] - self._measured))
+
+    def slopes(self, place: FloatArray, error: FloatArray) -> FloatArray:
+        """Slopes (n, D) of the residuals, by differences away from the nearer bound."""
+        steps = np.where(place < 0.5, _DIFFERENCE, -_DIFFERENCE)
+        with np.errstate(invalid="ignore", over="ignore"):
+            found = (self.errors(place + np.diag(steps)) - error).T / steps
+        return np.where(np.isfinite(found), found, 0.0)
+
+    def lowest(
+        self, here: tuple[FloatArray, FloatArray], starts: Sequence[tuple[FloatArray, FloatArray]],
+        white: Whitening,
+    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+        """The lowest minimum from a place with its residuals and from other such starts."""
+        ends = [self.minimum(*start, white) for start in (here, *starts)]
+        totals = _sums(white.of(np.array([error for _, error in ends])))
+        self.ends, self.rms = np.array([place for place, _ in ends]), np.sqrt(totals)
+        return ends[int(np.argmin(totals))]
+
+    def minimum(
+        self, place: FloatArray, error: FloatArray, white: Whitening
+    ) -> tuple[FloatArray, FloatArray]:
+        """The minimum that Levenberg-Marquardt finds from a place (D,), and its residuals (n,)."""
+        damping, columns = 1e-3, None
+        for _ in range(_STEPS):
+            if self.left < (self._step if columns is None else _DAMPINGS.size):
+                self.is_cut = True
+                break
+            if columns is None:
+                columns = white.of(self.slopes(place, error).T)
+            seen = white.of(error)
+            total, tried = float(seen @ seen), np.maximum(_DAMPINGS * damping, _LEAST)
+            places, promised = _proposals(columns, seen, place, tried)
+            if promised <= _TOLERANCE * total:
+                break
+            errors = self.errors(places)
+            totals = _sums(white.of(errors))
+            best = int(np.argmin(totals))
+            if totals[best] < total:
+                place, error, columns = places[best], errors[best], None
+                damping = float(np.clip(tried[best] if best else 1e-2 * damping, _LEAST, _MOST))
+            else:
+                damping *= 1e3
+                if damping > _MOST:
+                    break
+        return place, error
+
+
+def _proposals(
+    columns: FloatArray, error: FloatArray, place: FloatArray, dampings: FloatArray
+) -> tuple[FloatArray, float]:
+    """Places (P, D) after the step of each damping (P,), and the most that one promises."""
+    normal, slope = columns @ columns.T, columns @ error
+    places = np.empty((dampings.size, place.size))
+    for one, damping in zip(places, dampings, strict=True):
+        damped_step(normal, slope, place, float(damping), one)
+    return places, max(0.0, float(np.max((place - places) @ slope)))
+
+
+def _sums(errors: FloatArray) -> FloatArray:
+    """Sums of squares (P,) of residuals (P, n); inf where one is not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        totals = np.einsum("pn,pn->p", errors, errors)
+    return np.where(np.isfinite(totals), totals, np.inf)

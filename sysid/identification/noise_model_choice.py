@@ -1,0 +1,192 @@
+"""Whether a model forgets where it began.
+
+The outputs of a lag of some time constant, or of a damped oscillator, do not depend on states of
+long ago. Those of an integrator do for ever: a drive's position, a tank's level, whatever has a
+pole at 0. In these a disturbance of a moment stays in all later outputs, and the error of a free
+run drifts by its nature.
+
+It is looked at where the model is: the start of one state after the other is moved a little, and
+the free run made again. A model remembers where all through the last quarter of a record more than
+a twentieth is left of the largest change, with one sign: a first-order lag with a time constant of
+more than a third of the record, too. Of several experiments all have to say so: a lag of seconds is
+forgotten, though one of them may end before. The phase of an oscillation that sustains itself, and
+chaos, are not forgotten either, but that is no drift.
+
+The noise model ``auto``: squares or generalised least squares, by whether the model forgets.
+
+Coloured residuals are noise or dynamics that the model lacks, and they do not tell which. In a
+model that forgets (`sysid.identification.noise_model_choice`) squares are the better criterion for
+a free run: whitened ones shift what is missing to low frequencies. In one that does not, whatever
+disturbs the states stays in all later outputs, so that residuals drift also where the dynamics are
+right, and squares weigh the drift. Simulated plants of 17 kinds bear it out (decision 26, as
+amended).
+
+The correlation time has to be known, too: where a record is not five times as long, generalised
+least squares was no better than squares.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from sysid.core.types import FloatArray
+from sysid.identification.generalised_least_squares import Generalised, coloured_outputs
+from sysid.identification.integration_step import step_notes
+from sysid.kernels.layout import Layout
+from sysid.residuals.autocorrelation import ROUNDING
+from sysid.residuals.coloured import parts
+from sysid.simulation.evaluator import population_predictions
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis
+
+_MOVE = 1e-3  # of the outputs' size: the change that is looked at
+_NEAR = 3.0  # factor by which it may be another
+TRIES = 8
+"""Simulations for each state, at most."""
+_FARTHER = 1e4  # where a move shows nothing: states have units of their own
+_LEFT = 0.05  # of the largest change
+_LATE = 0.75  # of a record: behind it the change is looked for
+
+
+def remembering(problem: Problem, theta: FloatArray) -> set[str]:
+    """Outputs in which a shift by the start of some state lasts up to the end of a record.
+
+    Parameters
+    ----------
+    theta : FloatArray, shape (D,)
+    """
+    names: set[str] = set()
+    before = problem.predictions(theta[None])[0]
+    for state in range(len(problem.model.states)):
+        change = _change(problem, theta, before, state)
+        if change is not None:
+            names |= _lasting(problem, change)
+    return names
+
+
+def _change(
+    problem: Problem, theta: FloatArray, before: FloatArray, state: int
+) -> FloatArray | None:
+    """What a move of a state's start makes of the weighted outputs (M,); None: nothing."""
+    size = problem.output_scale
+    move, weight = _MOVE * size, problem.evaluator.weight
+    for _ in range(TRIES):
+        with np.errstate(all="ignore"):  # what diverges from where it is moved to
+            change = weight * (_moved(problem, theta, state, move) - before)
+            largest = float(np.max(np.abs(change)))
+        if not np.isfinite(largest):
+            move /= _FARTHER
+        elif largest <= ROUNDING * size:
+            move *= _FARTHER
+        elif size * _MOVE / _NEAR <= largest <= size * _MOVE * _NEAR:
+            return np.asarray(change)
+        else:
+            move *= size * _MOVE / largest
+    return np.asarray(change) if np.isfinite(largest) and largest > ROUNDING * size else None
+
+
+def _moved(problem: Problem, theta: FloatArray, state: int, move: float) -> FloatArray:
+    """Outputs (M,) where a state starts elsewhere, in every experiment."""
+    evaluator, layout = problem.evaluator, Layout.of(problem.model)
+    floats, template, values = evaluator.floats.copy(), evaluator.template.copy(), theta.copy()
+    for laid, (ints, first, _) in zip(problem.experiments, evaluator.plans.tolist(), strict=True):
+        start = laid.starts[state]
+        if start.row >= 0:
+            template[start.row] += move
+            values[evaluator.rows == start.row] += move
+        else:
+            floats[first + layout.initial(state)] += move
+            given = first + int(evaluator.ints[ints + layout.state(state, "given")])
+            floats[given : given + start.given.size] += move
+    elsewhere = evaluator._replace(floats=floats, template=template)
+    return np.asarray(population_predictions(elsewhere, values[None])[0])
+
+
+def _lasting(problem: Problem, change: FloatArray) -> set[str]:
+    """Outputs shifted one way at the end of every experiment, beside its largest change of all."""
+    lasts: dict[str, bool] = {}
+    weights = problem.split(problem.evaluator.weight)
+    for changes, weight in zip(problem.split(change), weights, strict=True):
+        seen = {name: one[weight[name] > 0] for name, one in changes.items()}
+        largest = max(float(np.max(np.abs(one), initial=0.0)) for one in seen.values())
+        for name, one in seen.items():
+            late = one[int(_LATE * one.size) :]
+            if late.size:
+                is_left = max(np.min(late), np.min(-late)) > _LEFT * largest
+                lasts[name] = lasts.get(name, True) and bool(is_left)
+    return {name for name, is_left in lasts.items() if is_left}
+
+
+_TIMES = 5.0  # correlation times that a record lasts at least
+
+
+def speaks_for_ar1(
+    problem: Problem, theta: FloatArray, analysis: Analysis,
+    is_late: Callable[[], bool] | None = None, most: int | None = None,
+) -> bool:  # fmt: skip
+    """Whether residuals of least squares at theta (D,) are coloured and none of it is forgotten.
+
+    The analysis of those estimates tells the colour: no more is looked at where it is white. What
+    comes of too long a step of the integration is no noise. `most` are the simulations that the
+    time leaves: where the look may take more there is none.
+    """
+    known = analysis.uncertainty
+    is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
+    if not is_free or known is None or known.noise_colour == "white":
+        return False
+    if most is not None and most < 2 + TRIES * len(problem.model.states):
+        return False
+    coloured = coloured_outputs(problem, theta)
+    if not coloured or not coloured <= remembering(problem, theta):
+        return False
+    simulated = problem.predictions(theta[None])[0]
+    return not step_notes(problem, theta, analysis.estimates, simulated, is_late)
+
+
+def settled(problem: Problem, theta: FloatArray, found: Generalised) -> Generalised:
+    """What was found under first-order noise, or squares again where it is not known well."""
+    longest: dict[str, float] = {}
+    for one in parts(problem):
+        span = float(one.times[-1] - one.times[0])
+        longest[one.output] = max(span, longest.get(one.output, 0.0))
+    times = found.correlation_times
+    squares = Generalised(theta, {}, found.evaluations, True)
+    if not found.is_complete or not any(times.values()):
+        return squares
+    slow = {name: time for name, time in times.items() if _TIMES * time > longest[name]}
+    return squares._replace(too_slow=slow) if slow else found._replace(instead_of=theta)
+
+
+def decided(problem: Problem, noise: Generalised) -> Problem:
+    """The problem with the noise model that its estimates are of, in place of ``auto``."""
+    if problem.loss.noise_model != "auto":
+        return problem
+    model, records, parameters, prediction, loss, *others = problem.arguments
+    loss = replace(loss, noise_model="ar1" if any(noise.correlation_times.values()) else "white")
+    return replace(problem, arguments=(model, records, parameters, prediction, loss, *others))
+
+
+def choice_notes(problem: Problem, noise: Generalised) -> tuple[str, ...]:
+    """Why there is a noise model that nobody asked for, and what squares gave; or why not."""
+    if noise.too_slow:
+        found = ", ".join(f"{name} {time:.3g} s" for name, time in noise.too_slow.items())
+        return (
+            "noise_model auto keeps squares, though the residuals drift and the model does not "
+            "forget where it began: ar1 would have a correlation time of "
+            f"{found}, and the record is not {_TIMES:g} times as long",
+        )
+    if noise.instead_of is None:
+        return ()
+    squares = ", ".join(
+        f"{one.name} = {value:.4g}{'' if one.unit == '1' else f' {one.unit}'}"
+        for one, value in zip(problem.space, noise.instead_of.tolist(), strict=True)
+    )
+    metrics = problem.metrics(np.asarray(noise.instead_of))
+    unit = "" if metrics.unit == "1" else f" {metrics.unit}"
+    return (
+        "noise_model auto chose ar1: the residuals of squares are not white, and the model does "
+        "not forget where it began, as a drive or a tank (it integrates), so that errors of a "
+        f"moment stay in all later outputs; squares gave {squares}, RMS {metrics.rms:.4g}{unit}; "
+        "to have them, use loss: {noise_model: white}",
+    )

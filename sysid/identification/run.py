@@ -1,0 +1,184 @@
+"""One run as a value that goes on from wherever it was cut: begin, advance, conclude.
+
+The result does not depend on where a run is cut, nor on which process evolves which island:
+islands evolve alone up to the next *border*, and only there do they exchange migrants and is it
+decided whether the run has ended. The clock decides when to stop, never what is computed; it is
+read here and nowhere else in this package.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from time import perf_counter
+
+from sysid.core.settings import GeneticAlgorithm
+from sysid.identification.conclude import conclude
+from sysid.islands.archipelago import found, plans
+from sysid.islands.evolve import course, ends_of, evolve_all, next_border, rests, step_of
+from sysid.islands.migration import migrate
+from sysid.islands.state import RunState
+from sysid.islands.stopping import has_ended
+from sysid.search.island import Island, evolve, of_island
+from sysid.search.state import WARMED, Plan
+from sysid.selection.starts import equation_error_starts
+from sysid.simulation.problem import Problem
+
+__all__ = [
+    "RunState", "advance", "advance_island", "begin", "border", "conclude", "exchange",
+    "is_finished", "is_resting",
+]  # fmt: skip
+
+CALL_SECONDS = 0.1
+"""Aimed at for one compiled call, by measured cost, so that a cancel is heard in time."""
+
+UNMEASURED_STEPS = 1_000_000  # steps of integration or recursion in a first call: some 10 ms
+
+
+def begin(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    seed: int,
+    warm: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
+) -> RunState:
+    """A run before its first generation; `warm`: parameter values that seed a quarter of it.
+
+    The improved search of a polynomial is seeded by least squares one step ahead, too. Values of
+    all free parameters are taken for an earlier result, behind which a run settles sooner; those
+    of some of them seed the search, and no more.
+    """
+    given = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
+    given = tuple(one for one in given if one)
+    is_warm = any(all(p.name in one for p in problem.space) for one in given)
+    starts = equation_error_starts(problem, algorithm)
+    islands = found(problem, algorithm, seed, given, starts.values, starts.evaluations)
+    for island in islands:
+        island.counters[WARMED] = is_warm
+    return RunState(seed, islands, is_warm=is_warm)
+
+
+def border(algorithm: GeneticAlgorithm, state: RunState) -> int:
+    """The generation up to which every island evolves alone."""
+    step = step_of(algorithm, is_warm=state.is_warm)
+    return next_border(state.generation, step, algorithm.migration.every, algorithm.generations)
+
+
+def is_resting(plan: Plan, island: Island) -> bool:
+    """Whether an island has used up its evaluations or reached the target RMS."""
+    return rests(plan, island.fitness, island.counters, island.champion_rms)
+
+
+def advance_island(
+    problem: Problem, algorithm: GeneticAlgorithm, island: Island, generations: int
+) -> Island:
+    """The island after some generations, fewer where it comes to rest."""
+    plan = plans(problem, algorithm, island.seed)[island.index]
+    return evolve(problem.evaluator, plan, island, generations)
+
+
+def exchange(algorithm: GeneticAlgorithm, state: RunState, islands: Sequence[Island]) -> RunState:
+    """The run at the next border, when all its islands have got there: migrate, look at the end."""
+    generation = border(algorithm, state)
+    state = replace(state, islands=tuple(islands), generation=generation)
+    if generation % algorithm.migration.every == 0 and len(islands) > 1:
+        bits = tuple(of_island(algorithm, i).bits for i in range(len(islands)))
+        moved, log = migrate(state.islands, bits, algorithm.migration, state.epoch)
+        state = replace(
+            state, islands=moved, migrations=state.migrations + log, epoch=state.epoch + 1
+        )
+    return replace(state, ended=_has_ended(algorithm, state))
+
+
+def _has_ended(algorithm: GeneticAlgorithm, state: RunState) -> bool:
+    is_old = state.is_warm and state.is_the_best_since(state.generation // 2)
+    ends = ends_of(algorithm, is_warm=state.is_warm)
+    return has_ended(ends, state.generation, *state.tally, is_old)
+
+
+def is_finished(algorithm: GeneticAlgorithm, state: RunState) -> bool:
+    """Whether an end condition holds: generations, evaluations, target RMS, settled, seconds."""
+    limit = algorithm.stop.seconds
+    return state.ended or (limit is not None and state.seconds >= limit)
+
+
+def advance(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    state: RunState,
+    seconds: float | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> RunState:
+    """Go on until an end condition holds, `seconds` are used up, or `should_stop` says so.
+
+    `should_stop` is asked between compiled calls, about every 0.1 s.
+    """
+    way = course(problem, algorithm, state.seed, is_warm=state.is_warm)
+    size = algorithm.population // algorithm.n_islands
+    pace = _Pace(
+        seconds, algorithm.stop.seconds, state.seconds, should_stop,
+        UNMEASURED_STEPS // (size * max(problem.n_steps, 1)),
+    )  # fmt: skip
+    while not is_finished(algorithm, state) and not pace.is_over():
+        before, left = _done(state), algorithm.generations - state.generation
+        stand = evolve_all(
+            problem.evaluator, way, state.islands, state.generation, state.epoch,
+            pace.affordable(left * algorithm.n_islands),
+        )  # fmt: skip
+        state = replace(
+            state, islands=stand.islands, generation=stand.generation, epoch=stand.epoch,
+            migrations=state.migrations + stand.migrants,
+        )  # fmt: skip
+        pace.measure(_done(state) - before)
+        ended = stand.has_crossed and _has_ended(algorithm, state)
+        state = replace(state, ended=ended, seconds=pace.used())
+    return state
+
+
+def _done(state: RunState) -> int:
+    """Generations of all islands together."""
+    return sum(island.generation for island in state.islands)
+
+
+class _Pace:
+    """How many generations one compiled call may run, and when to stop, by the clock.
+
+    `first`: those of the first call, before anything is measured.
+    """
+
+    def __init__(
+        self,
+        seconds: float | None,
+        limit: float | None,
+        before: float,
+        should_stop: Callable[[], bool] | None,
+        first: int,
+    ) -> None:
+        self._start = self._last = perf_counter()
+        self._before, self._should_stop, self._calls = before, should_stop, 0
+        ends = [
+            end for end in (seconds, None if limit is None else limit - before) if end is not None
+        ]
+        self._end = min(ends, default=float("inf"))
+        self._first = first
+        self._cost = 0.0  # of one generation of one island, as measured
+
+    def used(self) -> float:
+        return self._before + perf_counter() - self._start
+
+    def is_over(self) -> bool:
+        """Whether to stop; at least one call is made, so that every advance advances."""
+        stopped = self._should_stop is not None and self._should_stop()
+        return stopped or (self._calls > 0 and self._last - self._start >= self._end)
+
+    def affordable(self, wanted: int) -> int:
+        """Generations for the next call: as many as are left, or as the time allows; one at least.
+
+        No time at all stands for the least that can be done.
+        """
+        left = min(CALL_SECONDS, self._start + self._end - self._last)
+        if left <= 0:
+            return 1
+        return max(1, min(wanted, int(left / self._cost) if self._calls else self._first))
+
+    def measure(self, count: int) -> None:
+        now = perf_counter()
+        self._cost = max((now - self._last) / max(count, 1), 1e-9)
+        self._last, self._calls = now, self._calls + 1

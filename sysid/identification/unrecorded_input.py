@@ -1,0 +1,163 @@
+"""Whether estimates hang on input that nobody recorded.
+
+For t < L a model reads the input from before the record's first sample. Where nothing is known of
+it, its first value is taken to have stood there, which is right for a plant at rest and a guess for
+a record that begins in the middle of things. Without the samples that read it the estimate would
+move by -(S'ᵀS')⁻¹S'ᵀe', S' and e' being the sensitivities and residuals of the others (one step of
+Gauss and Newton; Cook 1977). Of two estimates, one from a part of the data of the other, the
+difference has the difference of their variances (Hausman 1978): a move that is far larger says that
+these samples do not fit the others. Only then the estimate is found anew without them, to be told.
+"""
+
+import numpy as np
+
+from sysid.core.errors import InvalidRecord
+from sysid.core.types import RANK, BoolArray, FloatArray
+from sysid.data.records import Channel, Record
+from sysid.kernels.reads import lags
+from sysid.models.delays import longest_lag, past_signals
+from sysid.models.model import EstimatedInitial
+from sysid.search.refine import refine
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis, physical_scale
+from sysid.uncertainty.estimates import Estimate
+
+_NOTABLE = 1.0  # of a standard error
+_UNLIKELY = 4.0  # deviations of the difference of both estimates
+_PLENTY = 2  # samples for each parameter, that are left
+_STEPS = 30  # of least squares, with as many simulations as there are parameters and one
+
+
+def past_notes(problem: Problem, analysis: Analysis) -> list[str]:
+    """What to say of estimates that are others without the samples that read an assumed input."""
+    if analysis.slopes is None or analysis.linear is None or problem.prediction != "simulation":
+        return []  # whitened, or not of squares
+    if analysis.is_cut_short:
+        return []  # the time is over
+    if not all(isinstance(one, EstimatedInitial) for one in problem.model.initial):
+        return []  # a start that is given carries the effect of the guess into the other samples
+    parts = reads_assumed(problem, analysis)
+    assumed = np.concatenate(parts)[problem.scored]
+    count = int(np.count_nonzero(assumed))
+    left = assumed.size - count
+    if not count or left <= _PLENTY * len(problem.space):
+        return []
+    if not _would_move(problem, analysis, assumed):
+        return []
+    told = _told(problem, analysis, _without(problem, analysis))
+    if not told:
+        return []
+    what, them = ("one sample reads", "it") if count == 1 else (f"{count} samples read", "them")
+    return [
+        f"{what} an input from before the record, which was not recorded: its first value is "
+        f"taken to have stood there; without {them} {', '.join(told)}: give the input before the "
+        "record (trim a longer recording, or put rows with an empty output before it), or skip: "
+        f"{max(int(np.count_nonzero(one)) for one in parts)}"
+    ]
+
+
+def reads_assumed(problem: Problem, analysis: Analysis) -> list[BoolArray]:
+    """Of every output of every experiment, which samples read an input of before what is known."""
+    return [
+        channel.times < until
+        for record, until in zip(problem.records, _known_from(problem, analysis), strict=True)
+        for channel in _outputs(problem, record)
+    ]
+
+
+def _outputs(problem: Problem, record: Record) -> list[Channel]:
+    channels = {channel.name: channel for channel in record.outputs}
+    return [channels[output.name] for output in problem.model.outputs]
+
+
+def _known_from(problem: Problem, analysis: Analysis) -> list[float]:
+    """For each experiment the time (s) from which on only recorded inputs are read."""
+    reach = _reach(problem, analysis)
+    return [
+        experiment.grid.start + reach - record.known_before
+        for record, experiment in zip(problem.records, problem.experiments, strict=True)
+    ]
+
+
+def _reach(problem: Problem, analysis: Analysis) -> float:
+    """How far (s) the estimated lags of inputs reach back."""
+    if not lags(problem.model, "input"):
+        return 0.0
+    spans = {one.name: (one.value, one.value) for one in analysis.estimates}
+    step = problem.experiments[0].grid.integration_step
+    return max(
+        longest_lag(problem.model, one, spans, step)
+        for one in past_signals(problem.model)
+        if one.kind == "input"
+    )
+
+
+def _would_move(problem: Problem, analysis: Analysis, assumed: BoolArray) -> bool:
+    """Whether one step without these samples moves an estimate by far more than chance would."""
+    if analysis.slopes is None:
+        return False
+    error, columns = analysis.slopes
+    known = columns[~assumed]
+    move = -np.linalg.lstsq(known, error[~assumed], rcond=RANK)[0]
+    by_all, by_known = _variances(columns), _variances(known)
+    scale = physical_scale(problem, _theta(problem, analysis))
+    for d, estimate in enumerate(_told_of(problem, analysis)):
+        if estimate is None or not estimate.stderr or not 0.0 < by_all[d] < np.inf:
+            continue
+        chance = np.sqrt(max(by_known[d] / by_all[d] - 1.0, 0.0))
+        if abs(move[d] * scale[d]) / estimate.stderr > max(_NOTABLE, _UNLIKELY * chance):
+            return True
+    return False
+
+
+def _told_of(problem: Problem, analysis: Analysis) -> list[Estimate | None]:
+    """The estimates in the order of the free parameters (D,); None of starts, and of vague ones."""
+    own = {one.name for one in problem.model.parameters}
+    by = {one.name: one for one in analysis.estimates if one.status == "identified"}
+    return [by.get(one.name) if one.name in own else None for one in problem.space]
+
+
+def _theta(problem: Problem, analysis: Analysis) -> FloatArray:
+    by = {one.name: one.value for one in analysis.estimates}
+    return np.array([by[one.name] for one in problem.space])
+
+
+def _without(problem: Problem, analysis: Analysis) -> FloatArray:
+    """The estimate (D,) from the other samples, from where it is; itself if there is none."""
+    model, records, changes, prediction, loss, _, skip, since = problem.arguments
+    theta = _theta(problem, analysis)
+    from_then = zip(_known_from(problem, analysis), since or [-np.inf] * len(records), strict=True)
+    try:
+        others = Problem.build(
+            model, records, parameters=changes, prediction=prediction, loss=loss, skip=skip,
+            weights=problem.output_weights, scored_from=[max(pair) for pair in from_then],
+        )  # fmt: skip
+    except InvalidRecord:  # of one record nothing would be left
+        return theta
+    (end,) = refine(others, [theta], _STEPS * (theta.size + 1))
+    return theta if end is None else end.theta
+
+
+def _told(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:
+    """Estimates that would be others, with their moves in standard errors."""
+    told = []
+    for estimate, value in zip(_told_of(problem, analysis), end.tolist(), strict=True):
+        if estimate is None or not estimate.stderr:
+            continue
+        shift = abs(value - estimate.value) / estimate.stderr
+        if shift > _NOTABLE:
+            told.append(
+                f"{estimate.name} is {value:.4g} instead of {estimate.value:.4g}, {shift:.2g} of "
+                "its standard errors away"
+            )
+    return told
+
+
+def _variances(columns: FloatArray) -> FloatArray:
+    """Diagonal of (SᵀS)⁻¹, (D,); inf of what these rows leave open."""
+    triangle = np.linalg.qr(columns, mode="r")  # of a long record in half the time
+    singular, rows = np.linalg.svd(triangle)[1:]
+    kept = singular > RANK * max(float(singular[0]), np.finfo(float).tiny)
+    found: FloatArray = np.sum((rows[kept].T / singular[kept]) ** 2, axis=1)
+    is_open = np.max(np.abs(rows[~kept]), axis=0, initial=0.0) > RANK
+    return np.where(is_open, np.inf, found)

@@ -1,0 +1,378 @@
+"""What a user should be told about a result, in whole sentences."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.identifiability.combinations import Group
+from sysid.identification.unrecorded_input import past_notes
+from sysid.kernels.reads import is_difference, lags
+from sysid.models.ties import names_in
+from sysid.models.units import mixed_units, time_unit_notes, unread_units
+from sysid.residuals.onset_delay import moves_alone
+from sysid.residuals.past_outputs import reads_outputs
+from sysid.residuals.residual_tests import ResidualTests
+from sysid.search.island import of_island
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import Analysis
+from sysid.uncertainty.estimates import Estimate, NoiseColour, Uncertainty
+
+_RIDGE, _STRONG = 0.9, 0.95  # of correlations, of a lag that may as well be 0, and of others
+_HELD = 0.5  # of an input's neighbouring samples are equal, where it is taken for one of steps
+_NOTABLE_GAIN = 0.01
+_SEPARABLE = 2.0  # standard errors: a lag on a ridge that is less than that
+_VAGUE = 0.5  # of its value: standard error of a group of which next to nothing is known
+_CHANCE = 1e-3  # that a true model's residuals look as little white: below, it is worth a sentence
+_ROUNDING = 1e-9  # of the output: below, the residual is rounding and has no optimum
+
+_ALLOWED: Mapping[NoiseColour, str] = {
+    "white": "the standard errors are too small",
+    "first-order": "the standard errors are those of the noise model",
+    "coloured": "the standard errors allow for the colour of the residuals, not for what the model "
+    "lacks",
+    "drifting": "the residuals drift over the whole record, so the standard errors are too small",
+}
+
+_SUGGESTION = "; if it is the noise that is coloured, use loss: {noise_model: ar1}"
+
+
+def warnings_of(
+    problem: Problem,
+    algorithm: GeneticAlgorithm,
+    analysis: Analysis,
+    simulated: FloatArray,
+    rms: float,
+    tests: ResidualTests | None = None,
+) -> tuple[str, ...]:
+    """All warnings, the weightiest first; `tests` are those of the residuals."""
+    found = []
+    limit = algorithm.safe_limit
+    if limit is not None and rms > limit:
+        found.append(f"the RMS error {rms:.4g} is above the safe limit {limit:g}: not valid")
+    found += mixed_units(problem.model, problem.records)
+    found += time_unit_notes(problem.model)
+    found += _held_back(analysis)
+    found += _no_prediction(problem)
+    found += _constant_outputs(problem)
+    found += _worse_than_a_line(problem, simulated)
+    found += _without_excitation(problem, analysis.estimates)
+    found += _steps_read_as_ramps(problem)
+    found += _begun_before(problem) or past_notes(problem, analysis)
+    found += [text for e in analysis.estimates if (text := _of_estimate(e))]
+    lagged = lag_parameters(problem)
+    if analysis.uncertainty is not None:
+        found += [text for e in analysis.estimates if (text := _vague(e))]
+        found += [text for group in analysis.uncertainty.groups if (text := _of_group(group))]
+        found += _correlated(analysis.uncertainty, analysis.estimates, lagged)
+    if analysis.is_cut_short:
+        found.append(
+            "the time was over, so minima beside the estimate were not looked for: where the loss "
+            "is rough the intervals are too narrow"
+        )
+    if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING * problem.output_scale:
+        found.append(_not_an_optimum(algorithm, analysis.possible_gain))
+    elif tests is not None:
+        loss = problem.loss
+        plain = loss.kind == "squares" and loss.noise_model != "ar1"
+        found += _coloured(tests, lagged, analysis.uncertainty, may_be_noise=plain)
+    return (*found, *unread_units(problem.model, problem.records))
+
+
+def _held_back(analysis: Analysis) -> list[str]:
+    """Bounds too narrow for the data, and which of them to widen."""
+    if not analysis.pulls:
+        return []
+    first, *others = analysis.pulls
+    more = f", and {', '.join(map(str, others))}" if others else ""
+    cures = " and ".join(one.cure for one in analysis.pulls)
+    return [f"the data pull {first}{more}: {cures}, unless nature sets it there"]
+
+
+def _steps_read_as_ramps(problem: Problem) -> list[str]:
+    """Inputs that look held between samples, but are read as straight lines.
+
+    A jump read as a ramp over one sample moves the estimate of a lag by half a sample.
+    """
+    if is_difference(problem.model):
+        return []  # a recursion reads inputs at the samples only
+    channels = [one for record in problem.arguments[1] for one in record.inputs]
+    names = {
+        one.name
+        for one in channels
+        if one.hold == "first" and _HELD <= np.mean(np.diff(one.values) == 0) < 1
+    }
+    return [
+        f"input {name!r} stays constant between jumps, but is read as straight between its "
+        f"samples, which moves a lag by about half a sample; if it was held, use hold: "
+        f"{{{name}: zero}}"
+        for name in sorted(names)
+    ]
+
+
+def _begun_before(problem: Problem) -> list[str]:
+    """Records of a lagged input whose output leaves its rest while no input has moved."""
+    if not lags(problem.model, "input"):
+        return []
+    found = []
+    for number, record in enumerate(problem.records, 1):
+        if alone := moves_alone(record):
+            where = f" in experiment {number}" if len(problem.records) > 1 else ""
+            found.append(
+                f"output {alone[0]!r} begins to move at t = {alone[1]:.4g} s{where} although no "
+                "input has moved yet: if the record begins with the step itself, the lag comes out "
+                "wrong, since an input is taken to have stood at its first value all the time "
+                "before; put some rows of the input at rest before the record"
+            )
+    return found
+
+
+def _no_prediction(problem: Problem) -> list[str]:
+    """Whether predictions one step ahead are asked for of a model that reads no measured output."""
+    if problem.prediction == "simulation" or reads_outputs(problem.model):
+        return []
+    names = ", ".join(output.name for output in problem.model.outputs)
+    return [
+        f"no output ({names}) is a state by itself, so predictions one step ahead are those of the "
+        "free run; for another start of every step write an output as a state, outputs: {y: x}"
+    ]
+
+
+def _constant_outputs(problem: Problem) -> list[str]:
+    """Outputs whose scored samples are all the same, in every experiment."""
+    measured = problem.split(problem.evaluator.measured)
+    weights = problem.split(problem.evaluator.weight)
+    found = []
+    for output in problem.model.outputs:
+        values = np.concatenate(
+            [y[output.name][w[output.name] > 0] for y, w in zip(measured, weights, strict=True)]
+        )
+        if np.ptp(values) == 0.0:
+            unit = "" if output.unit == "1" else f" {output.unit}"
+            found.append(
+                f"output {output.name!r} is constant ({values[0]:.4g}{unit}): it tells nothing of "
+                "the dynamics, and no fit % can be given"
+            )
+    return found
+
+
+def _worse_than_a_line(problem: Problem, simulated: FloatArray) -> list[str]:
+    """Whether straight lines through the outputs would fit better than the model does."""
+    measured = problem.split(problem.evaluator.measured)
+    weights = problem.split(problem.evaluator.weight)
+    models = problem.split(simulated)
+    found = []
+    for e, experiment in enumerate(problem.experiments):
+        for output, samples in zip(problem.model.outputs, experiment.outputs, strict=True):
+            scored = weights[e][output.name] > 0
+            if np.count_nonzero(scored) < 3:
+                continue
+            y, model = measured[e][output.name][scored], models[e][output.name][scored]
+            line = _rms(y - _line(samples.places[scored], y))
+            rms = _rms(y - model)
+            if rms > line:
+                where = f" of experiment {e + 1}" if len(problem.experiments) > 1 else ""
+                unit = "" if output.unit == "1" else f" {output.unit}"
+                found.append(
+                    f"the model fits {output.name}{where} worse than a straight line "
+                    f"(RMS {rms:.4g} against {line:.4g}{unit})"
+                )
+    return found
+
+
+def _line(x: FloatArray, y: FloatArray) -> FloatArray:
+    centred = x - np.mean(x)
+    spread = float(centred @ centred)
+    slope = float(centred @ (y - np.mean(y))) / spread if spread > 0 else 0.0
+    return np.asarray(np.mean(y) + slope * centred)
+
+
+def _rms(values: FloatArray) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _of_estimate(estimate: Estimate) -> str:
+    low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
+    side, bound = ("lower", estimate.lower) if low else ("upper", estimate.upper)
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    place = f"lies at its {side} bound {bound:g}{unit}"
+    match estimate.status:
+        case "at bound":
+            return f"{estimate.name} {place}"
+        case "group" | "unidentifiable":
+            also = f"; it {place}" if estimate.value == bound else ""
+            return f"{estimate.name} is not identified: {estimate.reason}{also}"
+    return ""
+
+
+def _vague(estimate: Estimate) -> str:
+    """Of a quantity that cannot be negative, and that may as well be 0.
+
+    Where both signs are allowed (an offset, an initial state) 0 is a value like any other.
+    """
+    if estimate.status != "identified" or not estimate.stderr or estimate.lower < 0:
+        return ""
+    if estimate.stderr < estimate.value:
+        return ""
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    return (
+        f"the standard error of {estimate.name}, {estimate.stderr:.3g}{unit}, is as large as its "
+        f"value, {estimate.value:.3g}{unit}"
+    )
+
+
+def _of_group(group: Group) -> str:
+    if not group.stderr or group.stderr < _VAGUE * abs(group.value):
+        return ""
+    return (
+        f"{group.expression} is practically unidentifiable: {group.value:.3g} with a standard "
+        f"error of {group.stderr:.3g}"
+    )
+
+
+def lag_parameters(problem: Problem) -> set[str]:
+    """Names of the parameters that lags are made of."""
+    past = [*lags(problem.model, "input"), *lags(problem.model, "state")]
+    found: set[str] = set()
+    for one in past:
+        if one.lag is not None:
+            found |= names_in(one.lag)
+    return found & {p.name for p in problem.space}
+
+
+def _correlated(
+    uncertainty: Uncertainty, estimates: tuple[Estimate, ...], lagged: set[str]
+) -> list[str]:
+    """Ridges; a lag on one that may as well be 0 is not separable from the other parameter.
+
+    Coloured residuals turn the ellipsoid of the estimates; what one sensitivity makes up for in
+    another stays. Of parameters that have no standard error their groups tell.
+    """
+    blind = {e.name for e in estimates if e.stderr is None}
+    vague = {e.name for e in estimates if e.name in lagged and _is_vague_lag(e)}
+    found = []
+    for i, first in enumerate(uncertainty.names):
+        for j in range(i + 1, len(uncertainty.names)):
+            second, r = uncertainty.names[j], float(uncertainty.correlation[i, j])
+            if {first, second} & blind:
+                continue
+            alike = float(uncertainty.alike[i, j])
+            if {first, second} & vague and max(abs(r), abs(alike)) > _RIDGE:
+                plain = "" if abs(r) > _RIDGE else f", {alike:.3f} if the residuals were white"
+                found.append(
+                    f"{first} and {second} not separable (r = {r:.3f}{plain}): the data fix a "
+                    "combination of them, and the lag is less than two of its standard errors"
+                )
+            elif abs(r) > _STRONG:
+                found.append(
+                    f"{first} and {second} are strongly correlated (r = {r:.3f}): "
+                    "the data fix a combination of them better than each alone"
+                )
+    return found
+
+
+def _is_vague_lag(estimate: Estimate) -> bool:
+    return estimate.stderr is not None and abs(estimate.value) < _SEPARABLE * estimate.stderr
+
+
+def _coloured(
+    tests: ResidualTests, lagged: set[str], uncertainty: Uncertainty | None, *, may_be_noise: bool
+) -> list[str]:
+    """Residuals that are clearly not white: the model lacks something, most often an order.
+
+    A lag makes up for an order that is missing. Of whether the tests are passed the result tells
+    by itself; a true model fails them often enough that a warning asks for more. Residuals that
+    depend on an input contain dynamics, which no noise model is for; those that do not may be slow
+    noise (Ljung, System Identification, 2nd ed., ch. 16.6). On validation data alone the errors of
+    the estimates do the same as dynamics that are missing: nothing is wrong with the standard
+    errors then.
+    """
+    if all(one.kind != "whiteness" or one.p is None or one.p > _CHANCE for one in tests.tests):
+        return []
+    colour = "white" if uncertainty is None else uncertainty.noise_colour
+    depends = any(one.kind == "independence" and one.outcome == "failed" for one in tests.tests)
+    advises = may_be_noise and colour in ("coloured", "drifting") and not depends
+    if lagged and uncertainty and (tests.data, colour) == ("validation", "white"):
+        return [
+            "the residuals on the validation data are not white, while those on the estimation "
+            "data may as well be white: the validation data show what the estimation data do not "
+            "tell, either dynamics that are not in the model or values that are known within their "
+            "standard errors only; estimate from data that cover both"
+        ]
+    if lagged:
+        suggestion = _SUGGESTION if advises else ""
+        return [
+            f"the residuals are not white (on the {tests.data} data): something of the dynamics is "
+            f"not in the model, the estimate of {', '.join(sorted(lagged))} depends on the order "
+            f"of the model, and {_ALLOWED[colour]}{suggestion}"
+        ]
+    if not advises:
+        return []
+    return [
+        f"the residuals are not white (on the {tests.data} data), and no input tells them: squares "
+        f"give slow noise too much weight{_SUGGESTION}"
+    ]
+
+
+def time_notes(is_cut_short: bool) -> tuple[str, ...]:
+    """What refinement left out because the time was over."""
+    if not is_cut_short:
+        return ()
+    return (
+        "the time was over before least squares had ended from the champions of all islands: the "
+        "estimate is the best found until then, and need not be the optimum; give more seconds, "
+        "or a shorter record",
+    )
+
+
+def noise_notes(
+    problem: Problem, correlation_times: Mapping[str, float], is_complete: bool
+) -> tuple[str, ...]:
+    """What a noise model did, or why it did nothing."""
+    if problem.loss.noise_model != "ar1":
+        return ()
+    found = [f"{name} {time:.3g} s" for name, time in correlation_times.items() if time > 0]
+    notes = []
+    if found:
+        notes.append(
+            "estimates and standard errors are those under first-order noise with a correlation "
+            f"time of {', '.join(found)}; squares alone would give a smaller RMS"
+        )
+    elif is_complete:
+        notes.append("the residuals may as well be white, so the noise model changes nothing")
+    if not is_complete:
+        notes.append(
+            "the noise model was not estimated to its end: it needs the method 'improved' with "
+            "refinement, and more simulations than the budget or the time left"
+        )
+    return tuple(notes)
+
+
+def _without_excitation(problem: Problem, estimates: tuple[Estimate, ...]) -> list[str]:
+    """Inputs that stay constant in every record, and what they leave open."""
+    blind = ", ".join(
+        e.name for e in estimates if e.status in ("group", "unidentifiable") and e.stderr is None
+    )
+    found = []
+    for quantity in problem.model.inputs:
+        values = [
+            one.values for record in problem.records for one in record.inputs
+            if one.name == quantity.name
+        ]  # fmt: skip
+        if blind and all(float(np.ptp(one)) == 0.0 for one in values):
+            found.append(
+                f"input {quantity.name!r} is constant, so it excites nothing; these data leave "
+                f"unidentified: {blind}"
+            )
+    return found
+
+
+def _not_an_optimum(algorithm: GeneticAlgorithm, gain: float) -> str:
+    methods = {of_island(algorithm, i).method for i in range(algorithm.n_islands)}
+    text = (
+        "the estimate is not a local optimum: one least-squares step promises to remove "
+        f"{100 * gain:.0f} % of the squared error, so the standard errors are a rough guide"
+    )
+    return text if "improved" in methods else f"{text} ({', '.join(sorted(methods))}: as found)"

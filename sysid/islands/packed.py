@@ -1,0 +1,105 @@
+"""The islands of a run one behind the other, as compiled code reads and changes them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.search.island import Island, improvement
+from sysid.search.state import VALUES, Improvement, Migrant
+
+
+class Fleet(NamedTuple):
+    """All islands of a run.
+
+    Attributes
+    ----------
+    first : IntArray, shape (I + 1,)
+        Island i has the individuals ``first[i]`` to ``first[i + 1] - 1``.
+    words : WordArray, shape (P, D)
+    fitness : FloatArray, shape (P,)
+    counters : IntArray, shape (I, N)
+    memory : FloatArray, shape (I, M)
+        These four are those of `sysid.search.island.Island`.
+    rms : FloatArray, shape (I,)
+        Of each island's best individual so far; ``inf`` before the first evaluation.
+    champions : FloatArray, shape (I, D)
+        Its values; arbitrary before the first evaluation.
+    """
+
+    first: IntArray
+    words: WordArray
+    fitness: FloatArray
+    counters: IntArray
+    memory: FloatArray
+    rms: FloatArray
+    champions: FloatArray
+
+
+class News(NamedTuple):
+    """What compiled code writes down of the islands of a fleet.
+
+    Attributes
+    ----------
+    improvements : FloatArray, shape (R, VALUES + D)
+    owners : IntArray, shape (R,)
+        The island of each.
+    migrants : FloatArray, shape (L, 4)
+        Epoch, source, destination and fitness of each.
+    written : IntArray, shape (2,)
+        How many improvements and migrants there are.
+    """
+
+    improvements: FloatArray
+    owners: IntArray
+    migrants: FloatArray
+    written: IntArray
+
+
+def gathered(islands: Sequence[Island]) -> Fleet:
+    """Copies of the islands' arrays, one behind the other."""
+    champions = np.zeros((len(islands), islands[0].words.shape[1]))
+    for i, island in enumerate(islands):
+        if island.history:
+            champions[i] = island.history[-1].parameters
+    return Fleet(
+        np.cumsum([0, *(island.fitness.size for island in islands)]),
+        np.concatenate([island.words for island in islands]),
+        np.concatenate([island.fitness for island in islands]),
+        np.array([island.counters for island in islands]),
+        np.array([island.memory for island in islands]),
+        np.array([island.champion_rms for island in islands]),
+        champions,
+    )
+
+
+def dealt(fleet: Fleet, news: News, islands: Sequence[Island]) -> tuple[Island, ...]:
+    """The islands as they are in the fleet, their histories longer by what is new."""
+    better: list[list[Improvement]] = [[] for _ in islands]
+    count = int(news.written[0])
+    owners, rows = news.owners[:count].tolist(), news.improvements[:count].tolist()
+    for owner, row in zip(owners, rows, strict=True):
+        better[owner].append(improvement(row))
+    ends = fleet.first.tolist()
+    return tuple(
+        Island(
+            island.index, island.seed, fleet.words[begin:end], fleet.fitness[begin:end],
+            fleet.counters[i], fleet.memory[i], (*island.history, *better[i]),
+        )
+        for i, (island, begin, end) in enumerate(zip(islands, ends[:-1], ends[1:], strict=True))
+    )  # fmt: skip
+
+
+def empty_news(improvements: int, migrants: int, n: int) -> News:
+    """Room for so many improvements of n parameters and so many migrants."""
+    return News(
+        np.empty((improvements, VALUES + n)), np.empty(improvements, dtype=np.int64),
+        np.empty((migrants, 4)), np.zeros(2, dtype=np.int64),
+    )  # fmt: skip
+
+
+def migrations(news: News) -> tuple[Migrant, ...]:
+    """The migrants that arrived."""
+    rows = news.migrants[: int(news.written[1])].tolist()
+    return tuple(Migrant(int(at), int(a), int(b), fitness) for at, a, b, fitness in rows)

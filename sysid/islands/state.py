@@ -1,0 +1,70 @@
+"""The state of a run: a value that can be pickled between any two compiled calls."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.core.types import FloatArray, IntArray
+from sysid.search.island import Island
+from sysid.search.state import SAME, Improvement, Migrant
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunState:
+    """A run between two compiled calls.
+
+    Attributes
+    ----------
+    seed : int
+    islands : tuple of Island
+        Some may be ahead of `generation`, up to the next border.
+    generation : int
+        The last border that all islands have passed.
+    epoch : int
+        Exchanges of migrants done.
+    migrations : tuple of Migrant
+    seconds : float
+        Time computed so far.
+    ended : bool
+        Whether an end condition held at the last border.
+    is_warm : bool
+        Whether it was given values of an earlier result to begin with.
+    """
+
+    seed: int
+    islands: tuple[Island, ...]
+    generation: int = 0
+    epoch: int = 0
+    migrations: tuple[Migrant, ...] = ()
+    seconds: float = 0.0
+    ended: bool = False
+    is_warm: bool = False
+
+    @property
+    def evaluations(self) -> int:
+        """Simulations run by all islands."""
+        return sum(island.evaluations for island in self.islands)
+
+    @property
+    def rms(self) -> float:
+        """Fitness of the best champion."""
+        return min(island.champion_rms for island in self.islands)
+
+    @property
+    def tally(self) -> tuple[FloatArray, IntArray]:
+        """RMS of the champions (I,) and counters (I, N) of the islands."""
+        rms = np.array([island.champion_rms for island in self.islands])
+        return rms, np.array([island.counters for island in self.islands])
+
+    def is_the_best_since(self, generation: int) -> bool:
+        """Whether the best fitness was found by then, and nothing better after."""
+        most = self.rms * (1.0 + SAME)
+        return any(
+            one.rms <= most and one.generation <= generation
+            for history in self.history for one in history
+        )  # fmt: skip
+
+    @property
+    def history(self) -> tuple[tuple[Improvement, ...], ...]:
+        """Improvements of each island."""
+        return tuple(island.history for island in self.islands)

@@ -1,0 +1,124 @@
+"""When a run has ended at a border: its generations, the target, searches that agree, or rest."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.core.jit import compiled
+from sysid.core.types import FloatArray, IntArray
+from sysid.search.state import CLIFFS, CONFIRMED, GENERATION, HOPS, RETURNED, SAME, TRIED
+
+_OF_EACH, _MORE = 2, 2
+_SHARE = 1 / 3  # of all searches
+_HALF, _MANY = 0.5, 2.5  # of those from random places agree, or there are so many times enough
+_AGREE = 2 / 3  # of the searches from random places, where the fitness jumps
+_RETURN = 0.9  # of those from beside the best individual
+_WARM_SETTLED = 3  # of the searches that agree, a warm start needs one in three
+
+
+class Ends(NamedTuple):
+    """End conditions that are looked at where all islands have got to a border.
+
+    Attributes
+    ----------
+    generations : int
+    rms : float
+        Target; negative: none.
+    settled : int
+        Searches that agree; 0: they do not end a run.
+    is_warm : bool
+        Whether an earlier result stands behind the run.
+    """
+
+    generations: int
+    rms: float
+    settled: int
+    is_warm: bool
+
+
+class Searches(NamedTuple):
+    """What the searches of all islands found, as far as it is the best champion.
+
+    Attributes
+    ----------
+    independent, confirmed : int
+        Searches that began at new random places, and how many of them led to it.
+    hops, returned : int
+        Searches from beside it, and how many of them led back.
+    has_cliffs : bool
+        Whether one of these has met jumps of the fitness.
+    """
+
+    independent: int
+    confirmed: int
+    hops: int
+    returned: int
+    has_cliffs: bool
+
+
+@compiled
+def searches(rms: FloatArray, counters: IntArray) -> Searches:
+    """Count them over islands with these champions' RMS (I,) and counters (I, ·)."""
+    independent = confirmed = hops = returned = 0
+    has_cliffs, most = False, np.min(rms) * (1.0 + SAME)
+    for i in range(rms.size):
+        independent += counters[i, TRIED]
+        if rms[i] <= most:
+            confirmed += counters[i, CONFIRMED]
+            hops += counters[i, HOPS]
+            returned += counters[i, RETURNED]
+            has_cliffs |= counters[i, CLIFFS] > 0
+    return Searches(independent, confirmed, hops, returned, has_cliffs)
+
+
+@compiled
+def has_ended(
+    ends: Ends, generation: int, rms: FloatArray, counters: IntArray, is_old: bool
+) -> bool:
+    """Whether one of the conditions holds at the border `generation`.
+
+    `is_old`: nothing better was found in the second half of the generations. It matters behind a
+    warm start alone.
+    """
+    if generation >= ends.generations or np.min(rms) <= ends.rms:
+        return True
+    if ends.settled > 0 and _is_settled(
+        ends.settled, ends.is_warm, searches(rms, counters), is_old
+    ):
+        return True
+    # Below the border only those islands stay that have used up their evaluations.
+    return bool(np.all(counters[:, GENERATION] < generation))
+
+
+@compiled
+def _is_settled(settled: int, is_warm: bool, made: Searches, is_old: bool) -> bool:
+    """Whether searches keep finding the best individual, from random places and from beside it.
+
+    Had a better one as many ways that lead to it, all of k searches that found the best again and
+    those that found others would have missed it with a probability below exp(-k). So where the
+    fitness around is smooth, those that led to worse ones say nothing against the best, unless
+    they are the most. Where it jumps, a better one nearby may draw few searches beside a wide one
+    that draws many: then nearly all must agree.
+    But what was found from beside the best says little of minima far away. So where fewer than
+    half of those from random places agree, these must be many: at 5 of 14 one search in a hundred
+    ended at twice the least RMS.
+    Behind a warm start stands an earlier result. So a third of them is enough, and so it is that
+    as many from random places, one from beside it (where the fitness jumps, as many) and the
+    second half of the generations have found nothing better. Those from beside it alone would not
+    do: around a false optimum they find nothing better.
+    """
+    if is_warm:
+        beside = settled if made.has_cliffs else 1
+        if is_old and made.independent >= settled and made.hops >= beside:
+            return True
+        settled = -(-settled // _WARM_SETTLED)
+    if made.has_cliffs:
+        every = made.returned >= max(settled, _RETURN * made.hops)
+        return every and made.confirmed >= max(settled, _AGREE * made.independent)
+    again, enough = made.confirmed + made.returned, settled + _MORE
+    if min(made.confirmed, made.returned) < -(-settled // _OF_EACH):
+        return False
+    agree = made.confirmed >= max(enough, _HALF * made.independent)
+    if not (is_warm or agree or made.independent >= _MANY * enough):
+        return False
+    return again >= max(enough, _SHARE * (made.independent + made.hops))

@@ -1,0 +1,96 @@
+"""How compiled code calls a kernel: its signature, once for all who emit, load or call one.
+
+A kernel is one C function of addresses and whole numbers::
+
+    void kernel(i64 P, double *theta, i64 stride, i64 *ints, double *floats, double *work,
+                double *predictions, i64 predictions_stride, double *loss)
+
+theta : K rows of `stride`: row = parameter, column = individual; P is a multiple of `FEW`.
+ints, floats : one experiment as `sysid.simulation.packing` lays it out.
+work : scratch of the experiment's size; its contents on entry do not matter.
+predictions : null, or M_e rows of `predictions_stride`: the simulated value at each measured time.
+loss : P sums; the kernel *adds* the experiment's loss, Σ w²e² for squares or
+    Σ 2s²(√(1 + (we/s)²) − 1) for soft-l1.
+
+A kernel raises nothing: a diverging simulation leaves ``inf`` or ``nan`` in its own column.
+"""
+
+from typing import Any
+
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
+
+LANES = 16
+"""W: individuals that run side by side in one vector of doubles."""
+
+FEW = 8
+"""The same where no more are left: a block of so many takes two thirds of the time."""
+
+ARGUMENTS = ("P", "theta", "stride", "ints", "floats", "work", "predictions",
+             "predictions_stride", "loss")  # fmt: skip
+_NUMBERS = ("P", "stride", "predictions_stride")
+
+
+def kernel_type() -> ir.FunctionType:
+    """LLVM type of a kernel; every argument is 64 bits wide."""
+    number, address = ir.IntType(64), ir.PointerType()
+    arguments = [number if name in _NUMBERS else address for name in ARGUMENTS]
+    return ir.FunctionType(ir.VoidType(), arguments)
+
+
+def _call_kernel(
+    typing_context: Any,
+    address: Any,
+    theta: Any,
+    ints: Any,
+    ints_begin: Any,
+    floats: Any,
+    floats_begin: Any,
+    work: Any,
+    predictions: Any,
+    first_row: Any,
+    loss: Any,
+) -> Any:
+    """Call the kernel at `address` for one experiment, from Numba code.
+
+    The arrays themselves are handed over, not their addresses, so that they stay alive during
+    the call. `theta` (K, stride), `predictions` (M, stride) and the rest are contiguous; the
+    experiment's numbers begin at ``ints[ints_begin]`` and ``floats[floats_begin]``, its
+    predictions go to the rows from `first_row`. `predictions` without rows: none are stored.
+    """
+    signature = types.void(
+        types.int64, theta, ints, types.int64, floats, types.int64, work, predictions,
+        types.int64, loss,
+    )  # fmt: skip
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        arrays = {
+            i: context.make_array(kind)(context, builder, value)
+            for i, (kind, value) in enumerate(zip(signature.args, values, strict=True))
+            if isinstance(kind, types.Array)
+        }
+
+        def extent(position: int, axis: int) -> Any:
+            return builder.extract_value(arrays[position].shape, axis)
+
+        def shifted(position: int, index: Any) -> Any:
+            return builder.gep(arrays[position].data, [index])
+
+        stride, rows, columns = extent(1, 1), extent(7, 0), extent(7, 1)
+        none = builder.icmp_signed("==", rows, rows.type(0))
+        first = shifted(7, builder.mul(values[8], columns))
+        target = builder.select(none, first.type(None), first)
+        arguments = [
+            stride, arrays[1].data, stride, shifted(2, values[3]), shifted(4, values[5]),
+            arrays[6].data, target, columns, arrays[9].data,
+        ]  # fmt: skip
+        integers = ir.FunctionType(ir.VoidType(), [a.type for a in arguments])
+        function = builder.inttoptr(values[0], integers.as_pointer())
+        builder.call(function, arguments)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+call_kernel: Any = intrinsic(_call_kernel)

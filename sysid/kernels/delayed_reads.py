@@ -1,0 +1,246 @@
+"""Readers of past values: how a signal with a lag is read between its samples, lane by lane.
+
+The lag ℓ, in integration steps, is the same in all steps, so its whole part and its fraction are
+computed once, and what one step has read the next need not read again.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from sysid.kernels.vectors import Lanes, Loop, Value
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """One state's past in the work array: a row for each step m, in it a double for each lane."""
+
+    base: Value
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One step of the time loop: its number, and the history's row of the last finished one."""
+
+    step: Value
+    row: Value
+
+
+class Reader(Protocol):
+    """Reads one signal at one lag.
+
+    Its life: made before the loop, opened in its head, and in every turn begun, read from and
+    ended.
+    """
+
+    def open(self, loop: Loop) -> None:
+        """Make the values that one turn hands to the next."""
+
+    def begin(self, turn: Turn) -> None:
+        """Read what the turn will need."""
+
+    def read(self, halves: int, now: Value, stage: Value) -> Value:
+        """Value at a place; a state is `now` at 0 and `stage` at the place itself."""
+
+    def end(self, loop: Loop, following: Value) -> None:
+        """Hand over to the next turn; `following` is the state's next value."""
+
+
+def inside_step(lanes: Lanes, lag: Value, halves: int, now: Value, stage: Value) -> Value:
+    """Value inside the present step: x + (c - ℓ)/c (x_c - x), which tends to x_c as ℓ → 0."""
+    portion = lanes.sub(lanes.number(1.0), lanes.mul(lag, lanes.number(2.0 / halves)))
+    return lanes.between(now, portion, stage)
+
+
+class LinearReader:
+    """A state between two samples, with one gather in a step.
+
+    `places` is a chain of whole steps (see `demand.chains`). If it reaches into the present step,
+    half steps may be read too: their two neighbours are among the three samples at hand.
+    """
+
+    def __init__(
+        self, lanes: Lanes, history: History, lag: Value, places: list[int], row: Value
+    ) -> None:
+        self._lanes, self._lag = lanes, lag
+        self._forward = places[0] > 0
+        self._top = min(places[0], 0) // 2
+        self._length = self._top - places[-1] // 2
+        whole, self._fraction = lanes.whole_and_fraction(lag)
+        b = lanes.builder
+        wide, own = lanes.splat(lanes.integer(lanes.width)), lanes.lane_numbers()
+        one = lanes.splat(lanes.integer(1))
+        self._within = b.icmp_signed("==", whole, lanes.splat(lanes.integer(0)))
+        back = b.select(self._within, one, whole)
+        self._addresses = lanes.addresses(history.base, b.sub(own, b.mul(whole, wide)))
+        # a lag below one step has no finished sample ahead: it reads the last one instead
+        self._ahead_addresses = lanes.addresses(history.base, b.sub(own, b.mul(back, wide)))
+        samples = [self._sample(row, self._top - j) for j in range(self._length + 2)]
+        self._initial = [samples[0], samples[1]] + [
+            lanes.between(samples[j], self._fraction, samples[j + 1])
+            for j in range(1, self._length + 1)
+        ]
+
+    def _sample(self, row: Value, steps: int) -> Value:
+        b, lanes = self._lanes.builder, self._lanes
+        index = b.mul(b.add(row, lanes.integer(steps)), lanes.integer(lanes.width))
+        return lanes.gather(self._addresses, index)
+
+    def open(self, loop: Loop) -> None:
+        """Make the values that one turn hands to the next."""
+        newest, *rest = self._initial
+        self._newest = loop.carry(newest) if self._forward else None
+        self._older, *self._chain = [loop.carry(value) for value in rest]
+
+    def begin(self, turn: Turn) -> None:
+        """Read what the turn will need."""
+        lanes = self._lanes
+        if self._forward:
+            b = lanes.builder
+            index = b.mul(b.add(turn.row, lanes.integer(1)), lanes.integer(lanes.width))
+            self._sample_now = self._newest
+            self._ahead = lanes.gather(self._ahead_addresses, index)
+        else:
+            self._sample_now = self._sample(turn.row, self._top)
+        self._values = [lanes.between(self._sample_now, self._fraction, self._older), *self._chain]
+
+    def read(self, halves: int, now: Value, stage: Value) -> Value:
+        """Value at a place."""
+        if halves <= 0:
+            return self._values[self._top - halves // 2]
+        finished = self._ahead_whole() if halves == 2 else self._ahead_half()
+        inside = inside_step(self._lanes, self._lag, halves, now, stage)
+        limit = self._lanes.number(halves / 2)
+        is_inside = self._lanes.compare("<", self._lag, limit)
+        return self._lanes.select(is_inside, inside, finished)
+
+    def _ahead_whole(self) -> Value:
+        return self._lanes.between(self._ahead, self._fraction, self._sample_now)
+
+    def _ahead_half(self) -> Value:
+        lanes, half = self._lanes, self._lanes.number(0.5)
+        later = lanes.between(self._ahead, lanes.add(self._fraction, half), self._sample_now)
+        earlier = lanes.between(self._sample_now, lanes.sub(self._fraction, half), self._older)
+        return lanes.select(lanes.compare("<", self._fraction, half), later, earlier)
+
+    def end(self, loop: Loop, following: Value) -> None:
+        """Hand over to the next turn."""
+        if self._newest is not None:
+            newest = self._lanes.builder.select(
+                self._within, self._lanes.splat(following), self._ahead
+            )
+            loop.update(self._newest, newest)
+        loop.update(self._older, self._sample_now)
+        for carried, value in zip(self._chain, self._values, strict=False):
+            loop.update(carried, value)
+
+
+class FreshReader:
+    """A state between its samples, read anew in every step.
+
+    For cubic interpolation (Lagrange through four samples; through three, or on a line inside the
+    present step, where the later ones do not exist yet), and for one-step prediction, where
+    samples change after they were read.
+    """
+
+    def __init__(self, lanes: Lanes, history: History, lag: Value, cubic: bool) -> None:
+        self._lanes, self._history, self._lag, self._cubic = lanes, history, lag, cubic
+
+    def open(self, loop: Loop) -> None:
+        """Make the values that one turn hands to the next."""
+
+    def begin(self, turn: Turn) -> None:
+        """Read what the turn will need."""
+        self._turn = turn
+        self._finished: dict[int, Value] = {}
+
+    def read(self, halves: int, now: Value, stage: Value) -> Value:
+        """Value at a place."""
+        if halves not in self._finished:
+            self._finished[halves] = self._interpolated(halves)
+        if halves <= 0:
+            return self._finished[halves]
+        inside = inside_step(self._lanes, self._lag, halves, now, stage)
+        is_inside = self._lanes.compare("<", self._lag, self._lanes.number(halves / 2))
+        return self._lanes.select(is_inside, inside, self._finished[halves])
+
+    def end(self, loop: Loop, following: Value) -> None:
+        """Hand over to the next turn."""
+
+    def _interpolated(self, halves: int) -> Value:
+        lanes = self._lanes
+        place = lanes.sub(lanes.number(halves / 2), self._lag)
+        whole, fraction = lanes.whole_and_fraction(place)
+        if not self._cubic:
+            return lanes.between(self._sample(whole, 0), fraction, self._sample(whole, 1))
+        samples = [self._sample(whole, j) for j in (-1, 0, 1, 2)]
+        four = _lagrange(lanes, fraction, (-1, 0, 1, 2), samples)
+        three = _lagrange(lanes, fraction, (-1, 0, 1), samples[:3])
+        limit = lanes.splat(lanes.integer(-2))
+        return lanes.select(lanes.builder.icmp_signed("<=", whole, limit), four, three)
+
+    def _sample(self, whole: Value, steps: int) -> Value:
+        """Sample `whole` + `steps` after the last finished one, or that one if it is later."""
+        lanes, b = self._lanes, self._lanes.builder
+        zero = lanes.splat(lanes.integer(0))
+        place = b.add(whole, lanes.splat(lanes.integer(steps)))
+        place = b.select(b.icmp_signed("<", place, zero), place, zero)
+        index = b.add(lanes.lane_numbers(), b.mul(place, lanes.splat(lanes.integer(lanes.width))))
+        addresses = lanes.addresses(self._history.base, index)
+        return lanes.gather(addresses, b.mul(self._turn.row, lanes.integer(lanes.width)))
+
+
+def _lagrange(lanes: Lanes, at: Value, nodes: tuple[int, ...], samples: list[Value]) -> Value:
+    """Polynomial through samples at whole nodes, at a fraction between 0 and 1."""
+    total = None
+    for node, sample in zip(nodes, samples, strict=True):
+        scale = 1.0
+        weight = None
+        for other in nodes:
+            if other != node:
+                scale *= node - other
+                factor = lanes.sub(at, lanes.number(other))
+                weight = factor if weight is None else lanes.mul(weight, factor)
+        term = lanes.mul(lanes.mul(weight, lanes.number(1.0 / scale)), sample)
+        total = term if total is None else lanes.add(total, term)
+    return total
+
+
+class InputReader:
+    """An input with a lag, between the points of its fine grid.
+
+    `places` is a chain of whole or of half steps: one is read, the others are its earlier values.
+    """
+
+    def __init__(
+        self, lanes: Lanes, floats: Value, zero: Value, points: Value, lag: Value, places: list[int]
+    ) -> None:
+        b = lanes.builder
+        self._lanes, self._floats, self._points, self._places = lanes, floats, points, places
+        whole, self._fraction = lanes.whole_and_fraction(lag)
+        self._addresses = lanes.addresses(floats, b.sub(lanes.splat(zero), whole))
+        self._initial = [self._value(lanes.integer(0), halves) for halves in places[1:]]
+
+    def _value(self, step: Value, halves: int) -> Value:
+        lanes, b = self._lanes, self._lanes.builder
+        place = b.mul(b.add(b.add(step, step), lanes.integer(halves)), self._points)
+        place = b.ashr(place, lanes.integer(1))
+        newest = lanes.gather(self._addresses, place)
+        older = lanes.gather(self._addresses, b.sub(place, lanes.integer(1)))
+        return lanes.between(newest, self._fraction, older)
+
+    def open(self, loop: Loop) -> None:
+        """Make the values that one turn hands to the next."""
+        self._chain = [loop.carry(value) for value in self._initial]
+
+    def begin(self, turn: Turn) -> None:
+        """Read what the turn will need."""
+        self._values = [self._value(turn.step, self._places[0]), *self._chain]
+
+    def read(self, halves: int, now: Value, stage: Value) -> Value:
+        """Value at a place."""
+        return self._values[self._places.index(halves)]
+
+    def end(self, loop: Loop, following: Value) -> None:
+        """Hand over to the next turn."""
+        for carried, value in zip(self._chain, self._values, strict=False):
+            loop.update(carried, value)

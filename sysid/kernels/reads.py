@@ -1,0 +1,145 @@
+"""Which past values a model reads, and where on the time axis, before any code is written.
+
+Places are counted in half integration steps from the last finished step: the stages of a
+Runge-Kutta step lie at 0, 1 and 2; the sample that a difference equation computes at 2.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from sysid.language.delays import mentions_time
+from sysid.language.tree import Binary, Call, Expression, Past, Unary
+from sysid.models.model import Model
+
+NEAR = 8
+"""Fixed offsets up to this many samples are kept in registers, further ones in the history."""
+
+_GAP = 4  # half steps: two values at most this far apart share one read
+
+
+class Read(NamedTuple):
+    """A past value and its place without its lag."""
+
+    past: Past
+    halves: int
+
+
+_KEPT = 64
+_reads: dict[int, tuple[Model, tuple[Read, ...]]] = {}  # by identity: a model's hash is a long walk
+
+
+def is_difference(model: Model) -> bool:
+    """Whether the model is a recursion over samples (a polynomial is one too)."""
+    return model.form != "differential"
+
+
+def stages(model: Model) -> tuple[int, ...]:
+    """Places at which the equations are evaluated in one step."""
+    if is_difference(model):
+        return (2,)
+    return (0, 1, 2) if model.solver.method == "rk4" else (0,)
+
+
+def state_place(model: Model, stage: int, equation: int, state: int) -> int:
+    """Place of a state's value without lag, in an equation at a stage.
+
+    The semi-implicit method uses states already updated as they are at the end of the step.
+    """
+    semi_implicit = not is_difference(model) and model.solver.method == "semi-implicit"
+    return 2 if semi_implicit and state < equation else stage
+
+
+def pasts(expression: Expression) -> Iterator[Past]:
+    """All signals of an expression, from left to right."""
+    match expression:
+        case Past():
+            yield expression
+        case Unary(_, operand):
+            yield from pasts(operand)
+        case Binary(_, left, right):
+            yield from pasts(left)
+            yield from pasts(right)
+        case Call(_, arguments):
+            for argument in arguments:
+                yield from pasts(argument)
+
+
+def reads(model: Model) -> tuple[Read, ...]:
+    """Every past value that the equations and the outputs read; kept, since every run asks."""
+    known = _reads.get(id(model))
+    if known is None or known[0] is not model:
+        if len(_reads) >= _KEPT:
+            _reads.clear()
+        known = _reads[id(model)] = (model, tuple(_found(model)))
+    return known[1]
+
+
+def _found(model: Model) -> list[Read]:
+    numbers = {state.name: i for i, state in enumerate(model.states)}
+    found: list[Read] = []
+    for i, equation in enumerate(model.equations):
+        for stage in stages(model):
+            for past in pasts(equation):
+                state = past.kind == "state"
+                at = state_place(model, stage, i, numbers[past.name]) if state else stage
+                found.append(Read(past, at - 2 * past.offset))
+    for output in model.outputs:
+        found += [Read(past, -2 * past.offset) for past in pasts(output.expression)]
+    return found
+
+
+def lags(model: Model, kind: str) -> list[Past]:
+    """The lagged values of that kind of signal, each once."""
+    return [*dict.fromkeys(r.past for r in reads(model) if r.past.kind == kind and r.past.lag)]
+
+
+def averaged_inputs(model: Model) -> frozenset[str]:
+    """Inputs that are read with unknown lags only: held ones are given as means over a step."""
+    inputs = [r.past for r in reads(model) if r.past.kind == "input"]
+    unknown = {past.name for past in inputs if _is_unknown(past)}
+    return frozenset(unknown - {past.name for past in inputs if not _is_unknown(past)})
+
+
+def _is_unknown(past: Past) -> bool:
+    return past.lag is not None and mentions_time(past.lag, "parameter")
+
+
+def with_history(model: Model) -> list[str]:
+    """States whose past must be kept in memory, in the model's order."""
+    needed = {
+        r.past.name
+        for r in reads(model)
+        if r.past.kind == "state" and (r.past.lag is not None or r.halves < -2 * NEAR)
+    }
+    return [state.name for state in model.states if state.name in needed]
+
+
+def depth(model: Model, state: str) -> int:
+    """How many finished samples of a state are kept in registers besides the last."""
+    fixed = [
+        -r.halves // 2
+        for r in reads(model)
+        if r.past.name == state and r.past.kind == "state" and r.past.lag is None
+    ]
+    return max([0, *(back for back in fixed if back <= NEAR)])
+
+
+def furthest(model: Model) -> int:
+    """Whole steps that the furthest read lies back, without its lag."""
+    return max([0, *(-(r.halves // 2) for r in reads(model))])
+
+
+def chains(places: set[int]) -> list[list[int]]:
+    """Places grouped so that a group needs one read: the rest are its values of earlier steps.
+
+    Each group holds the place that is read and then, step by step, those behind it.
+    """
+    groups: list[list[int]] = []
+    for parity in (0, 1):
+        for place in sorted((p for p in places if p % 2 == parity), reverse=True):
+            last = groups[-1] if groups else None
+            if last and last[0] % 2 == parity and last[-1] - place <= _GAP:
+                last.extend(range(last[-1] - 2, place - 1, -2))
+            else:
+                groups.append([place])
+    return groups

@@ -1,0 +1,106 @@
+"""Past values: an index such as ``k - 1 - L/h`` into its whole samples and its unknown lag."""
+
+from math import floor, isinf
+from typing import NamedTuple
+
+from sysid.language.intervals import bounds
+from sysid.language.monomials import CONSTANT, Polynomial, add, collect, rebuild, scale, times
+from sysid.language.printer import number, text
+from sysid.language.scope import Scope
+from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary
+
+_PERIOD = Symbol("h", "period")
+_LONGEST = 1e6
+
+
+class Delay(NamedTuple):
+    """How far back a value lies: whole samples, and what comes on top."""
+
+    offset: int
+    lag: Expression | None
+
+
+def delay(index: Expression, scope: Scope) -> Delay | str:
+    """The delay that an index stands for, or what is wrong with it.
+
+    In the difference form the offset is as large as the bounds allow to be fixed: ``y(k - d)``
+    with d from 1 to 20 is one sample back and d - 1 more.
+    """
+    clock = Symbol(scope.clock, "index" if scope.form == "difference" else "time")
+    terms = collect(index)
+    slope = terms.pop(((clock, 1),), 0.0)
+    back = scale(terms, -1.0)
+    rest = rebuild(back)
+    if slope == 1.0 and set(back) == {CONSTANT} and back[CONSTANT] < 0:
+        return "this is a value of the future, which is not known"
+    if not mentions_time(rest) and not slope:
+        return f"the index does not count from {scope.clock}; {_right(scope)}"
+    if scope.form == "difference" and mentions_time(rest, "time"):
+        return f"the index counts seconds; {_right(scope)}"
+    if abs(slope - 1.0) > 1e-9 or mentions_time(rest):
+        return f"the lag changes with time; {_right(scope)}, where the lag is fixed"
+    if (low := bounds(rest, scope.parameters)[0]) < 0:
+        return _negative(back, low, scope)
+    if not back:
+        return Delay(0, None)
+    # Any period tells a lag without limit; back[CONSTANT] counts samples or seconds.
+    if max(bounds(rest, scope.parameters, 1.0)[1], back.get(CONSTANT, 0.0)) > _LONGEST:
+        return f"the lag {text(rest, scope.clock)} has no limit inside the bounds of its parameters"
+    return Delay(0, rest) if scope.form == "differential" else _split(back, low, scope)
+
+
+def mentions_time(expression: Expression, *kinds: str) -> bool:
+    """Whether an expression depends on t or k; or on one of the given kinds of symbol."""
+    match expression:
+        case Symbol(_, kind):
+            return kind in (kinds or ("time", "index"))
+        case Unary(_, operand):
+            return mentions_time(operand, *kinds)
+        case Binary(_, left, right):
+            return mentions_time(left, *kinds) or mentions_time(right, *kinds)
+        case Call(_, arguments):
+            return any(mentions_time(one, *kinds) for one in arguments)
+        case _:
+            return False
+
+
+def past_values(expression: Expression) -> tuple[Past, ...]:
+    """Every signal value in an expression, in the order of the text."""
+    match expression:
+        case Past():
+            return (expression,)
+        case Unary(_, operand):
+            return past_values(operand)
+        case Binary(_, left, right):
+            return past_values(left) + past_values(right)
+        case Call(_, arguments):
+            return tuple(value for one in arguments for value in past_values(one))
+        case _:
+            return ()
+
+
+def _split(back: Polynomial, low: float, scope: Scope) -> Delay:
+    constant = back.get(CONSTANT, 0.0)
+    unknown = {monomial: value for monomial, value in back.items() if monomial != CONSTANT}
+    offset = 1 if low >= 1 else 0
+    if bounds(rebuild(unknown), scope.parameters)[0] >= 0:
+        offset = max(offset, floor(constant))
+    lag = add(back, {CONSTANT: -float(offset)})
+    return Delay(offset, rebuild(lag) if lag else None)
+
+
+def _negative(back: Polynomial, low: float, scope: Scope) -> str:
+    unit = "samples" if scope.form == "difference" else "s"
+    if isinf(low):  # h may be as small as it likes: say it in seconds
+        low, unit = bounds(rebuild(times(back, _PERIOD)), scope.parameters)[0], "s"
+    smallest = "" if isinf(low) else f"; its smallest value is {number(low)} {unit}"
+    return (
+        f"the lag {text(rebuild(back), scope.clock)} may be negative inside the bounds{smallest}; "
+        "give its parameters bounds that keep it at 0 or more"
+    )
+
+
+def _right(scope: Scope) -> str:
+    if scope.form == "difference":
+        return "in the difference form write x(k - n - L/h)"
+    return "in the differential form write x(t - L)"

@@ -1,0 +1,83 @@
+"""The catalogue of built-in models, and loading a model from wherever it is."""
+
+from collections.abc import Mapping
+from copy import deepcopy
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from sysid.core.errors import Fault, InvalidModel, UnknownModel
+from sysid.models.documents import MAX_CHARACTERS, read_yaml
+from sysid.models.model import Model
+from sysid.models.parse import parse_model
+
+_FOLDER = Path(__file__).parent
+
+
+@cache
+def catalogue() -> tuple[str, ...]:
+    """Names of the built-in models, in alphabetical order."""
+    return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
+
+
+def document(name: str) -> dict[str, Any]:
+    """The document of a built-in model, to read or to change.
+
+    Raises
+    ------
+    UnknownModel
+        With the nearest known name.
+    """
+    return deepcopy(_document(name))
+
+
+def load_model(source: str | Mapping[str, Any] | Path) -> Model:
+    """A model of the catalogue by its name, of a document, or of a YAML or JSON file.
+
+    A text is only ever a name: files are read for a `Path` alone, so that a name that came over
+    a network cannot open one.
+
+    Raises
+    ------
+    UnknownModel
+        If the catalogue has no such name.
+    InvalidModel
+        If the file or the document has faults.
+    """
+    if isinstance(source, Path):
+        return parse_model(read_document(source), is_new=True)
+    if isinstance(source, str):
+        return _built_in(source)
+    return parse_model(source, is_new=True)
+
+
+def read_document(path: Path) -> Any:
+    """The data of a YAML or JSON file.
+
+    Raises
+    ------
+    InvalidModel
+        If the file cannot be read as such.
+    """
+    try:
+        if path.stat().st_size > 4 * MAX_CHARACTERS:
+            raise InvalidModel([Fault("", f"{path} is larger than {4 * MAX_CHARACTERS} bytes")])
+        return read_yaml(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InvalidModel([Fault("", f"{path} cannot be read: {error.strerror}")]) from None
+    except UnicodeDecodeError as error:
+        detail = f"{path} is not UTF-8 text: byte {error.start} does not fit"
+        raise InvalidModel([Fault("", detail)]) from None
+
+
+@cache
+def _built_in(name: str) -> Model:
+    return parse_model(_document(name))
+
+
+@cache
+def _document(name: str) -> dict[str, Any]:
+    if name not in catalogue():
+        raise UnknownModel(name, catalogue())
+    found: dict[str, Any] = read_document(_FOLDER / f"{name}.yaml")
+    return found

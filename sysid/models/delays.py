@@ -1,0 +1,186 @@
+"""Whether a model's lags stay in the past, and inside a record, for bounds given in a request.
+
+What a request gives without any effect: refused, since it is a mistake more often than not.
+"""
+
+from collections.abc import Mapping, Sequence
+
+from sysid.core.errors import Fault, InvalidSettings, RecordTooShort
+from sysid.language.delays import past_values
+from sysid.language.intervals import Interval, bounds
+from sysid.language.printer import text
+from sysid.language.tree import Past
+from sysid.models.model import Model, initial_parameters
+from sysid.models.parameters import Parameter, override
+from sysid.models.sections import interval
+from sysid.models.ties import names_in, tied_model, ties_of
+
+_HALVINGS = 60  # of a parameter's interval, in search of the largest value that a record allows
+
+
+def check_lags(model: Model, parameters: Sequence[Parameter], period: float | None = None) -> None:
+    """Raise if a lag could be negative inside these bounds.
+
+    Parameters
+    ----------
+    model : Model
+    parameters : sequence of Parameter
+        The model's, with the bounds and fixed values of a request.
+    period : float or None
+        Sampling period in s, if it is known.
+
+    Raises
+    ------
+    InvalidSettings
+        Naming the past value and the smallest lag.
+    """
+    ends = {parameter.name: interval(parameter) for parameter in parameters}
+    clock = "t" if model.form == "differential" else "k"
+    unit = "s" if model.form == "differential" else "samples"
+    for value in past_signals(model):
+        low = bounds(value.lag, ends, period)[0] if value.lag is not None else 0.0
+        if low < 0:
+            smallest = f"{low + value.offset:g} {unit}"
+            raise InvalidSettings(
+                "/parameters",
+                f"inside these bounds the lag of {text(value, clock)} can be as small as "
+                f"{smallest}; the model needs {value.offset} {unit} or more",
+            )
+
+
+def past_signals(model: Model) -> list[Past]:
+    """Every past value that an equation or an output reads."""
+    trees = (*model.equations, *(output.expression for output in model.outputs))
+    return [value for tree in trees for value in past_values(tree)]
+
+
+def longest_lag(
+    model: Model, past: Past, spans: Mapping[str, Interval], step: float | None
+) -> float:
+    """How far (s) a past value may lie back inside these bounds; `step`: of the integration, s."""
+    back = past.offset + (0.0 if past.lag is None else bounds(past.lag, spans, step)[1])
+    return back if model.form == "differential" else back * (step or 0.0)
+
+
+def check_length(
+    model: Model, past: Past, spans: Mapping[str, Interval], step: float, duration: float
+) -> None:
+    """Raise if a past value may lie as far back as a record lasts.
+
+    Parameters
+    ----------
+    spans : mapping of str to (lower, upper)
+        Of every parameter; one that is fixed has two equal ends.
+    step, duration : float
+        Of the integration and of the record, in s.
+
+    Raises
+    ------
+    RecordTooShort
+        Naming the parameters that the lag is made of, their bounds, and what would be short
+        enough.
+    """
+    longest = longest_lag(model, past, spans, step)
+    if longest < duration:
+        return
+    names = sorted(names_in(past.lag) & set(spans)) if past.lag is not None else []
+    units = {parameter.name: parameter.unit for parameter in model.parameters}
+    told = [_told(name, spans[name], units.get(name, "1")) for name in names]
+    cure = "a longer record"
+    if len(names) == 1:
+        most = _largest(model, past, spans, step, duration)
+        unit = _unit(units.get(names[0], "1"))
+        end = names[0] if _is_known(spans[names[0]]) else f"upper bound of {names[0]}"
+        cure += "" if most is None else f", or a smaller {end}: below {most:.4g}{unit}"
+    elif names:
+        cure += ", or smaller ones"
+    what = f"the lag of {past.name!r}"
+    raise RecordTooShort(duration, longest, what, " and ".join(told), cure)
+
+
+def _told(name: str, span: Interval, unit: str) -> str:
+    value = f"{span[1]:.6g}{_unit(unit)}"
+    return f"{name} is {value}" if _is_known(span) else f"the upper bound of {name} is {value}"
+
+
+def _is_known(span: Interval) -> bool:
+    return span[0] == span[1]
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else f" {unit}"
+
+
+def _largest(
+    model: Model, past: Past, spans: Mapping[str, Interval], step: float, duration: float
+) -> float | None:
+    """The largest value of the lag's only parameter that the record allows; None: there is none."""
+    [name] = names_in(past.lag) & set(spans) if past.lag is not None else []
+    lower, upper = spans[name]
+    start = min(lower, 0.0) if _is_known(spans[name]) else lower
+
+    def fits(value: float) -> bool:
+        return longest_lag(model, past, {**spans, name: (start, value)}, step) < duration
+
+    if not fits(start):
+        return None
+    low, high = start, upper
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return high
+
+
+def unused(
+    model: Model, parameters: Sequence[Parameter], weights: Mapping[str, float] | None
+) -> list[Fault]:
+    """Free parameters that no equation reads, and a weight beside which there is no other output.
+
+    Parameters
+    ----------
+    model : Model
+        Its ties resolved.
+    parameters : sequence of Parameter
+        The model's own, as they are sought.
+    """
+    trees = (*model.equations, *(output.expression for output in model.outputs))
+    read = {name for tree in trees for name in names_in(tree)}
+    where = "no term" if model.form == "polynomial" else "no equation and no output"
+    found = [
+        Fault(
+            f"/parameters/{one.name}",
+            f"{where} of model {model.name!r} uses {one.name!r}, so no data can tell its value; "
+            "take it out of the model, or fix it",
+        )
+        for one in parameters
+        if one.is_free and one.name not in read
+    ]
+    only = [output.name for output in model.outputs]
+    if len(only) == 1 and only[0] in (weights or {}):
+        detail = (
+            f"{only[0]!r} is the model's only output, so a weight would change nothing; leave it "
+            "out"
+        )
+        found.append(Fault(f"/weights/{only[0]}", detail))
+    return found
+
+
+def check_used(
+    model: Model,
+    experiments: int,
+    changes: Mapping[str, Mapping[str, object]] | None,
+    weights: Mapping[str, float] | None,
+) -> None:
+    """Raise for the first of these.
+
+    Raises
+    ------
+    InvalidSettings, InvalidBounds
+        With its pointer; also if the changes of parameters cannot be used.
+    """
+    everything = override(
+        (*model.parameters, *initial_parameters(model, experiments)), dict(changes or {})
+    )
+    tied = tied_model(model, ties_of(model, everything))
+    for fault in unused(tied, everything[: len(model.parameters)], weights):
+        raise InvalidSettings(fault.pointer, fault.detail)

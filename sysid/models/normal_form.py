@@ -1,0 +1,125 @@
+"""The normal form of a document: every default filled in, so that equal models read equal."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from sysid.models.model import EstimatedInitial, FixedInitial, Initial, Model, Output
+from sysid.models.parameters import Parameter
+
+_TEXTS = ("description", "source")
+
+
+def normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
+    """Document from which the same model is built; it is its own normal form.
+
+    Parameters
+    ----------
+    fields : mapping
+        The document as given, checked.
+    model : Model
+        What it describes.
+    """
+    head: dict[str, Any] = {"name": model.name, "title": model.title}
+    for key in _TEXTS:
+        if fields.get(key):
+            head[key] = " ".join(fields[key].split())
+    head["form"] = model.form
+    head["inputs"] = {signal.name: signal.unit for signal in model.inputs}
+    body = _polynomial(fields, model) if model.form == "polynomial" else _equations(fields, model)
+    declared = fields.get("parameters") or {}
+    return {
+        **head,
+        **body,
+        "parameters": {
+            p.name: _parameter(p, declared) for p in model.parameters if p.name in declared
+        },
+        "constants": {k: float(v) for k, v in (fields.get("constants") or {}).items()},
+        "initial": {
+            state.name: _initial(start)
+            for state, start in zip(model.states, model.initial, strict=True)
+        },
+        "solver": _solver(model),
+    }
+
+
+def _equations(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
+    return {
+        "states": {state.name: state.unit for state in model.states},
+        "equations": {s.name: _text(fields["equations"][s.name]) for s in model.states},
+        "outputs": {o.name: _output(o, fields["outputs"][o.name]) for o in model.outputs},
+    }
+
+
+def _polynomial(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
+    [state] = model.states
+    body: dict[str, Any] = {"output": {state.name: state.unit}}
+    if fields.get("degree") is not None:
+        body["degree"] = int(fields["degree"])
+    if fields.get("lags") is not None:
+        body["lags"] = {k: [_text(one) for one in v] for k, v in fields["lags"].items()}
+    body["coefficients"] = {k: _value(v) for k, v in fields["coefficients"].items()}
+    body["constant"] = bool(fields.get("constant", False))
+    body["terms"] = _terms(fields.get("terms", "all"), model)
+    return body
+
+
+def _terms(written: Any, model: Model) -> object:
+    if model.rule is None:
+        return written if isinstance(written, str) else [_text(one) for one in written]
+    rule: dict[str, Any] = {"select": written["select"], "keep": model.rule.keep}
+    if model.rule.err is not None:
+        rule["err"] = model.rule.err
+    candidates = written.get("candidates", "all")
+    listed = candidates if isinstance(candidates, str) else [_text(one) for one in candidates]
+    rule |= {"criterion": model.rule.criterion, "exchange": model.rule.exchange}
+    rule["error"] = model.rule.error
+    return {**rule, "candidates": listed}
+
+
+def _text(written: object) -> str:
+    return " ".join(written.split()) if isinstance(written, str) else repr(written)
+
+
+def _value(written: object) -> object:
+    is_number = isinstance(written, int | float) and not isinstance(written, bool)
+    return float(written) if is_number else written  # type: ignore[arg-type]
+
+
+def _output(output: Output, written: Any) -> dict[str, str]:
+    text = written["expression"] if isinstance(written, Mapping) else written
+    return {"expression": _text(text), "unit": output.unit}
+
+
+def _parameter(parameter: Parameter, declared: Mapping[str, Any]) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "lower": parameter.lower,
+        "upper": parameter.upper,
+        "unit": parameter.unit,
+        "scale": parameter.scale,
+    }
+    if parameter.fixed is not None:
+        entry["fixed"] = parameter.fixed
+    if parameter.tied is not None:
+        entry["tied"] = _text(parameter.tied)
+    if description := declared[parameter.name].get("description"):
+        entry["description"] = " ".join(description.split())
+    return entry
+
+
+def _initial(start: Initial) -> object:
+    if isinstance(start, FixedInitial):
+        return start.value
+    if isinstance(start, EstimatedInitial):
+        return {"lower": start.lower, "upper": start.upper}
+    return "measured"
+
+
+def _solver(model: Model) -> dict[str, Any]:
+    solver = model.solver
+    past = {"history": solver.history, "interpolation": solver.interpolation}
+    if model.form == "polynomial":
+        return past
+    if model.form == "difference":
+        return {"substeps": solver.substeps, **past}
+    step = "sample" if solver.step is None else solver.step
+    return {"method": solver.method, "step": step, "substeps": solver.substeps, **past}

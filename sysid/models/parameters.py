@@ -1,0 +1,144 @@
+"""A quantity to identify and the interval in which it is sought."""
+
+import re
+from collections.abc import Mapping, Set
+from dataclasses import dataclass, replace
+from math import isfinite
+from typing import Any, Literal
+
+from sysid.core.errors import InvalidBounds, InvalidSettings, nearest
+
+Scale = Literal["linear", "log"]
+
+_START = re.compile(r"(\w+)\(0\)(?:\[\d+\])?")
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One quantity to identify.
+
+    Attributes
+    ----------
+    name : str
+        Symbol used in equations, reports and stored results.
+    lower, upper : float
+        Closed search interval, in `unit`.
+    unit : str
+        Unit symbol; ``"1"`` for a dimensionless quantity.
+    scale : {"linear", "log"}
+        How the interval is divided by the chromosome; ``"log"`` where it spans decades.
+    fixed : float or None
+        A known value; the parameter is then not searched.
+    tied : str or None
+        What it is in terms of other parameters, such as ``"2*a"``; it is then not searched, and
+        its bounds say nothing.
+
+    Raises
+    ------
+    InvalidBounds
+        If a bound is not finite, ``lower >= upper``, a log scale starts at or below zero, or
+        `fixed` lies outside the bounds.
+    """
+
+    name: str
+    lower: float
+    upper: float
+    unit: str = "1"
+    scale: Scale = "linear"
+    fixed: float | None = None
+    tied: str | None = None
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.lower) and isfinite(self.upper) and self.lower < self.upper):
+            raise InvalidBounds(self.name, self.lower, self.upper)
+        if self.scale == "log" and self.lower <= 0:
+            raise InvalidBounds(self.name, self.lower, self.upper, "a log scale needs lower > 0")
+        if self.fixed is not None and not self.lower <= self.fixed <= self.upper:
+            detail = f"but is fixed at {self.fixed:g}, outside them"
+            raise InvalidBounds(self.name, self.lower, self.upper, detail)
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the parameter is searched."""
+        return self.fixed is None and self.tied is None
+
+
+_FIELDS = ("lower", "upper", "scale", "fixed", "tied")
+
+
+def override(
+    parameters: tuple[Parameter, ...], changes: Mapping[str, Mapping[str, Any]]
+) -> tuple[Parameter, ...]:
+    """Parameters with some bounds, scales, fixed values or ties replaced.
+
+    Both bounds make a parameter free that its model fixes or ties.
+
+    Raises
+    ------
+    InvalidSettings
+        If a name or a field is unknown, a value is not a number, a parameter is fixed outside its
+        bounds, or it is tied and something else as well.
+    InvalidBounds
+        If the result is not a usable interval.
+    """
+    known = {p.name for p in parameters}
+    for name, fields in changes.items():
+        if name not in known:
+            raise InvalidSettings(
+                f"/parameters/{name}", f"the model has no parameter {name!r}{_known(name, known)}"
+            )
+        for field, value in fields.items():
+            _check_field(f"/parameters/{name}/{field}", field, value)
+        if "tied" in fields and len(fields) > 1:
+            others = ", ".join(repr(field) for field in fields if field != "tied")
+            raise InvalidSettings(
+                f"/parameters/{name}", f"a tied parameter is not searched; leave out {others}"
+            )
+    return tuple(_changed(p, changes.get(p.name, {})) for p in parameters)
+
+
+def _known(name: str, known: Set[str]) -> str:
+    """What there is instead of an unknown name."""
+    start = _START.fullmatch(name)
+    if start is None:
+        return nearest(name, known)
+    state, first = start[1], f"{start[1]}(0)"
+    if first in known:
+        starts = sum(other == first or other.startswith(f"{first}[") for other in known)
+        return f": the records hold {starts} start(s) of {state!r}, {first} and so on"
+    return (
+        f": a start is one where the model's document has bounds for it, "
+        f"initial: {{{state}: {{lower: …, upper: …}}}}"
+    )
+
+
+def _check_field(pointer: str, field: str, value: object) -> None:
+    if field not in _FIELDS:
+        raise InvalidSettings(pointer, f"unknown field{nearest(field, _FIELDS)}")
+    if field == "tied":
+        if not isinstance(value, str):
+            raise InvalidSettings(pointer, f"{value!r} is not an expression, such as '2*a'")
+    elif field == "scale":
+        if value not in ("linear", "log"):
+            raise InvalidSettings(pointer, f"{value!r} is not 'linear' or 'log'")
+    elif isinstance(value, bool) or not isinstance(value, int | float):
+        raise InvalidSettings(pointer, f"{value!r} is not a number")
+
+
+def _changed(parameter: Parameter, fields: Mapping[str, Any]) -> Parameter:
+    if "tied" in fields:
+        return replace(parameter, tied=fields["tied"], fixed=None)
+    values: dict[str, Any] = {k: v if k == "scale" else float(v) for k, v in fields.items()}
+    if {"lower", "upper"} <= values.keys() and "fixed" not in values:
+        values |= {"fixed": None, "tied": None}  # an interval to search frees what the model gives
+    fixed = values.get("fixed")
+    if fixed is not None:
+        values["tied"] = None
+    lower, upper = (values.get(k, getattr(parameter, k)) for k in ("lower", "upper"))
+    if fixed is not None and not lower <= fixed <= upper:
+        raise InvalidSettings(
+            f"/parameters/{parameter.name}/fixed",
+            f"{fixed:g} lies outside the bounds [{lower:g}, {upper:g}] of {parameter.name!r}; give "
+            "a value inside them, or give 'lower' and 'upper' that hold it",
+        )
+    return replace(parameter, **values)

@@ -1,0 +1,240 @@
+"""Whether the channels of all records are in the units of the model, and of one another.
+
+Whether parameters in another unit of time than seconds are read in seconds.
+
+Units are labels to a model: dx/dt is per second, so ``(u - x)/T`` reads T in seconds, whatever its
+unit says. A time constant in minutes would be estimated in seconds and told in minutes. Equations
+that convert it, as ``(u - x)/(60*T)``, multiply it by a number wherever they read it, or the sum in
+which it stands; those that read it as it stands, or within a function, may do so on purpose: they
+are warned of, not refused. Of a ratio of two such parameters nothing is to be converted.
+Lags, which have nothing but a time in them, are refused (`sysid.models.units`).
+
+Whether the unit of an unknown lag is the one in which lags are counted.
+
+Units are labels to a model: ``u(t - L)`` reads L in seconds, whatever its unit says. A lag in
+minutes would be estimated in seconds and told in minutes.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import combinations
+from math import isclose, prod
+
+from sysid.core.errors import InvalidRecord
+from sysid.core.units import difference, factor, is_blank, is_known, is_read, suggestion
+from sysid.data.records import Channel, Record
+from sysid.language.delays import past_values
+from sysid.language.monomials import Monomial, collect
+from sysid.language.scope import Timing
+from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary
+from sysid.models.documents import Reader, pointer
+from sysid.models.model import Model
+
+_PERIOD = (Symbol("h", "period"), -1)
+_SECONDS = "s"
+
+
+def check_lag_units(reader: Reader, model: Model) -> None:
+    """Report each parameter that is a lag as it stands, in another unit than that of lags."""
+    units = {one.name: one.unit for one in model.parameters}
+    form: Timing = "differential" if model.form == "differential" else "difference"
+    told = set()
+    for tree in (*model.equations, *(one.expression for one in model.outputs)):
+        for past in past_values(tree):
+            for name, in_periods in _bare(past):
+                size = factor(units.get(name, "1"), _SECONDS)
+                in_seconds = form == "differential" or in_periods
+                if size is None or (size == 1.0 and in_seconds) or name in told:
+                    continue
+                told.add(name)
+                detail = _detail(name, units[name], size, form, in_periods=in_periods)
+                reader.fault(pointer("parameters", name, "unit"), detail)
+
+
+def _bare(past: Past) -> Iterator[tuple[str, bool]]:
+    """Parameters that a lag adds without a factor, and whether they are divided by the period."""
+    if past.lag is None:
+        return
+    for monomial, coefficient in collect(past.lag).items():
+        name = _single(tuple(one for one in monomial if one != _PERIOD))
+        if name is not None and coefficient == 1.0:
+            yield name, _PERIOD in monomial
+
+
+def _single(monomial: Monomial) -> str | None:
+    match monomial:
+        case ((Symbol(name, "parameter"), 1),):
+            return name
+        case _:
+            return None
+
+
+def _detail(name: str, unit: str, size: float, form: Timing, *, in_periods: bool) -> str:
+    if size == 1.0:
+        return f"found {unit!r}, but this lag counts samples: write {name}/h, or the unit samples"
+    clock = "t" if form == "differential" else "k"
+    right = f"{clock} - {size:.12g}*{name}" + ("" if form == "differential" else "/h")
+    if form == "difference" and not in_periods:
+        return f"found {unit!r}, but this lag counts samples: write {right}, or the unit samples"
+    return f"found {unit!r}, but this lag counts seconds: give it in s, or write {right}"
+
+
+def time_unit_notes(model: Model) -> list[str]:
+    """One sentence for each parameter of a differential model that is read as if in seconds."""
+    if model.form != "differential":
+        return []
+    sizes = {one.name: factor(one.unit, "s") for one in model.parameters}
+    units = {one.name: one.unit for one in model.parameters}
+    known = {name: size for name, size in sizes.items() if size is not None}
+    bare = {name for tree in model.equations for name in _without_unit(tree, known)}
+    return [
+        f"{name} has the unit {units[name]}, but the equations read it as it stands, and their "
+        f"rates are per second: unless that is meant, give it in s, or write {size:.12g}*{name}"
+        for name, size in sizes.items()
+        if name in bare and size not in (None, 1.0)
+    ]
+
+
+def _without_unit(tree: Expression, sizes: Mapping[str, float]) -> Iterator[str]:
+    """Parameters that a term has without a number to multiply them; `sizes` in seconds."""
+    for monomial, coefficient in collect(tree).items():
+        if abs(coefficient) == 1.0:
+            yield from _names(monomial, sizes)
+        for one, _ in monomial:
+            for part in _inside(one):
+                yield from _without_unit(part, sizes)
+
+
+def _names(monomial: Monomial, sizes: Mapping[str, float]) -> list[str]:
+    """Parameters of a product, none where their units cancel out."""
+    found = {
+        one.name: power
+        for one, power in monomial
+        if isinstance(one, Symbol) and one.kind == "parameter" and one.name in sizes
+    }
+    cancel = isclose(prod(sizes[name] ** power for name, power in found.items()), 1.0)
+    return [] if cancel else list(found)
+
+
+def _inside(node: Expression) -> tuple[Expression, ...]:
+    """Of what stands in a product as a whole, the terms inside."""
+    match node:
+        case Call(_, arguments):
+            return arguments
+        case Unary(_, operand):
+            return (operand,)
+        case Binary(_, left, right):  # a denominator has its own sum, with its factor in it
+            return (left, right) if collect(node) == {((node, 1),): 1.0} else (node,)
+        case _:
+            return ()
+
+
+_SHOWN = 40  # characters of a unit in a message
+
+
+class SignalUnits:
+    """Unit of every signal of a model: its own, or where it has none that of the first record.
+
+    A channel without a unit, with the unit 1, or with one that cannot be read may be anything.
+    """
+
+    def __init__(self, model: Model) -> None:
+        signals = [(one.name, one.unit) for one in model.inputs]
+        signals += [(one.name, one.unit) for one in model.outputs]
+        whose = f"model {model.name!r}"
+        self._known = {name: (unit, whose) for name, unit in signals if not is_blank(unit)}
+
+    def fault(self, signal: str, channel: str, unit: str | None, where: str) -> str:
+        """What is wrong with the unit of a channel that is to be a signal; empty if nothing is.
+
+        Parameters
+        ----------
+        channel, unit : str
+            Of the record; `where` says which it is.
+        """
+        if unit is None or is_blank(unit):
+            return ""
+        own, whose = self._known.setdefault(signal, (unit, where))
+        if is_read(unit) and not is_read(own):  # which tells more of the records that follow
+            self._known[signal] = (unit, where)
+        found = difference(unit, own)
+        if not found:
+            return ""
+        if factor(unit, own) is None:
+            cure = "correct the one that is wrong"
+        else:
+            cure = f'convert the data, by the derivation {{"unit": {{"{channel}": "{own}"}}}}'
+        role = "" if channel == signal else f" (signal {signal!r})"
+        return (
+            f"channel {channel!r}{role} is in {unit} in {where}, but in {whose} it is in {own}: "
+            f"{found}; {cure}"
+        )
+
+
+def check_units(model: Model, records: Sequence[Record]) -> None:
+    """Raise if a channel is in another unit than the model has, or than a record before has.
+
+    Raises
+    ------
+    InvalidRecord
+        Naming the channel and both units.
+    """
+    units = SignalUnits(model)
+    for number, record in enumerate(records, 1):
+        where = f"record {record.name!r}" if record.name else f"record {number}"
+        for channel in (*record.inputs, *record.outputs):
+            fault = units.fault(channel.name, channel.name, channel.unit, where)
+            if fault:
+                raise InvalidRecord(fault)
+
+
+def unknown_units(channels: Iterable[Channel]) -> list[str]:
+    """What to say of channels whose units nobody knows, such as ``bat`` for ``bar``."""
+    return [
+        f"channel {one.name!r}: {_quoted(one.unit)} is no known unit, so it is kept as it is "
+        f"written and compared with no other{suggestion(one.unit)}"
+        for one in channels
+        if not (is_blank(one.unit) or is_known(one.unit))
+    ]
+
+
+def unread_units(model: Model, records: Sequence[Record]) -> list[str]:
+    """Channels of which nobody can tell whether they are in the unit of the model."""
+    found = {}
+    known = {one.name: one.unit for one in model.inputs}
+    known |= {one.name: one.unit for one in model.outputs}
+    for record in records:
+        for channel in (*record.inputs, *record.outputs):
+            unit, own = channel.unit, known.get(channel.name, "")
+            unread = [one for one in (unit, own) if not is_read(one)]
+            if unread and not (is_blank(unit) or is_blank(own) or unit.strip() == own.strip()):
+                found[channel.name, unit] = (
+                    f"channel {channel.name!r} is in {unit}, and in the model it is in {own}: "
+                    f"{' and '.join(unread)} could not be read as a unit, so they were not compared"
+                )
+    return list(found.values())
+
+
+def mixed_units(model: Model, records: Sequence[Record]) -> list[str]:
+    """Channels of one quantity in two units, where the model does not give the units of both.
+
+    What is found then holds for these units: a gain of 1 between kPa and Pa is one of 1000.
+    """
+    free = {one.name for one in model.inputs if is_blank(one.unit)}
+    free |= {one.name for one in model.outputs if is_blank(one.unit)}
+    units: dict[str, str] = {}
+    for record in records:  # those of the first stand for all: `check_units` has compared them
+        for channel in (*record.inputs, *record.outputs):
+            if not is_blank(channel.unit):
+                units.setdefault(channel.name, channel.unit)
+    return [
+        f"{a!r} is in {units[a]} and {b!r} in {units[b]}, and model {model.name!r} does not say in "
+        "which units both are: the numbers were taken as they are, so a gain between the two is in "
+        f"these units, whatever stands beside it ({difference(units[a], units[b])}); to have both "
+        f'in one unit, convert the data, by the derivation {{"unit": {{"{a}": "{units[b]}"}}}}'
+        for a, b in combinations(units, 2)
+        if free & {a, b} and factor(units[a], units[b]) not in (None, 1.0)
+    ]
+
+
+def _quoted(unit: str) -> str:
+    return repr(unit if len(unit) <= _SHOWN else f"{unit[:_SHOWN]}…")

@@ -1,0 +1,1 @@
+"""Tests and colour of residuals: Ljung–Box, AR(1), HAC covariance, onset delay, feedback."""

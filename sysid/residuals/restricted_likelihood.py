@@ -1,0 +1,181 @@
+"""The colour of residuals by restricted likelihood, as short records ask for.
+
+Residuals are noise less what D parameters took of it, and that is mostly its slow part: of 50 to
+100 samples autocovariances, and all that is made of them, come out too small. The restricted
+likelihood (Patterson and Thompson 1971) is that of the combinations of samples in which the
+parameters have no part, so nothing was taken from them (Cheang and Reinsel 2000). The noise is one
+of first order beside white noise, with the share w of the white one:
+
+    r(k) = (1 - w) aᵏ for k > 0,  r(0) = 1
+
+The differences y(i) - aᵏ y(i - 1), over the k periods between two samples, are then correlated with
+their neighbours only, so that all takes a time in proportion to the samples. How exact a and w are
+tells the degrees of freedom of each variance (Satterthwaite 1946, by the curvature of the
+likelihood; Kenward and Roger 1997). Where what it leaves is not white it is no model of the noise.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, expit
+
+from sysid.core.types import RANK, FloatArray, IntArray
+from sysid.residuals.autocorrelation import Laid, whiteness
+
+STEEPEST = 0.97
+"""Pole of a recursion: one nearer 1 would follow a single drift (Andrews and Monahan 1992)."""
+
+_STARTS = ((0.6, -1.5), (1.5, 0.0))
+_EVALUATIONS = 80  # of each of them
+_CLOSE = 0.02  # of the likelihood, and of the two numbers that it is searched over
+_STEP = 0.1  # of their differences
+_VAGUE = 0.05  # curvature: a likelihood that is flatter knows no more
+_WHITE = 0.05  # chance of what is left of the residuals, if it is white
+
+
+class Modelled(NamedTuple):
+    """SᵀRS of one series, and how exact it is.
+
+    Attributes
+    ----------
+    middle : FloatArray, shape (D, D)
+    slopes : FloatArray, shape (2, D, D)
+        Of the middle, over two numbers that stand for a and w.
+    covariance : FloatArray, shape (2, 2)
+        Of those.
+    degrees : float
+        Of the variance of the noise, were its colour known.
+    share : float
+        How much of a white sample one says of a mean.
+    """
+
+    middle: FloatArray
+    slopes: FloatArray
+    covariance: FloatArray
+    degrees: float
+    share: float
+
+    def variation(self, direction: FloatArray) -> float:
+        """Variance of the logarithm of the variance of a combination (D,) of Sᵀe."""
+        size = float(direction @ self.middle @ direction)
+        slope = np.einsum("d,kde,e->k", direction, self.slopes, direction)
+        known = float(slope @ self.covariance @ slope) / size**2 if size > 0 else 0.0
+        return known + 2.0 / self.degrees
+
+
+class _Series(NamedTuple):
+    """Values (n,) beside what the parameters can take of them (n, r), and periods between (n-1)."""
+
+    values: FloatArray
+    basis: FloatArray
+    gaps: IntArray
+
+
+def modelled(laid: Laid, columns: FloatArray) -> Modelled | None:
+    """The model's colour; None where it is none of these residuals.
+
+    Parameters
+    ----------
+    columns : FloatArray, shape (n, D)
+        Sensitivities of the samples that are present.
+    """
+    from scipy.optimize import minimize  # late, as below: few runs need what takes long to load
+
+    values = laid.values[laid.present]
+    left, size, _ = np.linalg.svd(columns, full_matrices=False)
+    basis = left[:, size > RANK * max(float(size[0]), np.finfo(float).tiny)]
+    series = _Series(values, basis, np.diff(np.flatnonzero(laid.present)))
+    if values.size <= basis.shape[1] + 2:
+        return None
+    found = [
+        minimize(_deviance, start, (series,), method="Nelder-Mead",
+                 options={"maxfev": _EVALUATIONS, "xatol": _CLOSE, "fatol": _CLOSE})
+        for start in _STARTS
+    ]  # fmt: skip
+    best = min(found, key=lambda one: float(one.fun)).x
+    innovations, power, _ = _left(best, series)
+    if not power > 0 or not _are_white(innovations):
+        return None
+    steps = _STEP * np.eye(2)
+    middles = [_middle(best + step, laid, columns, series) for step in (*steps, *-steps)]
+    slopes = np.array([(middles[i] - middles[i + 2]) / (2.0 * _STEP) for i in range(2)])
+    degrees = float(values.size - basis.shape[1])
+    a, w = _meant(best)
+    share = 1.0 / (1.0 + (1.0 - w) * 2.0 * a / (1.0 - a))
+    middle = _middle(best, laid, columns, series)
+    return Modelled(middle, slopes, _covariance(best, series), degrees, min(share, 1.0))
+
+
+def _meant(place: FloatArray) -> tuple[float, float]:
+    """Pole and share of white noise."""
+    return STEEPEST * float(np.tanh(place[0])), float(expit(place[1]))
+
+
+def _solved(place: FloatArray, series: _Series) -> tuple[FloatArray, float]:
+    """Basis and values (n, r + 1) as of white noise, and ln of the determinant of R."""
+    from scipy.linalg import cholesky_banded, solve_banded
+
+    a, w = _meant(place)
+    carried = a**series.gaps
+    band = np.ones((2, series.values.size))
+    band[0, 1:] = (1.0 - w) * (1.0 - carried**2) + w * (1.0 + carried**2)
+    band[1, :-1] = -w * carried
+    band[1, -1] = 0.0
+    root = cholesky_banded(band, lower=True)
+    both = np.column_stack([series.basis, series.values])
+    both[1:] -= carried[:, None] * both[:-1]
+    return solve_banded((1, 0), root, both), 2.0 * float(np.sum(np.log(root[0])))
+
+
+def _left(place: FloatArray, series: _Series) -> tuple[FloatArray, float, float]:
+    """White residuals (n,), their squares' sum, and ln of both determinants."""
+    both, size = _solved(place, series)
+    basis, values = both[:, :-1], both[:, -1]
+    gram = basis.T @ basis
+    left = values - basis @ np.linalg.solve(gram, basis.T @ values)
+    return left, float(left @ left), size + float(np.linalg.slogdet(gram)[1])
+
+
+def _deviance(place: FloatArray, series: _Series) -> float:
+    """Minus twice the logarithm of the restricted likelihood, but for a constant."""
+    _, power, determinants = _left(place, series)
+    n, r = series.basis.shape
+    return float((n - r) * np.log(max(power, float(np.finfo(float).tiny))) + determinants)
+
+
+def _are_white(values: FloatArray) -> bool:
+    ones = np.ones(values.size, dtype=np.bool_)
+    laid = Laid(np.arange(float(values.size)), values, ones, 1.0, is_regular=True)
+    return float(chdtrc(laid.lags, whiteness(laid).statistic)) >= _WHITE
+
+
+def _middle(place: FloatArray, laid: Laid, columns: FloatArray, series: _Series) -> FloatArray:
+    """SᵀRS (D, D)."""
+    from scipy.linalg import solve_banded
+
+    a, w = _meant(place)
+    n, r = series.basis.shape
+    variance = _left(place, series)[1] / (n - r)
+    spread = np.zeros((laid.values.size, columns.shape[1]))
+    spread[laid.present] = columns
+    recursion = np.array([[1.0], [-a]]) * np.ones(laid.values.size)
+    ahead = solve_banded((1, 0), recursion, spread)
+    behind = solve_banded((1, 0), recursion, spread[::-1])[::-1]
+    slow = spread.T @ (ahead + behind - spread)
+    middle = variance * ((1.0 - w) * slow + w * (columns.T @ columns))
+    return np.asarray(0.5 * (middle + middle.T))
+
+
+def _covariance(place: FloatArray, series: _Series) -> FloatArray:
+    """Of the two numbers (2, 2), by the curvature of the likelihood."""
+    one, other = _STEP * np.eye(2)
+
+    def at(move: FloatArray) -> float:
+        return 0.5 * _deviance(place + move, series)
+
+    here = at(np.zeros(2))
+    mixed = (at(one + other) - at(one - other) - at(other - one) + at(-one - other)) / 4.0
+    straight = [at(step) - 2.0 * here + at(-step) for step in (one, other)]
+    curvature = np.array([[straight[0], mixed], [mixed, straight[1]]]) / _STEP**2
+    size, rows = np.linalg.eigh(curvature)
+    return np.asarray((rows / np.maximum(size, _VAGUE)) @ rows.T)

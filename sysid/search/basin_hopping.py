@@ -1,0 +1,221 @@
+"""Hops: developments that begin beside the champion, a little way off or one parameter far off.
+
+Along the covariance of the estimate a hop stays in the champion's valley. One parameter alone
+leaves it across: that leads out where the fitness is a comb of narrow valleys side by side.
+
+Jumps of the fitness beside an estimate, as where dry friction switches a sample earlier.
+
+Then minima lie side by side that differ in width by far: a wide one draws most searches while a
+better one next to it draws few, and counting how often the best was found again proves little.
+
+A jump is what does not shrink. On a straight line through the estimate, the increments of the loss
+between neighbouring places vary slowly where it is smooth. The one that differs most from its
+neighbours is looked at again, with as many places inside of it, and so on: of a smooth loss next
+to nothing of that difference is left in any of these, of a jump all of it in one. No scale enters.
+
+Whether more is to be found far from the champion, and whether a start far away leads nowhere.
+
+Both compare with nothing but the champion's own errors, so no scale enters.
+"""
+
+import numpy as np
+
+from sysid.core.jit import compiled
+from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.search.levenberg_marquardt import factored, spread
+from sysid.search.operators import DEVELOPMENT, below, decoded, draws, normal, unit
+from sysid.search.slopes import normal_equations, partial_fitness, slope_distance
+from sysid.search.state import (
+    CLIFFS,
+    EVALUATIONS,
+    GENERATION,
+    HOP,
+    HOPS,
+    JUMPS,
+    POINT,
+    WARMED,
+    Plan,
+)
+from sysid.simulation.evaluator import Evaluator, partial_predictions, population_fitness
+from sysid.simulation.scaling import located
+
+PLACES = 16  # on a line: one block of lanes
+REACH = 5.0  # standard errors to both sides, in a random direction
+_LEVELS = 4  # each looks at a fifteenth of the last
+MOST = _LEVELS * PLACES
+_LEFT = 0.25  # of the difference; a smooth loss leaves less than a tenth
+_HIGH = 4.0  # times the loss at the point: edges of what is far worse, or diverges, do not matter
+
+
+@compiled
+def most_unlike(losses: FloatArray) -> tuple[int, float]:
+    """The increment that differs most from the mean of its two neighbours, and by how much.
+
+    By nothing where the losses vary as a parabola.
+    """
+    place, most = 1, 0.0
+    for i in range(1, losses.size - 2):
+        before, after = losses[i] - losses[i - 1], losses[i + 2] - losses[i + 1]
+        unlike = abs(losses[i + 1] - losses[i] - 0.5 * (before + after))
+        if unlike > most:
+            place, most = i, unlike
+    return place, most
+
+
+@compiled
+def _losses(
+    evaluator: Evaluator, factor: FloatArray, point: FloatArray, direction: FloatArray,
+    first: float, last: float, most: float,
+) -> FloatArray:  # fmt: skip
+    """Squared fitness, `most` at most, at equal distances on a line through the point."""
+    places, deviation = np.empty((PLACES, point.size)), np.empty(point.size)
+    for p in range(PLACES):
+        for d in range(point.size):
+            deviation[d] = (first + (last - first) * p / (PLACES - 1)) * direction[d]
+        spread(factor, point, deviation, places[p])
+    return np.minimum(population_fitness(evaluator, located(evaluator, places)) ** 2, most)
+
+
+@compiled
+def has_cliff(
+    evaluator: Evaluator, factor: FloatArray, point: FloatArray, direction: FloatArray,
+    base: float, counters: IntArray,
+) -> bool:  # fmt: skip
+    """Whether the loss jumps on a line through a point (D,), in at most `MOST` simulations.
+
+    Parameters
+    ----------
+    factor : FloatArray, shape (D, D)
+        That of the sums of products of slopes (`sysid.search.levenberg_marquardt.factored`).
+    direction : FloatArray, shape (D,)
+        Standard normal numbers times the fitness `base` at the point: a standard error.
+    counters : IntArray
+        The island's: simulations are counted.
+    """
+    first, width, before, above = -REACH, 2.0 * REACH, 0.0, 0.0
+    variance, most = base**2 / evaluator.n_weight, _HIGH * base**2
+    for level in range(_LEVELS):
+        counters[EVALUATIONS] += PLACES
+        losses = _losses(evaluator, factor, point, direction, first, first + width, most)
+        place, unlike = most_unlike(losses)
+        if unlike <= variance or (level > 0 and unlike <= _LEFT * before):
+            return False
+        before, width = unlike, width / (PLACES - 1)
+        first += place * width
+        above = max(losses[place], losses[place + 1])
+    return bool(above < most)
+
+
+SHORTEST_HOP, LONGEST_HOP = 0.3, 50.0  # standard errors
+COUNTED, UNCOUNTED, SINGLE = 1, 2, 4  # hops: evidence for the champion or not; of one parameter
+FARTHER = 10.0  # times as far, in standard errors with the others held, one parameter moves
+LOOKS = 4  # hops that also look for jumps of the fitness, as long as there is none
+LINES = 2  # on which each does
+
+
+@compiled
+def hop(evaluator: Evaluator, plan: Plan, counters: IntArray, memory: FloatArray) -> None:
+    """Move the point away: as the estimate's covariance spreads it, or one parameter alone."""
+    point = memory[POINT:]
+    counters[EVALUATIONS] += point.size + 1
+    difference = slope_distance(plan, counters, memory)
+    matrix, gradient, base = normal_equations(evaluator, plan, point, 1.0, difference)
+    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    size = base * SHORTEST_HOP * (LONGEST_HOP / SHORTEST_HOP) ** unit(word[0])
+    factor = factored(matrix, gradient, point, 0.0)
+    if counters[HOP] & COUNTED:
+        _look(evaluator, plan, factor, base, counters, memory)
+    if counters[HOP] & SINGLE:
+        _move_one(plan, counters, matrix, FARTHER * size, point)
+    else:
+        spread(factor, point, _deviation(plan, counters, 0, size, point.size), point)
+
+
+@compiled
+def _move_one(
+    plan: Plan, counters: IntArray, matrix: FloatArray, size: float, point: FloatArray
+) -> None:
+    """Move one parameter by so many of its standard errors with the others held: off the valley.
+
+    One to which the output is insensitive stays.
+    """
+    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 1)
+    d = below(word[2], point.size)
+    if 0.0 < matrix[d, d] < np.inf:
+        moved = point[d] + size * normal(word) / np.sqrt(matrix[d, d])
+        point[d] = min(max(moved, 0.0), 1.0)
+
+
+@compiled
+def _deviation(plan: Plan, counters: IntArray, line: int, size: float, n: int) -> FloatArray:
+    """Normal numbers (n,) of that standard deviation."""
+    drawn = np.empty(n)
+    for d in range(n):
+        draw = 1 + line * n + d
+        word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
+        drawn[d] = size * normal(word)
+    return drawn
+
+
+@compiled
+def _look(
+    evaluator: Evaluator, plan: Plan, factor: FloatArray, base: float, counters: IntArray,
+    memory: FloatArray,
+) -> None:  # fmt: skip
+    """Note whether the fitness jumps on lines through the point; not where a budget ends."""
+    point = memory[POINT:]
+    for line in range(1, LINES + 1):
+        if counters[EVALUATIONS] + MOST + point.size + 1 > plan.evaluations or not np.isfinite(
+            base
+        ):
+            return
+        if counters[CLIFFS] == 0 and counters[HOPS] < LOOKS:
+            direction = _deviation(plan, counters, line, base, point.size)
+            counters[CLIFFS] += has_cliff(evaluator, factor, point, direction, base, counters)
+            # A warm start settles by fewer searches, chosen with those of a smooth fitness.
+            counters[JUMPS] += counters[CLIFFS] if counters[WARMED] == 0 else 0
+
+
+COLOURED = 0.5  # correlation of neighbouring errors: noise has none, a wrong response nearly 1
+
+
+@compiled
+def _champion(
+    evaluator: Evaluator, plan: Plan, words: WordArray, horizon: float, counters: IntArray
+) -> FloatArray:
+    """Predictions (M, 1 or more) of the champion up to that part of the record."""
+    counters[EVALUATIONS] += 1
+    champion = located(evaluator, decoded(words[:1], plan.bits))
+    return partial_predictions(evaluator, champion, horizon)
+
+
+@compiled
+def is_coloured(evaluator: Evaluator, plan: Plan, words: WordArray, counters: IntArray) -> bool:
+    """Whether the champion's errors go together with their neighbours: a simulation.
+
+    Then far more than noise is left to explain. Neighbours are so in the list of measured values.
+    """
+    predicted = _champion(evaluator, plan, words, 1.0, counters)
+    products, squares, last = 0.0, 0.0, 0.0
+    for m in range(predicted.shape[0]):
+        if evaluator.weight[m] != 0.0:
+            error = evaluator.weight[m] * (predicted[m, 0] - evaluator.measured[m])
+            products += error * last
+            squares += error * error
+            last = error
+    return bool(products > COLOURED * squares)
+
+
+@compiled
+def is_behind(
+    evaluator: Evaluator, plan: Plan, words: WordArray, counters: IntArray, horizon: float,
+    reached: float,
+) -> bool:  # fmt: skip
+    """Whether the champion fits a part better than what was fitted to it: a simulation.
+
+    Not where the budget ends.
+    """
+    if counters[EVALUATIONS] >= plan.evaluations:
+        return False
+    predicted = _champion(evaluator, plan, words, horizon, counters)
+    return bool(partial_fitness(evaluator, plan, predicted, horizon)[0] < reached)

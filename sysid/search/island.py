@@ -1,0 +1,177 @@
+"""An island: one population between two generations, and its evolution as a pure function."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.kernels.abi import LANES
+from sysid.search.adaptive_search import TRIALS
+from sysid.search.evolution import generations
+from sysid.search.state import (
+    AT_EVALUATIONS,
+    AT_GENERATION,
+    EVALUATIONS,
+    GENERATION,
+    PHASE,
+    PHASES,
+    RMS,
+    VALUES,
+    Improvement,
+    Plan,
+)
+from sysid.simulation.evaluator import Evaluator
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Island:
+    """One population at one generation. A value: to evolve is to make a new one.
+
+    Attributes
+    ----------
+    index : int
+        Its number in the archipelago.
+    seed : int
+        The run's seed: with the index, what its random numbers derive from.
+    words : WordArray, shape (P, D)
+        Chromosomes, fittest first.
+    fitness : FloatArray, shape (P,)
+        J of Eq. 10, ascending; ``inf`` diverges, ``nan`` is not evaluated yet.
+    counters : IntArray
+        Generation, evaluations and the phase of the search (see `sysid.search.state`).
+    memory : FloatArray
+        What a sequence search carries from one generation to the next.
+    history : tuple of Improvement
+        Every better champion since the start.
+    """
+
+    index: int
+    seed: int
+    words: WordArray
+    fitness: FloatArray
+    counters: IntArray
+    memory: FloatArray
+    history: tuple[Improvement, ...] = ()
+
+    @property
+    def generation(self) -> int:
+        """Generations completed."""
+        return int(self.counters[GENERATION])
+
+    @property
+    def evaluations(self) -> int:
+        """Simulations run."""
+        return int(self.counters[EVALUATIONS])
+
+    @property
+    def champion_rms(self) -> float:
+        """Fitness of the best individual; ``inf`` before the first evaluation."""
+        return self.history[-1].rms if self.history else float("inf")
+
+
+def evolve(evaluator: Evaluator, plan: Plan, island: Island, count: int) -> Island:
+    """The island after `count` generations, fewer where it comes to rest.
+
+    ``evolve(…, a + b)`` equals ``evolve(…, b)`` of ``evolve(…, a)``, bit for bit.
+    """
+    words, fitness = island.words.copy(), island.fitness.copy()
+    counters, memory = island.counters.copy(), island.memory.copy()
+    rows = np.empty((count + 1, VALUES + words.shape[1]))
+    written = generations(evaluator, plan, count, words, fitness, counters, memory, rows)
+    better = tuple(improvement(row) for row in rows[:written].tolist())
+    history = island.history + better
+    return Island(island.index, island.seed, words, fitness, counters, memory, history)
+
+
+def improvement(row: Sequence[float]) -> Improvement:
+    """An improvement, of the row that compiled code wrote of it."""
+    return Improvement(
+        int(row[AT_GENERATION]),
+        int(row[AT_EVALUATIONS]),
+        row[RMS],
+        PHASES[int(row[PHASE])],
+        tuple(row[VALUES:]),
+    )
+
+
+_UNLIMITED = 2**62
+NEVER = -1.0
+
+
+def sizes(algorithm: GeneticAlgorithm) -> tuple[int, ...]:
+    """Individuals of each island: the population dealt as evenly as possible."""
+    each, more = divmod(algorithm.population, algorithm.n_islands)
+    return tuple(each + (i < more) for i in range(algorithm.n_islands))
+
+
+def of_island(algorithm: GeneticAlgorithm, index: int) -> GeneticAlgorithm:
+    """The settings of one island, where islands differ."""
+    if not isinstance(algorithm.islands, tuple):
+        return algorithm
+    change = algorithm.islands[index]
+    return replace(
+        algorithm,
+        method=change.method or algorithm.method,
+        bits=change.bits or algorithm.bits,
+        mutation=change.mutation or algorithm.mutation,
+    )
+
+
+def search_budget(algorithm: GeneticAlgorithm, n: int) -> int:
+    """Simulations that the islands may run: all but a tenth kept for the refinement.
+
+    At least a few steps of the refinement (of n + 1 simulations) and at most half are kept, and
+    what the last step of each island may take beyond its share.
+    """
+    limit = algorithm.stop.evaluations
+    if limit is None:
+        return _UNLIMITED
+    if not algorithm.refine:
+        return limit
+    beyond = algorithm.n_islands * (n + LANES)
+    return limit - min(max(limit // 10, 4 * (n + 2)) + beyond, limit // 2)
+
+
+def analysis_budget(n: int) -> int:
+    """Simulations kept for the standard errors of n parameters.
+
+    They take two a parameter, beside jumps of the output ten more, and a look at what cannot be
+    told two more.
+    """
+    return 14 * n + 1
+
+
+def _island_budget(algorithm: GeneticAlgorithm, n: int, size: int) -> int:
+    """Simulations from which on an island begins no other generation.
+
+    Its share of `search_budget`; of a tiny budget less, so that its last generation does not take
+    it beyond its share of what the standard errors leave.
+    """
+    limit = algorithm.stop.evaluations
+    if limit is None:
+        return _UNLIMITED
+    share = search_budget(algorithm, n) * size // algorithm.population
+    left = max(limit - analysis_budget(n), algorithm.population) * size // algorithm.population
+    return max(1, min(share, left - _generation(n, size) + 1))
+
+
+def _generation(n: int, size: int) -> int:
+    """Simulations of one generation of an island at most."""
+    return size + n + 1 + TRIALS
+
+
+def budget_before(algorithm: GeneticAlgorithm, n: int) -> int:
+    """What the islands and the standard errors leave of the budget to the finding of starts.
+
+    It counts as the first island's work, which may be less than its share for that.
+    """
+    limit = algorithm.stop.evaluations
+    if limit is None:
+        return _UNLIMITED
+    taken = 0
+    for size in sizes(algorithm)[1:]:
+        rests = _island_budget(algorithm, n, size)
+        taken += size if rests <= size else rests - 1 + _generation(n, size)
+    return max(0, limit - (2 * n + 1) - sizes(algorithm)[0] - taken)

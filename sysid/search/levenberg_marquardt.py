@@ -1,0 +1,101 @@
+"""Linear algebra of Levenberg–Marquardt steps: normal equations, factors, damped steps."""
+
+import numpy as np
+
+from sysid.core.jit import compiled
+from sysid.core.types import FloatArray
+
+
+@compiled
+def product(one: FloatArray, other: FloatArray, count: int) -> float:
+    """Inner product of the first `count` entries, as four sums that do not wait for each other."""
+    a, b, c, d = 0.0, 0.0, 0.0, 0.0
+    whole = count // 4 * 4
+    for m in range(0, whole, 4):
+        a += one[m] * other[m]
+        b += one[m + 1] * other[m + 1]
+        c += one[m + 2] * other[m + 2]
+        d += one[m + 3] * other[m + 3]
+    for m in range(whole, count):
+        a += one[m] * other[m]
+    return (a + b) + (c + d)
+
+
+@compiled
+def factored(
+    matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float
+) -> FloatArray:
+    """Lower Cholesky factor of A + λ diag A, with zero rows for parameters that stay.
+
+    These are the parameters at a bound that would leave the box, those to which the output is
+    insensitive, and those whose effect is a combination of others' (no positive pivot).
+    """
+    n = point.size
+    factor = np.zeros((n, n))
+    for d in range(n):
+        below, above = point[d] <= 0.0 and gradient[d] > 0.0, point[d] >= 1.0 and gradient[d] < 0.0
+        if below or above or not 0.0 < matrix[d, d] < np.inf:
+            continue
+        for e in range(d + 1):
+            value = matrix[d, e] * (1.0 + damping if d == e else 1.0)
+            for k in range(e):
+                value -= factor[d, k] * factor[e, k]
+            if d == e:
+                factor[d, d] = np.sqrt(value) if value > 1e-14 * matrix[d, d] else 0.0
+            elif factor[e, e] > 0.0:
+                factor[d, e] = value / factor[e, e]
+    return factor
+
+
+@compiled
+def _back(factor: FloatArray, vector: FloatArray) -> None:
+    """Solve Lᵀ x = v in place; parameters that stay get zero."""
+    for d in range(vector.size - 1, -1, -1):
+        for k in range(d + 1, vector.size):
+            vector[d] -= factor[k, d] * vector[k]
+        vector[d] = vector[d] / factor[d, d] if factor[d, d] > 0.0 else 0.0
+
+
+@compiled
+def _shift(point: FloatArray, step: FloatArray, place: FloatArray) -> None:
+    for d in range(point.size):
+        place[d] = min(max(point[d] + step[d], 0.0), 1.0)
+
+
+@compiled
+def solved(factor: FloatArray, gradient: FloatArray) -> FloatArray:
+    """The step p (D,) of L Lᵀ p = −g; parameters that stay get zero."""
+    step = np.zeros(gradient.size)
+    for d in range(gradient.size):
+        if factor[d, d] > 0.0:
+            value = -gradient[d]
+            for k in range(d):
+                value -= factor[d, k] * step[k]
+            step[d] = value / factor[d, d]
+    _back(factor, step)
+    return step
+
+
+@compiled
+def damped_step(matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float,
+                place: FloatArray) -> float:  # fmt: skip
+    """Write the place after the step p of (A + λ diag A) p = −g, kept inside [0, 1].
+
+    Gives −gᵀp: what the whole step promises to gain, in the loss's linear part.
+    """
+    step = solved(factored(matrix, gradient, point, damping), gradient)
+    _shift(point, step, place)
+    promised = 0.0
+    for d in range(point.size):
+        promised -= gradient[d] * step[d]
+    return promised
+
+
+@compiled
+def spread(factor: FloatArray, point: FloatArray, deviation: FloatArray, place: FloatArray) -> None:
+    """Write a place whose distance from `point` has covariance A⁻¹, for normal `deviation`.
+
+    Long where the output is insensitive, short across the valley. `factor` is that of A.
+    """
+    _back(factor, deviation)
+    _shift(point, deviation, place)

@@ -1,0 +1,162 @@
+"""Operators of the genetic algorithm on chromosomes: rank, cross, mutate (Figure 4).
+
+The code of an individual: one unsigned word per free parameter (Eq. 8, 9).
+
+Reading of Eq. 9: θ = lower + (upper − lower)·int/(2^bits − 1); on a logarithmic scale the same
+rule holds for ln θ. The *place* of a parameter is int/(2^bits − 1), a number in [0, 1].
+
+Random numbers as a pure function of where they are used: counter-based, nothing is stored.
+
+The generator is Philox4x32-10 (Salmon et al., *Parallel random numbers: as easy as 1, 2, 3*,
+SC 2011). Its key is the run's seed, its counter (use, island, generation, draw). So a loop that
+is cut anywhere, or runs on another machine, draws the same numbers, and no two uses share any.
+"""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from sysid.core.jit import compiled
+from sysid.core.types import FloatArray, IntArray, WordArray
+
+Draws: TypeAlias = tuple[Any, Any, Any, Any]
+"""Four independent words of 32 bits, as whole numbers."""
+
+# Uses of random numbers: the first word of the counter.
+INITIAL, STRATA, CHILDREN, DEVELOPMENT, RESTART, WARM = 1, 2, 3, 4, 5, 6
+
+_MASK = np.uint64(0xFFFFFFFF)
+_HALF = np.uint64(32)
+_MULTIPLIER_0, _MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
+_WEYL_0, _WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
+
+
+@compiled
+def draws(seed: int, use: int, island: int, generation: int, draw: int) -> Draws:
+    """Four words of 32 bits that belong to this place of this run."""
+    k0, k1 = np.uint64(seed) & _MASK, np.uint64(seed) >> _HALF
+    c0, c1 = np.uint64(draw) & _MASK, np.uint64(generation) & _MASK
+    c2, c3 = np.uint64(island) & _MASK, np.uint64(use) & _MASK
+    for _ in range(10):
+        p0, p1 = _MULTIPLIER_0 * c0, _MULTIPLIER_1 * c2
+        c0, c1, c2, c3 = (p1 >> _HALF) ^ c1 ^ k0, p1 & _MASK, (p0 >> _HALF) ^ c3 ^ k1, p0 & _MASK
+        k0, k1 = (k0 + _WEYL_0) & _MASK, (k1 + _WEYL_1) & _MASK
+    return np.int64(c0), np.int64(c1), np.int64(c2), np.int64(c3)
+
+
+@compiled
+def unit(word: int) -> float:
+    """A drawn word as a number in (0, 1)."""
+    return (word + 0.5) / 4294967296.0
+
+
+@compiled
+def below(word: int, n: int) -> int:
+    """A drawn word as a whole number 0 … n − 1 (n is far below 2³², so the bias is nil)."""
+    return (word * n) >> 32
+
+
+@compiled
+def normal(word: Draws) -> float:
+    """A normal number of standard deviation 1 from the first two of four drawn words."""
+    return float(np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(2.0 * np.pi * unit(word[1])))
+
+
+@compiled
+def coded(places: FloatArray, bits: int) -> WordArray:
+    """Nearest chromosomes of places in [0, 1]."""
+    largest = float((1 << bits) - 1)
+    words = np.empty(places.shape, np.uint32)
+    for p in range(places.shape[0]):
+        for d in range(places.shape[1]):
+            words[p, d] = np.uint32(round(min(max(places[p, d], 0.0), 1.0) * largest))
+    return words
+
+
+@compiled
+def decoded(words: WordArray, bits: int) -> FloatArray:
+    """Places of chromosomes; the inverse of `coded`."""
+    largest = float((1 << bits) - 1)
+    places = np.empty(words.shape)
+    for p in range(words.shape[0]):
+        for d in range(words.shape[1]):
+            places[p, d] = words[p, d] / largest
+    return places
+
+
+@compiled
+def rank(words: WordArray, fitness: FloatArray) -> None:
+    """Sort a population in place, fittest first; equals keep their order.
+
+    By insertion: populations are small, and after a generation half of them is in order.
+    """
+    n = words.shape[1]
+    held = np.empty(n, np.uint32)
+    for p in range(1, fitness.size):
+        value, place = fitness[p], p
+        if fitness[p - 1] <= value:
+            continue
+        for d in range(n):
+            held[d] = words[p, d]
+        while place > 0 and fitness[place - 1] > value:
+            fitness[place] = fitness[place - 1]
+            for d in range(n):
+                words[place, d] = words[place - 1, d]
+            place -= 1
+        fitness[place] = value
+        for d in range(n):
+            words[place, d] = held[d]
+
+
+@compiled
+def cross(child: WordArray, first: WordArray, second: WordArray, cut: int, bits: int) -> None:
+    """One-point crossover of the whole bit string: `cut` bits of `first`, the rest of `second`.
+
+    The string is the words one after the other, each from its highest bit.
+    """
+    for d in range(child.size):
+        taken = min(max(cut - d * bits, 0), bits)
+        low = np.uint32((1 << (bits - taken)) - 1)
+        child[d] = (first[d] & ~low) | (second[d] & low)
+
+
+@compiled
+def flip(child: WordArray, position: int, bits: int) -> None:
+    """Mutation: one bit of the string changes."""
+    child[position // bits] ^= np.uint32(1 << (bits - 1 - position % bits))
+
+
+@compiled
+def scheduled(starts: IntArray, rates: FloatArray, generation: int) -> float:
+    """Mutation rate at a generation: that of the last entry that has begun."""
+    rate = float(rates[0])
+    for i in range(starts.size):
+        if starts[i] <= generation:
+            rate = float(rates[i])
+    return rate
+
+
+@compiled
+def reflected(place: float) -> float:
+    """A place of at most one range outside, mirrored at the bound it has passed."""
+    inside = abs(place)
+    return inside if inside <= 1.0 else max(2.0 - inside, 0.0)
+
+
+@compiled
+def stepped(place: float, size: int, sign: int, bits: int) -> float:
+    """Scale-free mutation: a step whose size is uniform in its logarithm, reflected at a bound.
+
+    A flipped bit also changes a parameter by a power of two, but of the code, so that some
+    neighbours are far apart (Hamming cliffs); a step on the axis has none.
+    """
+    step = float(2.0 ** (-unit(size) * bits))
+    return reflected(place + (step if sign & 1 else -step))
+
+
+@compiled
+def two_of(a: int, b: int, n: int) -> tuple[int, int]:
+    """Two different numbers below n (n ≥ 2) from two drawn words."""
+    first = below(a, n)
+    second = below(b, n - 1)
+    return first, second + (1 if second >= first else 0)

@@ -1,0 +1,167 @@
+"""Selecting terms by the error of the free run instead of the error one step ahead.
+
+A term that helps to predict the next sample need not help a simulation, which never sees the
+measured output again. Near a good model the free run is linear in the coefficients: its slopes
+with respect to those of all candidates, also of those that are zero now, are the columns of a
+regression on what the free run has not explained. Terms are selected from these columns, the
+coefficients refined, and so on until the selection stays. Of all rounds the best by the rule's own
+criterion is taken: they may differ in the number of terms, and more terms nearly always leave less.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sysid.core.errors import InvalidSettings
+from sysid.core.settings import GeneticAlgorithm
+from sysid.core.types import FloatArray
+from sysid.data.records import Record
+from sysid.models.model import Model, Selection, TermRule
+from sysid.search.refine import refine
+from sysid.selection.frols import Forward, forward, merit, select
+from sysid.selection.regression import BLOCK, fold, lag_parameters
+from sysid.selection.starts import equation_error_starts
+from sysid.simulation.problem import Problem
+
+MOST_SLOPES = 40_000_000
+"""Samples times candidates: 320 MB."""
+
+_ROUNDS = 6
+_BATCH = 16  # simulations at once, as many as a kernel runs side by side
+_DIFFERENCE = 1e-6  # of a coefficient's range
+
+Changes = Mapping[str, Mapping[str, Any]]
+
+
+class Simulated(NamedTuple):
+    """A selection, its coefficients (T,), lags, and the RMS of its free run."""
+
+    found: Forward
+    coefficients: FloatArray
+    lags: dict[str, float]
+    rms: float
+
+
+def reselected(
+    model: Model, rule: TermRule, records: Sequence[Record], changes: Changes, skip: int,
+    first: Sequence[int], lags: Mapping[str, float],
+) -> Simulated | None:  # fmt: skip
+    """The terms that explain most of the free run, beginning with those in `first` and `lags`.
+
+    None if no free run with these stays finite.
+
+    Raises
+    ------
+    InvalidSettings
+        If there are too many candidates for so many samples.
+    """
+    candidates = replace(model, rule=None, selection=Selection((), lags))
+    whole = Problem.build(candidates, records, parameters=changes, skip=skip)
+    _check_size(whole)
+    chosen, best = tuple(first), None
+    least: tuple[float, ...] = (np.inf,)
+    power = _power(whole)
+    seen: set[frozenset[int]] = set()
+    for _ in range(_ROUNDS):
+        if frozenset(chosen) in seen:
+            break
+        seen.add(frozenset(chosen))
+        fitted = _fitted(whole, candidates, changes, chosen)
+        if fitted is None:
+            break
+        values, rms = fitted
+        triangle = _triangle(whole, values)
+        value = merit(rule, rms * rms / power, len(chosen), whole.n_scored)
+        if best is None or value < least:
+            best, least = _told(whole, triangle, chosen, values, rms), value
+        chosen = select(triangle, rule, whole.n_scored).order
+    return best
+
+
+def _power(problem: Problem) -> float:
+    """Mean square of the scored output, in the units of the RMS."""
+    weight = problem.evaluator.weight
+    scored = weight > 0
+    squares = np.square(weight[scored] * problem.evaluator.measured[scored])
+    return max(float(np.mean(squares)), np.finfo(float).tiny)
+
+
+def _check_size(problem: Problem) -> None:
+    terms = len(problem.model.terms)
+    if problem.n_scored * terms > MOST_SLOPES:
+        raise InvalidSettings(
+            "/model/terms/error",
+            f"{terms} candidates on {problem.n_scored} samples are too many to select by the "
+            f"simulation; at most {MOST_SLOPES // terms} samples, or take error: one-step",
+        )
+
+
+def _fitted(
+    whole: Problem, candidates: Model, changes: Changes, chosen: Sequence[int]
+) -> tuple[dict[str, float], float] | None:
+    """Values of all parameters, those of terms not chosen zero, and the RMS of the free run."""
+    names = {candidates.terms[i].coefficient for i in chosen}
+    absent = {
+        one.name: {"lower": min(one.lower, -1.0), "upper": max(one.upper, 1.0),
+                   "scale": "linear", "fixed": 0.0}
+        for one in candidates.parameters
+        if one.name.startswith("a[") and one.name not in names
+    }  # fmt: skip
+    _, records, _, prediction, loss, weights, skip, since = whole.arguments
+    part = Problem.build(
+        candidates, records, parameters={**changes, **absent}, prediction=prediction, loss=loss,
+        weights=weights, skip=skip, scored_from=since,
+    )  # fmt: skip
+    starts = equation_error_starts(part, GeneticAlgorithm()).values
+    if not starts:
+        return None
+    begin = np.array([[starts[0].get(p.name, 0.5 * (p.lower + p.upper)) for p in part.space]])
+    refined = refine(part, [begin[0]])[0]
+    theta = begin[0] if refined is None else refined.theta
+    values = {one.name: float(v) for one, v in zip(part.space, theta, strict=True)}
+    rms = float(part.fitness(theta[None])[0])
+    fixed = {one.name: one.fixed for one in part.all_parameters if one.fixed is not None}
+    return {**fixed, **values}, rms
+
+
+def _triangle(whole: Problem, values: Mapping[str, float]) -> FloatArray:
+    """R of the QR decomposition of [slopes, what they are to explain], (M + 1, M + 1)."""
+    terms = whole.model.terms
+    theta = np.array([values[one.name] for one in whole.space])
+    columns = {one.name: d for d, one in enumerate(whole.space)}
+    scored = whole.evaluator.weight > 0
+    here = whole.predictions(theta[None])[0]
+    slopes = np.zeros((int(np.count_nonzero(scored)), len(terms)))
+    sought = [i for i, term in enumerate(terms) if term.coefficient in columns]
+    for first in range(0, len(sought), _BATCH):
+        batch = sought[first : first + _BATCH]
+        moved = np.repeat(theta[None], len(batch), axis=0)
+        steps = np.empty(len(batch))
+        for row, i in enumerate(batch):
+            d = columns[terms[i].coefficient]
+            steps[row] = _DIFFERENCE * (whole.evaluator.upper[d] - whole.evaluator.lower[d])
+            moved[row, d] += steps[row]
+        with np.errstate(over="ignore", invalid="ignore"):
+            slope = (whole.predictions(moved) - here)[:, scored] / steps[:, None]
+        slopes[:, batch] = np.where(np.all(np.isfinite(slope), axis=1)[:, None], slope, 0.0).T
+    coefficients = np.array([values.get(term.coefficient, 0.0) for term in terms])
+    target = (whole.evaluator.measured - here)[scored] + slopes @ coefficients
+    folded = np.zeros((0, len(terms) + 1))
+    for first in range(0, target.size, BLOCK):
+        rows = slice(first, first + BLOCK)
+        folded = fold(folded, np.column_stack([slopes[rows], target[rows]]))
+    return folded
+
+
+def _told(
+    whole: Problem, triangle: FloatArray, chosen: Sequence[int], values: Mapping[str, float],
+    rms: float,
+) -> Simulated:  # fmt: skip
+    """The chosen terms in the order in which they explain most."""
+    terms = whole.model.terms
+    found = forward(triangle, len(chosen), among=chosen)
+    coefficients = np.array([values.get(term.coefficient, 0.0) for term in terms])
+    lags = {name: values[name] for name in sorted(lag_parameters(whole.model))}
+    return Simulated(found, coefficients, lags, rms)

@@ -1,0 +1,1 @@
+"""Records on a grid → `Problem`; simulate, evaluate a population, metrics, unit scaling."""

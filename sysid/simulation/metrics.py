@@ -1,0 +1,60 @@
+"""How well a simulation agrees with a measurement."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.core.types import FloatArray
+
+
+def rms(residual: FloatArray) -> float:
+    """√mean e² (Eq. 10), in the residual's unit."""
+    return float(np.sqrt(np.mean(np.square(residual))))
+
+
+def fit_percent(measured: FloatArray, simulated: FloatArray) -> float:
+    """100 (1 - ‖y - ŷ‖ / ‖y - mean y‖): 100 is perfect, 0 as good as the mean.
+
+    ``nan`` for a constant measurement, against which no fit can be told.
+    """
+    spread = float(np.linalg.norm(measured - np.mean(measured)))
+    if spread == 0.0:
+        return float("nan")
+    return 100.0 * (1.0 - float(np.linalg.norm(measured - simulated)) / spread)
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelMetrics:
+    """Agreement of one output of one experiment, over its scored samples.
+
+    `span` is from the least to the largest measured value: an estimate holds for amplitudes such
+    as these.
+    """
+
+    experiment: int
+    output: str
+    unit: str
+    samples: int
+    rms: float
+    fit_percent: float
+    span: tuple[float, float] = (float("nan"), float("nan"))
+
+
+@dataclass(frozen=True, slots=True)
+class Metrics:
+    """Agreement over all experiments and outputs.
+
+    Attributes
+    ----------
+    rms : float
+        J of Eq. 10: with one output, unweighted in its unit; with several, weighted.
+    unit : str
+    fit_percent : float
+        Over all scored samples, each output of each experiment about its own mean, weighted.
+    channels : tuple of ChannelMetrics
+    """
+
+    rms: float
+    unit: str
+    fit_percent: float
+    channels: tuple[ChannelMetrics, ...]

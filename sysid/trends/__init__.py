@@ -1,0 +1,1 @@
+"""Weighted regression of estimates over a label (length, temperature)."""

@@ -1,0 +1,211 @@
+"""Laws of a trend: a straight line and a power law, by weighted least squares.
+
+The weights are 1/s² with the stated standard errors s. C = (JᵀWJ)⁻¹ is the covariance of the
+coefficients where the stated errors are right. Where the points scatter more than these say,
+the Birge ratio R = √(χ²/ν) [1]_ is above 1 and every error is multiplied by it.
+
+.. [1] R. T. Birge, The calculation of errors by the method of least squares, Phys. Rev. 40 (1932)
+   207-227.
+"""
+
+from dataclasses import dataclass
+from math import exp, inf, log, sqrt
+from typing import Literal
+
+import numpy as np
+
+from sysid.core.types import FloatArray
+
+LawName = Literal["line", "power"]
+FORMULAS: dict[LawName, str] = {"line": "a + b·x", "power": "a·x^b"}
+
+_FITTED = 3  # two coefficients and the scale of the errors
+_EXPONENTS = np.linspace(-8.0, 8.0, 161)
+_STEPS, _HALVINGS = 60, 30
+_MOST = 300.0  # exponents of e beyond which doubles overflow, squared still in range
+_ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
+_SINGULAR = 1e-14
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Law:
+    """A fitted law: y = c + b (x - x₀), or y = c (x/x₀)^b.
+
+    The centre x₀ keeps c and b nearly uncorrelated.
+
+    Attributes
+    ----------
+    theta : FloatArray, shape (2,)
+        c and b.
+    covariance : FloatArray, shape (2, 2)
+        Of these, as the stated errors say.
+    chi_squared : float
+        Weighted sum of the squared residuals.
+    degrees : int
+        Points less two.
+    aic : float
+        n ln(χ²/n) + 2k with k = 3, the scale of the errors counted [1]_.
+    aicc : float
+        With the correction for few points, 2k(k + 1)/(n - k - 1); ``inf`` where n ≤ k + 1.
+
+    .. [1] K. P. Burnham, D. R. Anderson, Model Selection and Multimodel Inference, 2nd ed.,
+       Springer 2002, §2.2 and §2.4.
+    """
+
+    kind: LawName
+    centre: float
+    theta: FloatArray
+    covariance: FloatArray
+    chi_squared: float
+    degrees: int
+    aic: float
+    aicc: float
+
+    @property
+    def birge(self) -> float:
+        """√(χ²/ν): 1 where the points scatter as their errors say."""
+        return sqrt(self.chi_squared / self.degrees)
+
+    @property
+    def widening(self) -> float:
+        """By what the stated errors are multiplied: the Birge ratio, never less than 1."""
+        return max(1.0, self.birge)
+
+    def values(self, x: FloatArray) -> FloatArray:
+        """The law at x."""
+        return _values(self.kind, x, self.centre, self.theta)
+
+    def stated(self, x: FloatArray) -> FloatArray:
+        """Standard errors of the law at x, as the stated errors say."""
+        slopes = _slopes(self.kind, x, self.centre, self.theta)
+        variance = np.einsum("ni,ij,nj->n", slopes, self.covariance, slopes)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    @property
+    def coefficients(self) -> tuple[tuple[str, float, float], ...]:
+        """Names, values and standard errors (widened) of a and b of `FORMULAS`."""
+        c, b = (float(one) for one in self.theta)
+        if self.kind == "line":
+            a, share, slopes = c - b * self.centre, 1.0, np.array([1.0, -self.centre])
+        else:
+            share = float(np.exp(-b * log(self.centre)))  # may be large: it is never squared
+            a, slopes = c * share, np.array([1.0, -c * log(self.centre)])
+        variance = max(float(slopes @ self.covariance @ slopes), 0.0)
+        error = self.widening * sqrt(variance) * share
+        return ("a", a, error), ("b", b, self.widening * sqrt(float(self.covariance[1, 1])))
+
+
+def fit_line(x: FloatArray, y: FloatArray, stderr: FloatArray) -> Law | None:
+    """The straight line through points (n ≥ 3, of three different x or more).
+
+    None where it is not determined in doubles, as where squares of x overflow.
+    """
+    weight = (np.min(stderr) / stderr) ** 2  # at most 1: no overflow where errors are tiny
+    centre = float(weight @ x / np.sum(weight))
+    slopes = _slopes("line", x, centre, np.zeros(2))
+    mean = float(weight @ y / np.sum(weight))
+    # y less its mean: else the rounding of the centre of x would enter times that mean
+    product = weight @ (slopes[:, 1] * (y - mean))
+    theta = np.array([mean, float(product / (weight @ slopes[:, 1] ** 2))])
+    return _made("line", x, y, stderr, centre, theta)
+
+
+def fit_power(x: FloatArray, y: FloatArray, stderr: FloatArray) -> Law | None:
+    """The power law through points of x > 0; None where it does not exist or is not determined.
+
+    The exponent is first scanned, since c follows from it linearly; then Gauss and Newton's
+    method goes to the minimum.
+    """
+    if not np.all(x > 0):
+        return None
+    centre = exp(float(np.mean(np.log(x))))
+    weight = np.min(stderr) / stderr
+    theta = _scanned(x, y, weight, centre)
+    for _ in range(_STEPS):
+        following = _stepped(x, y, weight, centre, theta)
+        if following is None:
+            break
+        theta = following
+    return _made("power", x, y, stderr, centre, theta)
+
+
+def _scanned(x: FloatArray, y: FloatArray, weight: FloatArray, centre: float) -> FloatArray:
+    """The best of many exponents, each with its best c."""
+    powers = np.clip(np.outer(_EXPONENTS, np.log(x / centre)), -_MOST, _MOST)
+    shapes = weight * np.exp(powers)
+    factors = shapes @ (weight * y) / np.sum(shapes**2, axis=1)
+    losses = np.sum((weight * y - factors[:, None] * shapes) ** 2, axis=1)
+    best = int(np.argmin(losses))
+    return np.array([factors[best], _EXPONENTS[best]])
+
+
+def _stepped(
+    x: FloatArray, y: FloatArray, weight: FloatArray, centre: float, theta: FloatArray
+) -> FloatArray | None:
+    """A step that lowers the loss, halved until it does; None at the minimum."""
+    slopes = weight[:, None] * _slopes("power", x, centre, theta)
+    residual = weight * (y - _values("power", x, centre, theta))
+    if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(residual))):
+        return None
+    step = np.linalg.lstsq(slopes, residual, rcond=None)[0]
+    before = float(residual @ residual)
+    for _ in range(_HALVINGS):
+        if _loss(x, y, weight, centre, theta + step) < before:
+            return np.asarray(theta + step)
+        step = 0.5 * step
+    return None
+
+
+def _loss(
+    x: FloatArray, y: FloatArray, weight: FloatArray, centre: float, theta: FloatArray
+) -> float:
+    residual = weight * (y - _values("power", x, centre, theta))
+    return float(residual @ residual)
+
+
+def _values(kind: LawName, x: FloatArray, centre: float, theta: FloatArray) -> FloatArray:
+    if kind == "line":
+        return np.asarray(theta[0] + theta[1] * (x - centre))
+    return np.asarray(theta[0] * np.exp(np.clip(theta[1] * np.log(x / centre), -_MOST, _MOST)))
+
+
+def _slopes(kind: LawName, x: FloatArray, centre: float, theta: FloatArray) -> FloatArray:
+    """Derivatives (n, 2) by c and b."""
+    if kind == "line":
+        return np.column_stack([np.ones_like(x), x - centre])
+    share = _values(kind, x, centre, np.array([1.0, float(theta[1])]))
+    return np.column_stack([share, theta[0] * share * np.log(x / centre)])
+
+
+def _made(
+    kind: LawName, x: FloatArray, y: FloatArray, stderr: FloatArray, centre: float,
+    theta: FloatArray,
+) -> Law | None:  # fmt: skip
+    least = float(np.min(stderr))
+    slopes = _slopes(kind, x, centre, theta) * (least / stderr)[:, None]
+    size = np.sqrt(np.sum(slopes**2, axis=0))
+    if not np.all(size > 0):
+        return None  # a curve of zero has no exponent
+    normal = (slopes / size).T @ (slopes / size)
+    if not np.linalg.det(normal) > _SINGULAR:
+        return None
+    covariance = np.linalg.inv(normal) / np.outer(size / least, size / least)
+    residual = (y - _values(kind, x, centre, theta)) / stderr
+    # What rounding leaves of an exact law is no evidence for it.
+    chi_squared = max(float(residual @ residual), rounding(y, stderr))
+    if not (np.isfinite(chi_squared) and np.all(np.isfinite(covariance))):
+        return None
+    aic, aicc = _criteria(chi_squared, x.size)
+    law = Law(kind, centre, theta, covariance, chi_squared, x.size - 2, aic, aicc)
+    return law if np.all(np.isfinite([one[1:] for one in law.coefficients])) else None
+
+
+def rounding(y: FloatArray, stderr: FloatArray) -> float:
+    """χ² that rounding of the values alone may give."""
+    return float(np.sum((_ROUNDING * np.max(np.abs(y)) / stderr) ** 2)) + 1e-300
+
+
+def _criteria(chi_squared: float, n: int) -> tuple[float, float]:
+    aic = n * log(chi_squared / n) + 2 * _FITTED
+    left = n - _FITTED - 1
+    return aic, aic + 2 * _FITTED * (_FITTED + 1) / left if left > 0 else inf

@@ -1,0 +1,1 @@
+"""Standard errors, correlations, Cramér–Rao, profile likelihood."""

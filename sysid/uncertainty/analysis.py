@@ -1,0 +1,371 @@
+"""How sure an estimate is: covariance, intervals, correlation, identifiability.
+
+All from the sensitivities S = ∂ŷ/∂p at the estimate, where p are the places in [0, 1] of the free
+parameters, so that columns are comparable: a unit of p is the parameter's whole range (on a log
+scale: of its logarithm).
+
+With squares the covariance is s²(SᵀS)⁻¹, s² = Σe²/(n − D). With the soft-l1 loss it is that of an
+M-estimator (sandwich): n/(n − D) · (SᵀKS)⁻¹ (SᵀΨ²S) (SᵀKS)⁻¹ with ψ = e/√(1 + (e/s)²) and
+K = (1 + (e/s)²)^(−3/2), so outliers neither widen nor narrow the intervals unduly. Where
+residuals of a free run are clearly not white, both are that of coloured ones
+(`sysid.residuals.coloured`), and where those of outputs are clearly correlated, that of a common
+noise (`sysid.residuals.correlated_outputs`). Under a noise model e and S are whitened first
+(`sysid.identification.generalised_least_squares`).
+
+Where the output does not change on a plateau of width w (a lag that is rounded to whole samples),
+nothing tells where in it the parameter lies: w²/12 is added to its variance, and the interval is
+around the plateau's middle, wherever on it the search has ended.
+
+What no data tell follows from the form of the equations (`sysid.identifiability.scaling`) and is
+taken out of S exactly; what these data do not tell, from its singular values. Both give groups
+(`sysid.identifiability.combinations`).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import stdtrit
+
+from sysid.core.types import RANK, BoolArray, FloatArray
+from sysid.identifiability.active_bounds import Pull, is_pulled, pulls
+from sysid.identifiability.bound_limits import reach
+from sysid.identifiability.combinations import Block, untold, weighed, written
+from sysid.identifiability.exchange import Exchanges
+from sysid.identifiability.scaling import scalings
+from sysid.identifiability.translations import translations
+from sysid.residuals.coloured import Coloured
+from sysid.residuals.correlated_outputs import coloured_jointly
+from sysid.residuals.whitening import Whitening
+from sysid.simulation.problem import Problem, loss_scale
+from sysid.simulation.scaling import AT_BOUND, placed
+from sysid.uncertainty.estimates import (
+    Criteria,
+    Estimate,
+    EstimateStatus,
+    NoiseColour,
+    Uncertainty,
+)
+from sysid.uncertainty.intervals import Known, estimates_of
+from sysid.uncertainty.linear_model import Linear, linear_model
+from sysid.uncertainty.sensitivities import BudgetSpentError, Sensitivities, sensitivities
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Analysis:
+    """The local analysis at an estimate.
+
+    Attributes
+    ----------
+    estimates : tuple of Estimate
+        All parameters, fixed and tied ones too.
+    uncertainty : Uncertainty or None
+        None when there are no more samples than parameters.
+    possible_gain : float
+        Part of the loss that one least-squares step promises to remove; near 0 at an optimum.
+    evaluations : int
+    criteria : Criteria
+    """
+
+    estimates: tuple[Estimate, ...]
+    uncertainty: Uncertainty | None
+    possible_gain: float
+    evaluations: int
+    criteria: Criteria
+    pulls: tuple[Pull, ...] = ()
+    """Bounds to widen together, the costliest first."""
+    linear: Linear | None = None
+    """None where there is no uncertainty or the loss is not that of squares."""
+    exchanges: Exchanges = ()
+    """Parameters that can change places."""
+    is_cut_short: bool = False
+    """Whether minima beside the estimate were not looked for because the time was over."""
+    slopes: tuple[FloatArray, FloatArray] | None = None
+    """Residuals (n,) and sensitivities (n, D) that are not whitened."""
+
+
+def analyse(
+    problem: Problem, theta: FloatArray, most: int | None = None, white: Whitening | None = None
+) -> Analysis:
+    """Standard errors, correlations and identifiability at an estimate (D,).
+
+    With no more than `most` simulations; where they do not suffice there are no standard errors.
+    With a whitening all is of the whitened residuals and sensitivities.
+    """
+    try:
+        sensitive = sensitivities(problem, theta, most)
+    except BudgetSpentError as spent:
+        return _unexplored(problem, theta, spent, white)
+    if white is not None:
+        columns = white.of(sensitive.columns.T).T
+        sensitive = sensitive._replace(error=white.of(sensitive.error), columns=columns)
+    analysis = _analysed(problem, theta, sensitive, most, white)
+    if white is not None:
+        return analysis
+    return replace(analysis, slopes=(sensitive.error, sensitive.columns))
+
+
+def _unexplored(
+    problem: Problem, theta: FloatArray, spent: BudgetSpentError, white: Whitening | None
+) -> Analysis:
+    """What is known without a look at the neighbours of the estimate.
+
+    With nothing left it is that of the simulation that a result shows: no budget counts it.
+    """
+    error = spent.error
+    if error is None:
+        weight = problem.evaluator.weight
+        errors = weight * (problem.predictions(theta[None])[0] - problem.evaluator.measured)
+        error = errors[weight > 0]
+    criteria = criteria_of(error if white is None else white.of(error), theta.size, white)
+    reason = "the budget of simulations left too few for standard errors"
+    return Analysis(_without(problem, theta, reason), None, 0.0, spent.evaluations, criteria)
+
+
+def _analysed(
+    problem: Problem, theta: FloatArray, sensitive: Sensitivities, most: int | None,
+    white: Whitening | None = None,
+) -> Analysis:  # fmt: skip
+    error, columns, plateau, one_sided, aside, count = sensitive
+    n, d = columns.shape
+    criteria = criteria_of(error, d, white)
+    if n <= d:
+        reason = f"{n} samples are not more than {d} parameters"
+        return Analysis(_without(problem, theta, reason), None, 0.0, count, criteria)
+    place = placed(problem.evaluator, theta[None])[0]
+    # No step of least squares gains from a parameter on a plateau: there the loss is flat.
+    sloping = np.where(plateau > 0, 0.0, columns)
+    influence = _influence(error, loss_scale(problem))
+    gain = _possible_gain(influence, sloping, place)
+    pulled = is_pulled(influence, sloping, place)
+    scale = physical_scale(problem, theta)
+    powers = scalings(problem.model, problem.all_parameters)
+    left = None if most is None else most - count
+    shifts, more = translations(problem, theta, columns, scale, left)
+    count += more
+    columns, known = without_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
+    singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
+    kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
+    kept[d - known :] = False
+    inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
+    colour = coloured_jointly(problem, influence, columns)
+    covariance, noise = _covariance(error, columns, inverse, loss_scale(problem), colour)
+    # A factor that is 0 is not moved by what scales it: the others are, without any effect.
+    moved = _moved(powers * theta) | _moved(shifts)
+    directions = weighed(singular, rows, ~kept, moved, covariance, noise)
+    physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
+    found = untold(directions)
+    names = tuple(p.name for p in problem.space)
+    uncertainty = Uncertainty(
+        names=names,
+        covariance=physical,
+        correlation=_correlation(physical),
+        alike=_correlation(inverse * np.outer(scale, scale)),
+        condition=float(singular[0] / singular[-1]) if kept.all() else float("inf"),
+        singular_values=singular,
+        noise_sd=noise,
+        noise_colour=_named(colour, white),
+        groups=tuple(g for one in found for g in written(one, names, theta, scale, physical)),
+    )
+    combined = {name for group in uncertainty.groups for name in group.members}
+    statuses = _statuses(place, found, pulled, np.array([name in combined for name in names]))
+    told = Known(
+        theta, statuses, physical, stdtrit(_told_by(n, inverse, colour, white), 0.975),
+        directions.member, uncertainty.groups, rows[~kept], scale,
+    )  # fmt: skip
+    estimates = _beside_jumps(problem, estimates_of(problem, told), one_sided, aside * scale)
+    linear = None
+    if loss_scale(problem) == 0.0:
+        stated = np.diag(covariance)
+        root = singular[:, None] * rows
+        linear = linear_model(error, columns, plateau > 0, place, stated, scale, inverse, root)
+    held = _held_back(problem, influence, sloping, place) if pulled.any() else ()
+    return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, held, linear)
+
+
+def _moved(directions: FloatArray) -> BoolArray:
+    """Which parameters (D,) any of some directions (m, D) moves."""
+    return np.asarray(np.any(directions != 0.0, axis=0))
+
+
+def _held_back(
+    problem: Problem, influence: FloatArray, columns: FloatArray, place: FloatArray
+) -> tuple[Pull, ...]:
+    at_end = (place < AT_BOUND) | (place > 1.0 - AT_BOUND)
+    reaches = tuple(
+        reach(problem, one) if asked else (one.lower, one.upper)
+        for one, asked in zip(problem.space, at_end, strict=True)
+    )
+    return pulls(problem.space, reaches, influence, columns, place)
+
+
+def criteria_of(error: FloatArray, parameters: int, white: Whitening | None = None) -> Criteria:
+    """Information criteria from the weighted residuals (n,); see `Criteria` for the formulae.
+
+    Of whitened residuals the likelihood is still that of the outputs, so that criteria with and
+    without a noise model compare; correlation times count as parameters.
+    """
+    n, counted = error.size, parameters + 1 + (0 if white is None else white.n_times)
+    mean = float(error @ error) / n
+    twice = -n * (np.log(2.0 * np.pi * mean) + 1.0) if mean > 0 else np.inf  # 2 ln ℓ
+    twice -= 0.0 if white is None else white.log_determinant
+    aic = 2.0 * counted - twice
+    left = n - counted - 1
+    aicc = aic + 2.0 * counted * (counted + 1) / left if left > 0 else None
+    bic = counted * float(np.log(n)) - twice
+    return Criteria(float(aic), None if aicc is None else float(aicc), float(bic), n, parameters)
+
+
+def without_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[FloatArray, int]:
+    """Sensitivities that do not change at all along the directions (k, D), and their number.
+
+    By differences they would change a little, and where friction breaks away more than that.
+    """
+    if not directions.size:
+        return columns, 0
+    lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+    size, rows = np.linalg.svd(directions / np.where(lengths > 0, lengths, 1.0),
+                               full_matrices=False)[1:]  # fmt: skip
+    rows = rows[size > RANK]
+    return columns - (columns @ rows.T) @ rows, rows.shape[0]
+
+
+def _beside_jumps(
+    problem: Problem, estimates: tuple[Estimate, ...], one_sided: BoolArray, aside: FloatArray
+) -> tuple[Estimate, ...]:
+    """Estimates of parameters whose output changes in jumps only."""
+    names = [p.name for p in problem.space]
+    blind = {name for name, one in zip(names, one_sided, strict=True) if one}
+    moved = {name: float(by) for name, by in zip(names, aside, strict=True) if by}
+    seen = (_on_one_side(one) if one.name in blind else one for one in estimates)
+    return tuple(_centred(one, moved[one.name]) if one.name in moved else one for one in seen)
+
+
+def _on_one_side(estimate: Estimate) -> Estimate:
+    """An estimate whose slope is not known because the output jumps on one side of it only."""
+    reason = "the output changes with it in jumps, and here on one side only"
+    return replace(estimate, stderr=None, interval95=None, reason=reason)
+
+
+def _centred(estimate: Estimate, aside: float) -> Estimate:
+    """An estimate whose interval is around the middle of its plateau, which lies so far above it.
+
+    On a plateau the loss is the same, so where on it the search ended says nothing.
+    """
+    if estimate.interval95 is None:
+        return estimate
+    lower, upper = estimate.interval95
+    return replace(estimate, interval95=(lower + aside, upper + aside))
+
+
+def _influence(error: FloatArray, scale: float) -> FloatArray:
+    """ψ(e): the residuals as the loss sees them, with soft-l1 those of outliers bounded."""
+    return error if scale == 0.0 else error / np.sqrt(1.0 + (error / scale) ** 2)
+
+
+def _possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray) -> float:
+    """Part of Σψ² in the span of those sensitivities along which the parameters may move.
+
+    It is zero at a local optimum. A parameter at its bound whose slope leads out of the bounds
+    may not move: there the bound is what holds it, and the estimate is optimal inside it.
+    """
+    total = float(influence @ influence)
+    downhill = -(columns.T @ influence)
+    held = ((place < AT_BOUND) & (downhill < 0)) | ((place > 1.0 - AT_BOUND) & (downhill > 0))
+    if total == 0.0 or held.all():
+        return 0.0
+    left, singular, _ = np.linalg.svd(columns[:, ~held], full_matrices=False)
+    span = left[:, singular > RANK * max(singular[0], np.finfo(float).tiny)]
+    return float(np.sum((span.T @ influence) ** 2)) / total
+
+
+def _covariance(
+    error: FloatArray, columns: FloatArray, inverse: FloatArray, scale: float,
+    colour: Coloured | None,
+) -> tuple[FloatArray, float]:  # fmt: skip
+    """Covariance of the places, and the standard deviation of the noise."""
+    n, d = columns.shape
+    widening = n / (n - d) if colour is None else colour.samples / colour.degrees
+    if scale == 0.0:
+        variance = float(error @ error) / (n - d)
+        if colour is not None:
+            return widening * inverse @ colour.middle @ inverse, float(np.sqrt(variance))
+        return variance * inverse, float(np.sqrt(variance))
+    influence = _influence(error, scale)
+    share = 1.0 / np.sqrt(1.0 + (error / scale) ** 2)
+    bread = np.linalg.pinv((columns.T * share**3) @ columns, rcond=RANK**2, hermitian=True)
+    filling = (columns.T * influence**2) @ columns if colour is None else colour.middle
+    noise = 1.4826 * float(np.median(np.abs(error)))  # of the bulk, not of the outliers
+    return widening * bread @ filling @ bread, noise
+
+
+def _told_by(
+    n: int, inverse: FloatArray, colour: Coloured | None, white: Whitening | None
+) -> FloatArray:
+    """Degrees of freedom of the intervals (D,): of whitened samples too, what a mean would have.
+
+    The correlation time is estimated from no more than that. `inverse` (D, D) is (SᵀS)⁻¹.
+    """
+    d = len(inverse)
+    degrees = np.full(d, float(n - d))
+    if colour is not None:
+        degrees = np.array([colour.degrees_along(row) for row in inverse])
+    return degrees if white is None else np.minimum(degrees, max(white.samples - d, 1.0))
+
+
+def _named(colour: Coloured | None, white: Whitening | None) -> NoiseColour:
+    if colour is None or colour.is_white:
+        return "white" if white is None else "first-order"
+    return "drifting" if colour.drifts else "coloured"
+
+
+def _statuses(
+    place: FloatArray, found: tuple[Block, ...], pulled: BoolArray, combined: BoolArray
+) -> tuple[EstimateStatus, ...]:
+    """What the data say of each parameter: see `EstimateStatus`.
+
+    `combined` (D,) are those in a combination; one in none is untold by itself, whatever moves the
+    others. Of one that they pull beyond its bound they say something, however large a residual the
+    bound leaves and standard errors with it.
+    """
+    statuses: list[EstimateStatus] = ["identified"] * place.size
+    for d in np.flatnonzero((place < AT_BOUND) | (place > 1.0 - AT_BOUND)):
+        statuses[d] = "at bound"
+    for block in found:
+        for d in block.members:
+            if not pulled[d]:
+                statuses[d] = "group" if combined[d] else "unidentifiable"
+    return tuple(statuses)
+
+
+def physical_scale(problem: Problem, theta: FloatArray) -> FloatArray:
+    """∂θ/∂p: the range, or on a log scale θ ln(upper/lower)."""
+    lower, upper = problem.evaluator.lower, problem.evaluator.upper
+    ratio = np.where(problem.evaluator.log > 0, upper / np.where(lower > 0, lower, 1.0), 1.0)
+    return np.asarray(np.where(problem.evaluator.log > 0, theta * np.log(ratio), upper - lower))
+
+
+def _correlation(covariance: FloatArray) -> FloatArray:
+    deviation = np.sqrt(np.diag(covariance))
+    safe = np.where(deviation > 0, deviation, 1.0)
+    correlation = covariance / np.outer(safe, safe)
+    np.fill_diagonal(correlation, 1.0)
+    return np.asarray(np.clip(correlation, -1.0, 1.0))
+
+
+def _without(problem: Problem, theta: FloatArray, reason: str) -> tuple[Estimate, ...]:
+    """Estimates of which nothing more is known than their values."""
+    d = theta.size
+    statuses: list[EstimateStatus] = ["unidentifiable"] * d
+    blind = np.ones(d, dtype=np.bool_)
+    known = Known(
+        theta,
+        tuple(statuses),
+        np.zeros((d, d)),
+        np.zeros(d),
+        blind,
+        (),
+        np.eye(d),
+        np.ones(d),
+        reason,
+    )
+    return estimates_of(problem, known)

@@ -1,0 +1,83 @@
+"""The Cramér–Rao floor: how exact an unbiased estimate can be under white Gaussian noise.
+
+With S = ∂ŷ/∂θ at the true parameters and noise of deviation σ on every scored sample, no unbiased
+estimate of θ has a covariance below σ²(SᵀS)⁻¹ (Cramér 1946; Rao 1945). An estimate that reaches it
+moves the response by σ√(r/n) in RMS, r the number of directions that the data tell. Both grow in
+proportion to σ, so they are given for σ = 1. Bounds on the parameters hold estimates below the
+floor where σ is large: it knows no bounds.
+
+It is the floor of the noise that a job adds, which `sysid.data.noise` draws for each output by
+itself: outputs are independent there, whatever noise a measured record has of its own. That one,
+which outputs may have in common (`sysid.residuals.correlated_outputs`), is in the standard errors
+and not in the floor.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.core.errors import InvalidSettings
+from sysid.core.types import RANK, FloatArray
+from sysid.identifiability.combinations import NULL_MEMBER
+from sysid.identifiability.scaling import scalings
+from sysid.identifiability.translations import translations
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.analysis import physical_scale, without_symmetries
+from sysid.uncertainty.sensitivities import sensitivities
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Floor:
+    """Least standard deviations for noise of σ = 1.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The D free parameters.
+    stderr : FloatArray, shape (D,)
+        In each parameter's unit by that of the output; ``inf`` where these data tell nothing of
+        the parameter by itself, or the output moves with it in jumps only.
+    response : float
+        RMS by which the response then differs from the true one: √(r/n), without unit.
+    samples : int
+        n scored samples.
+    """
+
+    names: tuple[str, ...]
+    stderr: FloatArray
+    response: float
+    samples: int
+
+
+def floor(problem: Problem, theta: FloatArray) -> Floor:
+    """The floor at true parameters (D,), inside their bounds.
+
+    The problem must weigh every output with 1, since the noise is the same on each.
+
+    Raises
+    ------
+    InvalidSettings
+        If an output has another weight.
+    """
+    odd = [name for name, weight in problem.output_weights.items() if weight != 1.0]
+    if odd:
+        raise InvalidSettings(f"/weights/{odd[0]}", "the floor is that of outputs of weight 1")
+    found = sensitivities(problem, theta)
+    scale = physical_scale(problem, theta)
+    powers = scalings(problem.model, problem.all_parameters)
+    shifts, _ = translations(problem, theta, found.columns, scale)
+    columns, known = without_symmetries(found.columns, np.vstack([powers * theta, shifts]) / scale)
+    n, d = columns.shape
+    # Rows of zeros make the directions complete where there are fewer samples than parameters.
+    square = np.vstack([columns, np.zeros((max(d - n, 0), d))])
+    singular, rows = np.linalg.svd(square, full_matrices=False)[1:]
+    kept = singular > RANK * max(float(singular[0]), np.finfo(float).tiny)
+    kept[d - known :] = False
+    variance = np.sum((rows[kept] / singular[kept, None]) ** 2, axis=0)
+    untold = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | found.one_sided
+    untold |= np.any(powers != 0.0, axis=0) | np.any(shifts != 0.0, axis=0) | (found.plateau > 0)
+    stderr = np.where(untold, np.inf, np.sqrt(variance) * np.abs(scale))
+    return Floor(
+        tuple(p.name for p in problem.space), stderr,
+        float(np.sqrt(np.count_nonzero(kept) / n)), n,
+    )  # fmt: skip

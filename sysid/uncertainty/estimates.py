@@ -1,0 +1,79 @@
+"""Estimates with their standard errors, intervals, statuses and information criteria."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sysid.core.types import FloatArray
+from sysid.identifiability.combinations import Group
+
+NoiseColour = Literal["white", "first-order", "coloured", "drifting"]
+EstimateStatus = Literal["identified", "group", "at bound", "unidentifiable", "fixed", "tied"]
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """One parameter's estimate.
+
+    Attributes
+    ----------
+    stderr : float or None
+        Standard error, in `unit`; None when there is none, and `reason` says why.
+    interval95 : tuple of float or None
+        95 % interval by the t distribution.
+    """
+
+    name: str
+    unit: str
+    value: float
+    lower: float
+    upper: float
+    stderr: float | None
+    interval95: tuple[float, float] | None
+    status: EstimateStatus
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Criteria:
+    """Information criteria, smaller is better: only models fitted to the same samples compare.
+
+    The log-likelihood is that of independent Gaussian residuals whose one variance is estimated
+    with the parameters: ln ℓ = -n/2 (ln(2π Σe²/n) + 1), e weighted. With κ = D + 1 (the variance
+    counts): AIC = 2κ - 2 ln ℓ, AICc = AIC + 2κ(κ + 1)/(n - κ - 1), BIC = κ ln n - 2 ln ℓ
+    (Akaike 1974; Hurvich and Tsai 1989; Schwarz 1978).
+
+    Attributes
+    ----------
+    aic, bic : float
+        Minus infinity where the residuals vanish.
+    aicc : float or None
+        None where there are not more samples than κ + 1.
+    samples, parameters : int
+        n scored samples and D free parameters.
+    """
+
+    aic: float
+    aicc: float | None
+    bic: float
+    samples: int
+    parameters: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Uncertainty:
+    """Local analysis at the estimate; rows and columns are the free parameters `names`.
+
+    `noise_colour` tells what the covariance takes the residuals for. Where they drift over the
+    whole record, it is a lower bound. `correlation` is of this covariance, `alike` that of
+    (SᵀS)⁻¹: how alike the sensitivities S are, whatever the colour of the residuals.
+    """
+
+    names: tuple[str, ...]
+    covariance: FloatArray
+    correlation: FloatArray
+    alike: FloatArray
+    condition: float
+    singular_values: FloatArray
+    noise_sd: float
+    groups: tuple[Group, ...] = ()
+    noise_colour: NoiseColour = "white"

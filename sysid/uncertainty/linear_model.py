@@ -1,0 +1,115 @@
+"""The linear model of the output around an estimate: by what part Σe² grows for a move."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sysid.core.types import RANK, BoolArray, FloatArray
+from sysid.simulation.scaling import AT_BOUND
+
+_STREAM = 2**63
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Linear:
+    """The sum of squares that linear outputs would have around an estimate.
+
+    A parameter on a plateau is held: from plateau to plateau the outputs are no line.
+
+    Attributes
+    ----------
+    covariance : FloatArray, shape (D, D)
+        s²(SᵀS)⁻¹, whatever the colour of the residuals; 0 for those held.
+    root : FloatArray, shape (k, D)
+        With abs(root · move)² = abs(S · move)².
+    slope : FloatArray, shape (D,)
+        Sᵀe of those at a bound that the data pull beyond it; 0 for the others.
+    error : float
+        Σe².
+    share : FloatArray, shape (D,)
+        Variance by s²(SᵀS)⁻¹ over the one stated; nan for those held and for those not told.
+    """
+
+    covariance: FloatArray
+    root: FloatArray
+    slope: FloatArray
+    error: float
+    share: FloatArray
+
+    def excess(self, moves: FloatArray) -> FloatArray:
+        """By what part of itself the sum grows for moves (P, D) of the parameters, (P,)."""
+        turned = moves @ self.root.T
+        gains = np.einsum("pk,pk->p", turned, turned) + 2.0 * moves @ self.slope
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(gains / self.error)
+
+
+def drawn_along(covariance: FloatArray) -> FloatArray:
+    """R (D, D) of RRᵀ, the covariance: R times standard normal numbers are moves with it.
+
+    By the eigenvalues of the correlation: of parameters whose units differ by many decades those
+    of the covariance would be rounding in all directions but the largest.
+    """
+    variance = np.diag(covariance)
+    deviation = np.sqrt(np.where(variance > 0, variance, 1.0))
+    size, rows = np.linalg.eigh(covariance / np.outer(deviation, deviation))
+    return np.asarray(deviation[:, None] * rows * np.sqrt(np.maximum(size, 0.0)))
+
+
+def moves_of(seed: int) -> np.random.Generator:
+    """Numbers for moves around an estimate: others than those that noise of that seed is made of.
+
+    `sysid.data.noise` numbers its streams by channels.
+    """
+    return np.random.Generator(np.random.Philox(key=[seed, _STREAM]))
+
+
+def linear_model(
+    error: FloatArray, columns: FloatArray, held: BoolArray, place: FloatArray,
+    stated: FloatArray, scale: FloatArray, inverse: FloatArray, root: FloatArray,
+) -> Linear:  # fmt: skip
+    """The linear model in the parameters' units.
+
+    Parameters
+    ----------
+    error : FloatArray, shape (n,)
+        Weighted residuals.
+    columns : FloatArray, shape (n, D)
+        Their slopes over the places.
+    held : BoolArray, shape (D,)
+        On a plateau.
+    place : FloatArray, shape (D,)
+    stated : FloatArray, shape (D,)
+        Variances of the places, without the width of a plateau.
+    scale : FloatArray, shape (D,)
+        ∂θ/∂p.
+    inverse : FloatArray, shape (D, D)
+        (SᵀS)⁻¹ over what moves the output.
+    root : FloatArray, shape (k, D)
+        R of SᵀS = RᵀR.
+    """
+    n, d = columns.shape
+    total = float(error @ error)
+    variance = total / (n - d)
+    told = (stated > 0) & ~held
+    white = variance * np.diag(inverse)
+    slope = np.where(held, 0.0, columns.T @ error)
+    if held.any():
+        inverse, root = _without(root, held)
+    leads_out = ((place < AT_BOUND) & (slope > 0)) | ((place > 1.0 - AT_BOUND) & (slope < 0))
+    unit = np.where(scale > 0, scale, 1.0)
+    return Linear(
+        covariance=variance * inverse * np.outer(scale, scale),
+        root=root / unit,
+        slope=np.where(leads_out, slope, 0.0) / unit,
+        error=total,
+        share=np.where(told, white, np.nan) / np.where(told, stated, 1.0),
+    )
+
+
+def _without(root: FloatArray, held: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """The same without the parameters held."""
+    root = np.where(held, 0.0, root)
+    singular, rows = np.linalg.svd(root, full_matrices=False)[1:]
+    kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
+    return (rows[kept].T / singular[kept] ** 2) @ rows[kept], root

@@ -1,0 +1,323 @@
+"""Profile likelihood: how far a parameter may move while all others follow it.
+
+For each value v of the parameter the others are estimated anew. With Gaussian noise of unknown
+variance the likelihood ratio against the estimate is n ln(S(v)/S₀), S the sum of squares; the
+interval is where it stays below the 95 % quantile of χ² with one degree of freedom (Venzon and
+Moolgavkar 1988; Raue et al. 2009). Where the model is linear in its parameters this is the
+interval of the t distribution, but for a part of order 1/n. Where it is not, the profile shows
+what the covariance cannot: ends that are open, more than one valley, a bound.
+
+With the soft-l1 loss its sum R stands in place of S, and the ratio is scaled so that it is again
+one of χ²: by R₀ ΣK / (n Σψ²), ψ and K as in `sysid.uncertainty.analysis` (the ratio test of an
+M-estimator, Hampel et al. 1986, ch. 7), which is 1 where no residual is an outlier.
+
+Where the residuals are coloured the ratio is divided by how much wider that makes the square of the
+interval (`sysid.residuals.coloured`), so that profile and standard error mean the same noise.
+
+The others are found by least squares from a neighbour: a lag that is rounded to samples, whose
+output moves in jumps only, stays as it is while another parameter is profiled.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sysid.core.errors import InvalidRecord, InvalidSettings, nearest
+from sysid.core.types import FloatArray
+from sysid.identifiability.exchange import Exchanges, exchanges, ordered
+from sysid.residuals.coloured import QUANTILE
+from sysid.residuals.correlated_outputs import coloured_jointly
+from sysid.search.refine import Refined, refine
+from sysid.simulation.problem import Problem, loss_scale
+from sysid.simulation.scaling import located, placed
+from sysid.uncertainty.sensitivities import sensitivities
+
+_SPAN = 1.5  # of the half width that the covariance promises: where the outermost value lies
+_BEYOND = 1.3  # growth of a step that does not reach the threshold, and how often
+_MOST, _LEAST = 40, 3
+_EXACT = 1e-9  # of the outputs' size: residuals that are rounding
+_ALONE = 1e-14  # of the square of a slope: below, nothing of it is the parameter's own
+_SLIT = 1e-6  # of the range: what is left to a parameter that another one holds at its bound
+_ROOTS = 6  # halvings of the gap in which the ratio crosses the threshold
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profile:
+    """The profile of one parameter.
+
+    Attributes
+    ----------
+    name, unit : str
+    values : FloatArray, shape (V,)
+        Rising; the estimate among them.
+    ratio : FloatArray, shape (V,)
+        n ln(S(v)/S₀), scaled, S₀ the least sum of all; 0 at the best value. ``inf``: it diverges.
+    rms : FloatArray, shape (V,)
+    others : FloatArray, shape (V, D - 1)
+        The other free parameters, in the problem's order.
+    interval : tuple of (float or None)
+        Ends of the 95 % interval; None where the ratio stays below the threshold up to the bound
+        or as far as was looked.
+    estimate : float
+        The best value.
+    evaluations : int
+    is_complete : bool
+        False if `should_stop` ended it.
+    """
+
+    name: str
+    unit: str
+    values: FloatArray
+    ratio: FloatArray
+    rms: FloatArray
+    others: FloatArray
+    interval: tuple[float | None, float | None]
+    estimate: float
+    evaluations: int
+    is_complete: bool
+
+
+def profile(
+    problem: Problem,
+    theta: FloatArray,
+    name: str,
+    points: int = 21,
+    should_stop: Callable[[], bool] | None = None,
+) -> Profile:
+    """Profile of a free parameter from an estimate (D,), which is refined first.
+
+    Parameters
+    ----------
+    points : int
+        About how many values, 3 or more; every one takes a least-squares search.
+    should_stop : callable
+        Asked before each of them.
+
+    Raises
+    ------
+    InvalidSettings
+        If there is no such free parameter, or there are fewer than 3 points.
+    InvalidRecord
+        If there are not more samples than parameters, if the simulation diverges, or if it equals
+        the records but for rounding.
+    """
+    names = [p.name for p in problem.space]
+    if name not in names:
+        raise InvalidSettings("/parameters", f"no free parameter {name!r}{nearest(name, names)}")
+    if problem.loss.noise_model == "ar1":
+        raise InvalidSettings(
+            "/loss/noise_model",
+            f"profiles are of plain squares, not of those under {problem.loss.noise_model}; fit "
+            "with the noise model 'white', or use the standard errors",
+        )
+    if points < _LEAST:
+        raise InvalidSettings("/points", f"found {points}; need {_LEAST} or more")
+    best = _best(problem, np.array(theta, dtype=np.float64))
+    groups, spent = exchanges(problem, best.theta)
+    here = ordered(problem, best.theta, groups)
+    walk = _Walk(problem, here, names.index(name), groups, should_stop)
+    walk.evaluations += best.evaluations + spent
+    step = _SPAN * walk.half_width / (points // 2)
+    walk.go(-step, points // 2)
+    walk.go(step, points // 2)
+    low, high = walk.end(-1.0), walk.end(1.0)
+    return walk.told(low, high)
+
+
+def _best(problem: Problem, theta: FloatArray) -> Refined:
+    """The optimum beside an estimate, if intervals can be measured from it."""
+    samples, free = problem.n_scored, len(problem.space)
+    if samples <= free:
+        raise InvalidRecord(f"{samples} samples are not more than {free} parameters; need more")
+    found = refine(problem, [theta])[0]
+    if found is None:
+        raise InvalidRecord("the simulation diverges at the estimate, so it has no profile")
+    if found.rms <= _EXACT * problem.output_scale:
+        raise InvalidRecord(
+            "the simulation equals the records but for rounding; a profile needs residuals"
+        )
+    return found
+
+
+class _Walk:
+    """Values of one parameter, as places in [0, 1], with the others estimated anew at each."""
+
+    def __init__(
+        self, problem: Problem, theta: FloatArray, d: int, groups: Exchanges,
+        should_stop: Callable[[], bool] | None,
+    ) -> None:  # fmt: skip
+        self._problem, self._d, self._should_stop = problem, d, should_stop
+        columns = [one for group in groups for one in zip(*group, strict=True) if d in one]
+        beside = [(i, theta[i] - theta[d] or d - i) for one in columns for i in one if i != d]
+        self._larger = [i for i, above in beside if above > 0]
+        self._smaller = [i for i, above in beside if above < 0]
+        self.stopped, self.evaluations = False, 1
+        self._place = float(placed(problem.evaluator, theta[None])[0, d])
+        rms = float(problem.fitness(theta[None])[0])
+        self._known = {self._place: (theta, rms)}
+        self.half_width = self._half_width(theta)
+
+    def go(self, step: float, count: int) -> None:
+        """Walk from the estimate to one side, until the threshold is passed or a bound is met."""
+        place, taken = self._place, 0
+        while taken < _MOST and not self._is_over(place, taken, count):
+            nearer, place = place, min(max(place + step, 0.0), 1.0)
+            if place == nearer:
+                return  # at the bound
+            self._try(place, nearer)
+            taken += 1
+            step *= _BEYOND if taken >= count else 1.0
+
+    def end(self, side: float) -> float | None:
+        """Place at which the ratio crosses the threshold; None if it does not."""
+        inside = min(self._known, key=lambda place: self._known[place][1])
+        places = sorted((p for p in self._known if side * (p - inside) > 0), key=lambda p: side * p)
+        for outside in places:
+            if self._ratio(outside) >= QUANTILE:
+                return self._crossing(inside, outside)
+            inside = outside
+        return None
+
+    def told(self, low: float | None, high: float | None) -> Profile:
+        """What was found, in the parameter's unit."""
+        parameter = self._problem.space[self._d]
+        order = sorted(self._known)
+        found = np.array([self._known[place][0] for place in order])
+        best = min(self._known, key=lambda place: self._known[place][1])
+        low_, high_ = (None if end is None else self._value(end) for end in (low, high))
+        return Profile(
+            name=parameter.name,
+            unit=parameter.unit,
+            values=found[:, self._d],
+            ratio=np.array([self._ratio(place) for place in order]),
+            rms=np.array([self._known[place][1] for place in order]),
+            others=np.delete(found, self._d, axis=1),
+            interval=(low_, high_),
+            estimate=self._value(best),
+            evaluations=self.evaluations,
+            is_complete=not self.stopped,
+        )
+
+    def _half_width(self, theta: FloatArray) -> float:
+        """What the covariance promises, at most the range and at least what can be told apart."""
+        columns, error = (sensed := sensitivities(self._problem, theta)).columns, sensed.error
+        self.evaluations += sensed.evaluations
+        direction = np.zeros(columns.shape[1])
+        direction[self._d] = 1.0
+        others = np.delete(columns, self._d, axis=1)
+        if others.shape[1]:
+            made_up = np.linalg.lstsq(others, columns[:, self._d], rcond=1e-7)[0]
+            direction[np.arange(direction.size) != self._d] = -made_up
+        own = columns @ direction
+        # What the others make up for but for rounding has no direction of its own.
+        norm = float(own @ own)
+        if norm <= _ALONE * float(columns[:, self._d] @ columns[:, self._d]):
+            norm = 0.0
+        self._factor = self._scaling(error, columns, direction, norm)
+        spread = float(np.linalg.norm(error)) / np.sqrt(max(error.size - columns.shape[1], 1))
+        wide = np.sqrt(QUANTILE / (norm * self._factor)) * spread if norm > 0 else 1.0
+        return float(min(max(wide, 1e-9), 1.0))
+
+    def _scaling(
+        self, error: FloatArray, columns: FloatArray, direction: FloatArray, norm: float
+    ) -> float:
+        """What makes n ln(R/R₀) a ratio of χ², also where the residuals are coloured."""
+        scale = loss_scale(self._problem)
+        seen = error if scale == 0.0 else error / np.sqrt(1.0 + (error / scale) ** 2)
+        colour = coloured_jointly(self._problem, seen, columns)
+        factor = _factor(error, scale)
+        if colour is None or not norm > 0:
+            return factor
+        return factor / colour.widening(direction, float(np.mean(np.square(seen))), norm)
+
+    def _is_over(self, place: float, taken: int, count: int) -> bool:
+        self.stopped = self.stopped or bool(self._should_stop and self._should_stop())
+        return self.stopped or (taken >= count and self._ratio(place) > QUANTILE)
+
+    def _try(self, place: float, nearer: float) -> None:
+        """Estimate the others at a place, beginning with what they were at a nearer one."""
+        d, start = self._d, self._known[nearer][0].copy()
+        start[d] = self._value(place)
+        held = _holding(self._in_order(float(start[d])), d, float(start[d]))
+        rest = np.clip(np.delete(start, d), held.evaluator.lower, held.evaluator.upper)
+        rms = float(held.fitness(rest[None])[0])
+        self.evaluations += 1
+        if rest.size:
+            end = refine(held, [rest])[0]
+            if end is not None:
+                rest, rms = end.theta, end.rms
+                self.evaluations += end.evaluations
+        self._known[place] = (np.insert(rest, d, start[d]), rms)
+
+    def _in_order(self, value: float) -> Problem:
+        """The problem with what can be exchanged with the parameter on its side of a value.
+
+        Beyond, the profile would be that of the other copy of the estimate.
+        """
+        if not self._larger and not self._smaller:
+            return self._problem
+        evaluator = self._problem.evaluator
+        lower, upper = evaluator.lower.copy(), evaluator.upper.copy()
+        least = _SLIT * (upper - lower)
+        for i in self._larger:
+            lower[i] = min(max(lower[i], value), upper[i] - least[i])
+        for i in self._smaller:
+            upper[i] = max(min(upper[i], value), lower[i] + least[i])
+        return replace(self._problem, evaluator=evaluator._replace(lower=lower, upper=upper))
+
+    def _crossing(self, inside: float, outside: float) -> float:
+        """Where the ratio, nearly a parabola, reaches the threshold."""
+        for _ in range(_ROOTS):
+            if self.stopped or abs(outside - inside) < 1e-3 * self.half_width:
+                break
+            middle = self._between(inside, outside)
+            nearer = min(self._known, key=lambda p: abs(p - middle))
+            if middle in self._known:
+                break
+            self._try(middle, nearer)
+            if self._ratio(middle) >= QUANTILE:
+                outside = middle
+            else:
+                inside = middle
+        return self._between(inside, outside)
+
+    def _between(self, inside: float, outside: float) -> float:
+        a, b = (np.sqrt(min(self._ratio(p), 1e12)) for p in (inside, outside))
+        share = (np.sqrt(QUANTILE) - a) / (b - a) if b > a else 0.5
+        return float(inside + min(max(share, 0.02), 0.98) * (outside - inside))
+
+    def _ratio(self, place: float) -> float:
+        best = min(rms for _, rms in self._known.values())
+        rms = self._known[place][1]
+        if rms == best:
+            return 0.0
+        return 2.0 * self._factor * self._problem.n_scored * float(np.log(rms / best))
+
+    def _value(self, place: float) -> float:
+        if place in self._known:
+            return float(self._known[place][0][self._d])
+        every = np.full((1, len(self._problem.space)), place)
+        return float(located(self._problem.evaluator, every)[0, self._d])
+
+
+def _factor(error: FloatArray, scale: float) -> float:
+    """What makes n ln(R/R₀) a ratio of χ²: 1 for squares."""
+    if scale == 0.0:
+        return 1.0
+    root = 1.0 + (error / scale) ** 2
+    least = 2.0 * scale**2 * float(np.mean(np.sqrt(root) - 1.0))
+    return least * float(np.mean(root**-1.5)) / float(np.mean(error**2 / root))
+
+
+def _holding(problem: Problem, d: int, value: float) -> Problem:
+    """The problem with one free parameter held at a value; nothing else changes."""
+    old = problem.evaluator
+    template = old.template.copy()
+    template[old.rows[d]] = value
+    evaluator = old._replace(
+        template=template, rows=np.delete(old.rows, d), lower=np.delete(old.lower, d),
+        upper=np.delete(old.upper, d), log=np.delete(old.log, d),
+    )  # fmt: skip
+    space = (*problem.space[:d], *problem.space[d + 1 :])
+    return replace(problem, space=space, evaluator=evaluator)

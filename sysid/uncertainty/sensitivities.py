@@ -1,0 +1,211 @@
+"""How the simulated output moves with each free parameter, also where it moves in jumps.
+
+Where the sign of a velocity flips one sample earlier, the output jumps. A difference across such a
+jump is as large as its step is small, and a standard error made of it far too small; searches end
+beside jumps, since the loss jumps too. So where the slopes to both sides disagree, each side is cut
+into segments from 1e-6 to 1e-2 of the range, and the slopes of two neighbours that agree are taken.
+
+A lag that is rounded to whole samples (nearest interpolation) leaves the output unchanged on a
+*plateau* and changes it at the plateau's ends. A small difference says nothing there: it is zero,
+or as large as the step is small. So each side is searched for the nearest jump, and the slope is
+taken from the middle of the plateau below to the middle of the plateau above.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sysid.core.jit import compiled
+from sysid.core.types import BoolArray, FloatArray, IntArray
+from sysid.simulation.problem import Problem
+from sysid.simulation.scaling import located, placed
+
+_DIFFERENCE = 1e-5  # of the range
+_ALIKE = 0.1  # of a slope: two that differ by less do not straddle a jump
+_EDGES = np.array([1e-6, _DIFFERENCE, 1e-4, 1e-3, 1e-2])  # of segments, of the range
+_GROWTH, _LARGEST = 4.0, 0.7  # of the step of the search for a jump; the largest, of the range
+_HALVINGS = 6  # a jump's place is then known to about 1 % of its distance
+
+
+class Sensitivities(NamedTuple):
+    """Weighted residuals and their slopes at an estimate, over the places in [0, 1].
+
+    Attributes
+    ----------
+    error : FloatArray, shape (n,)
+    columns : FloatArray, shape (n, D)
+        ∂ŷ/∂p, weighted; zero where none is known.
+    plateau : FloatArray, shape (D,)
+        Width on which the output does not change with that parameter; 0: it changes at once.
+    one_sided : BoolArray, shape (D,)
+        The output changes on one side of the estimate only, and not at once: no slope.
+    middle : FloatArray, shape (D,)
+        How far above the estimate the middle of its plateau lies; 0 where there is none.
+    evaluations : int
+    """
+
+    error: FloatArray
+    columns: FloatArray
+    plateau: FloatArray
+    one_sided: BoolArray
+    middle: FloatArray
+    evaluations: int
+
+
+class BudgetSpentError(Exception):
+    """The simulations that were left do not suffice; `evaluations` of them were run.
+
+    `error` are the weighted residuals (n,) at the estimate, None where not even one was left.
+    """
+
+    def __init__(self, evaluations: int, error: FloatArray | None) -> None:
+        super().__init__(f"{evaluations} simulations were not enough")
+        self.evaluations, self.error = evaluations, error
+
+
+def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) -> Sensitivities:
+    """Central differences at an estimate (D,); beside a bound one-sided.
+
+    Raises
+    ------
+    BudgetSpentError
+        If they take more than `most` simulations.
+    """
+    probe = _Probe(problem, theta, most)
+    d = probe.place.size
+    plateau, middle = np.zeros(d), np.zeros(d)
+    one_sided = np.zeros(d, dtype=np.bool_)
+    both = np.arange(2 * d)
+    steps, beside = probe.at(both % d, np.where(both < d, -_DIFFERENCE, _DIFFERENCE))
+    columns, moves, differ = _central(probe.predicted, steps, beside)
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        for d in np.flatnonzero(moves & differ).tolist():
+            columns[:, d] = _slope_beside_jumps(probe, d)
+        jumping = np.flatnonzero(~moves)
+        if jumping.size:
+            down, below = probe.jumps(jumping, -1.0)
+            up, above = probe.jumps(jumping, 1.0)
+            both = np.isfinite(down) & np.isfinite(up)
+            width = np.where(both, up + down, 0.0)
+            plateau[jumping], one_sided[jumping] = width, np.isfinite(down) != np.isfinite(up)
+            middle[jumping] = np.where(both, 0.5 * (up - down), 0.0)
+            steps = np.where(both, 2.0 * width, np.inf)
+            columns[:, jumping] = np.where(both, (above - below) / steps, 0.0)
+        columns = probe.weight[:, None] * np.where(np.isfinite(columns), columns, 0.0)
+        error = probe.error
+    return Sensitivities(error, columns, plateau, one_sided, middle, probe.evaluations)
+
+
+@compiled
+def _central(
+    here: FloatArray, steps: FloatArray, beside: FloatArray
+) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """Central differences (n, D); whether the output moves on both sides at once, whether unlike.
+
+    Parameters
+    ----------
+    here, beside : FloatArray, shape (n,), (n, 2D)
+        Output at the estimate, and after `steps` (2D,) of each parameter down and then up.
+    """
+    d = steps.size // 2
+    slopes = np.zeros((here.size, d))
+    moves, differ = np.empty(d, dtype=np.bool_), np.empty(d, dtype=np.bool_)
+    for j in range(d):
+        low, high = steps[j], steps[d + j]
+        falls, rises, apart, left, right = low == 0.0, high == 0.0, 0.0, 0.0, 0.0
+        for i in range(here.size):
+            below, above = beside[i, j], beside[i, d + j]
+            falls |= below != here[i]
+            rises |= above != here[i]
+            down, up = (here[i] - below) / -low, (above - here[i]) / high
+            left, right, apart = left + down**2, right + up**2, apart + (up - down) ** 2
+        moves[j] = falls and rises
+        differ[j] = not apart <= _ALIKE**2 * min(left, right)  # also where there is one side only
+        if moves[j]:
+            for i in range(here.size):
+                slopes[i, j] = (beside[i, d + j] - beside[i, j]) / (high - low)
+    return slopes, moves, differ
+
+
+def _slope_beside_jumps(probe: "_Probe", d: int) -> FloatArray:
+    """Slope (n,) in one parameter: the mean of those sides of the estimate that show one."""
+    sides = [_slope_of_side(probe, d, side) for side in (-1.0, 1.0)]
+    best = min(doubt for doubt, _ in sides)
+    kept = [slope for doubt, slope in sides if doubt <= max(best, _ALIKE)]
+    return np.asarray(np.mean(kept, axis=0))
+
+
+def _slope_of_side(probe: "_Probe", d: int, side: float) -> tuple[float, FloatArray]:
+    """How far the two neighbouring segments that agree best differ, and their slope (n,)."""
+    room = 1.0 - probe.place[d] if side > 0 else probe.place[d]
+    ends = side * _EDGES[room >= _EDGES]
+    if ends.size < 2:
+        return np.inf, np.zeros(probe.predicted.size)
+    steps, outputs = probe.at(np.full(ends.size, d), ends)
+    lengths = np.diff(steps, prepend=0.0)
+    slopes = (np.diff(outputs, prepend=probe.predicted[:, None]) / lengths).T
+    sizes = np.linalg.norm(slopes, axis=1)
+    apart = np.linalg.norm(np.diff(slopes, axis=0), axis=1)
+    doubt = apart / np.maximum(np.minimum(sizes[1:], sizes[:-1]), np.finfo(float).tiny)
+    best = int(np.argmin(np.where(np.isfinite(doubt), doubt, np.inf)))
+    return float(doubt[best]), slopes[best + 1]
+
+
+class _Probe:
+    """The scored output beside an estimate, one parameter moved at a time."""
+
+    def __init__(self, problem: Problem, theta: FloatArray, most: int | None) -> None:
+        if most is not None and most < 1:
+            raise BudgetSpentError(0, None)
+        self._problem, self._most = problem, most
+        self.weight = problem.evaluator.weight[problem.scored]
+        self.measured = problem.evaluator.measured[problem.scored]
+        self.place = placed(problem.evaluator, theta[None])[0]
+        self.predicted = problem.predictions(theta[None])[0][problem.scored]
+        self.evaluations = 1
+
+    @property
+    def error(self) -> FloatArray:
+        """Weighted residuals (n,) at the estimate."""
+        return np.asarray(self.weight * (self.predicted - self.measured))
+
+    def at(self, which: IntArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Steps taken, cut off at the bounds, and the outputs there: (n, number of `which`)."""
+        if self._most is not None and self.evaluations + which.size > self._most:
+            raise BudgetSpentError(self.evaluations, self.error)
+        moved = np.clip(self.place[which] + steps, 0.0, 1.0)
+        around = np.repeat(self.place[None], which.size, axis=0)
+        around[np.arange(which.size), which] = moved
+        predicted = self._problem.predictions(located(self._problem.evaluator, around))
+        self.evaluations += which.size
+        scored = predicted[:, self._problem.scored]
+        return moved - self.place[which], np.ascontiguousarray(scored.T)
+
+    def jumps(self, which: IntArray, side: float) -> tuple[FloatArray, FloatArray]:
+        """Distance of each parameter's nearest jump on one side, and the outputs beyond it.
+
+        The distance is infinite where there is none.
+        """
+        near, far = np.zeros(which.size), np.full(which.size, np.inf)
+        beyond = np.repeat(self.predicted[:, None], which.size, axis=1)
+        step = _DIFFERENCE
+        while step < _LARGEST and np.any(np.isinf(far)):
+            self._try(which, side, np.full(which.size, step), near, far, beyond)
+            step *= _GROWTH
+        for _ in range(_HALVINGS):
+            self._try(which, side, 0.5 * (near + far), near, far, beyond)
+        return far, beyond
+
+    def _try(
+        self, which: IntArray, side: float, steps: FloatArray,
+        near: FloatArray, far: FloatArray, beyond: FloatArray,
+    ) -> None:  # fmt: skip
+        """Narrow down each jump, in place, by the output at one more step of each parameter."""
+        open_ = np.flatnonzero((near < steps) & (steps < far))
+        if open_.size == 0:
+            return
+        taken, predicted = self.at(which[open_], side * steps[open_])
+        moved = np.any(predicted != self.predicted[:, None], axis=0)
+        far[open_[moved]] = np.abs(taken[moved])
+        beyond[:, open_[moved]] = predicted[:, moved]
+        near[open_[~moved]] = steps[open_[~moved]]
