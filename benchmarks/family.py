@@ -58,7 +58,7 @@ def kind(process: int) -> str:
     except OSError:
         return "ended"
     for mark, name in (
-        ("ray::", "workers"), ("service.dispatcher", "dispatcher"), ("serve", "web process"),
+        ("ray::", "workers"), ("service.dispatch.process", "dispatcher"), ("serve", "web process"),
         ("gcs_server", "Ray"), ("raylet", "Ray"), ("/ray/", "Ray"),
     ):  # fmt: skip
         if mark in words:

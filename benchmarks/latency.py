@@ -11,8 +11,8 @@ from tempfile import TemporaryDirectory
 
 from benchmarks import paper_example
 from benchmarks.table import Row, parser, report
-from service.client import Client
-from service.embedded import embedded_service
+from service.client.client import Client
+from service.client.embedded import embedded_service
 from sysid.core.code_cache import cache_folder
 
 POLL_SECONDS = 0.004
@@ -23,7 +23,8 @@ import time, sys
 import sysid.identification.identify, numpy as np
 from sysid import load_model
 from sysid.simulation.problem import Problem
-from sysid.data.records import Channel, Record
+from sysid.data.records import Channel
+from sysid.data.records import Record
 t = 0.1 * np.arange(300)
 record = Record((Channel("u", t, np.cos(t), "1"),), (Channel("y", t, np.sin(t), "1"),))
 start = time.perf_counter()

@@ -12,8 +12,7 @@ sys.path[:] = [entry for entry in sys.path if Path(entry).resolve() != Path(__fi
 import numpy as np
 
 from benchmarks.table import Row, parser, report
-from service.signals.reader import read_recording
-from service.signals.writer import write_recording
+from service.formats.mcap import read_recording, write_recording
 from sysid.data.records import Channel, Recording
 
 SAMPLES = 1_000_000

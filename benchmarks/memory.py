@@ -9,9 +9,9 @@ from typing import Any
 from benchmarks import paper_example
 from benchmarks.family import memory_megabytes
 from benchmarks.table import Row, parser, report
-from service import calls
-from service.client import Client
-from service.embedded import embedded_service
+from service.client import calls
+from service.client.client import Client
+from service.client.embedded import embedded_service
 
 BARS_MB = {"dispatcher": 400.0, "workers": 350.0, "web process": 200.0}
 SMALL = {"method": "simple", "population": 4, "generations": 1, "islands": 1, "refine": False}

@@ -18,8 +18,8 @@ from unittest.mock import patch
 from benchmarks import paper_example
 from benchmarks.family import cpu_seconds
 from benchmarks.table import Row, parser, report
-from service.client import Client
-from service.embedded import embedded_service
+from service.client.client import Client
+from service.client.embedded import embedded_service
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.noise import Noise, with_noise
 from sysid.identification.identify import identify

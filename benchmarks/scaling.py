@@ -18,8 +18,8 @@ from typing import Any
 from benchmarks import paper_example
 from benchmarks.family import cpu_seconds
 from benchmarks.table import Row, Skipped, parser, report
-from service.client import Client
-from service.embedded import embedded_service
+from service.client.client import Client
+from service.client.embedded import embedded_service
 from sysid.core.settings import GeneticAlgorithm, Stop
 from workers.cluster import ClusterSettings, RayCrew
 from workers.packing import PACK_SECONDS

@@ -12,7 +12,7 @@ from benchmarks.family import cpu_seconds
 from benchmarks.real_data.session import data_folder, identify, parameter, service
 from benchmarks.real_data.silverbox import ESTIMATION, TESTS
 from benchmarks.table import Row, Skipped, parser, report
-from service.client import Client
+from service.client.client import Client
 
 SECONDS = 30.0
 MULTISINE_MV = 0.31

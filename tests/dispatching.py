@@ -11,18 +11,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from service.datasets import add_recording
-from service.dispatch.claiming import Leases
-from service.dispatcher import Dispatcher
-from service.jobs import submit
-from service.schemas_jobs import JobIn
-from service.settings import Settings
-from service.storage.jobs import JobRepository
+from service.core.settings import Settings
+from service.datasets.datasets import add_recording
+from service.dispatch.dispatcher import Dispatcher
+from service.dispatch.leases import Leases
+from service.dispatch.supervisor import clear_family, environment_of
+from service.jobs.schemas import JobIn
+from service.jobs.submit import submit
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore, open_store
-from service.storage.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import OPEN, Job, Run, State
-from service.supervision import clear_family, environment_of
 from sysid.data.records import Recording
 from tests.database import migrated_sqlite
 from tests.runs import step_record
@@ -76,7 +76,7 @@ class Place:
         """A dispatcher for the length of the block; nothing of it is left afterwards."""
         log = (self.settings.data_dir / "dispatcher.log").open("ab")
         child = subprocess.Popen(
-            [sys.executable, "-m", "service.dispatcher_process"],
+            [sys.executable, "-m", "service.dispatch.process"],
             env={**os.environ, **environment_of(self.settings)},
             stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
         )  # fmt: skip

@@ -3,14 +3,14 @@
 from datetime import timedelta
 from typing import Any
 
-from service import jobs
-from service.api.deps import Parts
-from service.dispatch.floors import floors_for
-from service.dispatch.preparing import JobRuns
-from service.dispatch.recording import Recorder
-from service.schemas_jobs import JobIn
-from service.storage.queue import Queue
-from service.storage.runs import RunRepository
+from service.api.dependencies import Parts
+from service.dispatch.cramer_rao import floors_for
+from service.dispatch.job_runs import JobRuns
+from service.dispatch.recorder import Recorder
+from service.jobs import submit as jobs
+from service.jobs.schemas import JobIn
+from service.queue.leases import Queue
+from service.repositories.runs import RunRepository
 from workers.feeding import Feeder
 from workers.inline import InlineCrew
 

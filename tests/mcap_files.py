@@ -6,7 +6,7 @@ from io import BytesIO
 
 from mcap.writer import CompressionType, Writer
 
-from service.signals.writer import write_recording
+from service.formats.mcap import write_recording
 from sysid.data.records import Recording
 
 

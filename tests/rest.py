@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from service.settings import Settings
+from service.core.settings import Settings
 
 CSV = {"content-type": "text/csv"}
 PROBLEM = "application/problem+json"

@@ -2,11 +2,11 @@
 
 from datetime import UTC, datetime, timedelta
 
-from service.storage.datasets import NewDataset
-from service.storage.jobs import JobRepository, NewJob
-from service.storage.ledger import Cell, RunLedger
-from service.storage.queue import Claim, Queue
-from service.storage.runs import RunRepository
+from service.queue.leases import Claim, Queue
+from service.queue.run_writes import Cell, RunLedger
+from service.repositories.datasets import NewDataset
+from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Job, Run, State
 

@@ -10,8 +10,8 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from benchmarks.breaking.stand import Stand
-from service.storage.patience import PASSING
-from service.storage.points import history_of, migrants_of
+from service.repositories.history import history_of, migrants_of
+from service.storage.retry import PASSING
 from service.storage.tables import Event, Job, MigrationLog, Run, RunHistory, State
 
 CLOCKED = ("seconds", "job", "run")

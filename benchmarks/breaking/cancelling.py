@@ -9,8 +9,8 @@ from typing import TypeVar
 
 from benchmarks.breaking.faults import LIMIT_SECONDS, Bench, goes_on, kill, recovery, renewal
 from benchmarks.breaking.stand import until
-from service.calls import ClientError, ProblemError
-from service.storage.patience import PASSING
+from service.client.calls import ClientError, ProblemError
+from service.storage.retry import PASSING
 from service.storage.tables import Job, State
 
 T = TypeVar("T")

@@ -36,7 +36,9 @@ class Family:
 
     def dispatchers(self) -> list[int]:
         """The dispatchers' processes."""
-        return sorted(pid for pid in self.members() if b"service.dispatcher" in _arguments(pid))
+        return sorted(
+            pid for pid in self.members() if b"service.dispatch.process" in _arguments(pid)
+        )
 
     def kill(self) -> None:
         """End what is left."""

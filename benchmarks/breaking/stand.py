@@ -17,8 +17,8 @@ from pathlib import Path
 import httpx
 
 from benchmarks.breaking.processes import MARK, Family
-from service.client import Client
-from service.embedded import free_port
+from service.client.client import Client
+from service.client.embedded import free_port
 from service.storage.sessions import Database, sqlite_url
 
 SHIM = Path(__file__).with_name("shim")
@@ -99,7 +99,7 @@ class Stand:
         """A second dispatcher for the length of the block, which ends in order."""
         with (self.folder / "second.log").open("ab") as log:
             child = subprocess.Popen(
-                [sys.executable, "-m", "service.dispatcher_process"], env=self.environment,
+                [sys.executable, "-m", "service.dispatch.process"], env=self.environment,
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
             )  # fmt: skip
         try:

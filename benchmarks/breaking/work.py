@@ -14,8 +14,8 @@ from sqlalchemy import select
 from benchmarks import paper_example
 from benchmarks.breaking.audit import Finding, audit, is_over
 from benchmarks.breaking.stand import Stand, until
-from service.calls import ClientError
-from service.storage.patience import PASSING
+from service.client.calls import ClientError
+from service.storage.retry import PASSING
 from service.storage.tables import Checkpoint, Job
 
 STUCK_SECONDS = 180.0

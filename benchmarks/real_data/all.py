@@ -14,7 +14,7 @@ from benchmarks.real_data import (
 )
 from benchmarks.real_data.session import program
 from benchmarks.table import Row
-from service.client import Client
+from service.client.client import Client
 
 PROGRAMS = {
     "Silverbox": silverbox.measure,

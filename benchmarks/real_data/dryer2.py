@@ -5,7 +5,7 @@ from typing import Any
 
 from benchmarks.real_data.session import identify, parameter, print_estimates, program
 from benchmarks.table import Row
-from service.client import Client
+from service.client.client import Client
 
 TITLE = "dryer2, free run on the last half"
 BARS = {"fopdt": None, "sopdt": 85.5}

@@ -5,7 +5,7 @@ from typing import Any
 
 from benchmarks.real_data.session import identify, print_estimates, program
 from benchmarks.table import Row
-from service.client import Client
+from service.client.client import Client
 
 TITLE = "EMPS, free run on the test with pulses"
 SKIP = 20

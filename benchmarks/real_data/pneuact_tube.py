@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmarks.real_data.session import identify_all, parameter, program
 from benchmarks.table import Row
-from service.client import Client
+from service.client.client import Client
 
 TITLE = "pneuact tube, fill, medians over pressures"
 LABELS = ["length_m", "p_nom_bar", "phase", "file", "repeat"]

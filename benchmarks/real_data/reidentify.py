@@ -11,7 +11,7 @@ from benchmarks.real_data import pneuact_tube
 from benchmarks.real_data.session import PEAK, data_folder, peak_memory_row, service
 from benchmarks.real_data.tube_reference import LAST_DIGIT, REFERENCE
 from benchmarks.table import Row, Skipped, parser, report
-from service.client import Client
+from service.client.client import Client
 
 TITLE = "batch re-identification of tubes"
 CHANNELS = {"u": "P1_meas_Pa", "y": "P2_meas_Pa"}

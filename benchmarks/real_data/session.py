@@ -9,8 +9,8 @@ from typing import Any
 
 from benchmarks.family import members, pss_bytes
 from benchmarks.table import Row, Skipped, parser, report
-from service.client import Client
-from service.embedded import embedded_service
+from service.client.client import Client
+from service.client.embedded import embedded_service
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from benchmarks.real_data.session import identify, parameter, print_estimates, program
 from benchmarks.table import Row
-from service.client import Client
+from service.client.client import Client
 
 TITLE = "Silverbox, free run on the test parts"
 ESTIMATION = [40650, 105712]  # the first 75 % of rows 40650:127400

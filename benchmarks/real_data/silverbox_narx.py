@@ -6,7 +6,7 @@ from typing import Any
 from benchmarks.real_data.session import identify, print_estimates, program
 from benchmarks.real_data.silverbox import ESTIMATION, PUBLISHED, TESTS
 from benchmarks.table import Row
-from service.client import Client
+from service.client.client import Client
 
 TITLE = "Silverbox, NARX, free run on the test parts"
 BARS_MV = {"multisine": 0.28, "arrow": 0.41, "arrow, first 32,000": 0.28}

@@ -5,7 +5,7 @@ from typing import Any
 
 from benchmarks.real_data.session import identify_all, parameter, program
 from benchmarks.table import Row
-from service.client import Client
+from service.client.client import Client
 
 TITLE = "tube reference, first order plus dead time"
 # Reference by least squares (T in s, L in s), patterns 1 and 2, printed to 0.1 ms.

@@ -1,1 +1,1 @@
-"""REST routes."""
+"""FastAPI: one thin file per resource."""

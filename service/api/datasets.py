@@ -7,15 +7,16 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
-from service import datasets, lineage, simulations
-from service.api.content import CROSS_ORIGIN, content_of, preflight
-from service.api.deps import Cursor, Limit, MaxPoints, PartsDep, ReadSession
-from service.api.uploads import received
-from service.csv_rows import csv_rows
-from service.recordings import recording_of
-from service.schemas import Page
-from service.schemas_datasets import DatasetOut, DeriveIn, LineageOut, SignalsOut, SimulateIn
-from service.storage.datasets import DatasetRepository, Stored
+from service.api.content import CROSS_ORIGIN, content_of, preflight, received
+from service.api.dependencies import Cursor, Limit, MaxPoints, PartsDep, ReadSession
+from service.core.wire import Page
+from service.datasets import datasets
+from service.datasets import datasets as lineage
+from service.datasets import simulated as simulations
+from service.datasets.recordings import recording_of
+from service.datasets.schemas import DatasetOut, DeriveIn, LineageOut, SignalsOut, SimulateIn
+from service.formats.csv_recordings import csv_rows
+from service.repositories.datasets import DatasetRepository, Stored
 
 router = APIRouter(prefix="/v1", tags=["datasets"])
 

@@ -9,11 +9,11 @@ from fastapi import APIRouter, Header
 from fastapi.responses import Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from service.api.deps import Parts, PartsDep
-from service.errors import InvalidRequest
-from service.storage.events import EventRepository
-from service.storage.jobs import JobRepository
-from service.storage.patience import PASSING, is_passing
+from service.api.dependencies import Parts, PartsDep
+from service.core.errors import InvalidRequest
+from service.repositories.events import EventRepository
+from service.repositories.jobs import JobRepository
+from service.storage.retry import PASSING, is_passing
 from service.storage.tables import Event
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])

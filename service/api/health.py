@@ -7,12 +7,12 @@ from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.api.deps import Parts, PartsDep, ReadSession
-from service.errors import FieldError, Unavailable
+from service.api.dependencies import Parts, PartsDep, ReadSession
+from service.core.errors import FieldError, Unavailable
+from service.queue.dispatchers import DispatcherRepository
+from service.repositories.jobs import JobRepository
 from service.storage import migrate
-from service.storage.dispatchers import DispatcherRepository
 from service.storage.errors import StorageError
-from service.storage.jobs import JobRepository
 
 router = APIRouter(tags=["health"])
 

@@ -5,17 +5,21 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Query, Response, status
 from fastapi.responses import StreamingResponse
 
-from service import jobs, runs, runs_table, summaries, trends
-from service.api.deps import Cursor, Limit, PartsDep, ReadSession, WriteSession
-from service.rms_units import unit_of
-from service.schemas import Page
-from service.schemas_jobs import JobIn, JobOut
-from service.schemas_runs import RunOut
-from service.schemas_summaries import SummaryOut
-from service.schemas_trends import TrendOut
-from service.storage.jobs import JobRepository
-from service.storage.runs import RunOrder
+from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession, WriteSession
+from service.core.wire import Page
+from service.datasets.rms_unit import unit_of
+from service.jobs import submit as jobs
+from service.jobs.schemas import JobIn, JobOut
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunOrder
+from service.runs import runs
+from service.runs import table as runs_table
+from service.runs.schemas import RunOut
 from service.storage.tables import State
+from service.sweeps import summary as summaries
+from service.sweeps.schemas import SummaryOut
+from service.trends import trend as trends
+from service.trends.schemas import TrendOut
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

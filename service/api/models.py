@@ -5,12 +5,12 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
-from service import models
-from service.api.deps import Cursor, Limit, PartsDep, ReadSession
-from service.documents import MAX_DOCUMENT_BYTES, read_json, read_yaml
-from service.errors import InvalidRequest, TooLarge, UnsupportedMediaType
-from service.schemas import Page
-from service.schemas_models import CheckOut, ModelOut
+from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession
+from service.core.documents import MAX_DOCUMENT_BYTES, read_json, read_yaml
+from service.core.errors import InvalidRequest, TooLarge, UnsupportedMediaType
+from service.core.wire import Page
+from service.models import models
+from service.models.schemas import CheckOut, ModelOut
 
 router = APIRouter(prefix="/v1", tags=["models"])
 

@@ -5,14 +5,18 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, Response
 
-from service.api.deps import Cursor, PartsDep, ReadSession
+from service.api.dependencies import Cursor, PartsDep, ReadSession
+from service.api.html import Page
 from service.api.jobs import Filter
-from service.api.page import Page
-from service.errors import NotFound
+from service.core.errors import NotFound
+from service.figures import plotly as figures
+from service.pages import figures as results
+from service.pages import pages, report
+from service.pages import pages as recipe_pages
+from service.pages import render as assets
+from service.pages.figures import FigureChoice, FigureName
+from service.pages.simulate import simulate_page as simulate
 from service.storage.tables import State
-from service.web import assets, figures, pages, recipe_pages, report, results
-from service.web.results import FigureChoice, FigureName
-from service.web.simulate_page import simulate_page as simulate
 
 router = APIRouter()
 

@@ -2,10 +2,10 @@
 
 from fastapi import APIRouter
 
-from service import references
-from service.api.deps import Cursor, Limit, ReadSession, WriteSession
-from service.schemas import Page
-from service.schemas_references import ReferenceIn, ReferenceOut
+from service.api.dependencies import Cursor, Limit, ReadSession, WriteSession
+from service.core.wire import Page
+from service.jobs import references
+from service.jobs.schemas import ReferenceIn, ReferenceOut
 
 router = APIRouter(prefix="/v1/references", tags=["references"])
 

@@ -1,20 +1,37 @@
-"""Routes of runs."""
+"""Routes of runs.
+
+The route that compares runs.
+"""
 
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from service import exports, free_runs, profiles, residuals, responses, run_simulations, runs
 from service.api.content import ByteRange, content_of
-from service.api.deps import MaxPoints, PartsDep, ReadSession
-from service.errors import NotFound
-from service.schemas_free_runs import FreeRunIn, FreeRunOut
-from service.schemas_profiles import ProfileIn, ProfilesOut
-from service.schemas_runs import HistoryOut, MigrationsOut, ResidualsOut, ResponseOut, RunOut
-from service.schemas_simulations import RunSimulateIn, RunSimulationOut
-from service.storage.runs import RunRepository
-from service.web.figures import in_theme
-from service.web.theme import Theme
+from service.api.dependencies import MaxPoints, PartsDep, ReadSession
+from service.control import simulate as run_simulations
+from service.control.schemas import RunSimulateIn, RunSimulationOut
+from service.core.errors import NotFound
+from service.figures.plotly import in_theme
+from service.figures.profiles import profile as profile_figure
+from service.figures.theme import Theme
+from service.repositories.runs import RunRepository
+from service.runs import comparison, exports, profiles, residuals, runs
+from service.runs import fitted as responses
+from service.runs import free_run as free_runs
+from service.runs.schemas import (
+    CompareIn,
+    ComparisonOut,
+    FreeRunIn,
+    FreeRunOut,
+    HistoryOut,
+    MigrationsOut,
+    ProfileIn,
+    ProfilesOut,
+    ResidualsOut,
+    ResponseOut,
+    RunOut,
+)
 from sysid.export.export import MOST_PADE, Format
 
 router = APIRouter(prefix="/v1/runs", tags=["runs"])
@@ -85,7 +102,8 @@ def validate(
 def profile(run_id: str, body: ProfileIn, parts: PartsDep, theme: Theme = "light") -> ProfilesOut:
     """Profile likelihood of some free parameters, the others estimated anew at every value."""
     found = profiles.profiles(parts.database, parts.store, run_id, body)
-    return found.model_copy(update={"figure": in_theme(found.figure, theme)})
+    figure = in_theme(profile_figure(found.profiles, found.threshold), theme)
+    return ProfilesOut(**dict(found), figure=figure)
 
 
 @router.head("/{run_id}/signals.mcap", include_in_schema=False)
@@ -99,3 +117,12 @@ def signals(run_id: str, request: Request, session: ReadSession, parts: PartsDep
     if run.signals_start is not None and run.signals_size is not None:
         part = ByteRange(run.signals_start, run.signals_start + run.signals_size)
     return content_of(request, parts.store, run.signals_sha256, f"{run_id}.mcap", part)
+
+
+comparison_router = APIRouter(prefix="/v1", tags=["runs"])
+
+
+@comparison_router.post("/runs:compare")
+def compare(body: CompareIn, session: ReadSession) -> ComparisonOut:
+    """Runs of several models on the same data side by side, the best first."""
+    return comparison.compare(session, body.runs)

@@ -1,1 +1,1 @@
-"""The command line `lagid`."""
+"""Typer commands."""

@@ -6,9 +6,9 @@ from typing import Annotated, Any
 import typer
 
 from service.cli.common import (
-    DEFAULT_URL,
     AsJson,
     Key,
+    Places,
     SampleTime,
     Segments,
     Url,
@@ -18,9 +18,10 @@ from service.cli.common import (
     print_json,
     print_listing,
     read_file,
+    told_at,
 )
-from service.cli.places import Places, told_at
-from service.documents import read_yaml
+from service.client.calls import DEFAULT_URL
+from service.core.documents import read_yaml
 
 app = typer.Typer(help="Add, simulate and derive recordings.", no_args_is_help=True)
 

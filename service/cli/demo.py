@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from service.client import Client
-from service.embedded import embedded_service
+from service.client.client import Client
+from service.client.embedded import embedded_service
 
 # Example 1 of the paper: Eq. 13-16 with the parameters and the input of its section 4.
 TRUTH = {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0}

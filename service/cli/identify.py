@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import (
+    Places,
     SampleTime,
     Segments,
     err,
@@ -25,16 +26,16 @@ from service.cli.common import (
     status_of,
     usage,
 )
-from service.cli.places import Places
 from sysid.core.errors import nearest
 
 if TYPE_CHECKING:
-    from service.errors import FieldError
-    from service.schemas_jobs import JobIn
+    from service.core.errors import FieldError
+    from service.jobs.schemas import JobIn
     from sysid.data.records import Record, Recording
     from sysid.identification.result import Identification
     from sysid.models.model import Model
     from sysid.residuals.residual_tests import ResidualTests
+
 
 # Fields of a job body that mean nothing in one process, and what does their work here.
 ELSEWHERE = {
@@ -128,11 +129,10 @@ def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
     """
     from pydantic import ValidationError
 
-    from service.conversion import faults_of
-    from service.errors import FieldError
-    from service.partial import beside
-    from service.pointers import explained
-    from service.schemas_jobs import JobIn
+    from service.core.errors import FieldError, faults_of
+    from service.core.partial_bodies import beside
+    from service.core.validation import explained
+    from service.jobs.schemas import JobIn
     from sysid.core.errors import SysidError
 
     job, model = None, None
@@ -160,7 +160,7 @@ def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
 
 
 def _meant(job: "JobIn", model: "Model", pieces: int) -> "list[FieldError]":
-    from service.setting_checks import setting_faults
+    from service.jobs.record_checks import setting_faults
     from sysid.models.model import initial_parameters
 
     parameters = (*model.parameters, *initial_parameters(model, pieces))
@@ -170,7 +170,7 @@ def _meant(job: "JobIn", model: "Model", pieces: int) -> "list[FieldError]":
 @contextmanager
 def _told_at_options() -> Iterator[None]:
     """End the command with what the core refuses, at the user's places."""
-    from service.conversion import faults_of
+    from service.core.errors import faults_of
     from sysid.core.errors import SysidError
 
     try:
@@ -195,14 +195,14 @@ def _refuse_same(data: Path, validation: Path | None) -> None:
 
 def read(path: Path, reading: Reading) -> "Recording":
     """A recording from a file; notes about it go to stderr."""
-    from service.signals.csv_reader import read_csv
+    from service.formats.csv_recordings import read_csv
     from sysid.models.units import unknown_units
 
     if not path.is_file():
         fail(f"there is no file {path}")
     if path.suffix.lower() == ".mcap":
-        from service.signals.limits import DEFAULT_LIMITS
-        from service.signals.reader import read_mcap
+        from service.formats.limits import DEFAULT_LIMITS
+        from service.formats.mcap import read_mcap
 
         recording, notes = read_mcap(path, DEFAULT_LIMITS)
     else:
@@ -216,7 +216,7 @@ def read(path: Path, reading: Reading) -> "Recording":
 
 def tell(model: "Model", found: "Identification", seconds: float, json_file: str | None) -> None:
     """Print the estimates, or write the result as JSON, or both."""
-    from service.result_document import result_document
+    from service.runs.result import result_document
 
     document = result_document(found, seconds)
     if json_file == "-":
@@ -281,7 +281,7 @@ def _identified(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from service.conversion import algorithm_of, loss_of
+    from service.jobs.to_core import algorithm_of, loss_of
     from sysid.data.noise import Noise
     from sysid.identification.identify import identify as identified
 

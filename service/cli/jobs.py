@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import (
-    DEFAULT_URL,
     AsJson,
     Key,
     Url,
@@ -15,22 +14,23 @@ from service.cli.common import (
     err,
     estimate,
     fail,
+    in_file,
     out,
     print_json,
     print_listing,
     print_table,
     read_file,
+    told_at,
     with_unit,
 )
-from service.cli.many_runs import MOST, print_many
-from service.cli.one_run import place_of, show_run, tell_reused
-from service.cli.places import in_file, told_at
-from service.cli.watching import follow
-from service.documents import read_yaml
-from service.errors import InvalidRequest
+from service.cli.tables import MOST, place_of, print_many, show_run, tell_reused
+from service.cli.watch import follow
+from service.client.calls import DEFAULT_URL
+from service.core.documents import read_yaml
+from service.core.errors import InvalidRequest
 
 if TYPE_CHECKING:
-    from service.client import Client
+    from service.client.client import Client
 
 
 class State(StrEnum):

@@ -8,13 +8,17 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from service.calls import ClientError, NotFinite, ProblemError
-from service.cli import datasets, exporting, jobs, models, references, runs, serving, sweeps, upkeep
+from service.cli import datasets, jobs, models, runs, sweeps
+from service.cli import reidentify as references
+from service.cli import runs as exporting
+from service.cli import server as serving
+from service.cli import server as upkeep
 from service.cli.common import err, out
 from service.cli.identify import identify
 from service.cli.paper import paper
-from service.cli.reidentifying import reidentify
-from service.errors import ServiceError
+from service.cli.reidentify import reidentify
+from service.client.calls import ClientError, NotFinite, ProblemError
+from service.core.errors import ServiceError
 
 SERVER_FAILS = 500
 NO_TEXT = "surrogates not allowed"
@@ -94,7 +98,7 @@ def _usage(error: TyperException) -> str:
         return ""
     cause: Any = error.__cause__
     if hasattr(cause, "errors"):  # Pydantic's, by which the values of options are read
-        from service.sentences import detail_of
+        from service.core.validation import detail_of
 
         text = text.replace(error.message, detail_of(cause.errors()[0], ()))
     context = getattr(error, "ctx", None)

@@ -5,7 +5,6 @@ from typing import Annotated, Any
 
 import typer
 
-from service.calls import DEFAULT_URL
 from service.cli.common import (
     AsJson,
     Key,
@@ -13,14 +12,16 @@ from service.cli.common import (
     connected,
     err,
     fail,
+    in_file,
     out,
     print_json,
     print_listing,
     read_file,
+    told_at,
 )
-from service.cli.places import in_file, told_at
-from service.documents import read_yaml
-from service.errors import InvalidRequest
+from service.client.calls import DEFAULT_URL
+from service.core.documents import read_yaml
+from service.core.errors import InvalidRequest
 
 app = typer.Typer(help="Built-in and own models.", invoke_without_command=True)
 
@@ -89,7 +90,7 @@ def check(
     as_json: AsJson = False,
 ) -> None:
     """Check a model document; each error with its place and, in equations, its column."""
-    from service.models import check as checked
+    from service.models.models import check as checked
 
     try:
         answer = checked(read_yaml(read_file(file))).model_dump(mode="json")
@@ -124,6 +125,6 @@ def add(
 
 
 def _built_in() -> list[dict[str, Any]]:
-    from service.models import catalogue
+    from service.models.models import catalogue
 
     return [one.model_dump(mode="json") for one in catalogue()]

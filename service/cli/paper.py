@@ -13,7 +13,7 @@ import typer
 from service.cli.common import Key, err, fail, out
 
 if TYPE_CHECKING:
-    from service.client import Client
+    from service.client.client import Client
 
 
 def paper(
@@ -34,7 +34,7 @@ def paper(
 ) -> None:  # fmt: skip
     """Reproduce the paper's tables and figures with real jobs; print tables, write a report."""
     from service.paper.bench import Bench
-    from service.paper.parts import markdown
+    from service.paper.document import markdown
     from service.paper.report import page
     from service.paper.study import chosen, conduct
 
@@ -55,8 +55,8 @@ def paper(
 @contextmanager
 def _client(url: str | None, key: str | None) -> "Iterator[Client]":
     """A client of the given server, or of one that lives as long as the command."""
-    from service.client import Client
-    from service.embedded import embedded_service
+    from service.client.client import Client
+    from service.client.embedded import embedded_service
 
     if url is not None:
         with Client(url, key) as client:

@@ -1,15 +1,18 @@
-"""`lagid runs`: list the runs of a job, and what can be asked of single ones."""
+"""`lagid runs`: list the runs of a job, and what can be asked of single ones.
+
+`lagid export`: the identified model of a run as a file for other programs.
+"""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from typer.core import TyperGroup
 
-from service.calls import DEFAULT_URL
 from service.cli.common import (
     AsJson,
     Key,
+    Places,
     Url,
     connected,
     estimate,
@@ -18,10 +21,11 @@ from service.cli.common import (
     print_json,
     print_table,
     read_file,
+    told_at,
 )
 from service.cli.jobs import runs as listing
-from service.cli.places import Places, told_at
-from service.documents import read_yaml
+from service.client.calls import DEFAULT_URL
+from service.core.documents import read_yaml
 from sysid.core.units import multiplied
 
 LISTING = "list"
@@ -238,3 +242,34 @@ def _chance(p: float | None) -> str | None:
 
 def _two(value: float | None) -> str | None:
     return None if value is None else f"{value:.2f}"
+
+
+PLACES = Places({"?format": "--format", "?pade_order": "--pade-order"})
+
+
+def export(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="Id of a run.")],
+    format: Annotated[
+        Literal["json", "python", "c", "control"],
+        typer.Option(help="JSON document, Python or C99 source, or a script for python-control."),
+    ] = "json",
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="File to write; without it to stdout.")
+    ] = None,
+    pade_order: Annotated[
+        int, typer.Option(min=1, max=20, help="Of the dead times' approximation in control.")
+    ] = 3,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Write the identified model of a run for another program."""
+    with connected(url, key) as client, told_at(PLACES):
+        text = client.export(run, format, pade_order)
+    if output is None:
+        typer.echo(text, nl=False)
+        return
+    try:
+        output.write_text(text, encoding="utf-8")
+    except OSError as error:
+        fail(f"{output} cannot be written: {error.strerror}")
+    out.print(str(output), markup=False)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import (
-    DEFAULT_URL,
     AsJson,
     Key,
+    Places,
     Url,
     connected,
     err,
@@ -18,15 +18,17 @@ from service.cli.common import (
     print_table,
     put,
     read_file,
+    told_at,
     usage,
     with_unit,
 )
-from service.cli.places import Places, told_at
-from service.cli.watching import follow
-from service.documents import read_yaml
+from service.cli.watch import follow
+from service.client.calls import DEFAULT_URL
+from service.core.documents import read_yaml
 
 if TYPE_CHECKING:
-    from service.client import Client
+    from service.client.client import Client
+
 
 app = typer.Typer(help="Recipes: sweeps made for one purpose.", no_args_is_help=True)
 

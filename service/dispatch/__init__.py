@@ -1,1 +1,1 @@
-"""What the dispatcher is made of: leases, preparation of runs, and their records."""
+"""The dispatcher process: claim, prepare, feed workers, record."""

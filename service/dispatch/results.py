@@ -3,9 +3,9 @@
 import math
 from collections.abc import Iterator, Mapping
 
-from service.result_document import finite, result_document
-from service.storage.ledger import RunOutcome
-from service.storage.points import HistoryPoint, MigrantPoint
+from service.queue.run_writes import RunOutcome
+from service.repositories.history import HistoryPoint, MigrantPoint
+from service.runs.result import finite, result_document
 from service.storage.tables import State
 from sysid.search.state import Improvement, Migrant
 from workers.ports import Concluded

@@ -1,1 +1,1 @@
-"""The paper's tables and figures, made anew by jobs of the service and shown beside its own."""
+"""The paper's tables and figures as real jobs; used by its command alone."""

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from service.figures import formats, theme
 from service.paper import figures, published
 from service.paper.bench import METHODS, Bench, Found
+from service.paper.document import Check, Plot, Section, Table
 from service.paper.oscillators import estimate_text
-from service.paper.parts import Check, Plot, Section, Table
-from service.web import formats, theme
 
 TITLE = "Table 4, Figures 20 and 21: pneumatic actuator"
 # The paper's proposed column, with k_b = k_a: only then do six numbers follow from P_a and θ. It

@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.client import Client
-from service.errors import ServiceError
+from service.client.client import Client
+from service.core.errors import ServiceError
 
 Document = Mapping[str, Any]
 METHODS = ("simple", "improved-paper", "improved")

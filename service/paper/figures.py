@@ -1,4 +1,4 @@
-"""Figures of the study that compare methods; their looks are those of `service.web.figures`."""
+"""Figures of the study that compare methods; their looks are those of `service.figures.plotly`."""
 
 from collections.abc import Mapping, Sequence
 from math import ceil, floor, log10
@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from service.figures import theme
+from service.figures.data import Floats
+from service.figures.plotly import Figure, finite, layout
 from service.paper.bench import Found
-from service.web import theme
-from service.web.evidence import Floats
-from service.web.figures import Figure, finite, layout
 
 Line = dict[str, Any]
 _STYLES: Mapping[str, dict[str, Any]] = {

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from service.paper import figures, forces, published
+from service.figures import theme
+from service.paper import figures, published
+from service.paper import force_noise as forces
 from service.paper.bench import METHODS, Bench
+from service.paper.document import Check, Plot, Section, Table
 from service.paper.oscillators import EXAMPLE_1, dataset, readings
-from service.paper.parts import Check, Plot, Section, Table
-from service.web import theme
 
 SIGMAS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 QUANTILES = (0.1, 0.5, 0.9)

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from service.figures import formats
+from service.figures.data import Floats
 from service.paper import figures, published
 from service.paper.bench import METHODS, Bench, Found
-from service.paper.bound import cramer_rao
-from service.paper.parts import Check, Plot, Section, Table
+from service.paper.cramer_rao import cramer_rao
+from service.paper.document import Check, Plot, Section, Table
 from service.paper.published import Columns
-from service.web import formats
-from service.web.evidence import Floats
 from sysid.data.records import Channel
 from sysid.models.catalogue.load import load_model
 

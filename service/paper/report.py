@@ -5,11 +5,10 @@ from datetime import UTC, datetime
 
 from markupsafe import Markup
 
-from service.paper.parts import Plot, Section, verdict
-from service.web import report as jobs
-from service.web.embedding import as_json, bare, templates
-from service.web.rendering import render
-from service.web.report_parts import style
+from service.figures.embed import as_json, bare, templates
+from service.pages import report as jobs
+from service.pages.render import render, style
+from service.paper.document import Plot, Section, verdict
 
 
 def page(sections: Sequence[Section], *, quick: bool) -> str:

@@ -3,10 +3,10 @@
 from math import exp, factorial
 from typing import Any
 
+from service.figures import formats, theme
 from service.paper import figures
 from service.paper.bench import Bench
-from service.paper.parts import Plot, Section, Table
-from service.web import formats, theme
+from service.paper.document import Plot, Section, Table
 
 RATE, END = 0.8, 5.0
 TERMS = (1, 2, 3, 4, 5)

@@ -3,10 +3,10 @@
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
-from service.errors import ServiceError
+from service.core.errors import ServiceError
 from service.paper import actuator, noise, oscillators, series, tube
 from service.paper.bench import Bench
-from service.paper.parts import Section
+from service.paper.document import Section
 
 Part = Callable[[Bench], list[Section]]
 PARTS: Mapping[str, Part] = {

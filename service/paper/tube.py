@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from service.calls import ProblemError
+from service.client.calls import ProblemError
+from service.figures import theme
 from service.paper import figures, published
 from service.paper.bench import METHODS, Bench, Found
+from service.paper.document import Check, Plot, Section, Table
 from service.paper.oscillators import estimate_text
-from service.paper.parts import Check, Plot, Section, Table
-from service.web import theme
 
 LENGTH = 40
 NAMES = ("K", "T", "L")

@@ -1,1 +1,1 @@
-"""SQL and the object store."""
+"""Tables, sessions, migrations, content-addressed objects."""

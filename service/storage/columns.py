@@ -8,8 +8,8 @@ from typing import Any, TypeAlias
 from sqlalchemy import JSON, BigInteger, DateTime, Dialect, Enum, Integer, String, TypeDecorator
 from sqlalchemy.dialects.postgresql import JSONB
 
+from service.core.text_checks import fault_in_json, fault_of
 from service.storage.errors import UnstorableValue
-from service.storage.texts import fault_in_json, fault_of
 
 Document: TypeAlias = dict[str, Any]
 """A JSON object."""

@@ -22,11 +22,12 @@ import obstore
 from obstore.exceptions import AlreadyExistsError, BaseError, NotFoundError
 from obstore.store import LocalStore, S3Store
 
-from service import temporary
+from service.core import temporary_files as temporary
 from service.storage.errors import InvalidStoreUrl, ObjectMissing, ObjectStoreFailed
 
 if TYPE_CHECKING:
     from obstore.store import RetryConfig
+
 
 _ROOT = "sha256"
 _HASH = re.compile(r"[0-9a-f]{64}")

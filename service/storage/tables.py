@@ -153,7 +153,7 @@ class Job(Base):
     `attempt` counts the claims and is the fencing token. `lost_leases` counts the dispatchers
     that fell silent; at `max_attempts` of them the job fails. `evaluations`, `generation` and
     `seconds_left` are progress over all runs, `best_rms` the smallest of any run so far. `n_reused`
-    runs were taken over from others. `floors` is what `service.dispatch.floors` makes of a job
+    runs were taken over from others. `floors` is what `service.dispatch.cramer_rao` makes of a job
     with noise.
     """
 
@@ -245,7 +245,7 @@ class Run(Base):
 
 
 class RunHistory(Base):
-    """Some of the better champions of a run's islands, packed by `service.storage.points`.
+    """Some of the better champions of a run's islands, packed by `service.repositories.history`.
 
     `digest` is the hash of `points`. `generation` and `evaluations` are the largest in it, `rms`
     the least.
@@ -263,7 +263,7 @@ class RunHistory(Base):
 
 
 class MigrationLog(Base):
-    """Some of a run's migrants, packed by `service.storage.points`; `digest` is their hash."""
+    """Some of a run's migrants, packed by `service.repositories.history`; `digest` is a hash."""
 
     __tablename__ = "migrations_log"
 

@@ -1,10 +1,10 @@
 """Which waiting job is next, and how much a project may have unfinished; on both databases."""
 
-from service.storage.admission import Admission, Unfinished, unfinished
-from service.storage.jobs import JobRepository, NewJob
-from service.storage.queue import Queue
+from service.queue.admission import Admission, Unfinished, unfinished
+from service.queue.leases import Queue
+from service.queue.notifications import look
+from service.repositories.jobs import JobRepository, NewJob
 from service.storage.tables import Project, State
-from service.storage.watch import look
 from tests.stored import claim, submit
 
 

@@ -4,11 +4,11 @@ import threading
 
 import pytest
 
+from service.queue.leases import Queue
+from service.queue.run_writes import RunLedger, RunOutcome
+from service.repositories.events import EventRepository
+from service.repositories.jobs import JobRepository
 from service.storage.errors import Conflict, NotFound
-from service.storage.events import EventRepository
-from service.storage.jobs import JobRepository
-from service.storage.ledger import RunLedger, RunOutcome
-from service.storage.queue import Queue
 from service.storage.tables import State
 from tests.stored import claim, claimed, job_of, runs_of, state_of, submit
 

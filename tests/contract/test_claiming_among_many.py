@@ -7,12 +7,12 @@ import pytest
 from sqlalchemy import Connection, Engine, event, insert, text
 
 from service.api.events import _look
-from service.storage.admission import Admission
+from service.queue.admission import Admission
+from service.queue.leases import Owners, Progress, Queue
+from service.queue.notifications import look
+from service.repositories.jobs import JobRepository
 from service.storage.columns import utc_now
-from service.storage.jobs import JobRepository
-from service.storage.queue import Owners, Progress, Queue
 from service.storage.tables import Job, Project, State
-from service.storage.watch import look
 from tests.stored import claimed
 
 PROJECTS = [f"p{number}" for number in range(4)]

@@ -6,11 +6,11 @@ from datetime import timedelta
 
 import pytest
 
-from service.storage.datasets import DatasetRepository
-from service.storage.dispatchers import DispatcherRepository
+from service.queue.dispatchers import DispatcherRepository
+from service.repositories.datasets import DatasetRepository
+from service.repositories.lineage import Edge, LineageRepository
+from service.repositories.models import ModelRepository
 from service.storage.errors import NotFound
-from service.storage.lineage import Edge, LineageRepository
-from service.storage.models import ModelRepository
 from tests.stored import Clock, new_dataset
 
 

@@ -6,11 +6,11 @@ import time
 import numpy as np
 import pytest
 
-from service.dispatch import floors
-from service.dispatch.claiming import Leases
-from service.dispatcher import Dispatcher
-from service.floors import Floors
+from service.dispatch import cramer_rao as floors
+from service.dispatch.dispatcher import Dispatcher
+from service.dispatch.leases import Leases
 from service.storage.tables import OPEN, State
+from service.sweeps.cramer_rao import Floors
 from tests.dispatching import LIMIT_SECONDS, Place
 from workers.inline import InlineCrew
 

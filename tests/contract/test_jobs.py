@@ -5,11 +5,11 @@ from datetime import UTC
 
 import pytest
 
+from service.queue.leases import Progress, Queue
+from service.queue.run_writes import RunLedger, RunOutcome
+from service.repositories.events import EventRepository
+from service.repositories.jobs import JobRepository, NewJob
 from service.storage.errors import Conflict, KeyReused, NotFound, UnstorableValue
-from service.storage.events import EventRepository
-from service.storage.jobs import JobRepository, NewJob
-from service.storage.ledger import RunLedger, RunOutcome
-from service.storage.queue import Progress, Queue
 from service.storage.tables import Project, State
 from tests.stored import claim, claimed, job_of, submit
 

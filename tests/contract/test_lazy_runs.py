@@ -4,20 +4,20 @@ from datetime import timedelta
 
 import pytest
 
-from service import jobs
-from service.dispatch import preparing
-from service.dispatch.preparing import JobRuns
-from service.runs import Choice, page
-from service.schemas_jobs import JobIn
+from service.dispatch import job_runs as preparing
+from service.dispatch.job_runs import JobRuns
+from service.jobs import submit as jobs
+from service.jobs.schemas import JobIn
+from service.queue.leases import Owners, Queue
+from service.queue.run_writes import RunLedger
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunRepository
+from service.repositories.summaries import GroupKey, groups
+from service.runs.runs import Choice, page
 from service.storage.errors import Conflict
-from service.storage.jobs import JobRepository
-from service.storage.ledger import RunLedger
-from service.storage.queue import Owners, Queue
-from service.storage.runs import RunRepository
-from service.storage.summaries import GroupKey, groups
 from service.storage.tables import Dataset, State
-from service.summaries import summary
-from service.unmade import all_groups
+from service.sweeps.groups import all_groups
+from service.sweeps.summary import summary
 from tests.dispatching import Place, carry_out
 from workers.inline import InlineCrew
 

@@ -9,8 +9,8 @@ import pytest
 from sqlalchemy import update
 from sqlalchemy.exc import OperationalError
 
-from service.dispatch.claiming import Leases
-from service.dispatcher import Dispatcher
+from service.dispatch.dispatcher import Dispatcher
+from service.dispatch.leases import Leases
 from service.storage.sessions import BUSY_SECONDS
 from service.storage.tables import Job, State
 from tests.dispatching import Place

@@ -6,11 +6,11 @@ from datetime import timedelta
 import pytest
 from sqlalchemy import text
 
+from service.queue.leases import Lease, Progress, Queue
+from service.queue.run_writes import Cell, RunLedger, RunOutcome
+from service.repositories.events import EventRepository
+from service.repositories.jobs import JobRepository
 from service.storage.errors import Conflict, LeaseLost
-from service.storage.events import EventRepository
-from service.storage.jobs import JobRepository
-from service.storage.ledger import Cell, RunLedger, RunOutcome
-from service.storage.queue import Lease, Progress, Queue
 from service.storage.tables import State
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
 

@@ -11,13 +11,13 @@ from datetime import timedelta
 
 import pytest
 
-from service.dispatch.claiming import Leases
-from service.reaping import Reaper, identity, is_awake, is_gone, reap
-from service.storage.clocks import clock_of
+from service.dispatch.leases import Leases
+from service.queue.clocks import clock_of
+from service.queue.dispatchers import LEASE_SECONDS, DispatcherRepository
+from service.queue.leases import BESIDE_OTHERS, HUNG, Queue
+from service.queue.orphaned_jobs import Reaper, identity, is_awake, is_gone, reap
+from service.queue.run_writes import Cell, RunLedger, RunOutcome
 from service.storage.columns import utc_now
-from service.storage.dispatchers import LEASE_SECONDS, DispatcherRepository
-from service.storage.ledger import Cell, RunLedger, RunOutcome
-from service.storage.queue import BESIDE_OTHERS, HUNG, Queue
 from service.storage.tables import State
 from tests.dispatching import until
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
@@ -38,7 +38,8 @@ def announce(database, owner: str, details) -> None:
 
 def of_a_process_that_has_ended():
     """What a dispatcher told that is no more."""
-    code = "import json; from service.reaping import identity; print(json.dumps(identity()))"
+    imports = "import json; from service.queue.orphaned_jobs import identity"
+    code = f"{imports}; print(json.dumps(identity()))"
     ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     return json.loads(ran.stdout)
 
@@ -187,7 +188,7 @@ def test_a_dispatcher_that_lives_but_hangs_is_reaped_at_last_and_not_called_gone
 @needs_proc
 def test_a_dispatcher_that_is_stopped_is_reaped_when_its_lease_ends(database) -> None:
     code = (
-        "import json; from service.reaping import identity\n"
+        "import json; from service.queue.orphaned_jobs import identity\n"
         "print(json.dumps(identity()), flush=True); input()"
     )
     process = subprocess.Popen(

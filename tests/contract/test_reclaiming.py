@@ -3,13 +3,13 @@
 import pytest
 
 from service.dispatch.checkpoints import packed, unpacked
-from service.dispatch.preparing import JobRuns
-from service.dispatch.recording import Recorder
-from service.storage.events import EventRepository
-from service.storage.ledger import RunLedger, RunOutcome
-from service.storage.points import HistoryPoint
-from service.storage.queue import Queue
-from service.storage.runs import RunRepository
+from service.dispatch.job_runs import JobRuns
+from service.dispatch.recorder import Recorder
+from service.queue.leases import Queue
+from service.queue.run_writes import RunLedger, RunOutcome
+from service.repositories.events import EventRepository
+from service.repositories.history import HistoryPoint
+from service.repositories.runs import RunRepository
 from service.storage.tables import Checkpoint, State
 from sysid.identification.run import begin
 from tests.dispatching import Place

@@ -4,12 +4,12 @@ import threading
 
 import pytest
 
+from service.queue.leases import Queue
+from service.queue.run_writes import Cell, RunLedger, RunOutcome
+from service.repositories.references import ReferenceRepository
+from service.repositories.trends import count_succeeded, trend_rows
 from service.storage.errors import NotFound
-from service.storage.ledger import Cell, RunLedger, RunOutcome
-from service.storage.queue import Queue
-from service.storage.references import ReferenceRepository
 from service.storage.tables import Run, State
-from service.storage.trends import count_succeeded, trend_rows
 from tests.stored import claimed, runs_of, submit
 
 RESULT = {

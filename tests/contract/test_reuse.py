@@ -4,9 +4,9 @@ from datetime import timedelta
 
 import pytest
 
-from service.storage.events import EventRepository
+from service.repositories.events import EventRepository
+from service.repositories.jobs import JobRepository
 from service.storage.garbage import collect
-from service.storage.jobs import JobRepository
 from service.storage.tables import State
 from tests.dispatching import Place, carry_out
 from workers.inline import InlineCrew
@@ -126,7 +126,7 @@ def test_a_run_that_failed_is_tried_again(place, monkeypatch):
         raise MemoryError(f"{len(done)} lost")
 
     with monkeypatch.context() as patched:
-        patched.setattr("service.dispatch.preparing.prepared", lambda *_: ((), None))
+        patched.setattr("service.dispatch.job_runs.prepared", lambda *_: ((), None))
         patched.setattr("sysid.identification.run.conclude", broken)
         patched.setattr("workers.tasks.conclude", broken)
         _, (run,), _ = carried_out(place, **sweep(1))
@@ -138,7 +138,7 @@ def test_a_run_that_failed_is_tried_again(place, monkeypatch):
 
 def test_a_run_without_its_signals_is_computed_again(place, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr("service.dispatch.preparing.save_fit", lambda *_: None)
+        patched.setattr("service.dispatch.job_runs.save_fit", lambda *_: None)
         _, (first,), _ = carried_out(place, **sweep(1))
     assert first.signals_sha256 is None
     _, (again,), computed = carried_out(place, **sweep(1))

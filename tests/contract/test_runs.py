@@ -2,17 +2,12 @@
 
 import pytest
 
+from service.queue.leases import Queue
+from service.queue.run_writes import Cell, RunLedger, RunOutcome, add_runs
+from service.repositories.history import HistoryPoint, MigrantPoint
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunRepository
 from service.storage.errors import InvalidCursor, NotFound, UnstorableValue
-from service.storage.jobs import JobRepository
-from service.storage.ledger import (
-    Cell,
-    RunLedger,
-    RunOutcome,
-    add_runs,
-)
-from service.storage.points import HistoryPoint, MigrantPoint
-from service.storage.queue import Queue
-from service.storage.runs import RunRepository
 from service.storage.tables import State
 from tests.stored import claimed, job_of, runs_of, submit
 

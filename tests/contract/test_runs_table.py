@@ -4,11 +4,11 @@ import csv
 import io
 from collections.abc import Sequence
 
-from service import runs_table
-from service.storage.jobs import JobRepository, NewJob
-from service.storage.ledger import Cell, RunLedger, RunOutcome, add_runs
-from service.storage.queue import Queue
-from service.storage.runs import RunRepository
+from service.queue.leases import Queue
+from service.queue.run_writes import Cell, RunLedger, RunOutcome, add_runs
+from service.repositories.jobs import JobRepository, NewJob
+from service.repositories.runs import RunRepository
+from service.runs import table as runs_table
 from service.storage.sessions import Database
 from service.storage.tables import State
 from tests.stored import claim

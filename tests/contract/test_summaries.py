@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from service.queue.leases import Lease, Queue
+from service.queue.run_writes import Cell, RunLedger, RunOutcome
+from service.repositories.summaries import QUANTILES, GroupKey, Quantity, groups, quietest_run
 from service.storage.errors import LeaseLost
-from service.storage.ledger import Cell, RunLedger, RunOutcome
-from service.storage.queue import Lease, Queue
-from service.storage.summaries import QUANTILES, GroupKey, Quantity, groups, quietest_run
 from service.storage.tables import Job, State
 from tests.stored import runs_of, submit
 

@@ -5,9 +5,9 @@ import time
 
 from sqlalchemy import text
 
-from service.storage.jobs import JobRepository
-from service.storage.queue import Queue
-from service.storage.wakeup import new_waker
+from service.queue.leases import Queue
+from service.queue.notifications import new_waker
+from service.repositories.jobs import JobRepository
 from tests.stored import claimed, submit
 
 LONG = 60.0  # far beyond what a wake-up takes; a test that waits that long has failed

@@ -5,13 +5,13 @@ from itertools import takewhile
 import pytest
 from sqlalchemy import event
 
-from service.conversion import algorithm_of
-from service.dispatch.preparing import JobRuns
-from service.errors import InvalidRequest
-from service.references import accept
-from service.schemas_references import ReferenceIn
-from service.storage.ledger import RunLedger
-from service.storage.queue import Queue
+from service.core.errors import InvalidRequest
+from service.dispatch.job_runs import JobRuns
+from service.jobs.references import accept
+from service.jobs.schemas import ReferenceIn
+from service.jobs.to_core import algorithm_of
+from service.queue.leases import Queue
+from service.queue.run_writes import RunLedger
 from service.storage.tables import State
 from sysid.core.errors import InvalidSettings
 from tests.dispatching import Place, carry_out
@@ -89,7 +89,7 @@ def test_a_chain_computed_before_is_taken_over_whole(place):
 
 def test_behind_a_run_that_failed_the_last_that_succeeded_serves(place):
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("service.dispatch.preparing.algorithm_of", broken_second_time())
+        patched.setattr("service.dispatch.job_runs.algorithm_of", broken_second_time())
         runs, warm = carried_out(place, **chained(NOISE))
     assert [one.state for one in runs] == [State.SUCCEEDED, State.FAILED, State.SUCCEEDED]
     assert warm[2] == (values(runs[0]),)
@@ -183,8 +183,8 @@ def test_every_chain_begins_at_once_whichever_axis_goes_fastest(place, axes, fir
 
 
 def test_a_chain_begins_also_where_its_first_run_was_not_made_yet(place, monkeypatch):
-    monkeypatch.setattr("service.jobs.AT_ONCE", 2)
-    monkeypatch.setattr("service.dispatch.preparing.CHUNK", 2)
+    monkeypatch.setattr("service.jobs.submit.AT_ONCE", 2)
+    monkeypatch.setattr("service.dispatch.job_runs.CHUNK", 2)
     runs, warm = carried_out(place, **chained(SEEDS, LABELLED))
     assert [one == () for one in warm] == [True, False, False] * 4
     assert {run.state for run in runs} == {State.SUCCEEDED}
@@ -240,6 +240,6 @@ def test_a_chain_of_runs_that_fail_asks_the_database_for_none_of_them(place, mon
         raise InvalidSettings("/algorithm", "as told")
 
     monkeypatch.setattr("service.dispatch.warm_starts.WarmStarts._stored", refused)
-    monkeypatch.setattr("service.dispatch.preparing.algorithm_of", broken)
+    monkeypatch.setattr("service.dispatch.job_runs.algorithm_of", broken)
     runs, _ = carried_out(place, **chained({"path": "/seed", "range": [0, 50]}))
     assert {one.state for one in runs} == {State.FAILED}

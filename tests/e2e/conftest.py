@@ -12,9 +12,9 @@ import pytest
 import uvicorn
 from playwright.sync_api import Browser, ConsoleMessage, Page, expect, sync_playwright
 
-from service.api.deps import Parts
-from service.app import create_app
-from service.settings import Settings
+from service.api.app import create_app
+from service.api.dependencies import Parts
+from service.core.settings import Settings
 from tests.e2e.filled import Filled, fill
 
 CHROMIUM = Path("/usr/bin/chromium")

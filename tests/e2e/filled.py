@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from service import jobs
-from service.datasets import add_recording
-from service.schemas_jobs import JobIn
-from service.settings import Settings
-from service.signals.writer import FittedOutput, write_fit
-from service.storage.ledger import RunLedger, RunOutcome
+from service.core.settings import Settings
+from service.datasets.datasets import add_recording
+from service.formats.mcap import FittedOutput, write_fit
+from service.jobs import submit as jobs
+from service.jobs.schemas import JobIn
+from service.queue.leases import Claim, Progress, Queue
+from service.queue.run_writes import RunLedger, RunOutcome
+from service.repositories.history import HistoryPoint, MigrantPoint
+from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore
-from service.storage.points import HistoryPoint, MigrantPoint
-from service.storage.queue import Claim, Progress, Queue
-from service.storage.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import State
 from sysid.data.records import Channel, Recording

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from playwright.sync_api import Page, expect
 
-from service.storage.jobs import JobRepository
+from service.repositories.jobs import JobRepository
 from tests.e2e.conftest import LIMIT_SECONDS, Site
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

@@ -6,7 +6,7 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, Request, Route, expect
 
-from service.storage.jobs import JobRepository
+from service.repositories.jobs import JobRepository
 from tests.e2e.conftest import LIMIT_SECONDS, Site
 from tests.e2e.filled import MODEL, end_running, progress
 from tests.e2e.test_form import EQUATIONS, opened, write_own

@@ -6,8 +6,8 @@ import re
 import pytest
 from playwright.sync_api import Page, expect
 
-from service.storage.jobs import JobRepository
-from service.storage.queue import Queue
+from service.queue.leases import Queue
+from service.repositories.jobs import JobRepository
 from service.storage.tables import State
 from tests.e2e.conftest import Site
 from tests.e2e.filled import TRUE, end_running, progress

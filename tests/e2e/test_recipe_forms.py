@@ -6,7 +6,7 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
-from service.storage.jobs import JobRepository
+from service.repositories.jobs import JobRepository
 from tests.e2e.conftest import LIMIT_SECONDS, Site
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from service.reaping import reap
+from service.queue.orphaned_jobs import reap
 from service.storage.columns import utc_now
 from service.storage.tables import Checkpoint, State
 from tests.dispatching import Place, until

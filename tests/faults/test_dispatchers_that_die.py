@@ -7,9 +7,9 @@ from datetime import timedelta
 
 import pytest
 
+from service.queue.leases import Queue
+from service.queue.run_writes import Cell, RunLedger, RunOutcome
 from service.storage.errors import LeaseLost
-from service.storage.ledger import Cell, RunLedger, RunOutcome
-from service.storage.queue import Queue
 from service.storage.sessions import Database
 from service.storage.tables import State
 from tests.stored import job_of, runs_of, submit

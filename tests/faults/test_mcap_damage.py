@@ -17,10 +17,10 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Chunk, DataEnd, Footer, Header, McapRecord, Message, Metadata, Schema
 from mcap.writer import CompressionType
 
-from service.signals.errors import InvalidUpload
-from service.signals.limits import DEFAULT_LIMITS, Limits
-from service.signals.mcap_file import MAGIC
-from service.signals.reader import read_mcap
+from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS, Limits
+from service.formats.mcap import read_mcap
+from service.formats.mcap_writer import MAGIC
 from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from service import supervision
-from service.settings import Settings
-from service.supervision import Supervisor, environment_of
+from service.core.settings import Settings
+from service.dispatch import supervisor as supervision
+from service.dispatch.supervisor import Supervisor, environment_of
 from workers.processes import of_session
 
 LIMIT_SECONDS = 40.0
@@ -27,7 +27,7 @@ time.sleep(60)
 
 OWNER = """
 import sys, time
-from service.supervision import Supervisor
+from service.dispatch.supervisor import Supervisor
 supervisor = Supervisor([sys.executable, "-c", sys.argv[2], sys.argv[1]], {})
 supervisor.start()
 time.sleep(60)

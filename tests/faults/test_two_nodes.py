@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from service.dispatch.supervisor import environment_of
 from service.storage.tables import Run, State
-from service.supervision import environment_of
 from tests.dispatching import Place, until
 from tests.two_nodes import two_nodes
 
@@ -20,7 +20,8 @@ ALGORITHM = {"generations": 1500, "islands": 2, "stop": {"settled": None}}
 
 JOIN = """
 import sys
-from workers.cluster import ClusterSettings, RayCrew
+from workers.cluster import ClusterSettings
+from workers.cluster import RayCrew
 from workers.errors import ClusterUnavailable
 try:
     RayCrew(ClusterSettings(sys.argv[1]))
@@ -31,8 +32,8 @@ except ClusterUnavailable as error:
 
 def plain(place: Place, job: str) -> list[dict[str, Any]]:
     """What the job's runs give in this process, without Ray."""
-    from service.dispatch.claiming import Leases
-    from service.dispatcher import Dispatcher
+    from service.dispatch.dispatcher import Dispatcher
+    from service.dispatch.leases import Leases
     from workers.inline import InlineCrew
 
     dispatcher = Dispatcher(place.database, place.store, InlineCrew(), Leases(place.database, 30))
@@ -98,7 +99,7 @@ def log_of(place: Place) -> str:
 
 @pytest.mark.parametrize(
     "command",
-    [["service.dispatcher_process"], ["service.cli.main", "dispatcher"]],
+    [["service.dispatch.process"], ["service.cli.main", "dispatcher"]],
     ids=["module", "lagid"],
 )
 @pytest.mark.parametrize(

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.signals.errors import InvalidUpload
-from service.signals.limits import DEFAULT_LIMITS, MIB
-from service.signals.upload import Kind, read_untrusted
+from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS, MIB
+from service.formats.sandbox import Kind, read_untrusted
 from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
 

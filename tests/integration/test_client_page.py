@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import uvicorn
 
-from service.api.deps import Parts
-from service.app import create_app
-from service.client import Client
-from service.storage.jobs import JobRepository
+from service.api.app import create_app
+from service.api.dependencies import Parts
+from service.client.client import Client
+from service.repositories.jobs import JobRepository
 from service.storage.tables import State
 from tests.identified import carried_out
 from tests.rest import settings_of

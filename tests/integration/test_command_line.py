@@ -15,7 +15,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.embedded import free_port
+from service.client.embedded import free_port
 from tests.rest import recording
 
 pytestmark = pytest.mark.slow  # processes of their own

@@ -4,12 +4,12 @@ from datetime import timedelta
 
 import pytest
 
-from service.storage.datasets import DatasetRepository
+from service.queue.leases import Queue
+from service.queue.run_writes import RunLedger, RunOutcome
+from service.repositories.datasets import DatasetRepository
+from service.repositories.jobs import JobRepository
 from service.storage.garbage import collect, lost, orphans
-from service.storage.jobs import JobRepository
-from service.storage.ledger import RunLedger, RunOutcome
 from service.storage.objects import open_store
-from service.storage.queue import Queue
 from service.storage.tables import State
 from tests.stored import claimed, new_dataset
 

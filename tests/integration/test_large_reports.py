@@ -12,12 +12,12 @@ import httpx
 import pytest
 from fastapi.testclient import TestClient
 
-from service import jobs
-from service.app import create_app
-from service.schemas_jobs import JobIn
-from service.storage.ledger import RunLedger, RunOutcome
-from service.storage.queue import Claim, Queue
-from service.storage.runs import RunRepository
+from service.api.app import create_app
+from service.jobs import submit as jobs
+from service.jobs.schemas import JobIn
+from service.queue.leases import Claim, Queue
+from service.queue.run_writes import RunLedger, RunOutcome
+from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import State
 from tests.rest import recording, settings_of

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.signals.csv_reader import read_csv
+from service.formats.csv_recordings import read_csv
 from sysid.data.derivations import derive
 from sysid.data.records import Recording
 

@@ -7,9 +7,9 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from sqlalchemy import text
 
+from service.repositories.history import PHASES
+from service.repositories.runs import RunRepository
 from service.storage import migrate, sessions
-from service.storage.points import PHASES
-from service.storage.runs import RunRepository
 
 BEFORE = "0006"
 HISTORY = [

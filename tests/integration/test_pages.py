@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from service.app import create_app
-from service.datasets import add_recording
-from service.settings import Settings
+from service.api.app import create_app
+from service.core.settings import Settings
+from service.datasets.datasets import add_recording
+from service.pages import render as assets
 from service.storage.tables import Job
-from service.web import assets
 from sysid.data.records import Channel, Recording
 from tests.e2e.filled import Filled, fill
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from service.client import Client
-from service.embedded import embedded_service
+from service.client.client import Client
+from service.client.embedded import embedded_service
 
 pytestmark = [pytest.mark.slow, pytest.mark.ray, pytest.mark.timeout(600)]
 

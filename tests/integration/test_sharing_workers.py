@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
-from service.dispatch.claiming import Leases
-from service.dispatcher import Dispatcher
-from service.storage.admission import Admission
+from service.dispatch.dispatcher import Dispatcher
+from service.dispatch.leases import Leases
+from service.queue.admission import Admission
+from service.queue.leases import Claim
 from service.storage.objects import open_store
-from service.storage.queue import Claim
 from service.storage.sessions import Database
 from service.storage.tables import State
 from tests.dispatching import LIMIT_SECONDS, Place

@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from service.app import create_app
+from service.api.app import create_app
+from service.core.concurrency import AT_ONCE, WAITING, simulating
+from service.pages.simulate import _defaults, _Known
 from service.storage.tables import Dataset
-from service.turns import AT_ONCE, WAITING, simulating
-from service.web.simulate_page import _defaults, _Known
 from sysid.models.catalogue.load import load_model
 from sysid.search import refine as refinement
 from sysid.search.refine import refine

@@ -15,7 +15,8 @@ import hashlib
 import numpy as np
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
-from sysid.data.records import Channel, Record
+from sysid.data.records import Channel
+from sysid.data.records import Record
 from sysid.core.settings import GeneticAlgorithm
 
 times = 0.01 * np.arange(20_000)

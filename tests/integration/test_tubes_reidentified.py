@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from starlette.testclient import TestClient
 
-from service.app import create_app
+from service.api.app import create_app
 from tests.identified import carried_out
 from tests.rest import CSV, settings_of
 

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from service.signals.csv_reader import read_csv
-from service.signals.errors import InvalidUpload
+from service.formats.csv_recordings import read_csv
+from service.formats.errors import InvalidUpload
 
 VALUES = st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=30)
 

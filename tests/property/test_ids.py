@@ -7,8 +7,8 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.storage import ids
-from service.storage.ids import new_id, new_ids
+from service.storage import statements as ids
+from service.storage.statements import new_id, new_ids
 
 
 def test_an_identifier_is_a_prefix_and_26_characters_without_lookalikes():

@@ -5,8 +5,8 @@ from math import prod
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.sweeps import positions_of
-from service.unmade import below
+from service.jobs.axes import positions_of
+from service.sweeps.groups import below
 
 
 @given(st.lists(st.integers(1, 4), max_size=4), st.data())

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from mcap.reader import make_reader
 
-from service.signals import mcap_file
-from service.signals.clock import clock_for
-from service.signals.reader import read_recording
+from service.formats import mcap_writer as mcap_file
+from service.formats.mcap import read_recording
+from service.formats.topics import clock_for
 from sysid.data.records import HOLDS, Channel, History, Recording
 from tests.mcap_files import recorded
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from service.dispatch.aside import Aside
+from service.dispatch.background import Aside
 from service.storage.columns import Document
 
 LIMIT_SECONDS = 30.0

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.chains import Chain
-from service.schemas_jobs import Axis
-from service.sweeps import Cell, Step, expand, grouped, values_of
+from service.jobs.axes import Cell, Step, expand, grouped, values_of
+from service.jobs.schemas import Axis
+from service.jobs.warm_start_order import Chain
 
 DATA = Axis(path="/datasets", values=["a", "b", "c"])
 SEEDS = Axis(path="/seed", range=[0, 4])

@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.comparison import _furthest, _plus_minus
+from service.runs.comparison import _furthest, _plus_minus
 
 
 def estimate(value: float, stderr: float | None) -> dict[str, object]:

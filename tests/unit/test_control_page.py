@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from service.schemas_simulations import ControlIn, RunSimulateIn
+from service.control.schemas import ControlIn, RunSimulateIn
 
 PAGE = (Path(__file__).parents[2] / "docs/control.md").read_text(encoding="utf-8")
 

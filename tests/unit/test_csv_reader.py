@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.signals.csv_reader import read_csv
-from service.signals.errors import InvalidUpload
+from service.formats.csv_recordings import read_csv
+from service.formats.errors import InvalidUpload
 
 
 def refused(content: str | bytes, **options: object) -> InvalidUpload:

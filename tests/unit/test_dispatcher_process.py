@@ -9,8 +9,8 @@ from workers.cluster import RayCrew
 
 
 def test_nothing_heavy_is_imported_before_ray_starts() -> None:
-    heavy = "{'ray', 'numpy', 'numba', 'sqlalchemy', 'service.dispatcher'}"
-    code = f"import sys, service.dispatcher_process; assert not {heavy} & set(sys.modules)"
+    heavy = "{'ray', 'numpy', 'numba', 'sqlalchemy', 'service.dispatch.dispatcher'}"
+    code = f"import sys, service.dispatch.process; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 

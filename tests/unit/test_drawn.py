@@ -6,9 +6,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from service.web.drawn import POINTS, drawing, is_drawable, text_of
-from service.web.drawn_axes import axes_of, label_of
-from service.web.figures import layout
+from service.figures.plotly import layout
+from service.figures.svg import POINTS, axes_of, drawing, is_drawable, label_of, text_of
 
 BOX = (100.0, 500.0, 20.0, 220.0)
 SVG = "{http://www.w3.org/2000/svg}"

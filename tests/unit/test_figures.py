@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.web import figures, figures_signals
-from service.web.decimation import MAX_POINTS, strided, thinned, window
-from service.web.evidence import (
+from service.figures import plotly as figures
+from service.figures import signals as figures_signals
+from service.figures.data import (
     Experiment,
     Improvement,
     OutputTraces,
@@ -15,8 +15,8 @@ from service.web.evidence import (
     SoughtParameter,
     Trace,
 )
-from service.web.reading import fitness_of
-from service.web.theme import DASHES, SERIES, series_style
+from service.figures.theme import DASHES, MAX_POINTS, SERIES, series_style, strided, thinned, window
+from service.pages.figure_data import fitness_of
 
 
 def island(points: int, start: float = 100.0) -> list[Improvement]:

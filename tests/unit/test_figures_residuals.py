@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.web import figures
-from service.web.evidence import CorrelationTrace
-from service.web.figures_residuals import residuals, residuals_height
-from service.web.findings import chance, findings_of
+from service.figures import plotly as figures
+from service.figures.data import CorrelationTrace
+from service.figures.residuals import residuals, residuals_height
+from service.pages.diagnostics import chance, findings_of
 
 
 def trace(

@@ -2,7 +2,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.web import formats
+from service.figures import formats
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.inputs import sampled
+from service.datasets.waveforms import sampled
 from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
-from service.schemas_datasets import DeriveIn
-from service.schemas_jobs import JobIn
+from service.datasets.schemas import DeriveIn
+from service.jobs.schemas import JobIn
 from sysid.data.derivations import STEPS, derive
 from sysid.data.records import Channel, Recording, Segment
 

@@ -8,9 +8,9 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.writer import CompressionType
 
-from service.signals.errors import InvalidUpload
-from service.signals.limits import DEFAULT_LIMITS
-from service.signals.reader import read_mcap
+from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS
+from service.formats.mcap import read_mcap
 from sysid.data.records import Recording
 from tests.mcap_files import foreign, json_messages
 

@@ -10,9 +10,15 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
-from service.signals import mcap_file
-from service.signals.reader import read_fit, read_metadata, read_recording
-from service.signals.writer import FittedOutput, write_fit, write_recording
+from service.formats import mcap_writer as mcap_file
+from service.formats.mcap import (
+    FittedOutput,
+    read_fit,
+    read_metadata,
+    read_recording,
+    write_fit,
+    write_recording,
+)
 from sysid.data.records import Channel, History, Recording, Segment
 from tests.mcap_files import recorded
 

@@ -4,10 +4,10 @@ import pytest
 import typer
 
 from service.cli.sweeps import grid, tables_of
-from service.floors import Floors, at_sigma
-from service.schemas_summaries import GroupOut, ParameterSummaryOut, SummaryOut
-from service.web.figures_noise import NORMAL_95, noise_keys, noise_sweep
-from service.web.theme import DASHES
+from service.figures.noise import NORMAL_95, noise_keys, noise_sweep
+from service.figures.theme import DASHES
+from service.sweeps.cramer_rao import Floors, at_sigma
+from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
 
 SIGMAS = (0.0, 0.5, 1.0)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.signals.csv_reader import read_csv
+from service.formats.csv_recordings import read_csv
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold, Record
 from sysid.models.catalogue.load import load_model

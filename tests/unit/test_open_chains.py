@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.chains import Chain
-from service.dispatch.open_chains import MOST_OPEN, OpenChains
+from service.dispatch.warm_starts import MOST_OPEN, OpenChains
+from service.jobs.warm_start_order import Chain
 
 SHAPES = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 6))
 """Values of the axes slower than the chain's, of its own, and of those faster."""

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from service.paper import figures, forces, noise, oscillators, published, study
+from service.datasets.schemas import SimulateIn
+from service.jobs.schemas import JobIn
+from service.paper import figures, noise, oscillators, published, study
+from service.paper import force_noise as forces
 from service.paper.bench import Found, Improvement, champions
-from service.paper.bound import cramer_rao
-from service.paper.parts import Check, Section, Table, markdown
-from service.schemas_datasets import SimulateIn
-from service.schemas_jobs import JobIn
+from service.paper.cramer_rao import cramer_rao
+from service.paper.document import Check, Section, Table, markdown
 from sysid.data.records import Channel
 from sysid.models.catalogue.load import document, load_model
 from sysid.models.parse import parse_model

@@ -8,7 +8,7 @@ import pytest
 from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError, InterfaceError, OperationalError
 
-from service.storage import patience
+from service.storage import retry as patience
 from service.storage.sessions import Database, sqlite_url
 
 

@@ -6,11 +6,12 @@ import httpx
 import pytest
 import typer
 
-from service.calls import NotFinite, ProblemError
-from service.cli import exporting, identify, sweeps
-from service.cli.places import Places, in_file, told_at
-from service.client import Client
-from service.errors import FieldError
+from service.cli import identify, sweeps
+from service.cli import runs as exporting
+from service.cli.common import Places, in_file, told_at
+from service.client.calls import NotFinite, ProblemError
+from service.client.client import Client
+from service.core.errors import FieldError
 
 
 @pytest.mark.parametrize(
@@ -29,7 +30,7 @@ def test_a_pointer_is_told_as_the_option_that_gives_it(pointer: str, place: str)
 
 
 def test_every_field_that_an_option_gives_is_told_at_that_option() -> None:
-    from service.schemas_noise import NoiseSweepIn
+    from service.sweeps.schemas import NoiseSweepIn
 
     by_options = {place.split("/")[1] for place in sweeps.PLACES.options}
     by_set = {"hold", "parameters", "prediction", "loss", "weights", "skip", "algorithm",

@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.pointers import escaped, explained
-from service.schemas_jobs import JobIn
+from service.core.validation import escaped, explained
+from service.jobs.schemas import JobIn
 
 
 def faults(**changes: Any) -> dict[str, str]:

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.storage.points import (
+from service.repositories.history import (
     PHASES,
     HistoryPoint,
     MigrantPoint,

@@ -9,9 +9,11 @@ from typing import Any
 import httpx
 import pytest
 
-from service import async_client as asynchronous
-from service import client as synchronous
-from service.client import AsyncClient, Client, ProblemError, ServerUnreachable
+from service.client import async_client as asynchronous
+from service.client import client as synchronous
+from service.client.async_client import AsyncClient
+from service.client.calls import ProblemError, ServerUnreachable
+from service.client.client import Client
 from tests.rest import awaited
 
 JOB = {"id": "job_1", "state": "queued"}

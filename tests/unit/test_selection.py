@@ -6,8 +6,8 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from service.models import resolved
-from service.web.findings import findings_of
+from service.models.models import resolved
+from service.pages.diagnostics import findings_of
 from sysid.core.errors import InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record

@@ -7,9 +7,8 @@ import pytest
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core._pydantic_core import list_all_errors
 
-from service.pointers import explained
-from service.schemas_jobs import JobIn
-from service.sentences import OWN_KINDS, detail_of
+from service.core.validation import OWN_KINDS, detail_of, explained
+from service.jobs.schemas import JobIn
 
 
 def told(kind: Any, value: Any) -> str:

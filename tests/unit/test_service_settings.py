@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from service.conversion import algorithm_of, loss_of
-from service.errors import Misconfigured
-from service.schemas_jobs import JobIn
-from service.settings import Settings, is_loopback
+from service.core.errors import Misconfigured
+from service.core.settings import Settings, is_loopback
+from service.jobs.schemas import JobIn
+from service.jobs.to_core import algorithm_of, loss_of
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import GeneticAlgorithm, IslandChange, Loss, Migration, Stop
 
@@ -52,13 +52,13 @@ def test_changes_of_single_islands_reach_the_core() -> None:
 
 def test_the_client_loads_neither_numpy_nor_ray_nor_the_core() -> None:
     heavy = "{'numpy', 'ray', 'sysid', 'fastapi', 'sqlalchemy', 'pydantic'}"
-    code = f"import sys, service.client; assert not {heavy} & set(sys.modules)"
+    code = f"import sys, service.client.client; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 def test_the_web_application_loads_neither_ray_nor_the_compiler() -> None:
     heavy = "{'ray', 'workers.tasks', 'workers.cluster', 'numba', 'llvmlite'}"
-    code = f"import sys, service.app; assert not {heavy} & set(sys.modules)"
+    code = f"import sys, service.api.app; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.dispatch import signals
-from service.dispatch.signals import Place, Shelf
+from service.dispatch import fitted_signals as signals
+from service.dispatch.fitted_signals import Place, Shelf
 from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import StoredObject
 

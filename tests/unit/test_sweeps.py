@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.errors import InvalidRequest
-from service.schemas_jobs import JobIn
-from service.sweeps import Cell, body_of, count, expand, groups_of, steps_of
+from service.core.errors import InvalidRequest
+from service.core.json_pointer import body_of
+from service.jobs.axes import Cell, count, expand, groups_of, steps_of
+from service.jobs.schemas import JobIn
 
 
 def job(*axes: dict[str, Any], **fields: Any) -> JobIn:

@@ -7,11 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from service import temporary
+from service.core import temporary_files as temporary
 from workers import local_ray, processes
 from workers.errors import ClusterUnavailable
 
-LEAVE = "import sys; from service import temporary; open(sys.argv[1] + temporary.prefix(), 'w')"
+LEAVE = """
+import sys
+from service.core import temporary_files
+open(sys.argv[1] + temporary_files.prefix(), "w")
+"""
 ELSEWHERE = "another boot pid:[4026531836]"
 
 

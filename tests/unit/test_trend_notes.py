@@ -4,8 +4,8 @@ from math import inf
 
 import pytest
 
-from service.trend_notes import quantity_notes
-from service.trend_points import Point, Quantity
+from service.trends.notes import quantity_notes
+from service.trends.points import Point, Quantity
 from sysid.trends.trend import Estimate, fit_trend
 
 BOUNDS = (0.0, 1.0)

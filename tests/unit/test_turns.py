@@ -5,9 +5,9 @@ from threading import BoundedSemaphore, Event, Semaphore
 
 import pytest
 
-from service import turns as module
-from service.errors import Busy
-from service.turns import Turns
+from service.core import concurrency as module
+from service.core.concurrency import Turns
+from service.core.errors import Busy
 
 
 def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused(

@@ -1,6 +1,6 @@
 """What pages call the fields that distinguish a run."""
 
-from service.web.views import cell_text
+from service.pages.views import cell_text
 
 
 def test_fields_are_told_by_their_last_part_and_those_that_end_alike_in_full() -> None:

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from service.chains import Chain
-from service.dispatch.open_chains import OpenChains
+from service.dispatch.warm_starts import OpenChains
+from service.jobs.warm_start_order import Chain
 from tests.runs import RECORDS, Notebook, spec
 from tests.unit.test_feeding import ScriptedCrew, fails, finish, jobs
 from workers.feeding import Feeder

@@ -4,9 +4,8 @@ from typing import Any
 
 import pytest
 
-from service.cli.many_runs import MOST_KINDS, print_many
-from service.cli.one_run import tell_reused
-from service.cli.watching import EVERY_S, Lines, Many
+from service.cli.tables import MOST_KINDS, print_many, tell_reused
+from service.cli.watch import EVERY_S, Lines, Many
 
 
 def job(state: str, finished: int = 0, **progress: Any) -> dict[str, Any]:

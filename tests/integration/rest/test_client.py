@@ -7,8 +7,10 @@ import httpx
 import pytest
 from starlette.testclient import TestClient
 
-from service import calls
-from service.client import AsyncClient, Client, NotFinite, ProblemError, ServerUnreachable
+from service.client import calls
+from service.client.async_client import AsyncClient
+from service.client.calls import NotFinite, ProblemError, ServerUnreachable
+from service.client.client import Client
 from tests.rest import awaited, recording
 
 MANY = {"axes": [{"path": "/seed", "range": [0, 600]}]}

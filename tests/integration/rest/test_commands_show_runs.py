@@ -10,11 +10,12 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner, Result
 
-from service.app import create_app
+from service.api.app import create_app
+from service.cli.common import Places
 from service.cli.main import app as program
-from service.cli.places import Places
-from service.cli.trends import print_trend
-from service.client import Client, ProblemError
+from service.cli.tables import print_trend
+from service.client.calls import ProblemError
+from service.client.client import Client
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
 from tests.rest import CSV, recording, settings_of

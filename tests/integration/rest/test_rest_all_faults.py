@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.errors import FieldError
-from service.partial import beside
-from service.schemas_jobs import JobIn
+from service.core.errors import FieldError
+from service.core.partial_bodies import beside
+from service.jobs.schemas import JobIn
 from tests.rest import refused
 
 SWEEP = {"sigma": [0.1], "replicates": 2}

@@ -7,8 +7,8 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.api.deps import Parts
-from service.app import create_app
+from service.api.app import create_app
+from service.api.dependencies import Parts
 from service.cli.main import app as lagid
 from tests.identified import identified
 from tests.rest import CSV, recording, refused, settings_of

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.api.body_limit import BodyLimit
-from service.app import create_app
-from service.errors import TooLarge
-from service.settings import Settings
+from service.api.app import create_app
+from service.api.middleware import BodyLimit
+from service.core.errors import TooLarge
+from service.core.settings import Settings
 from tests.rest import CSV, awaited, recording, refused, settings_of
 
 LIMIT = 20_000

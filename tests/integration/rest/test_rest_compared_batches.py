@@ -7,7 +7,7 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.app import create_app
+from service.api.app import create_app
 from service.cli.main import app as lagid
 from tests.integration.rest.test_rest_reidentify import (
     BODY,
@@ -162,7 +162,7 @@ def test_a_run_that_cannot_be_accepted_is_told_before_anything_is_sent(
     def connected(*_: object) -> None:
         raise AssertionError("sent before it was checked")
 
-    monkeypatch.setattr("service.cli.reidentifying.connected", connected)
+    monkeypatch.setattr("service.cli.reidentify.connected", connected)
     told = CliRunner().invoke(
         lagid, ["reidentify", "--model", "tube", "--label", "length_m", *words]
     )  # fmt: skip
@@ -204,7 +204,7 @@ def test_a_reference_batch_that_is_too_large_for_a_trend_is_a_note(
     batch = [{"x": x, "datasets": served.datasets[x][:1]} for x in LENGTHS[:3]]
     reference = run_at(served, served.job, 2.0)
     job = batch_of(served.server, served.parts, batch=batch, reference=reference)
-    monkeypatch.setattr("service.trends.MOST_RUNS", 3)
+    monkeypatch.setattr("service.trends.trend.MOST_RUNS", 3)
     found = trend(served, job)
     (note,) = found["notes"]
     assert "has 4 runs" in note

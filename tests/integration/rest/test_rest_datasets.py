@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.datasets import told_again
-from service.signals.reader import read_recording
+from service.datasets.datasets import told_again
+from service.formats.mcap import read_recording
+from service.repositories.datasets import Stored
 from service.storage.columns import utc_now
-from service.storage.datasets import Stored
 from service.storage.tables import Dataset
 from tests.rest import CSV, recording, refused
 

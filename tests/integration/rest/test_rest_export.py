@@ -12,9 +12,11 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.app import create_app
+from service.api.app import create_app
 from service.cli.main import app as commands
-from service.client import AsyncClient, Client, ProblemError
+from service.client.async_client import AsyncClient
+from service.client.calls import ProblemError
+from service.client.client import Client
 from tests.exporting import in_control, in_python
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
@@ -149,7 +151,7 @@ def test_the_command_writes_a_file_or_to_stdout(
     served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client = Client("http://testserver", transport=Through(served.server))
-    monkeypatch.setattr("service.cli.exporting.connected", lambda *_: nullcontext(client))
+    monkeypatch.setattr("service.cli.runs.connected", lambda *_: nullcontext(client))
     told = export(served, served.run, format="python").text
     run = CliRunner().invoke
     shown = run(commands, ["export", served.run, "--format", "python"])

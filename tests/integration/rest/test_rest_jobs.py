@@ -4,10 +4,10 @@ from typing import Any
 
 from starlette.testclient import TestClient
 
-from service.api.deps import Parts
-from service.storage.ledger import RunLedger
-from service.storage.points import HistoryPoint
-from service.storage.queue import Queue
+from service.api.dependencies import Parts
+from service.queue.leases import Queue
+from service.queue.run_writes import RunLedger
+from service.repositories.history import HistoryPoint
 from service.storage.tables import State
 from tests.rest import CSV, recording, refused
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.app import create_app
+from service.api.app import create_app
 from tests.rest import CSV, recording, refused, settings_of
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.api.deps import Parts
-from service.app import create_app
+from service.api.app import create_app
+from service.api.dependencies import Parts
 from tests.identified import identified
 from tests.rest import CSV, refused, settings_of
 from tests.unit.test_noise_choice import LAG, STEP, TANK, N, disturbed, plant, signal

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.api.deps import Parts
-from service.app import create_app
-from service.recordings import recording_of
+from service.api.app import create_app
+from service.api.dependencies import Parts
+from service.datasets.recordings import recording_of
 from tests.identified import carried_out
 from tests.rest import CSV, recording, refused, settings_of
 
@@ -124,8 +124,9 @@ def test_a_relative_deviation_reads_no_more_than_a_request_may(
 ) -> None:
     body = {**BODY, "truth": None, "datasets": [dataset], "relative": True}
     assert server.post(URL, json=body).status_code == 202
-    monkeypatch.setattr("service.recipes.spread.MOST_VALUES", 599)  # 300 samples of two channels
-    monkeypatch.setattr("service.recipes.spread.recording_of", None)
+    # 300 samples of two channels
+    monkeypatch.setattr("service.sweeps.output_spread.MOST_VALUES", 599)
+    monkeypatch.setattr("service.sweeps.output_spread.recording_of", None)
     (fault,) = refused(server.post(URL, json=body), 422, "invalid")
     assert fault["pointer"] == "/relative"
     assert "600 values in all" in fault["detail"]
@@ -140,7 +141,7 @@ def test_recordings_are_read_while_no_session_is_open(
         seen.append(parts.database.engine.pool.checkedout())
         return recording_of(*given)
 
-    monkeypatch.setattr("service.recipes.spread.recording_of", noted)
+    monkeypatch.setattr("service.sweeps.output_spread.recording_of", noted)
     body = {**BODY, "truth": None, "datasets": [dataset], "relative": True}
     assert server.post(URL, json=body).status_code == 202
     assert seen == [0]

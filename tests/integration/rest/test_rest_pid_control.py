@@ -10,11 +10,11 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.app import create_app
+from service.api.app import create_app
 from service.cli import runs as program
-from service.client import Client
-from service.run_simulations import _request
-from service.schemas_simulations import RunSimulateIn
+from service.client.client import Client
+from service.control.schemas import RunSimulateIn
+from service.control.simulate import _request
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
 from tests.rest import refused, settings_of

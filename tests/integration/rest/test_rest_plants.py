@@ -9,8 +9,8 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
 from service.cli import datasets as program
-from service.client import Client
-from service.signals.reader import read_recording
+from service.client.client import Client
+from service.formats.mcap import read_recording
 from sysid.data.records import Recording
 from tests.integration.rest.test_client import Through
 from tests.rest import refused

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.models import model_of_run
+from service.models.models import model_of_run
 from service.storage.tables import Job, Run, State
 from sysid.models.parse import parse_model, with_terms
 from tests.polynomials import document, frols

@@ -7,10 +7,10 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-import service.profiles
-from service.app import create_app
+import service.runs.profiles
+from service.api.app import create_app
 from service.cli.runs import app as runs_app
-from service.client import Client
+from service.client.client import Client
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
 from tests.rest import CSV, recording, refused, settings_of
@@ -101,10 +101,10 @@ def test_a_profile_that_cannot_be_had_is_refused(
     fault = refused(served.server.post(url, json={"points": 2}), 422, "invalid")[0]
     assert fault["pointer"] == "/points"
     refused(served.server.post("/v1/runs/run_0:profile", json={}), 404, "not-found")
-    monkeypatch.setattr(service.profiles, "SECONDS", -1.0)
+    monkeypatch.setattr(service.runs.profiles, "SECONDS", -1.0)
     fault = refused(served.server.post(url, json={"parameters": ["L"]}), 422, "invalid")[0]
     assert "were stopped at 'L'" in fault["detail"]
-    monkeypatch.setattr(service.profiles, "MOST_WORK", 10)
+    monkeypatch.setattr(service.runs.profiles, "MOST_WORK", 10)
     fault = refused(served.server.post(url, json={}), 422, "invalid")[0]
     assert "need at most 10" in fault["detail"]
 

@@ -11,11 +11,12 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.api.deps import Parts
-from service.app import create_app
-from service.cli import references, reidentifying
+from service.api.app import create_app
+from service.api.dependencies import Parts
+from service.cli import reidentify as references
+from service.cli import reidentify as reidentifying
 from service.cli.main import app as lagid
-from service.client import Client
+from service.client.client import Client
 from tests.identified import carried_out
 from tests.integration.rest.test_client import Through
 from tests.rest import CSV, refused, settings_of

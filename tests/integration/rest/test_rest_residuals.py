@@ -13,11 +13,11 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.api.deps import Parts
-from service.app import create_app
-from service.async_client import AsyncClient
+from service.api.app import create_app
+from service.api.dependencies import Parts
 from service.cli.runs import app as runs_app
-from service.client import Client
+from service.client.async_client import AsyncClient
+from service.client.client import Client
 from service.storage.errors import ObjectMissing
 from service.storage.objects import ObjectStore
 from sysid.data.records import Recording
@@ -205,7 +205,7 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
     def lost(store: ObjectStore, sha256: str) -> Recording:
         raise ObjectMissing(sha256)
 
-    monkeypatch.setattr("service.residuals.recording_of", lost)
+    monkeypatch.setattr("service.runs.residuals.recording_of", lost)
     asked = served.server.get(f"/v1/runs/{served.runs[0]}/residuals").json()
     assert [one["test"] for one in asked["tests"]] == ["whiteness"]
     assert "not to be had any more" in asked["note"]

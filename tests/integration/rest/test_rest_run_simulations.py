@@ -11,10 +11,10 @@ import pytest
 from starlette.testclient import TestClient
 from typer.testing import CliRunner
 
-from service.app import create_app
+from service.api.app import create_app
 from service.cli import runs as program
-from service.client import Client
-from service.signals.reader import read_recording
+from service.client.client import Client
+from service.formats.mcap import read_recording
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
 from tests.rest import CSV, recording, refused, settings_of

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.api.deps import Parts
-from service.app import create_app
-from service.signals.reader import read_fit
+from service.api.app import create_app
+from service.api.dependencies import Parts
+from service.formats.mcap import read_fit
+from service.repositories.runs import RunRepository
 from service.storage.errors import ObjectStoreFailed
-from service.storage.runs import RunRepository
 from service.storage.tables import Run
 from tests.identified import identified
 from tests.rest import CSV, recording, settings_of

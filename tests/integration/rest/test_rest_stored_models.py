@@ -4,7 +4,7 @@ from typing import Any
 
 from starlette.testclient import TestClient
 
-from service.storage.models import ModelRepository
+from service.repositories.models import ModelRepository
 
 OLD: dict[str, Any] = {
     "name": "old", "form": "difference", "inputs": {"u": "V"}, "states": {"x": "V"},

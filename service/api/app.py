@@ -1,0 +1,87 @@
+"""The web application: parts opened and closed, routes joined, errors made problem documents."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from datetime import timedelta
+from importlib.metadata import version
+
+from fastapi import FastAPI
+from starlette.concurrency import run_in_threadpool
+
+from service.api import (
+    datasets,
+    events,
+    health,
+    jobs,
+    models,
+    pages,
+    problems,
+    recipes,
+    references,
+    runs,
+)  # fmt: skip
+from service.api.dependencies import Parts
+from service.api.middleware import BodyLimit
+from service.core.settings import Settings
+from service.queue.orphaned_jobs import Reaper
+from service.storage.open_storage import open_storage
+
+DESCRIPTION = (
+    "Identification of nonlinear time-lag systems. Send a recording, name a model or write its "
+    "equations, submit a job, read the estimates with their standard errors. Errors are RFC 9457 "
+    "problem documents."
+)
+
+
+def create_app(settings: Settings | None = None) -> FastAPI:
+    """The application with these settings; by default those of the environment.
+
+    Its lifespan opens database and store and brings the tables to this version. `app.state.parts`
+    holds them while it runs.
+    """
+    chosen = settings or Settings()
+    app = FastAPI(
+        title="lagid",
+        version=version("lagid"),
+        description=DESCRIPTION,
+        lifespan=_lifespan(chosen),
+        separate_input_output_schemas=False,
+        docs_url=None,  # FastAPI's own page loads its scripts from elsewhere; ours is at /docs
+        redoc_url=None,
+    )
+    problems.install(app)
+    app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
+    # Exact REST paths come first: a page's path may have parameters.
+    for router in (
+        health.router, datasets.router, models.router, jobs.router, recipes.router,
+        references.router, events.router, runs.comparison_router, runs.router, pages.router,
+    ):  # fmt: skip
+        app.include_router(router)
+    return app
+
+
+def open_parts(settings: Settings) -> Parts:
+    """Open database and object store, making the data folder and the tables where needed.
+
+    Raises
+    ------
+    Misconfigured
+        If the data folder is not writable.
+    """
+    return Parts(settings, *open_storage(settings))
+
+
+def _lifespan(settings: Settings):  # type: ignore[no-untyped-def]
+    @asynccontextmanager
+    async def run(app: FastAPI) -> AsyncIterator[None]:
+        app.state.parts = parts = await run_in_threadpool(open_parts, settings)
+        reaper = Reaper(parts.database, timedelta(seconds=settings.lease_seconds), parts.stopping)
+        reaper.start()
+        try:
+            yield
+        finally:
+            parts.stopping.set()
+            reaper.join()
+            parts.database.dispose()
+
+    return run

@@ -1,0 +1,55 @@
+"""What routes ask for: the parts of the service, sessions, and page cursors."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from threading import Event
+from typing import Annotated
+
+from fastapi import Depends, Query, Request
+from sqlalchemy.orm import Session
+
+from service.core.settings import Settings
+from service.storage.objects import ObjectStore
+from service.storage.sessions import Database
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The service's parts, one of each per process.
+
+    `stopping` is set as soon as the process is asked to end: open event streams then close.
+    """
+
+    settings: Settings
+    database: Database
+    store: ObjectStore
+    stopping: Event = field(default_factory=Event)
+
+
+def parts(request: Request) -> Parts:
+    """The parts of this process."""
+    found: Parts = request.app.state.parts
+    return found
+
+
+PartsDep = Annotated[Parts, Depends(parts)]
+
+
+def _reading(found: PartsDep) -> Iterator[Session]:
+    with found.database.read() as session:
+        yield session
+
+
+def _writing(found: PartsDep) -> Iterator[Session]:
+    """One session and one transaction per request: commit if the route returns, else roll back."""
+    with found.database.write() as session:
+        yield session
+
+
+# The scope makes the commit happen before the answer is sent: what a client is told is stored.
+ReadSession = Annotated[Session, Depends(_reading, scope="function")]
+WriteSession = Annotated[Session, Depends(_writing, scope="function")]
+
+Cursor = Annotated[str | None, Query(max_length=100, description="`next` of the page before")]
+Limit = Annotated[int, Query(ge=1, le=1000, description="items a page")]
+MaxPoints = Annotated[int, Query(ge=2, le=1_000_000, description="points a line, at most")]

@@ -1,0 +1,48 @@
+"""A page as it is answered, with what a browser may load for it; also that of an error."""
+
+from collections.abc import Mapping, Sequence
+
+from fastapi import Request
+from fastapi.responses import HTMLResponse
+
+from service.core.errors import FieldError
+from service.pages.render import render
+
+NO_PAGES = ("/v1/", "/static/", "/pages/", "/healthz", "/readyz", "/metrics", "/openapi.json")
+"""Addresses, or their beginnings, that programs read and scripts load."""
+# Scripts and data come from here only. Plotly styles its own elements, hence the inline styles;
+# it writes pictures for download through blob: and data: addresses.
+PAGE_HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' data: blob:; connect-src 'self'; form-action 'self'; base-uri 'none'; "
+        "frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+class Page(HTMLResponse):
+    """A page, with what a browser may load for it."""
+
+    def __init__(
+        self, content: str, status: int = 200, headers: Mapping[str, str] | None = None
+    ) -> None:
+        super().__init__(content, status, headers={**PAGE_HEADERS, **(headers or {})})
+
+
+def is_for_people(request: Request) -> bool:
+    """Whether a browser asked for a page: then an error is told on one."""
+    accepted = request.headers.get("accept", "")
+    is_page = request.method in ("GET", "HEAD") and not request.url.path.startswith(NO_PAGES)
+    return is_page and "text/html" in accepted
+
+
+def error_page(
+    status: int, title: str, detail: str, errors: Sequence[FieldError], headers: Mapping[str, str]
+) -> Page:
+    """An error as a page, in the words of the problem document."""
+    lines = [str(one).removeprefix("?") for one in errors] or [detail]
+    return Page(render("error.html", status=status, title=title, lines=lines), status, headers)

@@ -1,0 +1,37 @@
+"""The route of batch re-identification.
+
+The route of the noise sweep.
+"""
+
+from fastapi import APIRouter, Response, status
+
+from service.api.dependencies import PartsDep
+from service.api.jobs import Key
+from service.jobs.schemas import JobOut
+from service.sweeps import noise, reidentify
+from service.sweeps.schemas import NoiseSweepIn, ReidentifyIn
+
+router = APIRouter(prefix="/v1/recipes", tags=["jobs"])
+
+
+@router.post("/noise-sweep", status_code=status.HTTP_202_ACCEPTED)
+def noise_sweep(
+    body: NoiseSweepIn, parts: PartsDep, response: Response, idempotency_key: Key = None
+) -> JobOut:
+    """Queue a job of σ × replicates × methods, from true parameters or from a dataset."""
+    job = noise.submit(parts.database, parts.store, parts.settings, body, idempotency_key)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    return job
+
+
+@router.post("/reidentify", status_code=status.HTTP_202_ACCEPTED)
+def batch(
+    body: ReidentifyIn,
+    parts: PartsDep,
+    response: Response,
+    idempotency_key: Key = None,
+) -> JobOut:
+    """Queue a run for each value of a label, warm-started, with a trend over it."""
+    job = reidentify.submit(parts.database, body, parts.settings, idempotency_key)
+    response.headers["Location"] = f"/v1/jobs/{job.id}"
+    return job

@@ -1,0 +1,304 @@
+"""`lagid reidentify`: a batch over a label, warm-started, as one job and one table.
+
+`lagid references`: runs that were accepted under a name.
+"""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.common import (
+    AsJson,
+    Key,
+    Places,
+    Url,
+    connected,
+    err,
+    estimate,
+    fail,
+    out,
+    print_json,
+    print_listing,
+    print_table,
+    put,
+    read_file,
+    told_at,
+    usage,
+)
+from service.cli.tables import print_trend, tell_reused
+from service.cli.watch import follow
+from service.client.calls import DEFAULT_URL
+from service.core.documents import read_yaml
+
+if TYPE_CHECKING:
+    from service.client.client import Client
+
+
+MODEL_SUFFIXES = (".yaml", ".yml", ".json")
+DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
+
+
+Experiments = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="X=DATA[,DATA] …",
+        help="For each value of the label its recordings, files or datasets on the server; those "
+        "joined by a comma are fitted together.",
+    ),
+]
+Model = Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")]
+Label = Annotated[str, typer.Option("--label", help="What X is, such as length_m.")]
+Reference = Annotated[
+    str | None,
+    typer.Option(help="Run (run_…) or accepted reference to start from and compare with."),
+]
+Parameters = Annotated[
+    str, typer.Option(help="Parameters to look at, by commas; by default all that are free.")
+]
+Predict = Annotated[str, typer.Option(help="Values of X to predict at, by commas.")]
+WarmStart = Annotated[
+    str | None, typer.Option(help="reference, previous or none: where each run begins.")
+]
+Channels = Annotated[str, typer.Option(help="Which channel is which signal: u=P1,y=P2.")]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="path=value of the job, as parameters.L.upper=0.5."),
+]
+Name = Annotated[str | None, typer.Option(help="Name of the job.")]
+Wait = Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")]
+Accept = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Accept a run as this reference at the end.")
+]
+AcceptRun = Annotated[
+    str | None, typer.Option(metavar="X", help="Which: that of this value of the label.")
+]
+JsonFile = Annotated[
+    str | None, typer.Option("--json", metavar="FILE", help="Write the trend; - for stdout.")
+]
+
+
+def reidentify(
+    experiments: Experiments,
+    model: Model,
+    label: Label,
+    reference: Reference = None,
+    parameters: Parameters = "",
+    predict: Predict = "",
+    warm_start: WarmStart = None,
+    channels: Channels = "",
+    changes: Changes = None,
+    name: Name = None,
+    wait: Wait = False,
+    accept: Accept = None,
+    accept_run: AcceptRun = None,
+    json_file: JsonFile = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+) -> None:
+    """Identify a model anew for several values of a label: estimates, trend, predictions, flags.
+
+    Each run begins at the reference, or at the result of its neighbour.
+    """
+    batch = [_experiments(text) for text in experiments]
+    chosen = _chosen([x for x, _ in batch], label, accept, accept_run)
+    body: dict[str, Any] = {
+        "model": _model(model), "label": label, "look_at": _names(parameters),
+        "predict": [_number("--predict", one) for one in _names(predict)],
+        "channels": dict(_pair(one) for one in _names(channels)),
+        **_given(reference=reference, warm_start=warm_start, name=name),
+    }  # fmt: skip
+    for change in changes or []:
+        put(body, change)
+    with connected(url, key) as client:
+        body["batch"] = _uploaded(client, batch)
+        with told_at(_places(experiments)):
+            job = client.reidentify(body)
+        if not (wait or accept or json_file):
+            runs = job["progress"]["runs"]
+            out.print(f"{job['id']}  {job['name']}: {runs} runs, {job['state']}", markup=False)
+            return
+        ended = follow(client, job["id"], quiet=json_file == "-")
+        _tell(client, ended, json_file)
+        if accept is not None:
+            _accept(client, ended, accept, label, chosen)
+
+
+def _places(experiments: list[str]) -> Places:
+    """Where the fields of the body stand on the command line; entries of the batch as typed."""
+    batch = {f"/batch/{number}": text for number, text in enumerate(experiments)}
+    return Places({
+        "/model": "--model …", "/label": "--label", "/look_at": "--parameters",
+        "/predict": "--predict", "/reference": "--reference", "/warm_start": "--warm-start",
+        "/name": "--name", "/channels": "--channels {}", **batch,
+    })  # fmt: skip
+
+
+def _tell(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
+    trend = client.trend(job["id"])
+    if json_file == "-":
+        print_json(trend)
+    else:
+        print_trend(trend, Places())
+        tell_reused(job, (), "--set reuse=false")
+    if json_file not in (None, "-"):
+        try:
+            Path(str(json_file)).write_text(json.dumps(trend, indent=2, ensure_ascii=False))
+        except OSError as error:
+            fail(f"{json_file} cannot be written: {error.strerror}")
+    if job["state"] != "succeeded":
+        reason = f": {job['error']}" if job["error"] else ""
+        err.print(f"lagid: {job['id']} {job['state']}{reason}", markup=False)
+        raise typer.Exit(1)
+
+
+def _chosen(given: list[float], label: str, accept: str | None, accept_run: str | None) -> float:
+    """The value of the label whose run is to be accepted: known before anything is computed."""
+    there = f"there are {', '.join(f'{x:g}' for x in sorted(set(given)))}"
+    if accept is None:
+        if accept_run is not None:
+            usage("--accept-run needs --accept NAME, the reference that the run is to be")
+        return given[0]
+    if accept_run is None and len(set(given)) > 1:
+        usage(f"--accept needs --accept-run, a value of {label}; {there}")
+    if accept_run is not None and accept_run.startswith("run_"):
+        usage(
+            f"--accept-run {accept_run}: need a value of {label}, since only a run of this batch "
+            f"can be meant; {there}. Another run: lagid references accept {accept} {accept_run}"
+        )
+    x = given[0] if accept_run is None else _number("--accept-run", accept_run)
+    if given.count(x) != 1:
+        found = f"{given.count(x)} experiments have {label} = {x:g}; {there}"
+        several = f". Accept one of their runs at the end: lagid references accept {accept} RUN"
+        usage(f"--accept-run {x:g}: {found}{several if x in given else ''}")
+    return x
+
+
+def _accept(client: "Client", job: dict[str, Any], name: str, label: str, x: float) -> None:
+    """Make a run of the batch the reference of a name."""
+    (run,) = client.runs(job["id"], label=f"{label}={json.dumps(x)}")
+    told = client.accept_reference(name, run["id"])
+    before = f" (before: {told['history'][0]['run']})" if told["history"] else ""
+    out.print(f"{told['name']}: {told['run']}{before}", markup=False)
+
+
+def _uploaded(client: "Client", batch: list[tuple[float, list[str]]]) -> list[dict[str, Any]]:
+    """The batch with identifiers of datasets; files are stored first, each once."""
+    known: dict[str, str] = {}
+    for source in (one for _, sources in batch for one in sources):
+        if source in known:
+            continue
+        is_file = Path(source).is_file()
+        if not is_file and source.endswith(DATA_SUFFIXES):
+            fail(f"there is no file {source}")
+        known[source] = client.add_dataset(Path(source))["id"] if is_file else source
+    return [{"x": x, "datasets": [known[one] for one in sources]} for x, sources in batch]
+
+
+def _experiments(text: str) -> tuple[float, list[str]]:
+    x, equals, sources = text.partition("=")
+    names = _names(sources)
+    if not (equals and names):
+        usage(f"{text}: need X=DATA, the value of the label and a recording, such as 5=a.csv")
+    return _number(text, x), names
+
+
+def _number(where: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) < float("inf"):
+        usage(f"{where}: found {text!r}; need a number")
+    return value
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, value = (part.strip() for part in text.partition("="))
+    if not (equals and name and value):
+        usage(f"--channels {text}: need signal=channel, such as u=P1")
+    return name, value
+
+
+def _given(**options: str | None) -> dict[str, str]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _model(name: str) -> Any:
+    path = Path(name)
+    return read_yaml(read_file(path)) if path.suffix in MODEL_SUFFIXES else name
+
+
+def _names(text: str) -> list[str]:
+    return [one.strip() for one in text.split(",") if one.strip()]
+
+
+app = typer.Typer(help="List, show and accept references.", no_args_is_help=True)
+
+PLACES = Places({"/run": "RUN", "/by": "--by", "/note": "--note", "{name}": "NAME"})
+
+ReferenceName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the reference.")]
+
+
+@app.command("list")
+def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
+    """List the references in use."""
+    with connected(url, key) as client:
+        found = client.references()
+    print_listing(
+        found, as_json, ("name", "run", "accepted", "by", "labels", "estimates"),
+        lambda one: (one["name"], one["run"], _when(one["at"]), one["by"], _labels(one["labels"]),
+                     _estimates(one["estimates"])),
+        empty="no references; accept one: lagid references accept NAME RUN",
+    )  # fmt: skip
+
+
+@app.command()
+def show(
+    name: ReferenceName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
+) -> None:
+    """Show a reference with what was accepted before it."""
+    with connected(url, key) as client:
+        found = client.reference(name)
+    if as_json:
+        print_json(found)
+        return
+    out.print(f"{found['name']}: {_estimates(found['estimates'])}", markup=False)
+    if found["labels"]:
+        out.print(_labels(found["labels"]), markup=False)
+    rows = [(one["run"], _when(one["at"]), one["by"], one["note"])
+            for one in (found, *found["history"])]  # fmt: skip
+    print_table(("run", "accepted", "by", "note"), rows, empty="")
+
+
+@app.command()
+def accept(
+    name: ReferenceName,
+    run: Annotated[str, typer.Argument(metavar="RUN", help="Id of a run that succeeded.")],
+    by: Annotated[str | None, typer.Option(help="Who accepts it.")] = None,
+    note: Annotated[str | None, typer.Option(help="Why.")] = None,
+    url: Url = DEFAULT_URL,
+    key: Key = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a run the reference of a name; the one before stays in the history."""
+    with connected(url, key) as client, told_at(PLACES):
+        found = client.accept_reference(name, run, by=by, note=note)
+    if as_json:
+        print_json(found)
+        return
+    before = f" (before: {found['history'][0]['run']})" if found["history"] else ""
+    out.print(f"{found['name']}: {found['run']}{before}", markup=False)
+
+
+def _when(at: str) -> str:
+    return at[:19].replace("T", " ")
+
+
+def _labels(labels: dict[str, Any]) -> str:
+    return ", ".join(f"{name} = {value}" for name, value in labels.items())
+
+
+def _estimates(estimates: dict[str, Any]) -> str:
+    return ", ".join(f"{name} = {estimate(one)}" for name, one in estimates.items())

@@ -1,0 +1,316 @@
+"""`lagid serve` and `lagid dispatcher`.
+
+`lagid db …` and `lagid doctor`.
+"""
+
+import errno
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from service.cli.common import err, out
+from service.core.errors import Misconfigured, Unavailable
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
+    from service.core.settings import Settings
+    from service.dispatch.supervisor import Supervisor
+    from service.storage.sessions import Database
+
+
+CLOSE_S = 3  # what an open answer may take once the process is asked to end
+
+Host = Annotated[str | None, typer.Option(help="Address to listen on.")]
+Port = Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0 for any free one.")]
+DataDir = Annotated[Path | None, typer.Option(help="Folder of database, objects and logs.")]
+Cpus = Annotated[int | None, typer.Option(min=1, help="Cores for the workers.")]
+
+
+def serve(
+    host: Host = None,
+    port: Port = None,
+    data_dir: DataDir = None,
+    cpus: Cpus = None,
+    with_dispatcher: Annotated[
+        bool,
+        typer.Option("--dispatcher/--no-dispatcher", help="Keep a dispatcher running beside it."),
+    ] = True,
+) -> None:
+    """Serve REST and pages, with a dispatcher beside (defaults from LAGID_… variables)."""
+    settings = settings_of(host=host, port=port, data_dir=data_dir, cpus=cpus)
+    settings.check_exposure()
+    settings.prepare_folder()
+    with listening(settings.host, settings.port) as listener:
+        from service.dispatch.supervisor import supervised_dispatcher
+
+        _end_on_signals()
+        child: AbstractContextManager[Supervisor | None] = nullcontext()
+        if with_dispatcher:
+            child = supervised_dispatcher(settings)
+        with child as supervisor:  # the dispatcher starts beside all that follows
+            _try_storage(settings)
+            from service.api.app import create_app
+
+            bound = listener.getsockname()[1]
+            folder = settings.data_dir.absolute()
+            out.print(f"lagid serves http://{settings.host}:{bound}/ (data in {folder}); "
+                      "Ctrl-C ends it", soft_wrap=True)  # fmt: skip
+            _run(create_app(settings), listener, supervisor)
+
+
+def dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
+    """Claim jobs and have them computed, until told to end (`serve` starts one by itself)."""
+    settings = settings_of(data_dir=data_dir, cpus=cpus)
+    settings.prepare_folder()
+    from service.dispatch.process import run
+
+    raise typer.Exit(run(settings))
+
+
+def settings_of(**given: Any) -> "Settings":
+    """Settings of the environment, with the options that were given.
+
+    Raises
+    ------
+    Misconfigured
+        If one cannot be used; the message names its variable.
+    """
+    from pydantic import ValidationError
+
+    from service.core.settings import Settings
+    from service.core.validation import detail_of
+
+    try:
+        return Settings(**{name: value for name, value in given.items() if value is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = "_".join(str(part) for part in first["loc"]).upper()
+        raise Misconfigured(f"LAGID_{name}: {detail_of(first, ())}") from None
+
+
+def listening(host: str, port: int) -> socket.socket:
+    """A socket that listens there.
+
+    Raises
+    ------
+    Misconfigured
+        If the port is in use, not allowed, or the host has no such address.
+    """
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listener = socket.socket(family, kind, protocol)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen(128)
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            raise Misconfigured(
+                f"port {port} of {host} is in use; choose another with --port, or --port 0"
+            ) from None
+        raise Misconfigured(f"cannot listen on {host}:{port}: {error.strerror}") from None
+    return listener
+
+
+def _run(app: "FastAPI", listener: socket.socket, supervisor: "Supervisor | None") -> None:
+    import uvicorn
+
+    class Server(uvicorn.Server):
+        """Tells open event streams and the dispatcher at once that the process is to end."""
+
+        def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+            if supervisor is not None:
+                threading.Thread(target=supervisor.stop, name="end").start()
+            parts = getattr(app.state, "parts", None)
+            if parts is not None:
+                parts.stopping.set()
+            super().handle_exit(sig, frame)
+
+    config = uvicorn.Config(
+        app, log_level="warning", access_log=False, timeout_graceful_shutdown=CLOSE_S
+    )
+    Server(config).run(sockets=[listener])
+
+
+def _try_storage(settings: "Settings") -> None:
+    """Open database and objects once, so that what cannot be opened is told in one line.
+
+    Raises
+    ------
+    Misconfigured, StorageError
+        If one cannot be opened.
+    """
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from service.storage.open_storage import open_storage
+
+    try:
+        database, _ = open_storage(settings)
+    except SQLAlchemyError as error:
+        reason = str(error).splitlines()[0]
+        raise Misconfigured(
+            f"the database cannot be opened: {reason}; is its server running, and is "
+            "LAGID_DATABASE_URL right?"
+        ) from None
+    database.dispose()
+
+
+def _end_on_signals() -> None:
+    """End by an exception, so that what is open is closed; uvicorn raises the signal again."""
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        raise SystemExit(0)
+
+    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGINT, end)
+
+
+database = typer.Typer(help="The tables of the database.", no_args_is_help=True)
+
+NEEDED = ("numpy", "scipy", "numba", "ray", "fastapi", "sqlalchemy", "obstore", "mcap")
+Fix = Annotated[bool, typer.Option("--fix", help="Delete the objects that no row names.")]
+
+
+@database.command()
+def upgrade(data_dir: DataDir = None) -> None:
+    """Create the tables, or bring them to this version."""
+    from service.storage import migrate
+
+    settings = settings_of(data_dir=data_dir)
+    settings.prepare_folder()
+    with opened(settings) as found:
+        migrate.upgrade(found)
+        out.print(f"the database is at revision {migrate.current(found)}", markup=False)
+
+
+@database.command()
+def check(data_dir: DataDir = None, fix: Fix = False) -> None:
+    """Compare database and store: the revision, lost objects, objects that no row names."""
+    from service.storage import garbage, migrate
+    from service.storage.objects import open_store
+
+    settings = settings_of(data_dir=data_dir)
+    if settings.database_url is None and not (settings.data_dir / "lagid.db").is_file():
+        raise Misconfigured(
+            f"there is no database in {settings.data_dir.absolute()}; `lagid serve` or "
+            "`lagid db upgrade` makes one, or name another folder with --data-dir"
+        )
+    with opened(settings) as found:
+        migrate.check(found)
+        store = open_store(settings.store)
+        with found.read() as session:
+            lost = garbage.lost(session, store)
+            orphans = list(garbage.orphans(session, store))
+            if fix:
+                freed = garbage.collect(session, store)
+                out.print(f"deleted {len(orphans)} objects, {freed} bytes")
+    out.print(f"tables at head; {len(lost)} objects lost; {len(orphans)} objects without a row")
+    for sha256 in sorted(lost):
+        err.print(f"lost: {sha256}", markup=False)
+    if lost:
+        raise typer.Exit(1)
+
+
+def doctor(data_dir: DataDir = None) -> None:
+    """Check the installation: packages, kernels, data folder, port."""
+    settings = settings_of(data_dir=data_dir)
+    checks: list[tuple[str, Callable[[], str]]] = [
+        ("Python", _python),
+        ("packages", _packages),
+        ("kernels", _kernels),
+        ("data folder", lambda: _folder(settings)),
+        ("port", lambda: _port(settings)),
+    ]
+    failed = False
+    for name, look in checks:
+        try:
+            out.print(f"ok      {name}: {look()}", markup=False, soft_wrap=True)
+        except (Misconfigured, ImportError, OSError, ArithmeticError) as error:
+            failed = True
+            err.print(f"failed  {name}: {error}", markup=False)
+    if failed:
+        raise typer.Exit(1)
+
+
+@contextmanager
+def opened(settings: "Settings") -> Iterator["Database"]:
+    """The database, for the length of a command.
+
+    Raises
+    ------
+    Unavailable
+        In one line, if it does not answer.
+    """
+    from sqlalchemy.exc import SQLAlchemyError
+
+    from service.storage.sessions import Database
+
+    found = Database(settings.database)
+    try:
+        yield found
+    except SQLAlchemyError as error:
+        reason = str(error).splitlines()[0]
+        raise Unavailable(f"the database cannot be used: {reason}") from error
+    finally:
+        found.dispose()
+
+
+def _python() -> str:
+    return sys.version.split()[0]
+
+
+def _packages() -> str:
+    return ", ".join(f"{name} {version(name)}" for name in NEEDED)
+
+
+def _kernels() -> str:
+    """Compile a model and simulate it: the harmonic oscillator without force rests."""
+    import numpy as np
+
+    from sysid.data.records import Channel
+    from sysid.models.catalogue.load import load_model
+    from sysid.simulation.simulate import simulate
+
+    model = load_model("duffing-eq16")
+    times = np.arange(20, dtype=np.float64) * 0.02
+    force = Channel("q", times, np.zeros(20))
+    values = {p.name: p.lower for p in model.parameters}
+    rest = simulate(model, [force], values, times=times).channels[-1].values
+    if np.any(rest != 0.0):
+        raise ArithmeticError("a system at rest without a force moves: the compiler is at fault")
+    return "compiled, and a system at rest stays at rest"
+
+
+def _folder(settings: "Settings") -> str:
+    folder = settings.data_dir.absolute()
+    if folder.is_dir():
+        settings.prepare_folder()
+        return str(folder)
+    above = next(parent for parent in folder.parents if parent.is_dir())
+    _probe(above)
+    return f"{folder} (will be made)"
+
+
+def _probe(folder: Path) -> None:
+    try:
+        with TemporaryDirectory(dir=folder):
+            return
+    except OSError as error:
+        raise Misconfigured(f"{folder} is not writable ({error.strerror})") from error
+
+
+def _port(settings: "Settings") -> str:
+    with listening(settings.host, settings.port):
+        return f"{settings.host}:{settings.port} is free"

@@ -1,0 +1,186 @@
+"""Live progress of a job: one bar a run, with its RMS; one bar for all where there are many.
+
+Where nobody looks (a file, a pipe) there are lines instead: at every change of state, and every
+`EVERY_S` at most. Of many runs both tell how many are done and how fast, not the best RMS: on other
+data or under other noise it tells nothing.
+"""
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from service.client.calls import TERMINAL
+from service.figures.formats import duration
+
+if TYPE_CHECKING:
+    from service.client.client import Client
+
+
+MANY = 12
+EVERY_S = 10.0
+LOOK_S = 1.0
+"""The run that ended last is asked for no more often."""
+COLUMNS = (
+    TextColumn("{task.description:<24.24}", markup=False),
+    BarColumn(bar_width=30),
+    TextColumn("{task.percentage:>3.0f} %"),
+    TextColumn("{task.fields[told]}", markup=False),
+    TextColumn("{task.fields[state]}"),
+    TimeElapsedColumn(),
+)
+Document = dict[str, Any]
+Clock = Callable[[], float]
+
+
+def follow(client: "Client", job_id: str, *, quiet: bool = False) -> Document:
+    """Show a job until it ends; its last state."""
+    if quiet:
+        return client.wait(job_id)
+    first = client.job(job_id)
+    console = Console(stderr=True, highlight=False)
+    many = Many(lambda: _newest(client, job_id), first["rms_unit"])
+    if not console.is_terminal:
+        return client.wait(job_id, progress=Lines(lambda text: _print(console, text), many).show)
+    with Progress(*COLUMNS, console=console, refresh_per_second=5) as progress:
+        bars = _Bars(client, progress, many, is_one=first["progress"]["runs"] > MANY)
+        return client.wait(job_id, progress=bars.show)
+
+
+class Many:
+    """What is told of the runs of a job: failed and reused, their pace, the one that ended last.
+
+    Parameters
+    ----------
+    newest : callable
+        Gives the run that ended last, or None.
+    unit : str or None
+        Of the RMS.
+    clock : callable
+        Seconds that never go back.
+    """
+
+    def __init__(
+        self, newest: Callable[[], Document | None], unit: str | None = None,
+        clock: Clock = time.monotonic,
+    ) -> None:  # fmt: skip
+        self._newest, self.unit, self.clock = newest, unit, clock
+        self._begun: tuple[float, int] | None = None
+        self._looked, self._seen, self._text = 0.0, 0, ""
+
+    def told(self, job: Document) -> list[str]:
+        """The parts of a line about a job of several runs."""
+        done, is_over = job["progress"], job["state"] in TERMINAL
+        parts = [f"{done[what]} {what}" for what in ("failed", "reused") if done[what]]
+        if is_over:
+            return parts
+        pace = self._pace(done["finished"]) if job["state"] == "running" else 0.0
+        parts += [f"{pace:.3g} runs/s"] if pace > 0 else []
+        if done["seconds_left"] is not None:
+            parts.append(f"{duration(done['seconds_left'])} left".replace("\u202f", " "))
+        return [*parts, *([text] if (text := self._last(done["finished"])) else [])]
+
+    def rms(self, value: float | None) -> str:
+        """An RMS with its unit."""
+        unit = "" if self.unit in (None, "1") else f" {self.unit}"
+        return "RMS –" if value is None else f"RMS {value:.6g}{unit}"
+
+    def _pace(self, finished: int) -> float:
+        """Runs a second since the first look at the running job."""
+        now = self.clock()
+        if self._begun is None:
+            self._begun = now, finished
+        since, before = self._begun
+        return (finished - before) / (now - since) if now > since else 0.0
+
+    def _last(self, finished: int) -> str:
+        now = self.clock()
+        if finished != self._seen and (not self._seen or now - self._looked >= LOOK_S):
+            self._looked, self._seen = now, finished
+            run = self._newest()
+            self._text = "" if run is None else f"last {self._run(run)}"
+        return self._text
+
+    def _run(self, run: Document) -> str:
+        cell = _values(run)
+        found = self.rms(run["rms"]) if run["state"] == "succeeded" else run["state"]
+        return f"run {run['number'] + 1}{f' ({cell})' if cell else ''}: {found}"
+
+
+class Lines:
+    """Lines of one job for a log; `tell` takes a line."""
+
+    def __init__(self, tell: Callable[[str], object], many: Many) -> None:
+        self._tell, self._many = tell, many
+        self._state, self._last, self._text = "", 0.0, ""
+
+    def show(self, job: Document) -> None:
+        """Tell what is new, if its state changed or the last line is old enough."""
+        now = self._many.clock()
+        if job["state"] == self._state and now - self._last < EVERY_S:
+            return
+        text = self._line(job)
+        if job["state"] == self._state and text == self._text:
+            return
+        self._state, self._last, self._text = job["state"], now, text
+        self._tell(text)
+
+    def _line(self, job: Document) -> str:
+        done = job["progress"]
+        told = [f"{job['id']} {job['state']}", f"{done['finished']}/{done['runs']} runs"]
+        if done["runs"] > 1:
+            return ", ".join([*told, *self._many.told(job)])
+        if done["generation"]:
+            told.append(f"generation {done['generation']}")
+        if done["best_rms"] is not None:
+            told.append(self._many.rms(done["best_rms"]))
+        return ", ".join(told)
+
+
+class _Bars:
+    """The bars of one job, one for all its runs or one each, brought up to date at every look."""
+
+    def __init__(self, client: "Client", progress: Progress, many: Many, *, is_one: bool) -> None:
+        self._client, self._progress, self._many = client, progress, many
+        self._is_one = is_one
+        self._bars: dict[str, TaskID] = {}
+
+    def show(self, job: Document) -> None:
+        done = job["progress"]
+        if self._is_one:
+            part = done["finished"] / done["runs"]
+            label = f"{done['finished']}/{done['runs']} runs"
+            self._update(job["id"], label, part, ", ".join(self._many.told(job)), job["state"])
+            return
+        for run in self._client.runs(job["id"]):
+            label = _values(run) or str(job["name"])
+            self._update(
+                run["id"], label, run["progress"], self._many.rms(run["rms"]), run["state"]
+            )
+
+    def _update(self, key: str, label: str, part: float, told: str, state: str) -> None:
+        if key not in self._bars:
+            self._bars[key] = self._progress.add_task(label, total=1.0, told=told, state=state)
+        self._progress.update(
+            self._bars[key], description=label, completed=part, told=told, state=state
+        )
+
+
+def _newest(client: "Client", job_id: str) -> Document | None:
+    """The run with the highest number of those that have ended: they begin in that order."""
+    ended = ["succeeded", "failed"]
+    found = client.runs(job_id, at_most=1, state=ended, order="number", descending=True)
+    return found[0] if found else None
+
+
+def _print(console: Console, text: str) -> None:
+    console.print(text, markup=False, soft_wrap=True)
+
+
+def _values(run: Document) -> str:
+    """Labels and values of axes of a run, without those that are data or models."""
+    values = [*run["labels"].values(), *run["cell"].values()]
+    return ", ".join(f"{one:g}" if isinstance(one, float) else str(one)
+                     for one in values if not isinstance(one, dict | list))  # fmt: skip

@@ -1,0 +1,106 @@
+"""A service of one's own for the length of a `with` block, for the demo, benchmarks and tests."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+
+from service.core.errors import ServiceDidNotStart
+
+START_LIMIT_S = 240.0
+"""A first start compiles the loops, which takes minutes beside other work."""
+STOP_LIMIT_S = 20.0
+
+
+@contextmanager
+def embedded_service(
+    data_dir: Path, *, port: int | None = None, cpus: int | None = None
+) -> Iterator[str]:
+    """Start `lagid serve` as a child, wait until it is ready, and stop it at the end.
+
+    Parameters
+    ----------
+    data_dir : Path
+        Database, objects and logs; made if absent.
+    port : int, optional
+        Port on loopback; a free one if not given.
+    cpus : int, optional
+        Cores for the workers; all if not given.
+
+    Yields
+    ------
+    str
+        Address of the service.
+
+    Raises
+    ------
+    ServiceDidNotStart
+        If it ended or was not ready in time; the message holds the end of its log.
+    """
+    data_dir.mkdir(parents=True, exist_ok=True)
+    chosen = port or free_port()
+    url = f"http://127.0.0.1:{chosen}"
+    command = [
+        sys.executable,
+        "-m",
+        "service.cli.main",
+        "serve",
+        "--host",
+        "127.0.0.1",
+        "--port",
+        str(chosen),
+        "--data-dir",
+        str(data_dir),
+    ]
+    command += ["--cpus", str(cpus)] if cpus else []
+    log = data_dir / "serve.log"
+    with log.open("ab") as sink:
+        child = subprocess.Popen(command, stdout=sink, stderr=sink, stdin=subprocess.DEVNULL)
+    try:
+        _wait_until_ready(url, child, log)
+        yield url
+    finally:
+        _stop(child)
+
+
+def free_port() -> int:
+    """Return a port of loopback that nobody listens on at this moment."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _wait_until_ready(url: str, child: "subprocess.Popen[bytes]", log: Path) -> None:
+    limit = time.monotonic() + START_LIMIT_S
+    while time.monotonic() < limit:
+        if child.poll() is not None:
+            raise ServiceDidNotStart(f"it ended with exit code {child.returncode}", _tail(log))
+        try:
+            if httpx.get(f"{url}/readyz", timeout=2.0).status_code == httpx.codes.OK:
+                return
+        except httpx.TransportError:
+            pass  # not listening yet
+        time.sleep(0.1)
+    raise ServiceDidNotStart(f"it was not ready after {START_LIMIT_S:g} s", _tail(log))
+
+
+def _tail(log: Path) -> str:
+    return "\n".join(log.read_text(errors="replace").splitlines()[-8:])
+
+
+def _stop(child: "subprocess.Popen[bytes]") -> None:
+    if child.poll() is not None:
+        return
+    child.send_signal(signal.SIGTERM)
+    try:
+        child.wait(timeout=STOP_LIMIT_S)
+    except subprocess.TimeoutExpired:
+        os.kill(child.pid, signal.SIGKILL)
+        child.wait()

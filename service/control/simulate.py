@@ -1,0 +1,270 @@
+"""Use case: the model of a run simulated on new inputs, or in a loop that is closed around it."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from service.control.closed_loop import Loop, check_transport, closed, control_faults
+from service.control.schemas import LATER_FIELDS, ControlIn, RunSimulateIn, RunSimulationOut
+from service.core.concurrency import simulating
+from service.core.errors import Conflict, FieldError, InvalidRequest
+from service.core.json_pointer import body_of
+from service.datasets.datasets import add_recording, key_of, series, told
+from service.datasets.schemas import DatasetOut
+from service.datasets.simulated import check_finite, check_lags_at
+from service.datasets.waveforms import Signals, sampled
+from service.models.models import model_of_run
+from service.repositories.datasets import DatasetRepository
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunRepository
+from service.storage.errors import StorageError
+from service.storage.objects import ObjectStore
+from service.storage.sessions import Database
+from service.storage.tables import Run
+from sysid.core.errors import nearest
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Recording
+from sysid.models.model import FixedInitial, Model
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What a request asks of a run, looked up."""
+
+    model: Model
+    values: dict[str, float]
+    times: FloatArray
+    inputs: list[Channel]
+    reference: Channel | None
+    parents: list[str]
+    notes: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Simulated:
+    """What the model does, and what is to be said of it."""
+
+    outputs: list[Channel]
+    inputs: list[Channel]
+    notes: list[str]
+
+
+@simulating.one()
+def simulate(
+    database: Database, store: ObjectStore, run_id: str, body: RunSimulateIn, max_points: int
+) -> RunSimulationOut:
+    """Simulate a run's model; with `store`, what comes out becomes a dataset.
+
+    Raises
+    ------
+    NotFound
+        If there is no such run or dataset.
+    Conflict
+        If the run has no estimates.
+    InvalidRequest
+        With every fault of the inputs and parameters, or where the simulation diverges.
+    """
+    with database.read() as session:
+        asked = _asked(session, store, run_id, body)
+    loop = _closed(asked, body.control) if body.control else None
+    found = _Simulated(
+        outputs=_open(asked) if loop is None else loop.outputs,
+        inputs=[_sampled(one, asked.times) for one in asked.inputs] + _entered(loop),
+        notes=[*asked.notes, *(loop.notes if loop else ())],
+    )
+    reference = None if asked.reference is None else _sampled(asked.reference, asked.times)
+    dataset = (
+        _stored(database, store, run_id, body, asked, found, reference) if body.store else None
+    )
+    return RunSimulationOut(
+        id=run_id,
+        parameters=asked.values,
+        outputs=[series(one, max_points) for one in found.outputs],
+        inputs=[series(one, max_points) for one in found.inputs],
+        reference=None if reference is None else series(reference, max_points),
+        command=series(loop.command, max_points) if loop else None,
+        metrics=loop.metrics if loop else None,
+        controller=loop.controller if loop else None,
+        tuning=loop.tuning if loop else None,
+        margins=loop.margins if loop else None,
+        notes=found.notes,
+        dataset=dataset,
+    )
+
+
+def _asked(session: Session, store: ObjectStore, run_id: str, body: RunSimulateIn) -> _Asked:
+    run = RunRepository(session).get(run_id)
+    if run.result is None or not run.result.get("parameters"):
+        raise Conflict(f"run {run_id} is {run.state.value} and has no estimates to simulate with")
+    job = JobRepository(session).get(run.job_id)
+    model = model_of_run(session, run, job)
+    faults = [*_parameter_faults(model, body.parameters), *_input_faults(model, body)]
+    if faults:
+        raise InvalidRequest(faults)
+    check_lags_at(model, body.parameters)
+    period, notes = _period(session, model, body_of(job.spec, run.cell), body)
+    times = np.arange(body.samples, dtype=np.float64) * period
+    check_transport(body.control, float(times[-1]))
+    signals = Signals(session, store, times)
+    inputs = [
+        signals.channel(f"/inputs/{one.name}", one.name, one.unit, body.inputs[one.name])
+        for one in model.inputs
+        if one.name in body.inputs
+    ]
+    reference = None
+    if body.control is not None:
+        unit = next((o.unit for o in model.outputs if o.name == body.control.output), "1")
+        at = "/control/reference"
+        reference = signals.channel(at, "reference", unit, body.control.reference)
+    values = _values(model, run, body.parameters)
+    given = inputs if reference is None else [*inputs, reference]
+    notes = [*notes, *_early_notes(model, given, period)]
+    return _Asked(model, values, times, inputs, reference, signals.parents, notes)
+
+
+def _early_notes(model: Model, given: Sequence[Channel], period: float) -> list[str]:
+    """What to say of signals from before t = 0: the solver begins where the first of them does."""
+    first = min(given, key=lambda one: float(one.times[0]), default=None)
+    if first is None or model.form != "differential" or first.times[0] > -0.5 * period:
+        return []
+    return [
+        f"{first.name} is given from {float(first.times[0]):.6g} s on: there the states start, not "
+        "at t = 0, with the values that are told for it"
+    ]
+
+
+def _period(
+    session: Session, model: Model, job: Mapping[str, Any], body: RunSimulateIn
+) -> tuple[float, list[str]]:
+    """The sampling period in s, and what is to be said of it."""
+    try:
+        known = DatasetRepository(session).get(job["datasets"][0]).sample_time
+    except StorageError:  # it was deleted since; the run can still be simulated
+        known = None
+    period = body.sample_time or known
+    if period is None:
+        raise InvalidRequest.at(
+            "/sample_time", "is missing, and the run's data do not tell one; give it in s"
+        )
+    if model.form == "differential" or known is None or abs(period / known - 1) < 1e-3:
+        return period, []
+    if model.form == "polynomial":
+        raise InvalidRequest.at(
+            "/sample_time",
+            f"found {period:g} s; the terms of this polynomial are samples of {known:g} s: "
+            "leave it out",
+        )
+    return period, [
+        f"the model is a recursion that was identified at {known:.6g} s; at {period:.6g} s it is "
+        "another approximation"
+    ]
+
+
+def _values(model: Model, run: Run, given: Mapping[str, float]) -> dict[str, float]:
+    """Value of every parameter and of every start that the model does not fix."""
+    rest = {
+        f"{state.name}(0)": 0.0
+        for state, start in zip(model.states, model.initial, strict=True)
+        if not isinstance(start, FixedInitial)
+    }
+    own = {parameter.name for parameter in model.parameters}
+    result = run.result or {}
+    found = {p["name"]: p["value"] for p in result["parameters"] if p["name"] in own}
+    # What is tied follows the parameters it is tied to, unless a value is given for itself.
+    tied = {p["name"] for p in result["parameters"] if p["status"] == "tied"} if given else set()
+    by_document = {p.name for p in model.parameters if p.tied is not None}
+    kept = {name: value for name, value in found.items() if name not in tied & by_document}
+    return {**rest, **kept, **given}
+
+
+def _open(asked: _Asked) -> list[Channel]:
+    # The compiler comes with this import, and most requests never need it.
+    from sysid.simulation.simulate import simulate as simulated
+
+    found = simulated(asked.model, asked.inputs, asked.values, times=asked.times).channels
+    check_finite(found, asked.times)
+    return list(found)
+
+
+def _closed(asked: _Asked, control: ControlIn) -> Loop:
+    assert asked.reference is not None
+    return closed(asked.model, asked.values, asked.times, asked.reference, asked.inputs, control)
+
+
+def _entered(loop: Loop | None) -> list[Channel]:
+    return [] if loop is None else [loop.entered]
+
+
+def _sampled(channel: Channel, times: FloatArray) -> Channel:
+    return replace(channel, times=times, values=sampled(channel, times), history=None)
+
+
+def _request(body: RunSimulateIn) -> dict[str, Any]:
+    """The request as its dataset keeps it: as it always was where it asks for nothing new."""
+    request = body.model_dump(mode="json", exclude={"name", "store"})
+    if request["control"] is not None:
+        fields = ControlIn.model_fields
+        request["control"] = {
+            name: value for name, value in request["control"].items()
+            if name not in LATER_FIELDS or value != fields[name].default
+        }  # fmt: skip
+    return request
+
+
+def _stored(
+    database: Database, store: ObjectStore, run_id: str, body: RunSimulateIn, asked: _Asked,
+    found: _Simulated, reference: Channel | None,
+) -> DatasetOut:  # fmt: skip
+    """The simulation as a dataset that knows its run; the same request gives the same one."""
+    request = _request(body)
+    key = key_of({"run": run_id, "simulation": request, "values": asked.values})
+    with database.read() as session:
+        known = DatasetRepository(session).by_source(key)
+    if known is not None:
+        return told(known)
+    channels = [*found.inputs, *found.outputs]
+    taken = {channel.name for channel in channels}
+    if reference is not None and reference.name not in taken:
+        channels.append(reference)
+    details = {"run": run_id, "simulation": request, "true_parameters": asked.values,
+               "warnings": found.notes}  # fmt: skip
+    stored = add_recording(
+        database, store, Recording(tuple(channels)),
+        name=body.name or f"{asked.model.name}, simulated with {run_id}", kind="simulate",
+        key=key, details=details, parents=[run_id, *asked.parents], relation="simulated",
+    )  # fmt: skip
+    return told(stored.dataset)
+
+
+def _parameter_faults(model: Model, values: Mapping[str, float]) -> Iterator[FieldError]:
+    known = [*(p.name for p in model.parameters), *(f"{one.name}(0)" for one in model.states)]
+    for name in values:
+        if name not in known:
+            detail = f"the model has no parameter {name!r}{nearest(name, known)}"
+            yield FieldError(f"/parameters/{name}", detail)
+
+
+def _input_faults(model: Model, body: RunSimulateIn) -> Iterator[FieldError]:
+    known = [one.name for one in model.inputs]
+    controlled = body.control.input if body.control else None
+    if body.control is not None:
+        found = list(control_faults(model, body.control))
+        yield from found
+        if found:  # which inputs are still to be given is not known then
+            return
+    for name in body.inputs:
+        if name not in known:
+            detail = f"the model has no input {name!r}{nearest(name, known)}"
+            yield FieldError(f"/inputs/{name}", detail)
+        elif name == controlled:
+            yield FieldError(f"/inputs/{name}", "the controller gives this input; leave it out")
+    for name in known:
+        if name not in body.inputs and name != controlled:
+            yield FieldError(
+                f"/inputs/{name}",
+                f"give input {name!r}, such as "
+                '{"kind": "step", "amplitude": 1}, or close the loop with "control"',
+            )

@@ -1,0 +1,1 @@
+"""Errors, settings, wire base types, validation messages, JSON pointers, concurrency limit."""

@@ -1,0 +1,69 @@
+"""Reading JSON and YAML that users write: data only, with the place of what cannot be read."""
+
+import json
+from typing import Any
+
+from service.core.errors import FieldError, InvalidRequest, TooLarge
+from service.core.text_checks import fault_in_json
+from sysid.core.errors import InvalidModel
+from sysid.models import documents
+
+MAX_DOCUMENT_BYTES = 4 * 1024**2
+
+
+def read_yaml(text: bytes) -> Any:
+    """What a YAML text says; JSON is YAML too.
+
+    Raises
+    ------
+    InvalidRequest
+        If it is not YAML; the message names line and column.
+    TooLarge
+        If it is longer than 4 MiB.
+    """
+    _check_size(text)
+    try:
+        return _storable(documents.read_yaml(text.decode("utf-8-sig")))
+    except UnicodeDecodeError as error:
+        raise InvalidRequest.at("", f"not UTF-8 text: byte {error.start} does not fit") from None
+    except InvalidModel as error:
+        raise InvalidRequest(FieldError(one.pointer, one.detail) for one in error.faults) from None
+
+
+def read_json(text: bytes) -> Any:
+    """What a JSON text says.
+
+    Raises
+    ------
+    InvalidRequest
+        If it is not JSON; the message names line and column.
+    TooLarge
+        If it is longer than 4 MiB.
+    """
+    _check_size(text)
+    try:
+        found = json.loads(text, parse_constant=_refuse_constant)
+    except json.JSONDecodeError as error:
+        place = f"line {error.lineno}, column {error.colno}"
+        raise InvalidRequest.at("", f"the body is not JSON: {place}: {error.msg}") from None
+    except (UnicodeDecodeError, ValueError, RecursionError) as error:
+        raise InvalidRequest.at("", f"the body is not JSON: {error}") from None
+    return _storable(found)
+
+
+def _storable(document: Any) -> Any:
+    """The document, whose texts a database can keep: escapes can stand for what is no text."""
+    written = json.dumps(document, ensure_ascii=False, default=repr, skipkeys=True)
+    fault = fault_in_json(written)
+    if fault is not None:
+        raise InvalidRequest.at("", fault)
+    return document
+
+
+def _check_size(text: bytes) -> None:
+    if len(text) > MAX_DOCUMENT_BYTES:
+        raise TooLarge(f"the document has {len(text)} bytes; at most {MAX_DOCUMENT_BYTES}")
+
+
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is not a JSON number")

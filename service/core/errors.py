@@ -1,0 +1,199 @@
+"""Every error the service raises on purpose, each with its HTTP status.
+
+* ServiceError
+    - NotFound               404  no such dataset, model, job or run
+    - Conflict               409  the state of the thing does not allow it
+    - StaleVersion           412  a precondition (If-Match) does not hold
+    - TooLarge               413  more than a stated limit
+    - UnsupportedMediaType   415  a body of a kind that is not read
+    - UnsatisfiableRange     416  a byte range outside the content
+    - InvalidRequest         422  the body or a query value cannot be used, with every fault
+    - TooMuchUnfinished      429  the project has as much queued and running as it may
+    - Unavailable            503  a part the service needs is down
+        - Busy                    too many requests of a heavy kind
+    - Misconfigured               the settings cannot be used (command line only)
+    - ServiceDidNotStart          `lagid serve` ended or did not get ready (command line only)
+
+One handler (`service.api.problems`) makes the RFC 9457 problem document. This module imports
+nothing but the standard library, so that the light client can use it.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from sysid.core.errors import InvalidBounds, InvalidModel, InvalidSettings, SysidError, UnknownModel
+
+
+@dataclass(frozen=True, slots=True)
+class FieldError:
+    """One thing wrong with a request.
+
+    Attributes
+    ----------
+    pointer : str
+        JSON pointer into the body, such as ``/algorithm/population``; ``?name`` for a query value,
+        ``{name}`` for a part of the path.
+    detail : str
+        What was wrong, what was found, what would be right.
+    column : int or None
+        Column (from 1) inside the text of the field, for equations.
+    """
+
+    pointer: str
+    detail: str
+    column: int | None = None
+
+    def __str__(self) -> str:
+        return f"{self.pointer}: {self.detail}" if self.pointer else self.detail
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry of a problem document's ``errors``."""
+        entry: dict[str, Any] = {"pointer": self.pointer, "detail": self.detail}
+        return entry if self.column is None else {**entry, "column": self.column}
+
+
+class ServiceError(Exception):
+    """Base class of the errors that the service raises on purpose."""
+
+    status: ClassVar[int] = 500
+    kind: ClassVar[str] = "internal"
+    title: ClassVar[str] = "The service failed"
+
+    def __init__(self, detail: str, errors: Iterable[FieldError] = ()) -> None:
+        super().__init__(detail)
+        self.detail = detail
+        self.errors = tuple(errors)
+
+    @property
+    def headers(self) -> Mapping[str, str]:
+        """Headers that the answer carries besides the document."""
+        return {}
+
+
+class NotFound(ServiceError):
+    """There is no such dataset, model, job or run."""
+
+    status, kind, title = 404, "not-found", "There is no such thing"
+
+    def __init__(self, what: str, name: str, hint: str = "") -> None:
+        super().__init__(f"there is no {what} {name!r}{hint}")
+        self.what, self.name = what, name
+
+
+class NoSuchDataset(ServiceError):
+    """No dataset has that identifier or name, or several have the name; the text says which."""
+
+    status, kind, title = 404, "not-found", "There is no such thing"
+
+
+class Conflict(ServiceError):
+    """The state of the thing does not allow it."""
+
+    status, kind, title = 409, "conflict", "The state does not allow it"
+
+
+class StaleVersion(ServiceError):
+    """A precondition does not hold: the thing has changed since it was read."""
+
+    status, kind, title = 412, "stale", "The thing has changed since it was read"
+
+
+class TooLarge(ServiceError):
+    """More than a stated limit."""
+
+    status, kind, title = 413, "too-large", "The body is too large"
+
+
+class UnsupportedMediaType(ServiceError):
+    """A body of a kind that is not read."""
+
+    status, kind, title = 415, "unsupported-media-type", "The body is of a kind that is not read"
+
+
+class UnsatisfiableRange(ServiceError):
+    """A byte range that lies outside the content."""
+
+    status, kind, title = 416, "range", "The byte range lies outside the content"
+
+    def __init__(self, asked: str, size: int) -> None:
+        super().__init__(f"the range {asked!r} lies outside the {size} bytes")
+        self.size = size
+
+    @property
+    def headers(self) -> Mapping[str, str]:
+        """The length, as RFC 9110 asks for."""
+        return {"Content-Range": f"bytes */{self.size}"}
+
+
+class InvalidRequest(ServiceError):
+    """The body or a query value cannot be used."""
+
+    status, kind, title = 422, "invalid", "The request cannot be used"
+
+    def __init__(self, errors: Iterable[FieldError]) -> None:
+        found = tuple(errors)
+        super().__init__("; ".join(map(str, found)), found)
+
+    @classmethod
+    def at(cls, pointer: str, detail: str) -> "InvalidRequest":
+        """A request with one fault."""
+        return cls((FieldError(pointer, detail),))
+
+
+class TooMuchUnfinished(ServiceError):
+    """The project has as much queued and running as it may."""
+
+    status, kind, title = 429, "too-much-unfinished", "The project has too much unfinished work"
+
+    @property
+    def headers(self) -> Mapping[str, str]:
+        """When to try again, in seconds: work ends all the time."""
+        return {"Retry-After": "10"}
+
+
+class Unavailable(ServiceError):
+    """A part that the service needs is down."""
+
+    status, kind, title = 503, "unavailable", "A part of the service is down"
+
+
+class Busy(Unavailable):
+    """Too many requests of a heavy kind at once."""
+
+    title = "The service has too much to do"
+
+    @property
+    def headers(self) -> Mapping[str, str]:
+        """When to ask again."""
+        return {"Retry-After": "2"}
+
+
+class Misconfigured(ServiceError):
+    """The settings cannot be used."""
+
+    kind, title = "misconfigured", "The settings cannot be used"
+
+
+class ServiceDidNotStart(ServiceError):
+    """A service that was started as a child ended, or did not get ready in time."""
+
+    kind, title = "did-not-start", "The service did not start"
+
+    def __init__(self, reason: str, log: str = "") -> None:
+        super().__init__(f"the service did not start: {reason}" + (f"\n{log}" if log else ""))
+        self.reason, self.log = reason, log
+
+
+def faults_of(error: SysidError) -> list[FieldError]:
+    """What an error of the numerical core says of a job or model document, with its places."""
+    match error:
+        case InvalidModel():
+            return [FieldError(f.pointer, f.detail, f.column) for f in error.faults]
+        case InvalidSettings():
+            return [FieldError(error.pointer, error.detail)]
+        case InvalidBounds():
+            return [FieldError(f"/parameters/{error.name}", str(error))]
+        case UnknownModel():
+            return [FieldError("/model", str(error))]
+    return [FieldError("", str(error))]

@@ -1,0 +1,38 @@
+"""JSON pointers into a job's body (RFC 6901)."""
+
+from collections.abc import Mapping
+from copy import copy
+from typing import Any
+
+
+def body_of(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Body of one run: the job's normal form with the cell's values put in.
+
+    What no value changes is the document's own: neither is to be changed.
+    """
+    body = {name: value for name, value in document.items() if name != "sweep"}
+    for path, value in values.items():
+        *parents, last = _parts(path)
+        here: Any = body
+        for part in parents:
+            place: Any = int(part) if isinstance(here, list) else part
+            child = here[place] if isinstance(here, list) else here.get(place)
+            here[place] = {} if child is None else copy(child)
+            here = here[place]
+        if isinstance(here, list):
+            here[int(last)] = value
+        else:
+            here[last] = [value] if path == "/datasets" and isinstance(value, str) else value
+    return body
+
+
+def value_at(document: Mapping[str, Any], path: str) -> Any:
+    """The value of a field that is there."""
+    here: Any = document
+    for part in _parts(path):
+        here = here[int(part)] if isinstance(here, list) else here[part]
+    return here
+
+
+def _parts(path: str) -> list[str]:
+    return [part.replace("~1", "/").replace("~0", "~") for part in path.split("/")[1:]]

@@ -1,0 +1,130 @@
+"""Settings of the service, from the environment (``LAGID_…``) or the file ``lagid.env``."""
+
+from ipaddress import ip_address
+from pathlib import Path
+from tempfile import TemporaryFile
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from service.core.errors import Misconfigured
+
+LOG_FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
+"""Of the lines that processes write about themselves."""
+
+
+class Settings(BaseSettings):
+    """Where things are kept, where the service listens, and its limits.
+
+    Attributes
+    ----------
+    data_dir : Path
+        Folder of everything that the embedded service keeps.
+    database_url, store_url : str or None
+        None: SQLite and a folder of objects inside `data_dir`.
+    ray_address : str or None
+        None: a local Ray of this process.
+    cpus : int or None
+        Workers of the local Ray; None: all cores.
+    worker_memory_mb : int or None
+        Memory that a worker may use for its runs, in MiB; None: its share of 80 % of the machine.
+    require_keys : bool or None
+        None: API keys are off on loopback and required elsewhere.
+    allow_open_host : bool
+        Serve other hosts although this version has no API keys yet.
+    max_upload_bytes, max_body_bytes : int
+        The longest recording, and the longest body of any other request; 413 beyond them.
+    max_open_jobs, max_open_runs : int
+        What one project may have unfinished; a submission beyond it is refused with 429.
+    project_cores : int or None
+        Cores that the runs of one project may take of each dispatcher; None: all.
+    lease_seconds : float
+        How long a job stays with a dispatcher that is not heard of.
+    data : Path or None
+        Folder of measured records, for tests and benchmarks.
+    """
+
+    model_config = SettingsConfigDict(env_prefix="LAGID_", env_file="lagid.env", extra="ignore")
+
+    data_dir: Path = Path("lagid-data")
+    database_url: str | None = None
+    store_url: str | None = None
+    ray_address: str | None = None
+    cpus: int | None = Field(default=None, ge=1)
+    worker_memory_mb: int | None = Field(default=None, ge=256)
+    host: str = "127.0.0.1"
+    port: int = Field(default=8000, ge=0, le=65535)
+    require_keys: bool | None = None
+    allow_open_host: bool = False
+    max_upload_bytes: int = Field(default=2 * 1024**3, ge=1)
+    max_body_bytes: int = Field(default=32 * 1024**2, ge=1)
+    max_runs_per_job: int = Field(default=100_000, ge=1)
+    max_open_jobs: int = Field(default=1000, ge=1)
+    max_open_runs: int = Field(default=1_000_000, ge=1)
+    project_cores: int | None = Field(default=None, ge=1)
+    lease_seconds: float = Field(default=10.0, gt=0)
+    max_attempts: int = Field(default=3, ge=1)
+    poll_seconds: float = Field(default=0.3, gt=0)
+    data: Path | None = None
+
+    @property
+    def database(self) -> str:
+        """SQLAlchemy address of the database."""
+        folder = self.data_dir.absolute()
+        return self.database_url or f"sqlite:///{folder / 'lagid.db'}"
+
+    @property
+    def worker_memory(self) -> int | None:
+        """The same in bytes."""
+        return None if self.worker_memory_mb is None else self.worker_memory_mb * 2**20
+
+    @property
+    def store(self) -> str:
+        """Address of the object store."""
+        return self.store_url or (self.data_dir.absolute() / "objects").as_uri()
+
+    def prepare_folder(self) -> None:
+        """Make the data folder if it is not there.
+
+        Raises
+        ------
+        Misconfigured
+            If it cannot be made or written to.
+        """
+        folder = self.data_dir.absolute()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with TemporaryFile(dir=folder):
+                pass  # only a try shows it: permissions, a full disk, a read-only file system
+        except OSError as error:
+            raise Misconfigured(
+                f"the data folder {folder} is not writable ({error.strerror}); "
+                "choose another with --data-dir"
+            ) from error
+
+    def check_exposure(self) -> None:
+        """Refuse to serve other hosts without keys.
+
+        Raises
+        ------
+        Misconfigured
+            If the host is not loopback, or keys are required: this version knows no keys.
+        """
+        if self.require_keys:
+            raise Misconfigured("this version has no API keys yet; unset LAGID_REQUIRE_KEYS")
+        if not is_loopback(self.host) and not self.allow_open_host:
+            raise Misconfigured(
+                f"host {self.host} can be reached from other machines, and this version has no "
+                "API keys yet; serve on 127.0.0.1, or set LAGID_ALLOW_OPEN_HOST=true if something "
+                "in front of it asks who is there"
+            )
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a host name or address reaches this machine only."""
+    if host == "localhost":
+        return True
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,216 @@
+"""What is wrong with one field, in our words: the one place that translates Pydantic's errors.
+
+Every sentence tells what was found and what would be right. An error that a wire type raises
+itself (`PydanticCustomError`) has its sentence with it; of a kind that is not known here nothing
+is quoted, so that no other wording reaches a user.
+
+What a validation error says to a user: where in the body, what was found, what is known.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from inspect import get_annotations
+from typing import Any, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic_core.core_schema import ErrorType
+
+from service.core.errors import FieldError
+from sysid.core.errors import nearest
+
+SHOWN = 80
+NOT_AN_OBJECT = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
+OWN_KINDS = frozenset(get_args(ErrorType))
+"""Kinds of errors that are Pydantic's own."""
+
+_NEEDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "greater_than": lambda c: f"a number above {_number(c['gt'])}",
+    "greater_than_equal": lambda c: f"{_number(c['ge'])} or more",
+    "less_than": lambda c: f"a number below {_number(c['lt'])}",
+    "less_than_equal": lambda c: f"{_number(c['le'])} or less",
+    "finite_number": lambda _: "a finite number",
+    "int_type": lambda _: "a whole number",
+    "int_parsing": lambda _: "a whole number",
+    "int_from_float": lambda _: "a whole number",
+    "int_parsing_size": lambda _: "a whole number with fewer digits",
+    "float_type": lambda _: "a number",
+    "float_parsing": lambda _: "a number",
+    "bool_type": lambda _: "true or false",
+    "bool_parsing": lambda _: "true or false",
+    "string_type": lambda _: "text",
+    "string_sub_type": lambda _: "text",
+    "string_unicode": lambda _: "text in UTF-8",
+    "string_too_long": lambda c: f"at most {c['max_length']} characters",
+    "string_too_short": lambda c: f"at least {_counted(c['min_length'], 'character')}",
+    "string_pattern_mismatch": lambda c: f"text of the form {c['pattern']}",
+    "literal_error": lambda c: str(c["expected"]),
+    "enum": lambda c: str(c["expected"]),
+    "list_type": lambda _: "a list",
+    "tuple_type": lambda _: "a list",
+    "too_short": lambda c: f"at least {_counted(c['min_length'], 'entry')}",
+    "too_long": lambda c: f"at most {_counted(c['max_length'], 'entry')}",
+    "invalid_key": lambda _: "text as the name of a field",
+    "none_required": lambda _: "null",
+    "union_tag_invalid": lambda c: f"{c['discriminator']} to be one of {c['expected_tags']}",
+    "union_tag_not_found": lambda c: f"an object with the field {c['discriminator']}",
+    "datetime_type": lambda _: "a time such as 2026-01-31T12:00:00Z",
+    "datetime_parsing": lambda _: "a time such as 2026-01-31T12:00:00Z",
+    "datetime_from_date_parsing": lambda _: "a time such as 2026-01-31T12:00:00Z",
+}
+
+
+def detail_of(entry: Mapping[str, Any], known: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
+    """What was wrong, what was found, what would be right.
+
+    Parameters
+    ----------
+    entry : mapping
+        As `pydantic.ValidationError.errors` gives them.
+    known : sequence of str
+        Fields that are known at its place; `elsewhere` are pointers to fields of its name.
+    """
+    kind, found = entry["type"], _found(entry.get("input"))
+    if kind == "extra_forbidden":
+        return f"unknown field {entry['loc'][-1]!r}{_hint(str(entry['loc'][-1]), known, elsewhere)}"
+    if kind == "missing":
+        return "this field is required"
+    if kind in NOT_AN_OBJECT:
+        some = f" with fields such as {', '.join(known)}" if known else " (name: value)"
+        return f"found {found}; need an object{some}"
+    if kind == "string_pattern_mismatch" and entry["loc"][-1] == "path":
+        return f"found {found}; need a JSON pointer, such as /noise/sigma"
+    if kind == "list_type":
+        one = f", such as [{found}]" if isinstance(entry.get("input"), str) else ""
+        return f"found {found}; need a list{one}"
+    if kind in _NEEDS:
+        return f"found {found}{_size(kind, entry)}; need {_NEEDS[kind](entry.get('ctx', {}))}"
+    return _raised(entry, found)
+
+
+def _raised(entry: Mapping[str, Any], found: str) -> str:
+    """The sentence that a validator raised; of the other kinds what was found."""
+    if entry["type"] in ("value_error", "assertion_error") and "error" in entry.get("ctx", {}):
+        return str(entry["ctx"]["error"])
+    if entry["type"] in OWN_KINDS:
+        return f"found {found}; this cannot be used here"
+    return f"{entry['msg']}; found {found}"
+
+
+def _hint(name: str, known: Sequence[str], elsewhere: Sequence[str]) -> str:
+    """Where a field of this very name is, else the nearest of those that are here."""
+    return f"; there is {' and '.join(elsewhere[:2])}" if elsewhere else nearest(name, known)
+
+
+def _found(value: Any) -> str:
+    """A value as it is written in JSON where Python has another word for it."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    try:
+        text = repr(value)
+    except RecursionError:
+        return "lists or objects nested too deeply"
+    return text if len(text) <= SHOWN else text[:SHOWN] + "…"
+
+
+def _size(kind: str, entry: Mapping[str, Any]) -> str:
+    """How much was found, where it is too much or too little."""
+    if kind == "too_long" and (length := entry.get("ctx", {}).get("actual_length")):
+        return f" ({_counted(length, 'entry')})"
+    if kind == "string_too_long" and isinstance(entry.get("input"), str):
+        return f" ({_counted(len(entry['input']), 'character')})"
+    return ""
+
+
+def _number(value: Any) -> str:
+    """A bound as it is written by hand: 9223372036854775808 stays, 0.0 is 0."""
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
+
+
+def _counted(count: int, what: str) -> str:
+    plural = f"{what[:-1]}ies" if what.endswith("y") else f"{what}s"
+    return f"1 {what}" if count == 1 else f"{count} {plural}"
+
+
+Location = Sequence[str | int]
+
+
+def explained(entries: Iterable[Mapping[str, Any]], body: Any, kind: Any) -> Iterator[FieldError]:
+    """Pydantic's errors of a body as faults with JSON pointers.
+
+    Parameters
+    ----------
+    entries : iterable of mapping
+        As `pydantic.ValidationError.errors` gives them.
+    kind : type
+        The body's wire type, for the names of known fields.
+    """
+    seen: set[str] = set()
+    for entry in entries:
+        pointer = pointer_into(body, entry["loc"], is_missing=entry["type"] == "missing")
+        # A union gives one entry per member; the first is about the member most often meant.
+        if pointer not in seen:
+            seen.add(pointer)
+            at = entry["loc"] if entry["type"] in NOT_AN_OBJECT else entry["loc"][:-1]
+            elsewhere = places_of(kind, entry["loc"][-1]) if entry["loc"] else []
+            yield FieldError(pointer, detail_of(entry, known_fields(kind, at), elsewhere))
+
+
+def pointer_into(body: Any, loc: Location, *, is_missing: bool = False) -> str:
+    """JSON pointer of a Pydantic location, without the names that unions put into it.
+
+    `is_missing`: the last part is not in the body, and should be.
+    """
+    parts: list[str] = []
+    here = body
+    for position, part in enumerate(loc):
+        if _is_in(here, part):
+            here = here[part]
+            parts.append(escaped(part))
+        elif is_missing and position == len(loc) - 1:
+            parts.append(escaped(part))
+    return "".join(f"/{part}" for part in parts)
+
+
+def body_type(endpoint: Callable[..., Any] | None) -> Any:
+    """Wire type of an endpoint's body."""
+    return get_annotations(endpoint, eval_str=True).get("body") if endpoint else None
+
+
+def known_fields(kind: Any, loc: Location) -> list[str]:
+    """Fields that a wire type knows at a location."""
+    types = list(_models(kind))
+    for part in loc:
+        fields = [t.model_fields[part] for t in types if part in t.model_fields]
+        # A list index, a key of a mapping or a union's own name leaves the types as they are.
+        if fields:
+            types = [model for field in fields for model in _models(field.annotation)]
+    return sorted({name for model in types for name in model.model_fields})
+
+
+def places_of(kind: Any, name: str | int, above: str = "") -> list[str]:
+    """Pointers of the fields of a name that can be reached by names alone, the shortest first."""
+    found = []
+    for model in _models(kind):
+        for own, field in model.model_fields.items():
+            if own == name:
+                found.append(f"{above}/{own}")
+            if get_origin(field.annotation) not in (dict, list):
+                found += places_of(field.annotation, name, f"{above}/{own}")
+    return sorted(dict.fromkeys(found), key=lambda place: place.count("/"))
+
+
+def escaped(part: str | int) -> str:
+    """One part of a JSON pointer (RFC 6901)."""
+    return str(part).replace("~", "~0").replace("/", "~1")
+
+
+def _is_in(value: Any, part: str | int) -> bool:
+    if isinstance(value, dict):
+        return part in value
+    return isinstance(value, list) and isinstance(part, int) and part < len(value)
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models(inner)

@@ -1,0 +1,84 @@
+"""What every wire type shares. Wire types import no core type, so that clients stay light."""
+
+from collections.abc import Iterable
+from typing import Annotated, Any, Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+from pydantic_core import PydanticCustomError
+
+Item = TypeVar("Item")
+
+Pointer = Annotated[str, Field(pattern=r"^(/[^/]+)+$", examples=["/noise/sigma"])]
+"""A JSON pointer into a job body."""
+
+
+DEEPEST = 50
+"""Levels of lists and objects within one another in a body; a model document has five."""
+
+
+def not_too_deep(value: Any) -> Any:
+    """The value itself; what is nested too deeply cannot be copied or written again."""
+    level, depth = [value], 0
+    while level := [inner for one in level if isinstance(one, dict | list) for inner in _in(one)]:
+        depth += 1
+        if depth > DEEPEST:
+            raise PydanticCustomError(
+                "nesting", "need lists and objects at most {most} levels within one another",
+                {"most": DEEPEST},
+            )  # fmt: skip
+    return value
+
+
+def _in(value: dict[Any, Any] | list[Any]) -> Iterable[Any]:
+    return value.values() if isinstance(value, dict) else value
+
+
+class Body(BaseModel):
+    """A request body: a field that is not known is an error, NaN and infinity are too."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Answer(BaseModel):
+    """A response body."""
+
+    model_config = ConfigDict(frozen=True)
+
+
+class Page(Answer, Generic[Item]):
+    """A part of a long list; `next` is the cursor of the following part, None at the end."""
+
+    items: list[Item]
+    next: str | None = None
+
+
+class FieldProblem(Answer):
+    """One thing wrong with a request."""
+
+    pointer: str
+    detail: str
+    column: int | None = None
+
+
+class ProblemDocument(Answer):
+    """An RFC 9457 problem document."""
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    instance: str | None = None
+    errors: list[FieldProblem] = Field(default=[])
+
+
+Json = dict[str, Any]
+
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class NoiseIn(Body):
+    """Noise added to the measured outputs before fitting, for sensitivity studies."""
+
+    sigma: Sigma = 0.0
+    seed: Seed = 0

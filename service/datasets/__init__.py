@@ -1,0 +1,1 @@
+"""Recordings stored, simulated, derived; lineage."""

@@ -1,0 +1,191 @@
+"""What the runs of a job with noise are measured by: true values, and the Cramér–Rao floor.
+
+A job may pose several problems (axes over datasets or bounds, say); each has a truth of its own.
+σ enters in proportion, so one floor a problem serves every σ. It is made here, in the dispatcher
+and when all runs of the job are over, so that the web process need not compute (decision 15); in a
+thread of its own, problem by problem, so that the workers are fed
+meanwhile (`service.dispatch.background`).
+"""
+
+import logging
+import math
+from collections.abc import Iterator, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from service.core.errors import ServiceError
+from service.core.json_pointer import body_of
+from service.dispatch.background import Make
+from service.dispatch.job_runs import JobRuns
+from service.queue.leases import Claim
+from service.repositories.datasets import DatasetRepository
+from service.repositories.summaries import Group, GroupKey, groups, quietest_run
+from service.runs.result import finite
+from service.storage.columns import Document
+from service.storage.errors import StorageError
+from service.storage.retry import patiently
+from service.storage.sessions import Database
+from service.storage.tables import Job, Run
+from service.sweeps.true_parameters import truth_of
+from sysid.core.errors import SysidError
+from sysid.core.threads import one_thread
+from sysid.core.types import FloatArray
+from sysid.data.noise import Noise
+from sysid.models.parse import parse_model
+from sysid.simulation.problem import Problem
+from sysid.uncertainty.cramer_rao import Floor, floor
+from workers.errors import RecordsUnavailable
+from workers.ports import ProblemSpec
+from workers.tasks import prepared
+
+_log = logging.getLogger(__name__)
+
+# Fields of a run that do not change what its parameters are measured by.
+SETTINGS = ("/noise", "/seed", "/algorithm", "/loss", "/weights", "/prediction", "/warm_start")
+MOST_PROBLEMS = 64
+LEFT_OUT = (
+    f"the sweep poses more than {MOST_PROBLEMS} problems: the first {MOST_PROBLEMS} have floors "
+    "and values to tell errors from, the others none"
+)
+MOST_WORK = 10_000_000
+"""Samples to simulate for the floors of one job: below a second in most models."""
+
+
+def floors_for(database: Database, claim: Claim, source: JobRuns) -> Make | None:
+    """Makes the document of a job's floors, a problem a step; None for a job without noise.
+
+    All runs of the job must be over, and their results written. The document has ``axes``, the
+    paths that tell the problems apart, ``note`` on problems that it leaves out, and ``problems``,
+    each with
+
+    - ``cell``: its values of the axes;
+    - ``reference``: ``kind`` (``truth``, or ``estimate``: the best run at the smallest σ), the
+      ``run`` and ``sigma`` of an estimate, and ``values`` by parameter; or null;
+    - ``stderr``: the floor of each free parameter for σ = 1, null where there is none;
+    - ``rms``: that of the response;
+    - ``note``: why something is missing, or nothing.
+    """
+    spec = claim.job.spec
+    axes = spec.get("sweep", {}).get("axes", [])
+    if not spec["noise"]["sigma"] and not any(axis["path"].startswith("/noise") for axis in axes):
+        return None
+    return _Floors(database, claim.job, source).steps
+
+
+class _Floors:
+    """Collects the floors of one job; `left` is the work that may still be done."""
+
+    def __init__(self, database: Database, job: Job, source: JobRuns) -> None:
+        self._database, self._job, self._source = database, job, source
+        self._left = MOST_WORK
+
+    def steps(self) -> Iterator[Document | None]:
+        """Nothing after each problem, and then the document."""
+        axes = [
+            axis["path"] for axis in self._job.spec["sweep"]["axes"]
+            if not axis["path"].startswith(SETTINGS)
+        ]  # fmt: skip
+        found = patiently(partial(self._groups, axes))
+        cells = [dict(zip(axes, one.key, strict=True)) for one in found[:MOST_PROBLEMS]]
+        problems = []
+        for cell in cells:
+            problems.append(self._problem(cell))
+            yield None
+        left_out = len(found) > MOST_PROBLEMS
+        yield {"axes": axes, "problems": problems, "note": LEFT_OUT if left_out else ""}
+
+    def _groups(self, axes: list[str]) -> list[Group]:
+        keys = [GroupKey("axis", path) for path in axes]
+        with self._database.read() as session:
+            return groups(session, self._job.id, keys, [], MOST_PROBLEMS, self._job.project_id)
+
+    def _problem(self, cell: Mapping[str, Any]) -> Document:
+        entry: Document = {
+            "cell": dict(cell), "reference": None, "stderr": {}, "rms": None, "note": "",
+        }  # fmt: skip
+        try:
+            entry["reference"] = patiently(partial(self._reference, cell))
+            if entry["reference"] is None:
+                return {**entry, "note": "no run succeeded whose values errors could be told from"}
+            spec = self._source.specification(cell).problem
+            return {**entry, **self._floor(spec, entry["reference"]["values"])}
+        except (SysidError, ServiceError, StorageError, RecordsUnavailable) as error:
+            _log.warning("%s: no floor: %s", self._job.id, error)
+            return {**entry, "note": f"there is no floor: {error}"}
+        except Exception as error:  # noqa: BLE001 - the results are there; a floor is not worth them
+            _log.exception("%s: no floor", self._job.id)
+            return {**entry, "note": f"there is no floor: internal error: {type(error).__name__}"}
+
+    def _reference(self, cell: Mapping[str, Any]) -> Document | None:
+        with self._database.read() as session:
+            return self._reference_in(session, cell)
+
+    def _reference_in(self, session: Session, cell: Mapping[str, Any]) -> Document | None:
+        body = body_of(self._job.spec, cell)
+        rows = DatasetRepository(session, self._job.project_id).get_all(body["datasets"])
+        true = truth_of(session, body["model"], rows)
+        if true is not None:
+            return {"kind": "truth", "run": None, "sigma": None, "values": true}
+        run: Run | None = quietest_run(session, self._job.id, cell, self._job.project_id)
+        if run is None:
+            return None
+        values = {name: one["value"] for name, one in (run.estimates or {}).items()}
+        return {"kind": "estimate", "run": run.id, "sigma": run.sigma, "values": values}
+
+    def _floor(self, spec: ProblemSpec, values: Mapping[str, float]) -> Document:
+        model = parse_model(spec.model)
+        if model.rule is not None:
+            return {"note": "there is no floor: the model selects its terms by the data"}
+        records, _ = prepared(
+            _without_noise(spec), {key: self._source.records(key) for key in spec.needs}
+        )
+        problem = Problem.build(
+            model, records, parameters=dict(_widened(spec, values)), skip=spec.skip,
+            weights={output.name: 1.0 for output in model.outputs},
+        )  # fmt: skip
+        unknown = [p.name for p in problem.space if p.name not in values]
+        if unknown:
+            return {"note": f"there is no floor: no value of {', '.join(unknown)} is known"}
+        work = problem.n_scored * (2 * len(problem.space) + 1)
+        if work > self._left:
+            return {"note": "there is no floor: the records are too long to compute it here"}
+        self._left -= work
+        theta: FloatArray = np.array([values[p.name] for p in problem.space])
+        with one_thread():
+            return _told(floor(problem, theta))
+
+
+def _told(found: Floor) -> Document:
+    stderr = {
+        name: finite(value) for name, value in zip(found.names, found.stderr.tolist(), strict=True)
+    }
+    untold = [name for name, value in stderr.items() if value is None]
+    note = f"the data tell nothing of {', '.join(untold)} alone: no floor" if untold else ""
+    return {"stderr": stderr, "rms": finite(found.response), "note": note}
+
+
+def _without_noise(spec: ProblemSpec) -> ProblemSpec:
+    # The cached key of a specification is no field: a new one is made from the fields.
+    return ProblemSpec(
+        spec.model, spec.records, spec.validation, spec.validation_fraction, spec.parameters,
+        skip=spec.skip, noise=Noise(),
+    )  # fmt: skip
+
+
+def _widened(
+    spec: ProblemSpec, values: Mapping[str, float]
+) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """The changes of the parameters, with bounds between which the known values lie."""
+    bounds = {p.name: (p.lower, p.upper) for p in parse_model(spec.model).parameters}
+    for name in {**bounds, **spec.parameters}:
+        change = dict(spec.parameters.get(name, {}))
+        lower, upper = bounds.get(name, (-math.inf, math.inf))
+        lower, upper = change.get("lower", lower), change.get("upper", upper)
+        value = values.get(name)
+        if value is not None and "fixed" not in change and not lower <= value <= upper:
+            change |= {"lower": min(lower, value), "upper": max(upper, value)}
+        if change:
+            yield name, change

@@ -1,0 +1,184 @@
+"""The leases of one dispatcher: claimed, kept alive, given back; and those of dead ones reaped."""
+
+import logging
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable
+from datetime import timedelta
+from functools import partial
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.queue.admission import Admission
+from service.queue.clocks import Clock
+from service.queue.dispatchers import LEASE_SECONDS, DispatcherRepository
+from service.queue.leases import Claim, Lease, Queue
+from service.queue.notifications import Signals, look
+from service.queue.orphaned_jobs import identity, reap
+from service.storage.columns import Document
+from service.storage.errors import LeaseLost
+from service.storage.retry import patiently
+from service.storage.sessions import Database
+
+_log = logging.getLogger(__name__)
+
+AGAIN_SECONDS = 0.5
+"""After a heartbeat that could not be written, until the next."""
+
+
+class Leases:
+    """The jobs this dispatcher may write for.
+
+    A thread renews all leases with one statement, three times within their length, and reaps the
+    expired ones of anybody. A lease that did not come back `is_lost`; one that was forgotten is
+    renewed no longer, and expires. While a heartbeat waits for the database, of a lease that is
+    late nothing is known: nothing should be written under it, but it may still be ours.
+
+    Parameters
+    ----------
+    seconds : float
+        Length of a lease.
+    clock, stopwatch : callable
+        The time of day as rows have it (by default the database's), and the seconds that pass for
+        this process.
+    """
+
+    def __init__(
+        self,
+        database: Database,
+        seconds: float,
+        *,
+        clock: Clock | None = None,
+        stopwatch: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.owner = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
+        self._database, self._length = database, timedelta(seconds=seconds)
+        self._clock, self._stopwatch = clock, stopwatch
+        self._held: dict[Lease, float] = {}  # when each was renewed
+        self._has_asked = False  # for a job, and was not answered
+        self._is_cut_off = False  # the last heartbeat did not reach the database
+        self._lock = threading.Lock()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+
+    def start(self, details: dict[str, object]) -> None:
+        """Announce the dispatcher and begin to beat."""
+        told = {LEASE_SECONDS: self._length.total_seconds(), **identity(), **details}
+        patiently(partial(self._announce, told))
+        self._thread.start()
+
+    def _announce(self, details: Document) -> None:
+        with self._database.write() as session:
+            DispatcherRepository(session, self._clock).announce(self.owner, details)
+        reap(self._database, self._length, self._clock)
+
+    def claim(self, admission: Admission | None = None) -> Claim | None:
+        """Take the next job that `admission` lets in, if one waits."""
+        begun = self._stopwatch()
+        claim, had_asked = None, self._has_asked
+        self._has_asked = True  # a claim whose answer is lost may have been made
+        with self._database.write() as session:
+            queue = Queue(session, self._clock)
+            if had_asked:
+                claim = queue.regain(self.owner, self._jobs())
+            if claim is None:
+                claim = queue.claim(self.owner, self._length, admission)
+        self._has_asked = False
+        if claim is not None:
+            with self._lock:
+                self._held[claim.lease] = begun
+        return claim
+
+    def look(self, admission: Admission | None = None) -> Signals:
+        """Whether a job waits that `admission` lets in, and which of ours are to be cancelled."""
+        with self._database.read() as session:
+            return look(session, self.owner, admission)
+
+    def _jobs(self) -> list[str]:
+        with self._lock:
+            return [lease.job_id for lease in self._held]
+
+    def is_lost(self, lease: Lease) -> bool:
+        """Whether the lease is known to be another's by now, or was forgotten."""
+        with self._lock:
+            return lease not in self._held
+
+    def is_sure(self, lease: Lease) -> bool:
+        """Whether the lease is ours: it was renewed within its length."""
+        with self._lock:
+            renewed = self._held.get(lease)
+        return renewed is not None and self._stopwatch() - renewed <= self._length.total_seconds()
+
+    def forget(self, lease: Lease) -> None:
+        """The job has ended, or was dropped: renew its lease no longer."""
+        with self._lock:
+            self._held.pop(lease, None)
+
+    def release_all(self, *, lost: bool = False) -> None:
+        """Give every job back, so that another dispatcher has it at once.
+
+        Parameters
+        ----------
+        lost : bool
+            Whether this counts as a lease that was lost.
+        """
+        with self._lock:
+            held = tuple(self._held)
+        worked = lost and patiently(self._worked)
+        for lease in held:
+            try:
+                patiently(partial(self._release, lease, lost=lost, beside_others=worked))
+            except LeaseLost:
+                _log.info("%s was no longer ours", lease.job_id)
+            self.forget(lease)
+
+    def _release(self, lease: Lease, *, lost: bool, beside_others: bool) -> None:
+        with self._database.write() as session:
+            Queue(session, self._clock).release(lease, lost=lost, beside_others=beside_others)
+
+    def _worked(self) -> bool:
+        with self._database.read() as session:
+            return Queue(session, self._clock).worked(self.owner)
+
+    def stop(self) -> None:
+        """Stop beating and take leave."""
+        self._ending.set()
+        self._thread.join(5.0)
+        with self._database.write() as session:
+            DispatcherRepository(session).leave(self.owner)
+
+    def renew(self) -> None:
+        """One heartbeat: renew what is held, and reap what has expired."""
+        begun = self._stopwatch()
+        with self._lock:
+            before = tuple(self._held)
+        with self._database.write(self._third) as session:
+            DispatcherRepository(session, self._clock).beat(self.owner)
+            held = Queue(session, self._clock).heartbeat(before, self._length)
+        renewed = {one.lease for one in held}
+        with self._lock:
+            for lease in before:
+                if lease not in renewed:
+                    self._held.pop(lease, None)
+                elif lease in self._held:
+                    self._held[lease] = begun
+        reap(self._database, self._length, self._clock, busy_seconds=self._third)
+
+    @property
+    def _third(self) -> float:
+        return self._length.total_seconds() / 3
+
+    def _beat(self) -> None:
+        third = self._third
+        pause = third
+        while not self._ending.wait(pause):
+            try:
+                self.renew()
+                pause, self._is_cut_off = third, False
+            except SQLAlchemyError as error:  # it may come back before the leases end
+                if not self._is_cut_off:
+                    _log.warning("no heartbeat could be written: %s", str(error).splitlines()[0])
+                pause, self._is_cut_off = min(third, AGAIN_SECONDS), True

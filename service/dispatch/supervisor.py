@@ -1,0 +1,168 @@
+"""Keep a dispatcher running beside the web process, and leave no process behind."""
+
+import contextlib
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from service.core.settings import Settings
+from workers.processes import clear_after, kill, of_session, standing
+
+_log = logging.getLogger(__name__)
+
+FIRST_PAUSE_SECONDS = 0.2
+LONGEST_PAUSE_SECONDS = 5.0
+STEADY_SECONDS = 60.0
+"""A child that lived so long is restarted after the first pause again."""
+LIVED_SECONDS = 5.0
+"""So is one that was killed, or lost its workers, after so long: it did not fail to start."""
+AGAIN = 75
+"""Exit code of a child that should be started again at once (EX_TEMPFAIL of sysexits)."""
+STOP_SECONDS = 2.0
+LOOK_SECONDS = 1.0
+STOPPED_SECONDS = 12.0
+"""A child that was stopped (SIGSTOP) past its lease is killed: it may hold SQLite's write lock."""
+
+SUPERVISED = "LAGID_SUPERVISED"
+"""Set for the child: it ends when its standard input does, that is, when this process dies."""
+
+
+class Supervisor:
+    """Runs a command as a child in a session of its own, again and again until `stop`.
+
+    The session is what finds every process that the child has started, also after the child
+    itself was killed: Ray's helpers put themselves into process groups of their own.
+    """
+
+    def __init__(
+        self, command: Sequence[str], environment: Mapping[str, str], log: Path | None = None
+    ) -> None:
+        self._command, self._environment, self._log_path = tuple(command), dict(environment), log
+        self._stopping = threading.Event()
+        self._lock, self._one_stop = threading.Lock(), threading.Lock()
+        self._child: subprocess.Popen[bytes] | None = None
+        self._thread = threading.Thread(target=self._keep_running, name="supervisor", daemon=True)
+
+    def start(self) -> None:
+        """Start the child and watch it."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the child: asked first, killed after `STOP_SECONDS`; then whatever it left.
+
+        A second call, from another thread too, waits for the first: a child that is asked twice
+        would not end in order.
+        """
+        with self._one_stop:
+            if not self._stopping.is_set():
+                self._stop()
+
+    def _stop(self) -> None:
+        with self._lock:
+            self._stopping.set()
+            child = self._child
+        if child is None:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            child.send_signal(signal.SIGTERM)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.wait(STOP_SECONDS)
+        child.kill()
+        child.wait()
+        clear_family(child.pid)
+        self._thread.join()
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the child that runs now."""
+        child = self._child
+        return None if child is None or child.poll() is not None else child.pid
+
+    def _keep_running(self) -> None:
+        pause = FIRST_PAUSE_SECONDS
+        while not self._stopping.is_set():
+            begun = time.monotonic()
+            child = self._spawn()
+            if child is None:
+                return
+            code = _end_of(child)
+            clear_family(child.pid)
+            assert child.stdin is not None
+            child.stdin.close()
+            if self._stopping.is_set():
+                return
+            lived = time.monotonic() - begun
+            was_well = lived > STEADY_SECONDS or (
+                lived > LIVED_SECONDS and (code < 0 or code == AGAIN)
+            )
+            pause = FIRST_PAUSE_SECONDS if was_well else min(2 * pause, LONGEST_PAUSE_SECONDS)
+            _log.warning("the dispatcher ended with %d; a new one in %.1f s", code, pause)
+            self._stopping.wait(pause)
+
+    def _spawn(self) -> "subprocess.Popen[bytes] | None":
+        with self._lock, contextlib.ExitStack() as stack:
+            if self._stopping.is_set():
+                return None
+            sink = None
+            if self._log_path is not None:
+                self._log_path.parent.mkdir(parents=True, exist_ok=True)
+                sink = stack.enter_context(self._log_path.open("ab"))
+            self._child = subprocess.Popen(
+                self._command,
+                env={**os.environ, **self._environment, SUPERVISED: "1"},
+                stdin=subprocess.PIPE,  # never written to: its end tells the child of our death
+                stdout=sink,
+                stderr=sink,
+                start_new_session=True,
+            )
+            return self._child
+
+
+@contextmanager
+def supervised_dispatcher(settings: Settings) -> Iterator[Supervisor]:
+    """Keep a dispatcher with these settings running for the length of the block."""
+    supervisor = Supervisor(
+        [sys.executable, "-m", "service.dispatch.process"],
+        environment_of(settings),
+        settings.data_dir.absolute() / "logs" / "dispatcher.log",
+    )
+    supervisor.start()
+    try:
+        yield supervisor
+    finally:
+        supervisor.stop()
+
+
+def environment_of(settings: Settings) -> dict[str, str]:
+    """The settings as environment variables, so that a child has the same."""
+    values = settings.model_dump(mode="json", exclude_none=True)
+    values["data_dir"] = str(settings.data_dir.absolute())
+    return {f"LAGID_{name.upper()}": str(value) for name, value in values.items()}
+
+
+def _end_of(child: "subprocess.Popen[bytes]") -> int:
+    """Wait for the end of a child; gives its exit code."""
+    awake = time.monotonic()
+    while True:
+        try:
+            return child.wait(LOOK_SECONDS)
+        except subprocess.TimeoutExpired:
+            found = standing(child.pid)
+        if found is None or not found.is_stopped:
+            awake = time.monotonic()
+        elif time.monotonic() - awake > STOPPED_SECONDS:
+            _log.warning("the dispatcher was stopped for %g s: it is killed", STOPPED_SECONDS)
+            child.kill()
+
+
+def clear_family(leader: int) -> None:
+    """Kill every process of the session of a child that has ended; clear what its Ray left."""
+    kill(of_session(leader))
+    clear_after(leader)

@@ -1,0 +1,1 @@
+"""One Plotly definition per figure; formats; no rendering of pages."""

@@ -1,0 +1,225 @@
+"""Figure 15: errors of the response and of each parameter against the noise, method by method."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from service.figures import theme
+from service.figures.formats import bracketed
+from service.figures.plotly import MARGIN, Figure, finite, layout
+from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
+
+SIGMA = "/noise/sigma"
+METHOD = "/algorithm/method"
+MOST_SERIES = 12
+NORMAL_95 = 1.6449  # standard deviations from the median to the 95 % quantile
+
+_STYLES: Mapping[str, dict[str, Any]] = {
+    "simple": {"color": theme.VERMILLION, "dash": "dashdot", "width": 1.6},
+    "improved-paper": {"color": theme.PURPLE, "dash": "dot", "width": 1.8},
+    "improved": {"color": theme.BLUE, "dash": "solid", "width": 2},
+}
+_OTHERS = ((theme.GREEN, "solid"), (theme.OCHRE, "dashdot"), (theme.PURPLE, "solid"))
+_FLOOR = {"color": theme.GREY, "dash": "dash", "width": 1.6}
+_CAPTION_PX, _PLOT_PX, _AXIS_PX = 30, 250, 54
+_ROW_PX = _CAPTION_PX + _PLOT_PX + _AXIS_PX
+_MARGIN = {**MARGIN, "l": 72, "t": 36, "b": 6}
+_GAP = 0.1
+
+
+@dataclass(slots=True)
+class _Band:
+    """Quantiles of one quantity over σ: 5, 50 and 95 %."""
+
+    x: list[float] = field(default_factory=list)
+    low: list[float] = field(default_factory=list)
+    middle: list[float] = field(default_factory=list)
+    high: list[float] = field(default_factory=list)
+
+    def add(self, sigma: float, quantiles: Sequence[float]) -> None:
+        self.x.append(sigma)
+        for values, place in ((self.low, 0), (self.middle, 2), (self.high, 4)):
+            values.append(quantiles[place])
+
+
+@dataclass(slots=True)
+class _Panel:
+    """One pair of axes: a band for each series, and the floor by σ."""
+
+    caption: str
+    title: str
+    is_signed: bool
+    bands: dict[str, _Band] = field(default_factory=dict)
+    floor: dict[float, float] = field(default_factory=dict)
+
+
+def noise_keys(axes: Sequence[Mapping[str, Any]]) -> list[str] | None:
+    """Keys to group by for this figure: σ and all axes but seeds; None without an axis of σ."""
+    paths = [axis["path"] for axis in axes]
+    return [path for path in paths if not path.endswith("/seed")] if SIGMA in paths else None
+
+
+def noise_sweep(summary: SummaryOut, unit: str, columns: int = 2) -> Figure:
+    """Medians and 5 to 95 % bands over σ, one line a method, and the Cramér–Rao floor.
+
+    The first plot has the RMS between the identified response and the record without noise, the
+    others each parameter's estimate minus its reference. Quantiles are those of the runs that
+    succeeded.
+    """
+    panels = _panels(summary, unit)
+    columns = max(1, min(columns, len(panels)))
+    rows = -(-len(panels) // columns)
+    figure: Figure = {
+        "data": [],
+        "layout": layout(noise_height(len(panels), columns), annotations=[], margin=_MARGIN),
+    }
+    told: set[str] = set()
+    for number, panel in enumerate(panels):
+        row, column = divmod(number, columns)
+        wide = (1 - _GAP * (columns - 1)) / columns
+        left = column * (wide + _GAP)
+        top = 1 - (row * _ROW_PX + _CAPTION_PX) / (rows * _ROW_PX)
+        bottom = max(top - _PLOT_PX / (rows * _ROW_PX), 0.0)
+        place = (left, min(left + wide, 1.0)), (bottom, top)
+        _add(figure, number, panel, place, unit, told)
+    return figure
+
+
+def noise_height(n_panels: int, columns: int = 2) -> int:
+    """Height (px) of the figure, so that a page can leave room for it."""
+    rows = -(-n_panels // max(1, min(columns, n_panels)))
+    return max(rows, 1) * _ROW_PX + int(_MARGIN["t"] + _MARGIN["b"])
+
+
+def _panels(summary: SummaryOut, unit: str) -> list[_Panel]:
+    suffix = bracketed(unit)
+    response = _Panel("<b>RMS error</b> of the response", f"RMS error{suffix}", is_signed=False)
+    panels = {"": response}
+    for group in summary.groups:
+        name = _series(group)
+        if group.sigma is None or not _is_shown(name, response):
+            continue
+        if group.rms_noise_free is not None:
+            _band(response, name).add(group.sigma, group.rms_noise_free)
+        if group.rms_floor is not None:
+            response.floor[group.sigma] = group.rms_floor
+        for one in group.parameters:
+            _add_error(panels.setdefault(one.name, _panel_of(one)), name, group.sigma, one)
+    return [one for one in panels.values() if one.bands]
+
+
+def _add_error(panel: _Panel, name: str, sigma: float, one: ParameterSummaryOut) -> None:
+    if one.error is not None:
+        _band(panel, name).add(sigma, one.error)
+    if one.floor is not None:
+        panel.floor[sigma] = one.floor
+
+
+def _panel_of(one: ParameterSummaryOut) -> _Panel:
+    suffix = bracketed(one.unit)
+    known = "" if one.reference is None else f" − {one.reference:.6g}".replace("−-", "+")
+    return _Panel(f"<b>{one.name}</b>{known}", f"error of {one.name}{suffix}", is_signed=True)
+
+
+def _band(panel: _Panel, name: str) -> _Band:
+    return panel.bands.setdefault(name, _Band())
+
+
+def _is_shown(name: str, panel: _Panel) -> bool:
+    return name in panel.bands or len(panel.bands) < MOST_SERIES
+
+
+def _series(group: GroupOut) -> str:
+    """What the runs of a group have in common besides σ."""
+    rest = {key: value for key, value in group.key.items() if key != SIGMA}
+    if list(rest) == [METHOD]:
+        return str(rest[METHOD])
+    words = (
+        value.get("name", "…") if isinstance(value, dict) else value for value in rest.values()
+    )
+    return ", ".join(map(str, words)) or "all runs"
+
+
+def _look(name: str, number: int) -> dict[str, Any]:
+    if name in _STYLES:
+        return dict(_STYLES[name])
+    if number >= len(_OTHERS):
+        return theme.series_style(number)
+    colour, dash = _OTHERS[number]
+    return {"color": colour, "dash": dash, "width": 1.6}
+
+
+def _add(
+    figure: Figure, number: int, panel: _Panel,
+    place: tuple[tuple[float, float], tuple[float, float]], unit: str, told: set[str],
+) -> None:  # fmt: skip
+    axis = "" if number == 0 else str(number + 1)
+    across, upward = place
+    at = {"xaxis": f"x{axis}", "yaxis": f"y{axis}"}
+    for place_in_order, (name, band) in enumerate(panel.bands.items()):
+        first = name not in told
+        told.add(name)
+        label = name if number == 0 else f"{panel.title}: {name}"
+        figure["data"] += _drawn(band, label, name, _look(name, place_in_order), at, first)
+    figure["data"] += _floors(panel, at, told)
+    figure["layout"][f"xaxis{axis}"] = {
+        "domain": across, "anchor": f"y{axis}", "rangemode": "tozero", "nticks": 7,
+        "title": {"text": "σ" + bracketed(unit), "font": {"size": 11},
+                  "standoff": 4},
+        **({} if number == 0 else {"matches": "x"}),
+    }  # fmt: skip
+    figure["layout"][f"yaxis{axis}"] = {
+        "domain": upward, "anchor": f"x{axis}", "nticks": 6, "zeroline": True,
+        **({} if panel.is_signed else {"rangemode": "tozero"}),
+        "title": {"text": panel.title, "font": {"size": 11}},
+    }  # fmt: skip
+    figure["layout"]["annotations"].append({
+        "text": panel.caption, "xref": "paper", "yref": "paper", "x": across[0], "y": upward[1],
+        "xanchor": "left", "yanchor": "bottom", "yshift": 4, "showarrow": False, "align": "left",
+    })  # fmt: skip
+
+
+def _drawn(
+    band: _Band, label: str, group: str, line: dict[str, Any], at: dict[str, str], first: bool
+) -> list[dict[str, Any]]:
+    """The band between its two edges, and the median over it."""
+    order = sorted(range(len(band.x)), key=band.x.__getitem__)
+    x = finite(band.x[i] for i in order)
+    low, middle, high = (
+        finite(values[i] for i in order) for values in (band.low, band.middle, band.high)
+    )
+    shared = {"type": "scatter", "x": x, "legendgroup": group, **at}
+    edge = {**shared, "mode": "lines", "line": {"width": 0}, "showlegend": False,
+            "hoverinfo": "skip"}  # fmt: skip
+    return [
+        {**edge, "name": f"{label}, 5 %", "y": low},
+        {**edge, "name": f"{label}, 95 %", "y": high, "fill": "tonexty",
+         "fillcolor": _faint(line["color"])},
+        {**shared, "mode": "lines+markers", "name": label, "y": middle, "line": line,
+         "marker": {"size": 5, "color": line["color"]}, "showlegend": first,
+         "hovertemplate": f"{group}<br>σ %{{x:.4g}}: %{{y:.4g}}<extra></extra>"},
+    ]  # fmt: skip
+
+
+def _floors(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dict[str, Any]]:
+    """The floor: of the response its value, of a parameter the 5 and 95 % that it stands for."""
+    x = sorted(panel.floor)
+    if not x:
+        return []
+    signs = (-NORMAL_95, NORMAL_95) if panel.is_signed else (1.0,)
+    name = "Cramér–Rao floor (of parameters: 5 and 95 %)"
+    lines = []
+    for sign in signs:
+        lines.append({
+            "type": "scatter", "mode": "lines", "name": name, "legendgroup": name,
+            "showlegend": name not in told, "x": finite(x),
+            "y": finite(sign * panel.floor[one] for one in x), "line": dict(_FLOOR), **at,
+            "hovertemplate": "floor, σ %{x:.4g}: %{y:.4g}<extra></extra>",
+        })  # fmt: skip
+        told.add(name)
+    return lines
+
+
+def _faint(colour: str) -> str:
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return f"rgba({red},{green},{blue},0.15)"

@@ -1,0 +1,336 @@
+"""Figures of a run as Plotly JSON: one definition for the pages, the REST route and the report.
+
+A figure is a plain ``{"data": […], "layout": {…}}``. Colours that depend on the paper come from
+the template (`service.figures.theme`); no line has more than `decimation.MAX_POINTS` points.
+"""
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from service.figures import formats, theme
+from service.figures.data import Floats, Improvement, RunEvidence, SoughtParameter
+from service.figures.theme import strided
+
+Figure = dict[str, Any]
+Abscissa = Literal["generations", "evaluations"]
+
+MARGIN = {"l": 64, "r": 16, "t": 28, "b": 44}
+WATERFALL_HEIGHT = 280
+_EPOCHS_MARKED = 80
+_CROWDED = 8.0
+"""Ratio of the largest to the smallest value from which on digits of a log axis stand too close."""
+_PHASES = {
+    "sequence": ("sequence", "diamond-open"),
+    "migration": ("migration", "triangle-up-open"),
+    "refinement": ("refinement", "star"),
+}
+
+
+def finite(values: Iterable[float]) -> list[float | None]:
+    """Numbers as JSON takes them, seven digits long; what is not finite is a gap."""
+    return [float(f"{v:.7g}") if np.isfinite(v) else None for v in values]
+
+
+def layout(height: int, **more: Any) -> dict[str, Any]:
+    """The layout that all figures share; `uirevision` keeps a zoom through live updates."""
+    shared: dict[str, Any] = {
+        "height": height,
+        "margin": MARGIN,
+        "uirevision": "keep",
+        "hovermode": "closest",
+        "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0, "xanchor": "left"},
+        "template": theme.template("light"),
+    }
+    return {**shared, **more}
+
+
+def in_theme(figure: Figure, paper: theme.Theme) -> Figure:
+    """The same figure on light or dark paper."""
+    return {**figure, "layout": {**figure["layout"], "template": theme.template(paper)}}
+
+
+def history(run: RunEvidence, abscissa: Abscissa = "generations") -> Figure:
+    """Fitness of every island's champion over generations or evaluations, phases marked."""
+    end = _end(run, abscissa)
+    lines = [
+        _island_line(number, points, abscissa, end)
+        for number, points in enumerate(run.history)
+        if points
+    ]
+    data = [*lines, *_phase_markers(run, abscissa)]
+    epochs = run.migrations if abscissa == "generations" and run.epoch else ()
+    return {
+        "data": data,
+        "layout": layout(
+            360,
+            xaxis={"title": {"text": abscissa}, "rangemode": "tozero"},
+            yaxis=_fitness_axis(run, data),
+            shapes=[_upright(epoch * run.epoch) for epoch in _some(epochs)],
+            uirevision=abscissa,
+        ),
+    }
+
+
+def convergence(run: RunEvidence, columns: int = 3) -> Figure:
+    """Every free parameter of the islands' champions over generations, between its bounds."""
+    parameters = run.parameters
+    columns = max(1, min(columns, len(parameters)))
+    rows = -(-len(parameters) // columns)
+    figure: Figure = {
+        "data": [],
+        "layout": layout(
+            convergence_height(len(parameters), columns),
+            showlegend=False,
+            shapes=[],
+            annotations=[],
+        ),
+    }
+    figure["layout"]["margin"] = {**MARGIN, "b": 36}
+    for number, parameter in enumerate(parameters):
+        row, column = divmod(number, columns)
+        _small_plot(figure, run, number, parameter, (row, rows), (column, columns))
+    return figure
+
+
+def convergence_height(n_parameters: int, columns: int) -> int:
+    """Height (px) of the small plots, so that a page can leave room for them."""
+    rows = -(-n_parameters // max(1, min(columns, n_parameters)))
+    return max(rows, 1) * 214 + 20
+
+
+def correlation_height(n_parameters: int) -> int:
+    """Height (px) of the correlation matrix."""
+    return min(130 + max(n_parameters, 3) * (46 if n_parameters <= 12 else 24), 760)
+
+
+def correlation(run: RunEvidence) -> Figure:
+    """Correlation matrix of the estimates, from −1 to 1."""
+    names = list((run.correlation or {}).get("names", ()))
+    rows = [finite(row) for row in (run.correlation or {}).get("matrix", ())]
+    few = len(names) <= 12
+    matrix = {
+        "type": "heatmap", "x": names, "y": names, "z": rows, "zmin": -1, "zmax": 1,
+        "colorscale": theme.DIVERGING, "xgap": 2, "ygap": 2,
+        "hovertemplate": "%{y} and %{x}: %{z:.3f}<extra></extra>",
+        "colorbar": {"thickness": 10, "outlinewidth": 0, "tickvals": [-1, -0.5, 0, 0.5, 1]},
+    }  # fmt: skip
+    if few:
+        matrix["texttemplate"] = "%{z:.2f}"
+    return {
+        "data": [matrix] if names else [],
+        "layout": layout(
+            correlation_height(len(names)),
+            xaxis={"showgrid": False, "type": "category", "showline": False, "ticks": ""},
+            yaxis={
+                "showgrid": False, "type": "category", "autorange": "reversed",
+                "showline": False, "ticks": "", "automargin": True,
+            },
+        ),
+    }  # fmt: skip
+
+
+def waterfall(run: RunEvidence) -> Figure:
+    """Fitness that each island found, best first, before and after refinement."""
+    order = sorted(range(len(run.islands)), key=lambda i: _last(run.islands[i]))
+    rank = list(range(1, len(order) + 1))
+    islands = [f"island {i + 1}" for i in order]
+    series = [("after the search", theme.GREY, "circle-open", 0)]
+    if any(refined is not None for _, refined in run.islands):
+        series.append(("after refinement", theme.BLUE, "circle", 1))
+    data = [
+        {
+            "type": "scatter", "mode": "lines+markers", "name": name, "x": rank,
+            "y": finite(np.nan if (v := run.islands[i][part]) is None else v for i in order),
+            "text": islands, "line": {"color": colour, "width": 1, "dash": "dot"},
+            "marker": {"color": colour, "symbol": symbol, "size": 9},
+            "hovertemplate": "%{text}: %{y:.5g} " + run.unit + "<extra></extra>",
+        }
+        for name, colour, symbol, part in series
+    ]  # fmt: skip
+    return {
+        "data": data if order else [],
+        "layout": layout(
+            WATERFALL_HEIGHT,
+            xaxis={"title": {"text": "islands, best first"}, "dtick": max(1, len(order) // 12),
+                   "range": [0.5, len(order) + 0.5]},
+            yaxis=_fitness_axis(run, data),
+        ),
+    }  # fmt: skip
+
+
+RUN_FIGURES: Mapping[str, Callable[[RunEvidence], Figure]] = {
+    "history": history,
+    "convergence": convergence,
+    "correlation": correlation,
+    "waterfall": waterfall,
+}
+
+
+def as_csv(figure: Figure) -> str:
+    """The numbers drawn, one a row: series, x, y (and z of a matrix)."""
+    sink = io.StringIO()
+    rows = csv.writer(sink, lineterminator="\n")
+    matrix = any("z" in trace for trace in figure["data"])
+    rows.writerow(["series", "x", "y", *(["z"] if matrix else [])])
+    for trace in figure["data"]:
+        name = trace.get("name", "")
+        if "z" in trace:
+            for y, line in zip(trace["y"], trace["z"], strict=True):
+                rows.writerows((name, x, y, z) for x, z in zip(trace["x"], line, strict=True))
+        else:
+            rows.writerows((name, x, y) for x, y in zip(trace["x"], trace["y"], strict=True))
+    return sink.getvalue()
+
+
+def _at(point: Improvement, abscissa: Abscissa) -> int:
+    return point.generation if abscissa == "generations" else point.evaluations
+
+
+def _end(run: RunEvidence, abscissa: Abscissa) -> int:
+    last = [_at(points[-1], abscissa) for points in run.history if points]
+    # Evaluations of a run are those of all its islands, which count their own.
+    return max([*last, run.generations if abscissa == "generations" else 0])
+
+
+def _steps(points: Sequence[Improvement], abscissa: Abscissa, end: int) -> tuple[list[int], Any]:
+    kept = [points[i] for i in strided(len(points), 990)]
+    ahead = [end] if _at(kept[-1], abscissa) < end else []
+    return [*(_at(p, abscissa) for p in kept), *ahead], [*kept, *([kept[-1]] if ahead else [])]
+
+
+def _island_line(
+    number: int, points: Sequence[Improvement], abscissa: Abscissa, end: int
+) -> dict[str, Any]:
+    x, kept = _steps(points, abscissa, end)
+    return {
+        "type": "scatter", "mode": "lines", "name": f"island {number + 1}",
+        "x": x, "y": finite(p.rms for p in kept),
+        "line": {**theme.series_style(number), "shape": "hv"},
+        "hovertemplate": f"island {number + 1}<br>%{{x}} {abscissa}: %{{y:.5g}}<extra></extra>",
+    }  # fmt: skip
+
+
+def _phase_markers(run: RunEvidence, abscissa: Abscissa) -> list[dict[str, Any]]:
+    markers = []
+    for phase, (name, symbol) in _PHASES.items():
+        found = [
+            (number, point)
+            for number, points in enumerate(run.history)
+            for point in points
+            if point.phase == phase
+        ]
+        if not found:
+            continue
+        found = [found[i] for i in strided(len(found))]
+        markers.append({
+            "type": "scatter", "mode": "markers", "name": name,
+            "x": [_at(p, abscissa) for _, p in found], "y": finite(p.rms for _, p in found),
+            "marker": {
+                "symbol": symbol, "size": 10 if phase == "refinement" else 6,
+                "color": [theme.series_style(i)["color"] for i, _ in found],
+            },
+            "text": [f"island {i + 1}" for i, _ in found],
+            "hovertemplate": f"{name}, %{{text}}<br>%{{x}}: %{{y:.5g}}<extra></extra>",
+        })  # fmt: skip
+    return markers
+
+
+def _some(epochs: Sequence[int]) -> list[int]:
+    distinct = sorted(set(epochs))
+    return distinct if len(distinct) <= _EPOCHS_MARKED else []
+
+
+def _fitness_axis(run: RunEvidence, data: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The axis of the fitness; `data` are the traces upon it."""
+    title = {"text": run.fitness + formats.bracketed(run.unit)}
+    # Over less than a decade the digits between its powers would stand alone, without any power.
+    axis = {"title": title, "type": "log", "exponentformat": "e", "minorloglabels": "complete"}
+    positive = [y for trace in data for y in trace["y"] if y is not None and y > 0]
+    if positive and _CROWDED <= max(positive) / min(positive) < 1000 * _CROWDED:
+        axis["dtick"] = "D2"  # 1, 2, 5: all nine digits of a decade lie upon each other
+    return axis
+
+
+def _upright(x: float) -> dict[str, Any]:
+    return {
+        "type": "line", "x0": x, "x1": x, "y0": 0, "y1": 1, "yref": "paper", "layer": "below",
+        "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dot"},
+    }  # fmt: skip
+
+
+def _last(island: tuple[float, float | None]) -> float:
+    champion, refined = island
+    return champion if refined is None else refined
+
+
+def _small_plot(
+    figure: Figure,
+    run: RunEvidence,
+    number: int,
+    parameter: SoughtParameter,
+    row: tuple[int, int],
+    column: tuple[int, int],
+) -> None:
+    axis = "" if number == 0 else str(number + 1)
+    left, right = _share(*column, gap=0.15)
+    bottom, top = (1 - v for v in reversed(_share(*row, gap=0.34)))
+    end = _end(run, "generations")
+    for island, points in enumerate(run.history):
+        if points:
+            x, kept = _steps(points, "generations", end)
+            y: Floats = np.array([p.parameters[number] for p in kept], dtype=np.float64)
+            figure["data"].append({
+                "type": "scatter", "mode": "lines",
+                "name": f"{parameter.name}, island {island + 1}",
+                "x": x, "y": finite(y), "xaxis": f"x{axis}", "yaxis": f"y{axis}",
+                "line": {**theme.series_style(island), "shape": "hv"},
+                "hovertemplate": f"island {island + 1}<br>%{{x}}: %{{y:.6g}}<extra></extra>",
+            })  # fmt: skip
+    figure["layout"][f"xaxis{axis}"] = {
+        "domain": [left, right], "anchor": f"y{axis}", "rangemode": "tozero", "nticks": 5,
+        **({} if number == 0 else {"matches": "x"}),
+    }  # fmt: skip
+    figure["layout"][f"yaxis{axis}"] = {
+        "domain": [bottom, top], "anchor": f"x{axis}", "nticks": 5, **_between_bounds(parameter),
+    }  # fmt: skip
+    figure["layout"]["shapes"] += [
+        _level(bound, axis) for bound in (parameter.lower, parameter.upper)
+    ]
+    figure["layout"]["annotations"].append({
+        "text": _caption(parameter), "xref": "paper", "yref": "paper", "x": left, "y": top,
+        "xanchor": "left", "yanchor": "bottom", "yshift": 4, "showarrow": False, "align": "left",
+    })  # fmt: skip
+
+
+def _share(number: int, of: int, gap: float) -> tuple[float, float]:
+    """Domain of the numbered of several equal parts, `gap` of a part left free between."""
+    part = 1 / (of - gap) if of > 1 else 1.0
+    return number * part, min(number * part + part * (1 - gap if of > 1 else 1), 1.0)
+
+
+def _between_bounds(parameter: SoughtParameter) -> dict[str, Any]:
+    lower, upper = parameter.lower, parameter.upper
+    if parameter.scale == "log":
+        lower, upper = float(np.log10(lower)), float(np.log10(upper))
+    room = 0.06 * (upper - lower)
+    return {"range": [lower - room, upper + room], "type": parameter.scale}
+
+
+def _level(y: float, axis: str) -> dict[str, Any]:
+    return {
+        "type": "line", "xref": f"x{axis} domain", "x0": 0, "x1": 1, "yref": f"y{axis}",
+        "y0": y, "y1": y, "layer": "below",
+        "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dash"},
+    }  # fmt: skip
+
+
+def _caption(parameter: SoughtParameter) -> str:
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    if parameter.value is None:
+        return f"<b>{parameter.name}</b>{f' [{parameter.unit}]' if unit else ''}"
+    value, error = formats.estimate(parameter.value, parameter.stderr)
+    return f"<b>{parameter.name}</b> = {value}{f' ± {error}' if error else ''}{unit}"

@@ -1,0 +1,101 @@
+"""Colours and templates of the figures. One set of line colours serves light and dark paper.
+
+The colours are those of Okabe and Ito, darkened where they vanish on white: each has a contrast of
+about 3 or more against both papers, and they stay apart for the colour-blind.
+
+Thinning of lines to what a screen can show, without losing what the eye looks for.
+"""
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.figures.data import Floats
+from service.formats.decimate import extremes
+
+Theme = Literal["light", "dark"]
+
+BLUE, VERMILLION, GREEN = "#2a83c4", "#d55e00", "#00916a"
+PURPLE, OCHRE, GREY = "#b9619b", "#b5830f", "#8a929b"
+SERIES = (BLUE, VERMILLION, GREEN, PURPLE, OCHRE, GREY)
+DASHES = ("solid", "dash", "dot", "dashdot")
+SHADE = "rgba(138,146,155,0.14)"
+HAIRLINE = "rgba(138,146,155,0.55)"
+DIVERGING = [[0.0, BLUE], [0.5, "rgba(138,146,155,0.10)"], [1.0, VERMILLION]]
+FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif"
+
+_INK: dict[Theme, dict[str, str]] = {
+    "light": {"text": "#303a44", "grid": "#e6e9ec", "line": "#b9c0c7", "card": "#ffffff"},
+    "dark": {"text": "#c6ced6", "grid": "#2a3138", "line": "#4c565f", "card": "#20262c"},
+}
+
+
+def series_style(number: int) -> dict[str, Any]:
+    """Colour and dash of the numbered series; no two of the first 24 are alike."""
+    return {
+        "color": SERIES[number % len(SERIES)],
+        "dash": DASHES[number // len(SERIES) % len(DASHES)],
+        "width": 1.6,
+    }
+
+
+def template(theme: Theme) -> dict[str, Any]:
+    """Plotly template: quiet axes on a transparent ground."""
+    ink = _INK[theme]
+    axis = {
+        "gridcolor": ink["grid"], "linecolor": ink["line"], "tickcolor": ink["line"],
+        "zerolinecolor": ink["line"], "zerolinewidth": 1, "showline": True, "ticks": "outside",
+        "ticklen": 4, "automargin": False, "title": {"standoff": 8},
+    }  # fmt: skip
+    return {
+        # Plotly takes a transparent cell for a white one and would write on it in black.
+        "data": {"heatmap": [{"textfont": {"color": ink["text"]}}]},
+        "layout": {
+            "paper_bgcolor": "rgba(0,0,0,0)",
+            "plot_bgcolor": "rgba(0,0,0,0)",
+            "font": {"family": FONT, "size": 12, "color": ink["text"]},
+            "colorway": list(SERIES),
+            "xaxis": axis,
+            "yaxis": axis,
+            "hoverlabel": {
+                "bgcolor": ink["card"],
+                "bordercolor": ink["line"],
+                "font": {"family": FONT, "size": 12, "color": ink["text"]},
+            },
+            "annotationdefaults": {"font": {"color": ink["text"], "size": 12}},
+            "modebar": {
+                "bgcolor": "rgba(0,0,0,0)",
+                "color": ink["line"],
+                "activecolor": ink["text"],
+            },
+        },
+    }
+
+
+MAX_POINTS = 1000
+
+
+def thinned(values: Floats, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
+    """Indices of at most `max_points` samples: the ends, and each bin's least and greatest.
+
+    A spike of one sample therefore stays visible at any zoom. Several arrays may share them.
+    """
+    if values.size <= max_points:
+        return np.arange(values.size)
+    inner = extremes(values, max_points - 2)
+    return np.unique(np.concatenate([[0, values.size - 1], inner])).astype(np.intp)
+
+
+def window(times: Floats, start: float | None, stop: float | None) -> slice:
+    """Samples between two times (s), with one more at each side so that lines reach the edge."""
+    first = 0 if start is None else int(np.searchsorted(times, start, "left")) - 1
+    last = times.size if stop is None else int(np.searchsorted(times, stop, "right")) + 1
+    return slice(max(first, 0), min(last, times.size))
+
+
+def strided(count: int, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
+    """Indices of at most `max_points` of `count` steps, the first and the last among them."""
+    if count <= max_points:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, max_points).round().astype(np.intp))

@@ -1,0 +1,200 @@
+"""The trend of a batch: every quantity over the label, its law with band, and predictions."""
+
+from typing import Any
+
+from service.figures import theme
+from service.figures.formats import bracketed
+from service.figures.plotly import MARGIN, Figure, finite, layout
+from service.trends.schemas import LawOut, PlaceOut, PointOut, QuantityOut, TrendOut
+
+_CAPTION_PX, _PLOT_PX, _AXIS_PX = 30, 250, 54
+_ROW_PX = _CAPTION_PX + _PLOT_PX + _AXIS_PX
+_MARGIN = {**MARGIN, "l": 72, "t": 36, "b": 6}
+_GAP = 0.1
+_BAND = "rgba(42,131,196,0.15)"
+_ESTIMATES, _LAW, _OTHER = "estimate ± standard error", "chosen law, 95 % band", "other law"
+_PREDICTED, _FLAGGED = "prediction, 95 % interval", "outlier or drift"
+_EXPECTED = "what the reference expects"
+
+Axes = dict[str, str]
+
+
+def trend_figure(found: TrendOut, columns: int = 2) -> Figure:
+    """Estimates with error bars over x, one small plot a quantity.
+
+    In each the chosen law as a line in its confidence band, the other law dotted, predictions as
+    diamonds with their intervals, and rings round outliers and what has drifted.
+    """
+    shown = [one for one in found.quantities if any(p.value is not None for p in one.points)]
+    columns = max(1, min(columns, len(shown)))
+    rows = -(-len(shown) // columns)
+    figure: Figure = {
+        "data": [],
+        "layout": layout(trend_height(len(shown), columns), annotations=[], margin=_MARGIN),
+    }
+    told: set[str] = set()
+    for number, one in enumerate(shown):
+        row, column = divmod(number, columns)
+        wide = (1 - _GAP * (columns - 1)) / columns
+        left = column * (wide + _GAP)
+        top = 1 - (row * _ROW_PX + _CAPTION_PX) / (rows * _ROW_PX)
+        bottom = max(top - _PLOT_PX / (rows * _ROW_PX), 0.0)
+        at = _axes(figure, number, one, found.x, ((left, min(left + wide, 1.0)), (bottom, top)))
+        for trace in _traces(one):
+            name = trace["legendgroup"]
+            first = name not in told and trace.get("showlegend", True)
+            label = name if first else f"{one.name}: {name}"
+            told.update({name} if first else ())
+            figure["data"].append({**trace, "name": label, "showlegend": first, **at})
+    return figure
+
+
+def trend_height(n_quantities: int, columns: int = 2) -> int:
+    """Height (px) of the figure, so that a page can leave room for it."""
+    rows = -(-n_quantities // max(1, min(columns, n_quantities)))
+    return max(rows, 1) * _ROW_PX + int(_MARGIN["t"] + _MARGIN["b"])
+
+
+def _axes(
+    figure: Figure, number: int, one: QuantityOut, x: str,
+    place: tuple[tuple[float, float], tuple[float, float]],
+) -> Axes:  # fmt: skip
+    axis = "" if number == 0 else str(number + 1)
+    across, upward = place
+    unit = bracketed(one.unit)
+    figure["layout"][f"xaxis{axis}"] = {
+        "domain": across, "anchor": f"y{axis}", "nticks": 7, "rangemode": "tozero",
+        "title": {"text": x, "font": {"size": 11}, "standoff": 4},
+        **({} if number == 0 else {"matches": "x"}),
+    }  # fmt: skip
+    figure["layout"][f"yaxis{axis}"] = {
+        "domain": upward, "anchor": f"x{axis}", "nticks": 6,
+        "title": {"text": f"{one.name}{unit}", "font": {"size": 11}},
+    }  # fmt: skip
+    figure["layout"]["annotations"].append({
+        "text": _caption(one), "xref": "paper", "yref": "paper", "x": across[0], "y": upward[1],
+        "xanchor": "left", "yanchor": "bottom", "yshift": 4, "showarrow": False, "align": "left",
+    })  # fmt: skip
+    return {"xaxis": f"x{axis}", "yaxis": f"y{axis}"}
+
+
+def _caption(one: QuantityOut) -> str:
+    chosen = next((law for law in one.laws if law.is_chosen), None)
+    if chosen is None:
+        return f"<b>{one.name}</b>: no law"
+    return f"<b>{one.name}</b> = {_formula(chosen)}"
+
+
+def _formula(law: LawOut) -> str:
+    a, b = (f"{one.value:.4g}".replace("-", "−") for one in law.coefficients)
+    return f"{a} + {b}·x".replace("+ −", "− ") if law.law == "line" else f"{a}·x<sup>{b}</sup>"
+
+
+def _traces(one: QuantityOut) -> list[dict[str, Any]]:
+    known = [point for point in one.points if point.value is not None]
+    return [
+        *_band(one.band), *_other(one), *_expected(known), *_predictions(one.predictions),
+        *_flagged(known), _estimates(known),
+    ]  # fmt: skip
+
+
+def _scatter(group: str, mode: str, x: list[Any], y: list[Any], **more: Any) -> dict[str, Any]:
+    return {"type": "scatter", "legendgroup": group, "mode": mode, "x": x, "y": y, **more}
+
+
+def _band(places: list[PlaceOut]) -> list[dict[str, Any]]:
+    if not places:
+        return []
+    x = finite(place.x for place in places)
+    edge = {"line": {"width": 0}, "showlegend": False, "hoverinfo": "skip"}
+    low, high, middle = (
+        _numbers([getattr(place, name) for place in places]) for name in ("lower", "upper", "value")
+    )
+    return [
+        _scatter(_LAW, "lines", x, low, **edge),
+        _scatter(_LAW, "lines", x, high, **edge, fill="tonexty", fillcolor=_BAND),
+        _scatter(_LAW, "lines", x, middle, line={"color": theme.BLUE, "width": 1.8},
+                 hovertemplate="law at %{x:.4g}: %{y:.4g}<extra></extra>"),
+    ]  # fmt: skip
+
+
+def _other(one: QuantityOut) -> list[dict[str, Any]]:
+    """The law that was not chosen, over the same stretch."""
+    law = next((law for law in one.laws if not law.is_chosen), None)
+    if law is None:
+        return []
+    a, b = (coefficient.value for coefficient in law.coefficients)
+    x = [place.x for place in one.band]
+    y = [a + b * at if law.law == "line" else _power(a, b, at) for at in x]
+    return [
+        _scatter(_OTHER, "lines", finite(x), finite(y),
+                 line={"color": theme.GREY, "dash": "dot", "width": 1.4},
+                 hovertemplate=f"{law.formula} at %{{x:.4g}}: %{{y:.4g}}<extra></extra>")
+    ]  # fmt: skip
+
+
+def _power(a: float, b: float, x: float) -> float:
+    return float(a * x**b) if x > 0 else float("nan")
+
+
+def _estimates(known: list[PointOut]) -> dict[str, Any]:
+    colour = theme.VERMILLION
+    return _scatter(
+        _ESTIMATES, "markers", finite(point.x for point in known),
+        _numbers([point.value for point in known]),
+        error_y={"type": "data", "array": _numbers([p.stderr or 0.0 for p in known]),
+                 "color": colour, "thickness": 1.4, "width": 4},
+        marker={"color": colour, "size": 7,
+                "symbol": ["circle" if p.is_used else "circle-open" for p in known]},
+        customdata=[[f"{p.stderr:.3g}" if p.stderr else "–", len(p.runs), p.status] for p in known],
+        hovertemplate="%{x:.4g}: %{y:.5g} ± %{customdata[0]}<br>%{customdata[1]} runs, "
+                      "%{customdata[2]}<extra></extra>",
+    )  # fmt: skip
+
+
+def _predictions(places: list[PlaceOut]) -> list[dict[str, Any]]:
+    known = [one for one in places if one.value is not None and one.upper is not None]
+    if not known:
+        return []
+    return [
+        _scatter(
+            _PREDICTED, "markers", finite(one.x for one in known),
+            _numbers([one.value for one in known]),
+            error_y={"type": "data", "symmetric": True, "color": theme.GREEN, "thickness": 1.4,
+                     "width": 6, "array": _numbers([_reach(one) for one in known])},
+            marker={"color": theme.GREEN, "size": 9, "symbol": "diamond-open"},
+            hovertemplate="predicted at %{x:.4g}: %{y:.4g} ± %{error_y.array:.2g}<extra></extra>",
+        )
+    ]  # fmt: skip
+
+
+def _reach(one: PlaceOut) -> float:
+    return 0.5 * ((one.upper or 0.0) - (one.lower or 0.0))
+
+
+def _flagged(known: list[PointOut]) -> list[dict[str, Any]]:
+    flagged = [p for p in known if p.is_outlier or any(one.drifted for one in p.drifts)]
+    if not flagged:
+        return []
+    return [
+        _scatter(_FLAGGED, "markers", finite(p.x for p in flagged),
+                 _numbers([p.value for p in flagged]), hoverinfo="skip",
+                 marker={"color": theme.PURPLE, "size": 18, "symbol": "circle-open",
+                         "line": {"width": 2}})
+    ]  # fmt: skip
+
+
+def _expected(known: list[PointOut]) -> list[dict[str, Any]]:
+    pairs = [(p.x, one.expected) for p in known for one in p.drifts]
+    if not pairs:
+        return []
+    return [
+        _scatter(_EXPECTED, "markers", finite(x for x, _ in pairs), finite(y for _, y in pairs),
+                 marker={"color": theme.GREY, "size": 10, "symbol": "x-thin",
+                         "line": {"width": 2, "color": theme.GREY}},
+                 hovertemplate="the reference expects %{y:.5g} at %{x:.4g}<extra></extra>")
+    ]  # fmt: skip
+
+
+def _numbers(values: list[float | None]) -> list[float | None]:
+    return [None if value is None else finite([value])[0] for value in values]

@@ -1,0 +1,1 @@
+"""MCAP and CSV, read in a sandboxed child; decimation."""

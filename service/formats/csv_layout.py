@@ -1,0 +1,160 @@
+"""What the first rows of a CSV file tell: separator, decimal sign, names, units, time column."""
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from service.formats.errors import InvalidUpload
+from sysid.core.errors import nearest
+from sysid.core.units import factor
+
+SEPARATORS = ("\t", ";", ",")
+TIME_NAMES = ("t", "t_s", "time", "time_s")
+SECONDS = ("", "s", "sec", "second", "seconds")
+LONGEST_TIME_UNIT = 86_400.0
+"""Seconds of a day: a longer unit is a slip."""
+
+_UNIT = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$")
+_DECIMAL_COMMA = re.compile(r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$")
+
+Role = Literal["time", "label", "value"]
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column: its name without the unit, and what it is."""
+
+    name: str
+    unit: str
+    role: Role
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How a file is to be read."""
+
+    columns: tuple[Column, ...]
+    separator: str
+    has_decimal_commas: bool
+
+    @property
+    def time(self) -> int | None:
+        """Place of the time column, if there is one."""
+        return next((i for i, one in enumerate(self.columns) if one.role == "time"), None)
+
+
+def find_layout(lines: Sequence[str], segments: Sequence[str], sample_time: float | None) -> Layout:
+    """Layout of a file from its first lines.
+
+    Raises
+    ------
+    InvalidUpload
+        If there is no usable header, or the time is missing or told twice.
+    """
+    separator = _separator(lines[0])
+    try:
+        rows = list(csv.reader(lines, delimiter=separator))
+    except csv.Error as error:
+        raise InvalidUpload(f"the first rows cannot be read ({error})") from None
+    names = [_name_and_unit(field) for field in rows[0]]
+    if len(names) == 1 and (sample_time is None or _is_number(rows[0][0])):
+        raise InvalidUpload(
+            f"there is only one column ({rows[0][0].strip()!r}); need a time column and a signal, "
+            "separated by comma, semicolon or tab"
+        )
+    _check_names(names)
+    columns = _with_roles(names, segments, sample_time)
+    if not any(column.role == "value" for column in columns):
+        raise InvalidUpload("there is no signal: every column is time or a label")
+    return Layout(columns, separator, separator != "," and _has_decimal_commas(rows[1:]))
+
+
+def _separator(header: str) -> str:
+    unquoted = re.sub(r'"[^"]*"', "", header)
+    return next((sign for sign in SEPARATORS if sign in unquoted), ",")
+
+
+def _name_and_unit(field: str) -> tuple[str, str]:
+    found = _UNIT.match(field.strip())
+    return (found["name"], found["unit"].strip()) if found else (field.strip(), "")
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _check_names(names: Sequence[tuple[str, str]]) -> None:
+    if all(_is_number(name) for name, _ in names):
+        raise InvalidUpload(
+            "the first row holds numbers; need a header that names the columns, such as t,u,y",
+            row=1,
+        )
+    seen: set[str] = set()
+    for place, (name, _) in enumerate(names, 1):
+        if not name:
+            raise InvalidUpload(f"column {place} of the header has no name", row=1)
+        if name in seen:
+            raise InvalidUpload("two columns have this name; names must differ", row=1, column=name)
+        seen.add(name)
+
+
+def _with_roles(
+    names: Sequence[tuple[str, str]], segments: Sequence[str], sample_time: float | None
+) -> tuple[Column, ...]:
+    known = [name for name, _ in names]
+    for label in segments:
+        if label not in known:
+            raise InvalidUpload(f"there is no label column {label!r}{nearest(label, known)}", row=1)
+    is_time = [name.lower() in TIME_NAMES and name not in segments for name in known]
+    time = is_time.index(True) if any(is_time) else None
+    _check_time(None if time is None else names[time], known, sample_time)
+    return tuple(
+        Column(name, unit, "time" if i == time else "label" if name in segments else "value")
+        for i, (name, unit) in enumerate(names)
+    )
+
+
+def _check_time(
+    column: tuple[str, str] | None, known: Sequence[str], sample_time: float | None
+) -> None:
+    if column is None:
+        if sample_time is None:
+            raise InvalidUpload(
+                f"there is no time column; found {', '.join(known)}; name one of them t (in "
+                "seconds) or give the sampling period with sample_time",
+                row=1,
+            )
+        if not 0 < sample_time < float("inf"):
+            raise InvalidUpload(
+                f"sample_time is {sample_time!r}; need a positive number of seconds"
+            )
+        return
+    name, unit = column
+    if sample_time is not None:
+        raise InvalidUpload(
+            "the file has this time column and sample_time is given too; leave one out",
+            row=1, column=name,
+        )  # fmt: skip
+    if seconds_in(unit) is None:
+        raise InvalidUpload(
+            f"times are in [{unit}]; need seconds, or another unit of time such as [ms] or [min]",
+            row=1, column=name,
+        )  # fmt: skip
+
+
+def seconds_in(unit: str) -> float | None:
+    """Seconds in one unit of a time column; None if it is no unit of time."""
+    if unit.lower() in SECONDS:
+        return 1.0
+    found = factor(unit, "s")
+    return found if found is not None and 0 < found <= LONGEST_TIME_UNIT else None
+
+
+def _has_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:
+    return any(_DECIMAL_COMMA.match(field) for row in rows for field in row)

@@ -1,0 +1,362 @@
+"""CSV files as recordings.
+
+The rules. The first column is ``t`` (also ``t_s``, ``time``, ``t [s]``) in seconds, or in the unit
+of time that its heading names (``t [min]``), or the sampling period is given. The header may carry
+a unit in brackets (``u [V]``). Comma, semicolon and tab separate; decimal commas are detected where
+the separator is not a comma. UTF-8, with or without a byte-order mark. An empty field or ``nan`` is
+a missing value: it is reported, an output is not scored there, and an input with one cannot be
+used. Times must grow, except from one segment to the next. Irregular times are kept as they are,
+never resampled.
+
+A recording as CSV, written while it is sent. Numbers come back bit for bit.
+
+Repeats of a measurement, laid end to end on one time axis.
+"""
+
+import csv
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from io import BytesIO, StringIO, TextIOWrapper
+from itertools import chain, islice
+from math import floor, isfinite, log10
+from pathlib import Path
+from typing import BinaryIO, cast
+
+import numpy as np
+
+from service.formats.csv_columns import Table, Values, read_columns
+from service.formats.csv_layout import Layout, find_layout, seconds_in
+from service.formats.errors import InvalidUpload
+from sysid.core.types import FloatArray, IntArray
+from sysid.data.records import Channel, Recording, Segment, sampling_of
+
+Labels = Mapping[str, float | str]
+
+
+def lay_out(
+    times: FloatArray, starts: IntArray, labels: Sequence[Labels]
+) -> tuple[FloatArray, tuple[Segment, ...]]:
+    """Times on one axis for segments whose own times may all begin anew.
+
+    Segment i begins at i steps, the step being the smallest of 1, 2, 5, 10, … · 10ᵏ s that is
+    longer than every segment: so a segment's place is easily read and its times stay exact.
+
+    Parameters
+    ----------
+    times : FloatArray, shape (N,)
+        Own times in s, growing within each segment.
+    starts : IntArray, shape (n_segments,)
+        First sample of each.
+    labels : sequence of mappings, n_segments long
+    """
+    lasts = np.append(starts[1:], times.size) - 1
+    step = _step_above(float(np.max(times[lasts] - times[starts])))
+    axis = np.empty_like(times)
+    segments = []
+    for i, (first, last) in enumerate(zip(starts, lasts, strict=True)):
+        origin, start = float(times[first]), i * step
+        # To the nanosecond: what a file's clock holds, so that a stored time is the same again.
+        axis[first : last + 1] = np.round(start + (times[first : last + 1] - origin), 9)
+        segments.append(Segment(start, float(axis[last]), origin, dict(labels[i])))
+    return axis, tuple(segments)
+
+
+def _step_above(longest: float) -> float:
+    if longest <= 0:
+        return 1.0
+    decade = 10.0 ** floor(log10(longest))
+    return next(step for m in (1, 2, 5, 10, 20) if (step := m * decade) > longest)
+
+
+PEEK_LINES = 200
+LONGEST_LINE = 1_000_000
+CLOCK_FROM = 1e8
+"""Times that begin later than this (s, three years) are a clock's, counted from some epoch."""
+
+
+def read_csv(
+    source: Path | str | bytes,
+    *,
+    sample_time: float | None = None,
+    segments: Sequence[str] = (),
+) -> tuple[Recording, tuple[str, ...]]:
+    """Read a CSV file.
+
+    Parameters
+    ----------
+    source : Path or str or bytes
+        A file's path, or its content.
+    sample_time : float or None
+        Sampling period in s, for a file without a time column.
+    segments : sequence of str
+        Columns of labels, numbers or text. Consecutive rows with equal labels are a segment, in
+        which the time may start again. Segments are laid end to end on one axis.
+
+    Returns
+    -------
+    recording : Recording
+    notes : tuple of str
+        What the user should know: missing values, irregular times, decimal commas.
+
+    Raises
+    ------
+    InvalidUpload
+        If the file cannot be used; with row (the header is row 1) and column.
+    """
+    with _opened(source) as stream:
+        lines = _lines(stream)
+        first = list(islice(lines, PEEK_LINES))
+        if not first:
+            raise InvalidUpload("the file is empty; need a header and rows, such as t,u,y")
+        if not first[0].strip():
+            raise InvalidUpload("the first row is empty; need a header such as t,u,y", row=1)
+        layout = find_layout(first, segments, sample_time)
+        table = read_columns(chain(first, lines), layout)
+    notes = ["decimal commas were read as decimal points"] if layout.has_decimal_commas else []
+    times, spans = _times(table, layout, sample_time, notes)
+    return _recording(table, layout, times, spans, notes), tuple(notes)
+
+
+@contextmanager
+def _opened(source: Path | str | bytes) -> Iterator[TextIOWrapper]:
+    binary: BinaryIO
+    with BytesIO(source) if isinstance(source, bytes) else Path(source).open("rb") as binary:
+        head = binary.read(65536)
+        binary.seek(0)
+        if head.startswith((b"\xff\xfe", b"\xfe\xff")):
+            raise InvalidUpload("the file is UTF-16 text; save it as CSV in UTF-8")
+        if b"\0" in head:
+            raise InvalidUpload("the file is not text; need CSV in UTF-8", byte=head.index(b"\0"))
+        yield TextIOWrapper(binary, encoding="utf-8-sig", newline="")
+
+
+def _lines(stream: TextIOWrapper) -> Iterator[str]:
+    number = 0
+    try:
+        while line := stream.readline(LONGEST_LINE + 1):
+            number += 1
+            if len(line) > LONGEST_LINE:
+                raise InvalidUpload(f"the row is longer than {LONGEST_LINE} characters", row=number)
+            yield line
+    except UnicodeDecodeError as error:
+        wrong = error.object[error.start]
+        raise InvalidUpload(
+            f"the file is not UTF-8 text (byte 0x{wrong:02x}); save it as CSV in UTF-8",
+            row=_row_of_bad_text(cast(BinaryIO, stream.buffer)),
+        ) from None
+
+
+def _row_of_bad_text(binary: BinaryIO) -> int | None:
+    # The decoder works on blocks of many rows, so the row is looked for again.
+    binary.seek(0)
+    for number, raw in enumerate(iter(lambda: binary.readline(LONGEST_LINE), b""), 1):
+        try:
+            raw.decode()
+        except UnicodeDecodeError:
+            return number
+    return None
+
+
+def _times(
+    table: Table, layout: Layout, sample_time: float | None, notes: list[str]
+) -> tuple[FloatArray, tuple[Segment, ...]]:
+    """Times on the recording's axis, and the segments."""
+    labels = [column.name for column in layout.columns if column.role == "label"]
+    starts = _segment_starts(table, labels)
+    place = layout.time
+    if place is None:
+        assert sample_time is not None  # the layout has checked it
+        ends = [*starts[1:], table.rows.size]
+        counts = [np.arange(b - a) for a, b in zip(starts, ends, strict=True)]
+        times = np.concatenate(counts) * sample_time
+    else:
+        name = layout.columns[place].name
+        times = _in_seconds(table.numbers(name), layout.columns[place].unit, notes)
+        _check_growth(times, starts, table, name)
+        _report_shared(times, starts, notes)
+        times = _from_the_start(times, notes)
+    if not labels:
+        _describe(times, notes)
+        return times, ()
+    values = {label: _labels(table.columns[label]) for label in labels}
+    each: list[Labels] = [
+        {label: column[first] for label, column in values.items()} for first in starts
+    ]
+    axis, spans = lay_out(times, starts, each)
+    notes.append(f"{len(spans)} segments are laid end to end on one time axis")
+    return axis, spans
+
+
+def _segment_starts(table: Table, labels: Sequence[str]) -> IntArray:
+    changes = np.zeros(table.rows.size, dtype=bool)
+    changes[0] = True
+    for label in labels:
+        column = table.columns[label]
+        changes[1:] |= column[1:] != column[:-1]
+    return np.flatnonzero(changes).astype(np.int64)
+
+
+def _labels(column: Values) -> list[float | str]:
+    texts = [str(text) for text in column]
+    try:
+        numbers = [float(text) for text in texts]
+    except ValueError:
+        return list(texts)
+    return list(numbers) if np.isfinite(numbers).all() else list(texts)
+
+
+def _in_seconds(times: FloatArray, unit: str, notes: list[str]) -> FloatArray:
+    size = seconds_in(unit) or 1.0
+    if size == 1.0:
+        return times
+    notes.append(f"times were converted from {unit} to s: lags and time constants are in s")
+    # A product with a whole number of units per second would not be the double nearest to it.
+    converted: FloatArray = times * size if size > 1.0 else times / round(1.0 / size)
+    return converted
+
+
+def _check_growth(times: FloatArray, starts: IntArray, table: Table, name: str) -> None:
+    steps = np.diff(times)
+    # Repeats are there to be pooled, and pooled samples may share a time.
+    stays = steps < 0 if starts.size > 1 else steps <= 0
+    stays[starts[1:] - 1] = False
+    wrong = np.flatnonzero(stays)
+    if wrong.size == 0:
+        return
+    before, after = float(times[wrong[0]]), float(times[wrong[0] + 1])
+    what = "repeats" if before == after else "decreases"
+    raise InvalidUpload(
+        f"the time {what}: {before!r} s is followed by {after!r} s; times must grow from row to "
+        "row (name the label columns of repeated measurements with segments)",
+        row=int(table.rows[wrong[0] + 1]), column=name,
+    )  # fmt: skip
+
+
+def _report_shared(times: FloatArray, starts: IntArray, notes: list[str]) -> None:
+    shared = np.diff(times) == 0
+    shared[starts[1:] - 1] = False
+    if count := int(np.count_nonzero(shared)):
+        notes.append(f"{count} samples have the same time as the one before, in their segment")
+
+
+def _from_the_start(times: FloatArray, notes: list[str]) -> FloatArray:
+    if float(np.min(times)) < CLOCK_FROM:
+        return times
+    notes.append(f"times are counted from the first, {float(times[0])!r} s of the file's clock")
+    shifted: FloatArray = times - times[0]
+    return shifted
+
+
+def _describe(times: FloatArray, notes: list[str]) -> None:
+    sampling = sampling_of(times)
+    if sampling.samples > 1 and not sampling.is_regular:
+        gaps = np.diff(times)
+        notes.append(
+            f"sampling is irregular: {gaps.min():.4g} to {gaps.max():.4g} s between samples, "
+            f"median {sampling.period:.4g} s; the samples are used at their own times"
+        )
+
+
+def _recording(
+    table: Table,
+    layout: Layout,
+    times: FloatArray,
+    spans: Iterable[Segment],
+    notes: list[str],
+) -> Recording:
+    channels = []
+    for column in layout.columns:
+        if column.role != "value":
+            continue
+        values = table.numbers(column.name)
+        _report_missing(column.name, values, table, notes)
+        channels.append(Channel(column.name, times, values, column.unit or "1"))
+    return Recording(tuple(channels), tuple(spans))
+
+
+def _report_missing(name: str, values: FloatArray, table: Table, notes: list[str]) -> None:
+    missing = np.flatnonzero(np.isnan(values))
+    if missing.size == 0:
+        return
+    if missing.size == values.size:
+        raise InvalidUpload("every value is missing; leave the column out", column=name)
+    notes.append(
+        f"channel {name!r}: {missing.size} of {values.size} values are missing (empty or NaN), the "
+        f"first in row {table.rows[missing[0]]}; as an output they are not scored, as an input "
+        "the channel cannot be used"
+    )
+
+
+BLOCK = 5000
+
+
+def csv_rows(recording: Recording) -> Iterator[str]:
+    """CSV text in blocks: time in s, label columns of segments, one column a channel.
+
+    In a segment the time is the segment's own, so that an upload with ``?segments=`` and the
+    label columns gives the same recording. Channels with other times have rows of their own.
+    """
+    labels = sorted({name for segment in recording.segments for name in segment.labels})
+    buffer = StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(["t", *labels, *(_heading(channel) for channel in recording.channels)])
+    for number, row in enumerate(_rows(recording, labels), 1):
+        writer.writerow(row)
+        if number % BLOCK == 0:
+            yield _taken(buffer)
+    yield _taken(buffer)
+
+
+def _rows(recording: Recording, labels: list[str]) -> Iterator[list[str]]:
+    if not recording.segments:
+        for time, values in _samples(recording):
+            yield [repr(time), *values]
+        return
+    for segment, piece in zip(recording.segments, recording.pieces(), strict=True):
+        texts = [_text(segment.labels.get(name, "")) for name in labels]
+        for time, values in _samples(piece):
+            yield [repr(time), *texts, *values]
+
+
+def _samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
+    """Times in their order; what a channel does not have at a time stays empty."""
+    groups: list[list[int]] = []
+    channels = recording.channels
+    for index, channel in enumerate(channels):
+        for group in groups:
+            if np.array_equal(channels[group[0]].times, channel.times):
+                group.append(index)
+                break
+        else:
+            groups.append([index])
+    times = np.concatenate([channels[group[0]].times for group in groups])
+    whose = np.concatenate(
+        [np.full(channels[group[0]].times.size, number) for number, group in enumerate(groups)]
+    )
+    place = np.concatenate([np.arange(channels[group[0]].times.size) for group in groups])
+    for index in np.argsort(times, kind="stable").tolist():
+        yield float(times[index]), _values(channels, groups[int(whose[index])], int(place[index]))
+
+
+def _values(channels: tuple[Channel, ...], filled: list[int], place: int) -> list[str]:
+    row = [""] * len(channels)
+    for index in filled:
+        row[index] = _text(float(channels[index].values[place]))
+    return row
+
+
+def _text(value: float | str) -> str:
+    if isinstance(value, str):
+        return value
+    return repr(value) if isfinite(value) else ""
+
+
+def _heading(channel: Channel) -> str:
+    return channel.name if channel.unit == "1" else f"{channel.name} [{channel.unit}]"
+
+
+def _taken(buffer: StringIO) -> str:
+    text = buffer.getvalue()
+    buffer.seek(0)
+    buffer.truncate()
+    return text

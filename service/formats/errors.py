@@ -1,0 +1,56 @@
+"""Errors of reading what a user uploads.
+
+* ServiceError (service.core.errors)
+    - InvalidRequest
+        - InvalidUpload      a file that cannot be used, with the place: row and column, or byte
+"""
+
+from service.core.errors import FieldError, InvalidRequest
+
+
+class InvalidUpload(InvalidRequest, ValueError):
+    """A file that a user sent cannot be used.
+
+    Attributes
+    ----------
+    detail : str
+        What was wrong, where, and what would be right: one line.
+    row : int or None
+        Row of a CSV file, from 1; the header is row 1.
+    column : str or None
+        Name of the column of a CSV file.
+    byte : int or None
+        Place in an MCAP file, from 0.
+    """
+
+    kind, title = "invalid-upload", "The file cannot be used"
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        row: int | None = None,
+        column: str | None = None,
+        byte: int | None = None,
+    ) -> None:
+        detail = _place(row, column, byte) + what
+        super().__init__((FieldError(_pointer(row, column, byte), detail),))
+        self.detail = detail
+        self.args = (detail,)
+        self.what, self.row, self.column, self.byte = what, row, column, byte
+
+
+def _place(row: int | None, column: str | None, byte: int | None) -> str:
+    if byte is not None:
+        return f"at byte {byte}: "
+    named = [] if row is None else [f"row {row}"]
+    named += [] if column is None else [f"column {column!r}"]
+    return f"{', '.join(named)}: " if named else ""
+
+
+def _pointer(row: int | None, column: str | None, byte: int | None) -> str:
+    if byte is not None:
+        return f"/bytes/{byte}"
+    parts = [] if row is None else ["rows", str(row)]
+    parts += [] if column is None else [column.replace("~", "~0").replace("/", "~1")]
+    return "".join(f"/{part}" for part in parts)

@@ -1,0 +1,310 @@
+"""MCAP files as recordings: ours by their manifest, others by their schemas.
+
+Recordings and fitted signals as MCAP files, one chunk as one array of messages.
+"""
+
+import io
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO, Protocol
+
+import numpy as np
+
+from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS, Limits
+from service.formats.mcap_content import Content, Source, no_signals, read_content, sorted_columns
+from service.formats.mcap_writer import McapFile
+from service.formats.topics import (
+    DATASET,
+    TIME_FIELD,
+    ChannelEntry,
+    Manifest,
+    Topic,
+    history_topics_of,
+    make_topic,
+    manifest_of,
+    parse_manifest,
+    topics_of,
+)
+from sysid.core.errors import InvalidRecord
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, History, Recording
+
+
+class Writable(Protocol):
+    """What a file is written to: anything that takes bytes."""
+
+    def write(self, data: bytes, /) -> object:
+        """Take the next bytes."""
+        ...
+
+
+Target = str | os.PathLike[str] | Writable
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedOutput:
+    """One output of one experiment: measured and simulated at the measured times (s)."""
+
+    experiment: str
+    name: str
+    unit: str
+    times: FloatArray
+    measured: FloatArray
+    simulated: FloatArray
+
+
+def write_recording(
+    recording: Recording,
+    target: Target,
+    *,
+    metadata: Mapping[str, str] | None = None,
+    attachments: Mapping[str, bytes] | None = None,
+) -> None:
+    """Write a recording as an MCAP file.
+
+    The same recording and metadata give the same bytes. Values and times come back bit for bit.
+    What was recorded before the first samples stands in topics of its own, below ``/history``.
+
+    Parameters
+    ----------
+    target : path or writable
+    metadata : mapping of str to str
+        Added to the record ``lagid.dataset``: hash of the source, parents, name …
+    attachments : mapping of str to bytes
+        JSON documents, such as the model or a calibration, by name.
+
+    Raises
+    ------
+    ValueError
+        If the times do not fit into a file's clock, or a metadata key is the file's own.
+    """
+    topics, history = topics_of(recording), history_topics_of(recording)
+    manifest = manifest_of(recording, topics, metadata or {}, history)
+    _write(target, (*topics, *history), manifest, attachments or {})
+
+
+def write_fit(
+    run: str,
+    fits: Sequence[FittedOutput],
+    target: Target,
+    *,
+    metadata: Mapping[str, str] | None = None,
+    attachments: Mapping[str, bytes] | None = None,
+) -> None:
+    """Write what a run identified as an MCAP file.
+
+    Topic ``/fit/<run>`` has for each output the fields ``<output>`` (simulated),
+    ``<output>_measured`` and ``<output>_residual``; further experiments, and outputs with other
+    times, have topics below it.
+    """
+    groups: list[list[FittedOutput]] = []
+    for fit in fits:
+        last = groups[-1][0] if groups else None
+        if last and last.experiment == fit.experiment and last.times is fit.times:
+            groups[-1].append(fit)
+        else:
+            groups.append([fit])
+    topics = []
+    for number, group in enumerate(groups):
+        channels = [channel for fit in group for channel in _channels(fit)]
+        names = [
+            f"{fit.name}{suffix}" for fit in group for suffix in ("", "_measured", "_residual")
+        ]
+        path = f"/fit/{run}" if number == 0 else f"/fit/{run}/{number + 1}"
+        topics.append(make_topic(path, channels, names))
+    recording = Recording(tuple(channel for topic in topics for channel in topic.channels))
+    _write(target, topics, manifest_of(recording, topics, metadata or {}), attachments or {})
+
+
+def _channels(fit: FittedOutput) -> tuple[Channel, ...]:
+    """Channels of one output; '/' separates experiment, output and what it is."""
+    named = f"{fit.experiment}/{fit.name}"
+    values = (
+        ("simulated", fit.simulated),
+        ("measured", fit.measured),
+        ("residual", fit.measured - fit.simulated),
+    )
+    return tuple(Channel(f"{named}/{what}", fit.times, data, fit.unit) for what, data in values)
+
+
+def _write(
+    target: Target,
+    topics: Sequence[Topic],
+    manifest: Mapping[str, str],
+    attachments: Mapping[str, bytes],
+) -> None:
+    if isinstance(target, str | os.PathLike):
+        with Path(target).open("wb") as stream:
+            _write(stream, topics, manifest, attachments)
+        return
+    file = McapFile(target.write)
+    file.add_metadata(DATASET, manifest)
+    for name, content in attachments.items():
+        file.add_attachment(name, "application/json", content)
+    numbers = [file.add_topic(topic.path, topic.all_fields) for topic in topics]
+    for number, topic in zip(numbers, topics, strict=True):
+        file.add_samples(number, topic.log_times, topic.columns)
+    file.finish()
+
+
+CLOCK_FROM_NS = 10**17
+"""Log times from here on (three years) are a clock's: they are counted from the first."""
+
+_Topics = Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]]
+"""Of every topic its times and its columns."""
+
+Readable = str | os.PathLike[str] | bytes | BinaryIO
+
+
+def read_recording(source: Readable, limits: Limits = DEFAULT_LIMITS) -> Recording:
+    """Read a recording from an MCAP file (path, content, or seekable stream).
+
+    Raises
+    ------
+    InvalidUpload
+        If the file is damaged, too large, or holds no signal.
+    """
+    return read_mcap(source, limits)[0]
+
+
+def read_metadata(source: Readable, limits: Limits = DEFAULT_LIMITS) -> dict[str, str]:
+    """Read the record ``lagid.dataset`` of a file; empty if there is none."""
+    with _opened(source) as (binary, size):
+        return read_content(binary, size, limits).metadata.get(DATASET, {})
+
+
+def read_fit(source: Readable, limits: Limits = DEFAULT_LIMITS) -> tuple[FittedOutput, ...]:
+    """Read what `write_fit` wrote.
+
+    Raises
+    ------
+    InvalidUpload
+        If the file is damaged or of another kind.
+    """
+    recording = read_recording(source, limits)
+    fits = []
+    for channel in recording.channels:
+        named, _, what = channel.name.rpartition("/")
+        if what != "simulated":
+            continue
+        experiment, _, name = named.partition("/")
+        measured = recording.channel(f"{named}/measured").values
+        fits.append(
+            FittedOutput(experiment, name, channel.unit, channel.times, measured, channel.values)
+        )
+    if not fits:
+        raise InvalidUpload("the file holds no fitted signals")
+    return tuple(fits)
+
+
+def read_mcap(source: Readable, limits: Limits) -> tuple[Recording, tuple[str, ...]]:
+    """Read a recording, and notes on what was left out or changed.
+
+    Raises
+    ------
+    InvalidUpload
+        If the file is damaged, too large, or holds no signal.
+    """
+    with _opened(source) as (binary, size):
+        content = read_content(binary, size, limits)
+    metadata = content.metadata.get(DATASET)
+    return _foreign(content, limits) if metadata is None else (_ours(content, metadata), ())
+
+
+@contextmanager
+def _opened(source: Readable) -> Iterator[tuple[BinaryIO, int]]:
+    if isinstance(source, bytes):
+        yield io.BytesIO(source), len(source)
+    elif isinstance(source, str | os.PathLike):
+        with Path(source).open("rb") as stream:
+            yield stream, os.fstat(stream.fileno()).st_size
+    else:
+        size = source.seek(0, io.SEEK_END)
+        source.seek(0)
+        yield source, size
+
+
+def _ours(content: Content, metadata: Mapping[str, str]) -> Recording:
+    try:
+        manifest = parse_manifest(metadata)
+    except ValueError as error:
+        raise InvalidUpload(f"the metadata record {DATASET!r} cannot be used: {error}") from None
+    topics: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
+    for source in content.sources.values():
+        if source.topic in manifest.clocks:
+            topics[source.topic] = _topic(source, manifest)
+    channels = tuple(
+        _with_history(_channel(entry, topics), manifest, topics) for entry in manifest.channels
+    )
+    return Recording(channels, manifest.segments)
+
+
+def _topic(source: Source, manifest: Manifest) -> tuple[FloatArray, dict[str, FloatArray]]:
+    log_times, columns, _ = sorted_columns(source)
+    times = manifest.clocks[source.topic].times(log_times, columns.get(TIME_FIELD))
+    if not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
+        raise InvalidUpload(f"the times of topic {source.topic!r} decrease or are not finite")
+    return times, columns
+
+
+def _channel(entry: ChannelEntry, topics: _Topics) -> Channel:
+    times, values = _field(f"channel {entry.name!r}", entry.topic, entry.field, topics)
+    return Channel(entry.name, times, values, entry.unit, entry.hold)
+
+
+def _with_history(channel: Channel, manifest: Manifest, topics: _Topics) -> Channel:
+    if channel.name not in manifest.history:
+        return channel
+    topic, field = manifest.history[channel.name]
+    found = History(*_field(f"the history of {channel.name!r}", topic, field, topics))
+    try:
+        return replace(channel, history=found)
+    except InvalidRecord as error:
+        raise InvalidUpload(str(error)) from None
+
+
+def _field(what: str, topic: str, field: str, topics: _Topics) -> tuple[FloatArray, FloatArray]:
+    times, columns = topics.get(topic, (np.empty(0), {}))
+    if field not in columns:
+        raise InvalidUpload(
+            f"{what} should be field {field!r} of topic {topic!r}, which the file does not hold"
+        )
+    return times, columns[field]
+
+
+def _foreign(content: Content, limits: Limits) -> tuple[Recording, tuple[str, ...]]:
+    read = [(source, *sorted_columns(source)) for source in content.sources.values()]
+    usable = [one for one in read if one[2]]
+    if not usable:
+        raise no_signals(content)
+    notes = [
+        f"topic {source.topic!r} is left out: {source.refused}"
+        for source in content.sources.values()
+        if source.refused
+    ]
+    notes += [f"topic {one[0].topic!r} was not in the order of time" for one in usable if one[3]]
+    first = min(int(times[0]) for _, times, _, _ in usable)
+    start = first if first >= CLOCK_FROM_NS else 0
+    if start:
+        notes.append(f"times are counted from the first, {start} ns of the file's clock")
+    channels: dict[str, Channel] = {}
+    for source, log_times, columns, _ in usable:
+        times = (log_times - np.uint64(start)).astype(np.float64) / 1e9
+        for field, values in columns.items():
+            name = _free_name(source.topic, field, alone=len(usable) == 1, taken=channels)
+            channels[name] = Channel(name, times, values)
+    if len(channels) > limits.channels:
+        raise InvalidUpload(f"the file has {len(channels)} signals; at most {limits.channels}")
+    return Recording(tuple(channels.values())), tuple(notes)
+
+
+def _free_name(topic: str, field: str, *, alone: bool, taken: Mapping[str, object]) -> str:
+    wanted = field if alone else f"{topic.strip('/')}.{field}"
+    number, name = 2, wanted
+    while name in taken:
+        name, number = f"{wanted}_{number}", number + 1
+    return name

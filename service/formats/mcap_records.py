@@ -1,0 +1,239 @@
+"""One pass over the records of an MCAP file that may be damaged or hostile.
+
+Nothing is believed: not the lengths, not the summary, not that there is an end. Every length is
+held against what is left and against a limit before a byte is read; every checksum that is there
+is compared. See https://mcap.dev/spec for the format.
+
+Chunks of an MCAP file, decompressed to their declared size and never beyond.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import BinaryIO, Final, NamedTuple, NoReturn
+
+import lz4.frame
+import zstandard
+from mcap.opcode import Opcode
+
+from service.formats.errors import InvalidUpload
+from service.formats.limits import Limits
+from service.formats.mcap_writer import FOOTER_BODY, MAGIC
+
+HEAD: Final = struct.Struct("<BQ")
+_NAMES: Final = {int(one): one.name.lower().replace("_", " ") for one in Opcode}
+_SUMMARY: Final = {
+    Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
+    Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER,
+}  # fmt: skip
+
+
+class Located(NamedTuple):
+    """A record's opcode, its place in the file, and its content without opcode and length."""
+
+    opcode: int
+    byte: int
+    body: bytes
+
+    @property
+    def name(self) -> str:
+        """What the record is called."""
+        return name_of(self.opcode)
+
+    def fail(self, what: str) -> NoReturn:
+        """Raise the error of this record."""
+        raise InvalidUpload(f"the {self.name} record {what}", byte=self.byte)
+
+
+def name_of(opcode: int) -> str:
+    """What a record of that opcode is called."""
+    return _NAMES.get(opcode, f"unknown (0x{opcode:02x})")
+
+
+class Cursor:
+    """Reads the parts of one record; a length that goes past the record's end is its error."""
+
+    def __init__(self, record: Located) -> None:
+        self._record, self._at = record, 0
+
+    def u16(self) -> int:
+        """Two bytes."""
+        return int.from_bytes(self.blob(2), "little")
+
+    def u32(self) -> int:
+        """Four bytes."""
+        return int.from_bytes(self.blob(4), "little")
+
+    def u64(self) -> int:
+        """Eight bytes."""
+        return int.from_bytes(self.blob(8), "little")
+
+    def blob(self, length: int) -> bytes:
+        """Return the next `length` bytes."""
+        body = self._record.body
+        if length > len(body) - self._at:
+            self._record.fail(
+                f"has an inner length of {length} bytes where {len(body) - self._at} are left"
+            )
+        self._at += length
+        return body[self._at - length : self._at]
+
+    def text(self) -> str:
+        """Text with its length before it."""
+        try:
+            return self.blob(self.u32()).decode()
+        except UnicodeDecodeError:
+            self._record.fail("has a text that is not UTF-8")
+
+    def mapping(self) -> dict[str, str]:
+        """Texts by name, with the length of the whole before them."""
+        end = self.u32() + self._at
+        found: dict[str, str] = {}
+        while self._at < end:
+            name = self.text()
+            found[name] = self.text()
+        if self._at != end:
+            self._record.fail("has a map whose entries go past its length")
+        return found
+
+
+class _Stream:
+    """The file as it is read: place, what is left, checksum since it was last reset."""
+
+    def __init__(self, stream: BinaryIO, size: int) -> None:
+        self._stream, self.size, self.at, self.crc = stream, size, 0, 0
+
+    def read(self, length: int, what: str) -> bytes:
+        left = self.size - self.at
+        data = self._stream.read(length) if length <= left else b""
+        if len(data) != length:
+            raise InvalidUpload(
+                f"the file ends inside {what} ({length} bytes needed, {left} left); it is cut off",
+                byte=self.at,
+            )
+        self.crc = zlib.crc32(data, self.crc)
+        self.at += length
+        return data
+
+
+def walk(binary: BinaryIO, size: int, limits: Limits) -> Iterator[Located]:
+    """Every record of the data section, in order, header first; then the end is checked.
+
+    Raises
+    ------
+    InvalidUpload
+        With the byte, at the first record that cannot be right.
+    """
+    if size > limits.file_bytes:
+        raise InvalidUpload(f"the file has {size} bytes; at most {limits.file_bytes} are read")
+    stream = _Stream(binary, size)
+    if size < len(MAGIC) or stream.read(len(MAGIC), "the magic bytes") != MAGIC:
+        raise InvalidUpload("the file does not begin with the magic bytes of MCAP", byte=0)
+    record = _next(stream, limits)
+    if record.opcode != Opcode.HEADER:
+        record.fail("stands where the header should be")
+    while record.opcode != Opcode.DATA_END:
+        if record.opcode == Opcode.FOOTER:
+            record.fail("comes before the end of the data")
+        yield record
+        crc = stream.crc
+        record = _next(stream, limits)
+    _check_crc(record, Cursor(record).u32(), crc, "data section")
+    _check_end(stream, limits)
+
+
+def _next(stream: _Stream, limits: Limits) -> Located:
+    start = stream.at
+    opcode, length = HEAD.unpack(stream.read(HEAD.size, "the head of a record"))
+    if opcode == 0:
+        raise InvalidUpload("a record has opcode 0, which is no record", byte=start)
+    if length > limits.record_bytes:
+        Located(opcode, start, b"").fail(
+            f"declares {length} bytes; at most {limits.record_bytes} are read"
+        )
+    return Located(opcode, start, stream.read(length, f"the {name_of(opcode)} record"))
+
+
+def _check_end(stream: _Stream, limits: Limits) -> None:
+    summary_start, stream.crc = stream.at, 0
+    while True:
+        start, crc = stream.at, stream.crc
+        record = _next(stream, limits)
+        if record.opcode < 0x80 and record.opcode not in _SUMMARY:
+            record.fail("stands in the summary, after the end of the data")
+        if record.opcode == Opcode.FOOTER:
+            break
+    fields = Cursor(record)
+    declared = fields.u64()
+    if declared not in (0, summary_start) or (declared == 0 and start != summary_start):
+        record.fail(f"says that the summary begins at {declared}; it begins at {summary_start}")
+    head = HEAD.pack(Opcode.FOOTER, FOOTER_BODY) + record.body[: FOOTER_BODY - 4]
+    fields.u64()
+    _check_crc(record, fields.u32(), zlib.crc32(head, crc), "summary")
+    if stream.read(len(MAGIC), "the closing magic bytes") != MAGIC:
+        raise InvalidUpload("the file does not end with the magic bytes of MCAP", byte=stream.at)
+    if stream.at != stream.size:
+        raise InvalidUpload("there are bytes after the end of the file's content", byte=stream.at)
+
+
+def _check_crc(record: Located, stored: int, found: int, what: str) -> None:
+    if stored not in (0, found):  # 0: the writer made none
+        record.fail(f"has the checksum {stored:08x} for the {what}; it is {found:08x}: damaged")
+
+
+def open_chunk(record: Located, limits: Limits) -> bytes:
+    """Content of a chunk record.
+
+    Raises
+    ------
+    InvalidUpload
+        If it is too large as declared or in truth, damaged, or compressed in an unknown way.
+    """
+    fields = Cursor(record)
+    fields.u64(), fields.u64()  # first and last time: the messages say it themselves
+    size, crc, compression = fields.u64(), fields.u32(), fields.text()
+    if size > limits.record_bytes:
+        record.fail(f"declares {size} bytes of content; at most {limits.record_bytes} are read")
+    content = _decompress(record, compression, fields.blob(fields.u64()), size)
+    if len(content) != size:
+        more = "more" if len(content) > size else f"{len(content)}"
+        record.fail(f"declares {size} bytes of content, but holds {more}")
+    if crc not in (0, zlib.crc32(content)):
+        record.fail(
+            f"has the checksum {crc:08x}, its content {zlib.crc32(content):08x}: it is damaged"
+        )
+    return content
+
+
+def _decompress(record: Located, compression: str, data: bytes, size: int) -> bytes:
+    try:
+        if compression == "zstd":
+            # The window is memory too, and a frame's header may ask for gigabytes of it.
+            window = max(1 << 10, 1 << size.bit_length())
+            reader = zstandard.ZstdDecompressor(max_window_size=max(window, 1 << 23))
+            with reader.stream_reader(data) as stream:
+                return bytes(stream.read(size + 1))
+        if compression == "lz4":
+            return _unlz4(data, size)
+    except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
+        record.fail(f"cannot be decompressed ({_first_line(error)}): it is damaged")
+    if compression:
+        record.fail(f"is compressed with {compression[:40]!r}; need zstd, lz4 or none")
+    return data
+
+
+def _unlz4(data: bytes, size: int) -> bytes:
+    decompressor = lz4.frame.LZ4FrameDecompressor()
+    parts: list[bytes] = []
+    wanted = size + 1
+    while wanted > 0 and not decompressor.eof:
+        part = decompressor.decompress(data, max_length=wanted)
+        if not part and not data:
+            break
+        parts.append(part)
+        wanted, data = wanted - len(part), b""
+    return b"".join(parts)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:80]

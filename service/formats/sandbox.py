@@ -1,0 +1,127 @@
+"""Uploads, read in a process of their own with a limit of memory and of time.
+
+A file from outside reaches C code (decompressors, protobuf) before anything else can judge it.
+So it is read in a child process, which writes what it found anew with our writer; this process
+reads only that.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from hashlib import file_digest
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+from service.core import temporary_files as temporary
+from service.formats.errors import InvalidUpload
+from service.formats.limits import DEFAULT_LIMITS, MIB, Limits
+from service.formats.mcap import read_recording
+from sysid.data.records import Recording
+
+Kind = Literal["csv", "mcap"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UploadedRecording:
+    """A recording as it was sent.
+
+    Attributes
+    ----------
+    notes : tuple of str
+        What the user should know: missing values, irregular times, what was left out.
+    source_sha256 : str
+        Of the bytes that were sent.
+    """
+
+    recording: Recording
+    notes: tuple[str, ...]
+    source_sha256: str
+
+
+def read_untrusted(
+    path: str | os.PathLike[str],
+    kind: Kind,
+    limits: Limits = DEFAULT_LIMITS,
+    *,
+    sample_time: float | None = None,
+    segments: Sequence[str] = (),
+) -> UploadedRecording:
+    """Read a file that a user sent.
+
+    Parameters
+    ----------
+    sample_time, segments
+        For CSV; see `service.formats.csv_recordings.read_csv`.
+
+    Raises
+    ------
+    InvalidUpload
+        If the file cannot be used, for whatever reason.
+    """
+    source = Path(path)
+    size = source.stat().st_size
+    if size > limits.file_bytes:
+        raise InvalidUpload(f"the file has {size} bytes; at most {limits.file_bytes} are read")
+    with source.open("rb") as stream:
+        sha256 = file_digest(stream, "sha256").hexdigest()
+    with TemporaryDirectory(prefix=temporary.prefix()) as folder:
+        clean = Path(folder) / "clean.mcap"
+        task = {
+            "source": str(source.absolute()),
+            "target": str(clean),
+            "kind": kind,
+            "sample_time": sample_time,
+            "segments": list(segments),
+            "limits": asdict(limits),
+        }
+        notes = _answer(_run_child(task, limits), limits)
+        return UploadedRecording(read_recording(clean, limits), notes, sha256)
+
+
+def _run_child(task: dict[str, Any], limits: Limits) -> "subprocess.CompletedProcess[str]":
+    # No secret of this process's environment goes to the child.
+    environment = {
+        "PATH": os.environ.get("PATH", ""),
+        "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry) or os.getcwd(),
+        "OPENBLAS_NUM_THREADS": "1",  # its threads' stacks would count as memory
+        "PYTHONUTF8": "1",
+    }
+    try:
+        return subprocess.run(
+            [sys.executable, "-m", "service.formats.sandbox_child"],
+            input=json.dumps(task),
+            capture_output=True,
+            text=True,
+            timeout=limits.seconds,
+            env=environment,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise _too_slow(limits) from None
+
+
+def _answer(child: "subprocess.CompletedProcess[str]", limits: Limits) -> tuple[str, ...]:
+    if child.returncode == -24:  # SIGXCPU: the child's own limit of processor time
+        raise _too_slow(limits)
+    try:
+        answer = json.loads(child.stdout)
+        if "error" in answer:
+            raise InvalidUpload(**answer["error"])
+        return tuple(answer["notes"])
+    except (json.JSONDecodeError, KeyError, TypeError):
+        reason = (child.stderr.strip().splitlines() or ["no message"])[-1]
+        if "MemoryError" in reason or child.returncode == -9:
+            raise InvalidUpload(
+                f"reading the file needs more than {limits.memory_bytes // MIB} MiB of memory"
+            ) from None
+        raise InvalidUpload(
+            f"the file makes its reader stop (exit {child.returncode}: {reason[:200]})"
+        ) from None
+
+
+def _too_slow(limits: Limits) -> InvalidUpload:
+    return InvalidUpload(f"reading the file takes more than {limits.seconds:g} s")

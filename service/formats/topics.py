@@ -1,0 +1,302 @@
+"""How a recording is laid out in a file: topics, fields, and the manifest that names them.
+
+Times of samples as MCAP's nanoseconds, such that the same bits come back.
+
+A file's clock counts whole nanoseconds. Of most recordings that is exact, because their times
+were printed with nine decimals or fewer (rule ``nanoseconds``); of computed times ``k·T`` the
+period is kept (rule ``regular``); of all others each message carries the time in a field of its
+own (rule ``field``).
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from math import floor
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.formats.mcap_messages import identifiers
+from sysid.core.types import FloatArray
+from sysid.data.records import HOLDS, Channel, Recording, Segment
+
+Rule = Literal["nanoseconds", "regular", "field"]
+Nanoseconds = NDArray[np.uint64]
+LATEST_NS = 2**63
+LATEST_S = LATEST_NS / 1e9
+TIME_FIELD = "time_s"
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """How the times of one topic come back from its file.
+
+    Attributes
+    ----------
+    rule : {"nanoseconds", "regular", "field"}
+    epoch : int
+        Time (s) of the file's nanosecond 0: not 0 only when times are negative.
+    start, period : float
+        First time and sampling period, for ``regular``.
+    """
+
+    rule: Rule
+    epoch: int = 0
+    start: float = 0.0
+    period: float = 0.0
+
+    def times(self, log_times: Nanoseconds, field: FloatArray | None) -> FloatArray:
+        """The times in s."""
+        if self.rule == "field" and field is not None:
+            return field
+        if self.rule == "regular":
+            grid: FloatArray = self.start + self.period * np.arange(
+                log_times.size, dtype=np.float64
+            )
+            return grid
+        return _seconds(log_times, self.epoch)
+
+    def as_dict(self) -> dict[str, object]:
+        """The entry of the file's metadata."""
+        return {"rule": self.rule, "epoch": self.epoch, "start": self.start, "period": self.period}
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, object]) -> "Clock":
+        """Return the inverse of `as_dict`; ValueError for an entry that is none."""
+        rule, epoch = entry.get("rule"), entry.get("epoch")
+        start, period = entry.get("start"), entry.get("period")
+        if rule not in ("nanoseconds", "regular", "field") or type(epoch) is not int:
+            raise ValueError(f"{entry!r} is not a rule of times")
+        if not isinstance(start, int | float) or not isinstance(period, int | float):
+            raise ValueError(f"{entry!r} is not a rule of times")
+        if not (-LATEST_S < epoch <= 0 and abs(start) < LATEST_S and 0 <= period < LATEST_S):
+            raise ValueError(f"{entry!r} goes beyond the clock of a file")
+        return cls(rule, epoch, float(start), float(period))
+
+
+def clock_for(times: FloatArray) -> tuple[Clock, Nanoseconds]:
+    """Return the clock of times (s, not decreasing), and the times on it.
+
+    Raises
+    ------
+    ValueError
+        If they span more than a file's clock can hold (292 years).
+    """
+    epoch = min(0, floor(float(times[0])))
+    if epoch <= -LATEST_S or float(times[-1]) - epoch >= LATEST_S:
+        raise ValueError(f"times up to {float(times[-1])!r} s do not fit into 63 bits of ns")
+    log_times = np.rint((times - epoch) * 1e9).astype(np.uint64)
+    if np.array_equal(_seconds(log_times, epoch), times):
+        return Clock("nanoseconds", epoch), log_times
+    for period in _periods(times):
+        clock = Clock("regular", epoch, float(times[0]), period)
+        if np.array_equal(clock.times(log_times, None), times):
+            return clock, log_times
+    return Clock("field", epoch), log_times
+
+
+def _seconds(log_times: Nanoseconds, epoch: int) -> FloatArray:
+    # A quotient of whole numbers is correctly rounded, like the decimal number it stands for.
+    signed = log_times.astype(np.int64) + epoch * 10**9
+    return np.asarray(signed / 1e9, dtype=np.float64)
+
+
+def _periods(times: FloatArray) -> Iterator[float]:
+    if times.size > 1:
+        mean = float(times[-1] - times[0]) / (times.size - 1)
+        yield float(times[1] - times[0])
+        for digits in range(3, 18):
+            yield float(f"{mean:.{digits}g}")
+
+
+DATASET = "lagid.dataset"
+"""Name of the metadata record that says what a file of ours holds."""
+
+FORMAT = "1"
+RESERVED = ("format", "sample_time", "channels", "topics", "segments", "history")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Topic:
+    """Channels that share their times: one MCAP channel, one protobuf field for each.
+
+    `extra` is the times themselves when the file's clock cannot hold them exactly.
+    """
+
+    path: str
+    channels: tuple[Channel, ...]
+    fields: tuple[str, ...]
+    clock: Clock
+    log_times: Nanoseconds
+    extra: tuple[FloatArray, ...] = ()
+
+    @property
+    def columns(self) -> tuple[FloatArray, ...]:
+        """What is written for each of `all_fields`."""
+        return (*(channel.values for channel in self.channels), *self.extra)
+
+    @property
+    def all_fields(self) -> tuple[str, ...]:
+        """Names of the message's fields."""
+        return (*self.fields, TIME_FIELD) if self.extra else self.fields
+
+
+def make_topic(path: str, channels: Sequence[Channel], names: Sequence[str]) -> Topic:
+    """Topic of channels with equal times; `names` are what its fields are to be called."""
+    times = channels[0].times
+    clock, log_times = clock_for(times)
+    extra = (times,) if clock.rule == "field" else ()
+    fields = identifiers((TIME_FIELD, *names))[1:]
+    return Topic(path, tuple(channels), fields, clock, log_times, extra)
+
+
+def topics_of(recording: Recording, root: str = "/signals") -> tuple[Topic, ...]:
+    """Topics of a recording: `root` for the first channel and all that share its times."""
+    groups: list[list[Channel]] = []
+    for channel in recording.channels:
+        for group in groups:
+            if _same_times(group[0], channel):
+                group.append(channel)
+                break
+        else:
+            groups.append([channel])
+    paths = [root, *(f"{root}/{name}" for name in identifiers(g[0].name for g in groups[1:]))]
+    return tuple(
+        make_topic(path, group, [one.name for one in group])
+        for path, group in zip(paths, groups, strict=True)
+    )
+
+
+def history_topics_of(recording: Recording) -> tuple[Topic, ...]:
+    """Topics of what was recorded before the first samples; none where nothing was."""
+    known = tuple(
+        Channel(one.name, one.history.times, one.history.values, one.unit)
+        for one in recording.channels
+        if one.history is not None and one.history.times.size
+    )
+    return topics_of(Recording(known), "/history") if known else ()
+
+
+def _same_times(a: Channel, b: Channel) -> bool:
+    return a.times is b.times or np.array_equal(a.times, b.times)
+
+
+def manifest_of(
+    recording: Recording,
+    topics: Sequence[Topic],
+    metadata: Mapping[str, str],
+    history: Sequence[Topic] = (),
+) -> dict[str, str]:
+    """Content of the record `DATASET`: everything that the messages themselves do not say.
+
+    A file without history does not speak of it; a program that knows of none reads the others as
+    the same recording without it.
+
+    Raises
+    ------
+    ValueError
+        If `metadata` uses a reserved key.
+    """
+    if taken := sorted(set(metadata) & set(RESERVED)):
+        raise ValueError(f"the metadata keys {', '.join(taken)} are the file's own")
+    order = [channel.name for channel in recording.channels]
+    entries = [
+        {"name": c.name, "unit": c.unit, "hold": c.hold, "topic": topic.path, "field": field}
+        for topic in topics
+        for c, field in zip(topic.channels, topic.fields, strict=True)
+    ]
+    entries.sort(key=lambda entry: order.index(entry["name"]))
+    before = {
+        c.name: {"topic": topic.path, "field": field}
+        for topic in history
+        for c, field in zip(topic.channels, topic.fields, strict=True)
+    }
+    clocks = {topic.path: topic.clock.as_dict() for topic in (*topics, *history)}
+    sampling = recording.sampling
+    return {
+        "format": FORMAT,
+        "sample_time": f"{sampling.period:.12g}" if sampling.is_regular else "",
+        "channels": json.dumps(entries),
+        "topics": json.dumps(clocks),
+        "segments": json.dumps([asdict(segment) for segment in recording.segments]),
+        **({"history": json.dumps(before)} if before else {}),
+        **metadata,
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelEntry:
+    """Where one channel of the recording stands in the file."""
+
+    name: str
+    unit: str
+    hold: Any
+    topic: str
+    field: str
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """The record `DATASET`, checked. `history`: topic and field of it, by channel."""
+
+    channels: tuple[ChannelEntry, ...]
+    clocks: Mapping[str, Clock]
+    segments: tuple[Segment, ...]
+    history: Mapping[str, tuple[str, str]]
+
+
+def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
+    """Check the content of a record `DATASET`.
+
+    Raises
+    ------
+    ValueError
+        If it is not what `manifest_of` writes; it may come from anyone.
+    """
+    try:
+        if metadata["format"] != FORMAT:
+            raise ValueError(f"its format is {metadata['format']!r}; this program reads {FORMAT!r}")
+        channels = tuple(_channel(entry) for entry in json.loads(metadata["channels"]))
+        clocks = json.loads(metadata["topics"])
+        segments = tuple(_segment(entry) for entry in json.loads(metadata["segments"]))
+        history = {
+            name: (entry["topic"], entry["field"])
+            for name, entry in json.loads(metadata.get("history", "{}")).items()
+        }
+        manifest = Manifest(
+            channels, {path: Clock.from_dict(entry) for path, entry in clocks.items()}, segments,
+            history,
+        )  # fmt: skip
+    except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise ValueError(f"{type(error).__name__}: {error}") from None
+    names = {one.name for one in channels}
+    if not names or len(names) != len(channels):
+        raise ValueError("its channels have no names, or the same name twice")
+    if any(one.topic not in manifest.clocks for one in channels):
+        raise ValueError("a channel names a topic that is not listed")
+    for name, (topic, field) in history.items():
+        is_text = isinstance(topic, str) and isinstance(field, str)
+        if name not in names or not is_text or topic not in manifest.clocks:
+            raise ValueError(f"the history of {name!r} is of no channel, or in no topic")
+    return manifest
+
+
+def _channel(entry: Mapping[str, Any]) -> ChannelEntry:
+    made = ChannelEntry(**entry)
+    texts = (made.name, made.unit, made.topic, made.field)
+    if not all(isinstance(text, str) for text in texts) or made.hold not in HOLDS:
+        raise ValueError(f"{entry!r} is not the entry of a channel")
+    return made
+
+
+def _segment(entry: Mapping[str, Any]) -> Segment:
+    made = Segment(**entry)
+    numbers = (made.start, made.stop, made.origin)
+    plain = all(isinstance(one, int | float) and np.isfinite(one) for one in numbers)
+    labels = isinstance(made.labels, dict) and all(
+        isinstance(one, (str, *get_args(int | float))) for one in made.labels.values()
+    )
+    if not plain or not labels or made.start > made.stop:
+        raise ValueError(f"{entry!r} is not a segment")
+    return made

@@ -1,0 +1,1 @@
+"""Submit, check and expand a job; warm-start order."""

@@ -1,0 +1,225 @@
+"""A sweep: from axes to cells, and from a cell to the body of its run."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import exp, log, prod
+from typing import Any
+
+from service.core.errors import FieldError, InvalidRequest
+from service.core.json_pointer import _parts
+from service.jobs.schemas import Axis, JobIn
+from sysid.core.errors import nearest
+
+# Fields that decide on the job as a whole; a cell of it cannot have its own.
+FIXED_FIELDS = ("name", "priority", "reuse", "sweep", "trend")
+
+MOST_LABEL = 64
+"""Characters of the name of a label at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One run of a sweep: the value of each axis' field, and labels for tables and plots."""
+
+    values: Mapping[str, Any] = field(default_factory=dict)
+    labels: Mapping[str, float | str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What one position of one group of axes sets, and where in the body it was written."""
+
+    pointer: str
+    cell: Cell
+
+
+@dataclass(frozen=True, slots=True)
+class Steps(Sequence[Step]):
+    """The positions of one group of axes, each made when it is asked for.
+
+    Attributes
+    ----------
+    columns : tuple
+        Number of each axis of the group in the sweep, the axis, and its values.
+    """
+
+    columns: tuple[tuple[int, Axis, Sequence[Any]], ...]
+
+    @classmethod
+    def of(cls, axes: Sequence[Axis], numbers: Sequence[int]) -> "Steps":
+        """The group of the axes of these numbers."""
+        return cls(tuple((number, axes[number], values_of(axes[number])) for number in numbers))
+
+    def __len__(self) -> int:
+        return len(self.columns[0][2])
+
+    def __getitem__(self, position: Any) -> Any:
+        if not -len(self) <= position < len(self):
+            raise IndexError(position)
+        labels: dict[str, float | str] = {}
+        for _, axis, _ in self.columns:
+            labels.update(axis.labels[position] if axis.labels else {})
+        cell = Cell({axis.path: values[position] for _, axis, values in self.columns}, labels)
+        return Step(_pointer(self.columns[0][0], self.columns[0][1], position), cell)
+
+
+def groups_of(job: JobIn) -> list[list[int]]:
+    """Numbers of the axes that step together; the groups are crossed.
+
+    Raises
+    ------
+    InvalidRequest
+        If a path is not a field of the body, axes of one zip differ in length, or labels in
+        number from values.
+    """
+    errors = list(axis_faults(job))
+    if errors:
+        raise InvalidRequest(errors)
+    return grouped(job.sweep.axes)
+
+
+def grouped(axes: Sequence[Axis]) -> list[list[int]]:
+    """Numbers of the axes that step together, group by group."""
+    groups: dict[str, list[int]] = {}
+    for number, axis in enumerate(axes):
+        groups.setdefault(f"zip {axis.zip}" if axis.zip else f"axis {number}", []).append(number)
+    return list(groups.values())
+
+
+def count(job: JobIn, groups: list[list[int]]) -> int:
+    """Number of runs that the crossed groups give."""
+    return prod(length_of(job.sweep.axes[numbers[0]]) for numbers in groups)
+
+
+def steps_of(axes: Sequence[Axis], groups: list[list[int]]) -> list[Steps]:
+    """What each position of each group sets."""
+    return [Steps.of(axes, numbers) for numbers in groups]
+
+
+def expand(groups: Sequence[Sequence[Step]], start: int = 0) -> Iterator[Cell]:
+    """Cells of the crossed groups from number `start` on; one empty cell without axes."""
+    lengths = [len(steps) for steps in groups]
+    for number in range(start, prod(lengths)):
+        values: dict[str, Any] = {}
+        labels: dict[str, float | str] = {}
+        for steps, position in zip(groups, positions_of(number, lengths), strict=True):
+            cell = steps[position].cell
+            values.update(cell.values)
+            labels.update(cell.labels)
+        yield Cell(values, labels)
+
+
+def positions_of(number: int, lengths: Sequence[int]) -> list[int]:
+    """Position of a cell in each of the crossed groups, the last of which goes fastest."""
+    found = []
+    for length in reversed(lengths):
+        number, position = divmod(number, length)
+        found.append(position)
+    return found[::-1]
+
+
+def length_of(axis: Axis) -> int:
+    """Number of values of an axis."""
+    if axis.log is not None:
+        return axis.log[2]
+    return len(axis.values if axis.values is not None else range(*(axis.range or [0])))
+
+
+def values_of(axis: Axis) -> Sequence[Any]:
+    """Values of an axis."""
+    if axis.values is not None:
+        return axis.values
+    if axis.range is not None:
+        return range(*axis.range)
+    assert axis.log is not None
+    start, stop, points = axis.log
+    ratio = log(stop / start) / max(points - 1, 1)
+    return [_plain(start * exp(ratio * i)) for i in range(points - 1)] + [_plain(stop)]
+
+
+def _plain(value: float) -> float | int:
+    """A whole number as such, so that fields of whole numbers take it."""
+    return int(value) if value.is_integer() and value < 2**53 else value
+
+
+def _pointer(number: int, axis: Axis, position: int) -> str:
+    kind = next(n for n in ("values", "range", "log") if getattr(axis, n) is not None)
+    return f"/sweep/axes/{number}/{kind}" + (f"/{position}" if kind == "values" else "")
+
+
+def axis_faults(job: JobIn) -> Iterator[FieldError]:
+    """What is wrong with the axes themselves: paths, lengths, labels."""
+    document = job.normal_form()
+    lengths: dict[str, int] = {}
+    seen: set[str] = set()
+    for number, axis in enumerate(job.sweep.axes):
+        place = f"/sweep/axes/{number}"
+        detail = _unknown_path(document, axis.path)
+        if axis.path in seen:
+            detail = f"{axis.path!r} is already an axis of this sweep"
+        if detail:
+            yield FieldError(f"{place}/path", detail)
+        seen.add(axis.path)
+        detail = _bad_spacing(axis)
+        if detail:
+            yield FieldError(f"{place}/{'log' if axis.log else 'range'}", detail)
+            continue
+        n = length_of(axis)
+        if axis.labels is not None and len(axis.labels) != n:
+            found = f"found {len(axis.labels)} labels for {n} values; need one each"
+            yield FieldError(f"{place}/labels", found)
+        yield from _bad_labels(axis, place)
+        if axis.zip is not None and lengths.setdefault(axis.zip, n) != n:
+            yield FieldError(
+                f"{place}/zip",
+                f"axes of zip {axis.zip!r} step together: found {n} values beside "
+                f"{lengths[axis.zip]}; need as many",
+            )
+
+
+def _bad_labels(axis: Axis, place: str) -> Iterator[FieldError]:
+    """Names that a database cannot look up in a document, which would merge its groups."""
+    for position, labels in enumerate(axis.labels or ()):
+        for name in labels:
+            if not 1 <= len(name) <= MOST_LABEL or not name.isprintable() or set(name) & {*'"\\'}:
+                yield FieldError(
+                    f"{place}/labels/{position}",
+                    f"found the name {name!r:.80}; need 1 to {MOST_LABEL} printable characters "
+                    "without quotation marks and backslashes",
+                )
+                return  # the other positions mostly have the same names
+
+
+def _bad_spacing(axis: Axis) -> str | None:
+    if axis.log is not None:
+        start, stop, points = axis.log
+        if not (start > 0 and stop > 0 and points >= 1):
+            return f"found {list(axis.log)}; need [start, stop, count] with start > 0, stop > 0"
+        return None
+    if axis.range is not None and (axis.range[2:] == [0] or not range(*axis.range)):
+        return f"the range {axis.range} is empty; need [start, stop] or [start, stop, step]"
+    return None
+
+
+def _unknown_path(document: Mapping[str, Any], path: str) -> str | None:
+    """Why a path is not a field of the body, or None."""
+    parts = _parts(path)
+    if parts[0] in FIXED_FIELDS:
+        return f"{path!r} cannot be swept"
+    if parts[0] in ("channels", "weights") and len(parts) == 2:
+        return None  # which signals there are, the check of each value tells
+    if parts[0] == "parameters" and len(parts) in (2, 3):
+        return None
+    here: Any = document
+    for part in parts:
+        known = _children(here)
+        if part not in known:
+            return f"the job has no field {path!r}{nearest(part, known)}"
+        here = here[int(part)] if isinstance(here, list) else here[part]
+    return None
+
+
+def _children(value: Any) -> list[str]:
+    if isinstance(value, list):
+        return [str(index) for index in range(len(value))]
+    return list(value) if isinstance(value, dict) else []

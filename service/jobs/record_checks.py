@@ -1,0 +1,193 @@
+"""What can be known of the records of a job before it runs: channels, units, lengths.
+
+What is wrong with the settings of a body, whatever records there are.
+
+It needs no database, so that the command line checks as the service does.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from service.core.errors import FieldError, faults_of
+from service.jobs.to_core import algorithm_of, loss_of
+from service.storage.tables import Dataset
+from sysid.core.errors import RecordTooShort, SysidError, nearest
+from sysid.data.records import both_ways
+from sysid.models.delays import check_length, longest_lag, past_signals
+from sysid.models.model import Model
+from sysid.models.parameters import Parameter, override
+from sysid.models.sections import interval
+from sysid.models.units import SignalUnits
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """What is known of the length of one record; `words` say which part of it is meant."""
+
+    duration: float
+    samples: int
+    period: float | None
+    words: str = ""
+
+    def without(self, fraction: float) -> "Piece | None":
+        """The part for estimation; None if it, or the part for validation, has no sample."""
+        left = self.samples - round(fraction * self.samples)
+        if not 0 < left < self.samples:
+            return None
+        # Where an irregular record is cut is not known here: its whole length is asked for.
+        duration = self.duration if self.period is None else (left - 1) * self.period
+        return Piece(duration, left, self.period, "of the part for estimation: ")
+
+
+def signals_of(model: Model) -> tuple[list[str], list[str]]:
+    """Names of a model's inputs and outputs: the signals that channels are given to."""
+    return [one.name for one in model.inputs], [one.name for one in model.outputs]
+
+
+def channel_faults(
+    channels: Mapping[str, str], model: Model, dataset: Dataset
+) -> Iterator[FieldError]:
+    """Signals of the model for which a dataset has no channel."""
+    known = [channel["name"] for channel in dataset.channels]
+    inputs, outputs = signals_of(model)
+    for signal in (*inputs, *outputs):
+        channel = channels.get(signal, signal)
+        if channel not in known:
+            yield FieldError(
+                f"/channels/{signal}" if signal in channels else "/channels",
+                f"dataset {dataset.id} ({dataset.name}) has no channel {channel!r} for signal "
+                f"{signal!r} of the model{nearest(channel, known)}",
+            )
+
+
+def given_both_ways(channels: Mapping[str, str], model: Model) -> Iterator[FieldError]:
+    """Inputs to which the channel of an output is given."""
+    given = [{one: channels.get(one, one) for one in group} for group in signals_of(model)]
+    for signal, fault in both_ways(*given).items():
+        yield FieldError(f"/channels/{signal}" if signal in channels else "/channels", fault)
+
+
+def unit_faults(
+    model: Model, channels: Mapping[str, str], datasets: Sequence[tuple[str, Dataset]]
+) -> Iterator[FieldError]:
+    """Channels in another unit than the model has, or than a dataset before has.
+
+    Parameters
+    ----------
+    datasets : sequence of (str, Dataset)
+        Each with its place in the job body.
+    """
+    units = SignalUnits(model)
+    roles = [(signal, channels.get(signal, signal)) for group in signals_of(model)
+             for signal in group]  # fmt: skip
+    for pointer, dataset in datasets:
+        found = {channel["name"]: channel.get("unit") for channel in dataset.channels}
+        for signal, channel in roles:
+            fault = units.fault(signal, channel, found.get(channel), f"dataset {dataset.name!r}")
+            if fault:
+                yield FieldError(pointer, fault)
+
+
+def pieces_of(dataset: Dataset) -> list[Piece]:
+    """The records that a dataset gives: its segments, or all of it."""
+    period = dataset.sample_time
+    spans = [one["stop"] - one["start"] for one in dataset.details.get("segments") or []]
+    if not spans:
+        return [Piece(dataset.duration, dataset.n_samples, period)]
+    if period is None:  # how many samples each has is not stored; all together are enough to ask
+        return [Piece(min(spans), dataset.n_samples, None)]
+    return [Piece(span, round(span / period) + 1, period) for span in sorted(set(spans))]
+
+
+def length_faults(
+    pointer: str, model: Model, parameters: tuple[Parameter, ...], piece: Piece, skip: int
+) -> Iterator[FieldError]:
+    """Lags that may reach back as far as a piece lasts, and a memory that it does not fill."""
+    period = model.solver.step or piece.period or piece.duration / max(piece.samples - 1, 1)
+    substeps = model.solver.substeps
+    error = _too_short(model, parameters, period / substeps, piece.duration)
+    if error is not None:
+        yield FieldError(pointer, f"{piece.words}{error}")
+    if (piece.samples - 1 - skip) * substeps < model.memory:
+        yield FieldError(
+            pointer,
+            f"{piece.words}the record has {piece.samples} samples; the model's memory "
+            f"({model.memory}) and 'skip' ({skip}) need more",
+        )
+
+
+def _too_short(
+    model: Model, parameters: tuple[Parameter, ...], step: float, duration: float
+) -> RecordTooShort | None:
+    """What is wrong with the longest of the lags, if it is too long."""
+    if not duration > 0:
+        return RecordTooShort(duration, 0.0, "a simulation")
+    spans = {p.name: interval(p) for p in parameters}
+    lagged = sorted(past_signals(model), key=lambda one: -longest_lag(model, one, spans, step))
+    try:
+        for past in lagged[:1]:
+            check_length(model, past, spans, step, duration)
+    except RecordTooShort as error:
+        return error
+    return None
+
+
+Body = dict[str, Any]
+
+
+def signal_faults(body: Body, model: Model) -> Iterator[FieldError]:
+    """Channels, holds and weights of signals that the model does not have."""
+    inputs, outputs = [one.name for one in model.inputs], [one.name for one in model.outputs]
+    for name in body["channels"]:
+        if name not in (*inputs, *outputs):
+            hint = nearest(name, (*inputs, *outputs))
+            yield FieldError(
+                f"/channels/{name}", f"model {model.name!r} has no signal {name!r}{hint}"
+            )
+    for name in body["hold"]:
+        if name not in inputs:
+            hint = nearest(name, inputs)
+            yield FieldError(f"/hold/{name}", f"model {model.name!r} has no input {name!r}{hint}")
+    for name, weight in (body["weights"] or {}).items():
+        if name not in outputs:
+            hint = nearest(name, outputs)
+            yield FieldError(f"/weights/{name}", f"the model has no output {name!r}{hint}")
+        elif not weight > 0:
+            yield FieldError(f"/weights/{name}", f"found {weight:g}; need a positive number")
+
+
+def conversion_faults(body: Body) -> list[FieldError]:
+    """Settings of search and loss that do not go together."""
+    found: list[FieldError] = []
+    tried(algorithm_of, found, body["algorithm"])
+    tried(loss_of, found, body["loss"])
+    if body["prediction"] == "one-step" and body["loss"].get("noise_model") == "ar1":
+        detail = "ar1 is for free runs; predictions one step ahead contain the noise"
+        found.append(FieldError("/loss/noise_model", detail))
+    return found
+
+
+def setting_faults(body: Body, model: Model, parameters: tuple[Parameter, ...]) -> list[FieldError]:
+    """Faults of a body that its model shows: names that it does not have, values that are none."""
+    found = conversion_faults(body)
+    overridden(found, parameters, body["parameters"])
+    return [*found, *signal_faults(body, model)]
+
+
+def overridden(
+    errors: list[FieldError], parameters: tuple[Parameter, ...], changes: Mapping[str, Any]
+) -> tuple[Parameter, ...]:
+    """The parameters with all changes that can be made; of each of the others its fault."""
+    for name, change in changes.items():
+        parameters = tried(override, errors, parameters, {name: change}) or parameters
+    return parameters
+
+
+def tried(make: Any, errors: list[FieldError], *arguments: Any) -> Any:
+    """What `make` gives; None where it raises, and its faults among `errors`."""
+    try:
+        return make(*arguments)
+    except SysidError as error:
+        errors += faults_of(error)
+        return None

@@ -1,0 +1,330 @@
+"""The job body and what is told about a job.
+
+Defaults stand here a second time, beside those of `sysid.core.settings`, so that the OpenAPI
+document shows them and a client needs no NumPy; a test compares the two.
+
+What is told about accepted references.
+"""
+
+from datetime import datetime
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from service.core.wire import Answer, Body, NoiseIn, Pointer, Seed, not_too_deep
+
+Whole = Annotated[int, Field(gt=-(2**62), lt=2**62)]
+# The bounds are those of `sysid.core.settings`, which a client does not load.
+Count = Annotated[int, Field(ge=1, le=10**9)]
+Evaluations = Annotated[int, Field(ge=1, le=10**12)]
+Generation = Annotated[int, Field(ge=0, le=10**9)]
+Mutation = Annotated[list[tuple[Generation, float]], Field(min_length=1, max_length=1000)]
+
+
+class ParameterIn(Body):
+    """Changes of one parameter of the model."""
+
+    lower: float | None = None
+    upper: float | None = None
+    scale: Literal["linear", "log"] | None = None
+    fixed: float | None = None
+    tied: str | None = Field(default=None, max_length=1000)
+
+
+class ValidationIn(Body):
+    """Data kept for validation: other datasets, or the last fraction of each record."""
+
+    datasets: list[str] | None = Field(default=None, min_length=1)
+    fraction: float | None = Field(default=None, gt=0, lt=1)
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Self:
+        if (self.datasets is None) == (self.fraction is None):
+            raise PydanticCustomError("one_of", "give either 'datasets' or 'fraction'")
+        return self
+
+
+class LossIn(Body):
+    """What is minimised: squares, or soft-l1 with a scale in the output's unit.
+
+    With the noise model ar1 the estimates are those of generalised least squares in the end; auto
+    is that where residuals are coloured and the model does not forget where it began, else white.
+    """
+
+    kind: Literal["squares", "soft-l1"] = "squares"
+    scale: float = Field(default=1.0, gt=0)
+    noise_model: Literal["auto", "white", "ar1"] = "auto"
+
+
+class SequenceIn(Body):
+    """The sequence search."""
+
+    kind: Literal["paper", "adaptive"] = "adaptive"
+    beta: float = Field(default=0.01, gt=0, lt=1)
+    relative: bool = True
+
+
+class MigrationIn(Body):
+    """Exchange between islands."""
+
+    every: Count = 25
+    topology: Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"] = (
+        "one-way-ring"
+    )
+    migrants: int = Field(default=2, ge=0, le=100_000)
+
+
+class StopIn(Body):
+    """End conditions besides the generations.
+
+    `settled`: `improved` ends when searches from random places and from beside the best individual
+    found it again two times more than that, a third of all of them, the more of them the less those
+    from random places agree; where the fitness jumps nearby, that many of either kind, and nearly
+    all; null: never.
+    """
+
+    evaluations: Evaluations | None = None
+    seconds: float | None = Field(default=None, gt=0)
+    rms: float | None = Field(default=None, gt=0)
+    settled: int | None = Field(default=6, ge=1, le=1_000_000)
+
+
+class IslandIn(Body):
+    """What one island does otherwise."""
+
+    method: Literal["simple", "improved-paper", "improved"] | None = None
+    bits: int | None = Field(default=None, ge=1, le=32)
+    mutation: Mutation | None = None
+
+
+class AlgorithmIn(Body):
+    """Settings of the search."""
+
+    method: Literal["simple", "improved-paper", "improved"] = "improved"
+    population: int = Field(default=50, ge=4, le=100_000)
+    generations: int = Field(default=400, ge=1, le=10_000_000)
+    bits: int = Field(default=24, ge=1, le=32)
+    selection_rate: float = Field(default=0.5, gt=0, lt=1)
+    mutation: Mutation = Field(default=[(0, 0.2), (50, 0.8)])
+    stagnation: Count = 30
+    sequence: SequenceIn = SequenceIn()
+    islands: int | list[IslandIn] | None = None
+    migration: MigrationIn = MigrationIn()
+    refine: bool = True
+    safe_limit: float | None = Field(default=None, gt=0)
+    stop: StopIn = StopIn()
+
+
+MOST_VALUES = 1_000_000
+Labels = Annotated[dict[str, float | str], Field(max_length=32)]
+
+
+class Axis(Body):
+    """One axis of a sweep: the field it changes and the values it takes.
+
+    Exactly one of `values`, `range` (start, stop[, step]; whole numbers, stop left out) and `log`
+    (start, stop, count; both ends taken) is given. Axes of one `zip` name step together; all
+    others are crossed. `labels` belong to the values, one each.
+    """
+
+    path: Pointer
+    values: list[Any] | None = Field(default=None, min_length=1, max_length=MOST_VALUES)
+    range: list[Whole] | None = Field(default=None, min_length=2, max_length=3)
+    log: tuple[float, float, int] | None = None
+    zip: str | None = Field(default=None, max_length=100)
+    labels: list[Labels] | None = Field(default=None, max_length=MOST_VALUES)
+
+    @model_validator(mode="after")
+    def _one_kind_of_values(self) -> Self:
+        given = [n for n in ("values", "range", "log") if getattr(self, n) is not None]
+        if len(given) != 1:
+            raise PydanticCustomError(
+                "one_of",
+                "give exactly one of 'values', 'range' and 'log'; found {found}",
+                {"found": " and ".join(given) or "none"},
+            )
+        return self
+
+
+class SweepIn(Body):
+    """A job of many runs: the crossed axes give one run a cell."""
+
+    axes: list[Axis] = Field(default=[], max_length=16)
+
+
+PREVIOUS, REFERENCE, RUN = "previous", "reference:", "run_"
+
+
+def _warm_start(value: str) -> str:
+    named = value.removeprefix(REFERENCE)
+    if value != PREVIOUS and not value.startswith(RUN) and (named == value or not named):
+        raise PydanticCustomError(
+            "warm_start", "need 'previous', the id of a run (run_…), or 'reference:' and a name"
+        )
+    return value
+
+
+def _reference(value: str) -> str:
+    if value == PREVIOUS:
+        raise PydanticCustomError("reference", "need the id of a run, or 'reference:' and a name")
+    return _warm_start(value)
+
+
+LEAST_PLACE, MOST_PLACE = 1e-100, 1e100
+"""Sizes of x in a trend, whose squares are computed."""
+
+
+def is_place(value: float) -> bool:
+    """Whether a number can be the x of a trend."""
+    return value == 0 or LEAST_PLACE <= abs(value) <= MOST_PLACE
+
+
+def _place(value: float) -> float:
+    if not is_place(value):
+        raise PydanticCustomError(
+            "place", "need 0, or a size from 1e-100 to 1e100; write x in another unit"
+        )
+    return value
+
+
+PlaceIn = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_place)]
+
+
+class TrendIn(Body):
+    """How parameters depend on a label.
+
+    `x` is the name of a label that is a number in every cell, `parameters` those to look at (all
+    that are free by default), `predict` the values of x for which predictions are wanted.
+    `reference` is a run (run_…, or `reference:` and a name) that the batch is compared with.
+    """
+
+    x: str = Field(min_length=1, max_length=64)
+    parameters: list[str] = Field(default=[], max_length=100)
+    predict: list[PlaceIn] = Field(default=[], max_length=100)
+    reference: Annotated[str, Field(max_length=300), AfterValidator(_reference)] | None = None
+
+
+def model_reference(value: Any) -> Any:
+    """A model as a body may give it: by name or as a document."""
+    if not isinstance(value, str | dict):
+        raise PydanticCustomError(
+            "model_reference",
+            "need the name of a model, 'name@version', or a model document (an object)",
+        )
+    return value
+
+
+class IdentificationIn(Body):
+    """What a job and the recipes that make jobs have in common: the model, and how to fit it."""
+
+    name: str | None = Field(default=None, max_length=200)
+    model: Annotated[Any, AfterValidator(model_reference)]
+    channels: dict[str, str] = Field(default={})
+    hold: dict[str, Literal["zero", "first", "band-limited"]] = Field(default={})
+    parameters: dict[str, ParameterIn] = Field(default={})
+    prediction: Literal["simulation", "one-step"] = "simulation"
+    loss: LossIn = LossIn()
+    weights: dict[str, float] | None = None
+    skip: int = Field(default=0, ge=0)
+    algorithm: AlgorithmIn = AlgorithmIn()
+    priority: int = Field(default=0, ge=-100, le=100)
+    reuse: bool = Field(default=True, description="take results of runs that were computed before")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _within_reach(cls, value: Any) -> Any:
+        return not_too_deep(value)
+
+    def given(self, *also: str) -> dict[str, Any]:
+        """These fields, and those named besides, as far as they were given."""
+        names = {*IdentificationIn.model_fields, *also}
+        return self.model_dump(include=names, exclude_unset=True)
+
+
+class JobIn(IdentificationIn):
+    """A job: what is to be identified, from which data, and how."""
+
+    datasets: list[str] = Field(min_length=1, max_length=1000)
+    validation: ValidationIn | None = None
+    noise: NoiseIn = NoiseIn()
+    seed: Seed = 1
+    sweep: SweepIn = SweepIn()
+    warm_start: Annotated[str, Field(max_length=300), AfterValidator(_warm_start)] | None = None
+    trend: TrendIn | None = None
+
+    def normal_form(self) -> dict[str, Any]:
+        """The body with every default written out, as it is stored and handed to workers."""
+        document = self.model_dump(mode="json")
+        document["parameters"] = {
+            name: change.model_dump(mode="json", exclude_none=True)
+            for name, change in self.parameters.items()
+        }
+        return document
+
+
+class Progress(Answer):
+    """How far a job has come."""
+
+    runs: int
+    finished: int
+    failed: int
+    reused: int = Field(default=0, description="taken over from runs that were computed before")
+    best_rms: float | None = Field(
+        default=None, description="of the best run; of runs on other data or noise it tells nothing"
+    )
+    evaluations: int = 0
+    generation: int = 0
+    seconds_left: float | None = None
+
+
+class JobOut(Answer):
+    """A job and its state."""
+
+    id: str
+    name: str
+    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
+    cancel_requested: bool = False
+    created_at: datetime
+    started_at: datetime | None = None
+    finished_at: datetime | None = None
+    attempt: int = Field(description="how often it was begun, when it was resumed as well")
+    error: str | None = None
+    model: str
+    priority: int
+    progress: Progress
+    rms_unit: str | None = Field(
+        default=None, description="of the best RMS; σ: of several outputs together"
+    )
+    request: dict[str, Any] | None = None
+
+
+class ReferenceIn(Body):
+    """Accept a run as the reference of a name; `by` and `note` are kept with it."""
+
+    run: str = Field(max_length=100)
+    by: str | None = Field(default=None, max_length=200)
+    note: str | None = Field(default=None, max_length=2000)
+
+
+class AcceptedOut(Answer):
+    """One acceptance."""
+
+    run: str
+    by: str | None = None
+    note: str | None = None
+    at: datetime
+
+
+class ReferenceOut(Answer):
+    """A reference: the run in use, what it gave, and what was accepted before it."""
+
+    name: str
+    run: str
+    job: str
+    by: str | None = None
+    note: str | None = None
+    at: datetime
+    labels: dict[str, Any] = Field(default={})
+    estimates: dict[str, dict[str, float | None]] = Field(default={})
+    history: list[AcceptedOut] = Field(default=[], description="the 1,000 before, latest first")

@@ -1,0 +1,196 @@
+"""Use cases of jobs: submit, read, cancel, resume, clone."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service.core.errors import InvalidRequest, TooMuchUnfinished
+from service.core.settings import Settings
+from service.core.wire import Page
+from service.datasets.rms_unit import unit_of
+from service.jobs.axes import count, grouped, steps_of
+from service.jobs.checks import JobChecker
+from service.jobs.schemas import JobIn, JobOut, Progress
+from service.jobs.stored_cells import AT_ONCE, resolved_axes, stored_cells, stored_groups
+from service.jobs.sweep_checks import faults_of_job
+from service.queue.admission import unfinished
+from service.queue.run_writes import Cell, add_runs
+from service.repositories.jobs import JobRepository, NewJob, Submission
+from service.repositories.lineage import LineageRepository
+from service.storage.sessions import Database
+from service.storage.tables import Dataset, Job, State
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """A job that can be queued: what was asked for, by its digest, and what is stored of it."""
+
+    job: NewJob
+    digest: str
+    cells: tuple[Cell, ...]
+
+
+def submit_to(
+    database: Database, body: JobIn, settings: Settings, key: str | None = None
+) -> JobOut:
+    """Queue a job. SQLite's one write lock is held for its rows only, not while it is checked.
+
+    Raises
+    ------
+    InvalidRequest, KeyReused, TooMuchUnfinished
+        As `submit`.
+    """
+    with database.read() as session:
+        checked = check(session, body, settings)
+    with database.write() as session:
+        return told(store(session, checked, settings, key).job)
+
+
+def submit(session: Session, body: JobIn, settings: Settings, key: str | None = None) -> Submission:
+    """Queue a job with its first runs; the dispatcher makes the others as it comes to them.
+
+    Raises
+    ------
+    InvalidRequest
+        With every fault that can be known before the job runs.
+    KeyReused
+        If the idempotency key was used with another body.
+    TooMuchUnfinished
+        If its project has as much queued and running as it may.
+    """
+    return store(session, check(session, body, settings), settings, key)
+
+
+def check(
+    session: Session, body: JobIn, settings: Settings, unstored: Iterable[Dataset] = ()
+) -> Checked:
+    """The job as it will be stored: with identifiers for names, also in its axes.
+
+    `unstored` are datasets that it may name before they are stored.
+
+    Raises
+    ------
+    InvalidRequest
+        With every fault that can be known before the job runs.
+    """
+    document = body.normal_form()
+    digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    checker = JobChecker(session, unstored)
+    faults = faults_of_job(session, checker, body, settings.max_runs_per_job)
+    if faults:
+        raise InvalidRequest(faults)
+    numbers = grouped(body.sweep.axes)
+    n_runs, groups = count(body, numbers), steps_of(body.sweep.axes, numbers)
+    spec = checker.resolved(document)
+    spec["sweep"] = {"axes": resolved_axes(checker, spec, groups)}
+    new = NewJob(
+        name=body.name or _name(checker, spec), spec=spec, n_runs=n_runs, priority=body.priority,
+        max_attempts=settings.max_attempts,
+    )  # fmt: skip
+    first = islice(stored_cells(spec, stored_groups(spec)), AT_ONCE)
+    return Checked(new, digest, tuple(first))
+
+
+def store(
+    session: Session, checked: Checked, settings: Settings, key: str | None = None
+) -> Submission:
+    """Write a job that was checked, and its first runs.
+
+    Raises
+    ------
+    KeyReused
+        If the idempotency key was used with another body.
+    TooMuchUnfinished
+        If its project has as much queued and running as it may.
+    """
+    submission = JobRepository(session).submit(checked.job, key=key, request_hash=checked.digest)
+    if submission.is_new:
+        spec = checked.job.spec
+        check_limits(session, submission.job, settings)
+        add_runs(session, submission.job, checked.cells)
+        lineage = LineageRepository(session)
+        lineage.link(submission.job.id, spec["datasets"], "estimation")
+        kept = (spec["validation"] or {}).get("datasets") or []
+        lineage.link(submission.job.id, kept, "validation")
+    return submission
+
+
+def check_limits(session: Session, job: Job, settings: Settings) -> None:
+    """Refuse a job that was just queued if its project now has more unfinished than it may.
+
+    Raises
+    ------
+    TooMuchUnfinished
+        With the counts; the caller's transaction ends with it.
+    """
+    open_now = unfinished(session, job.project_id)
+    if open_now.jobs > settings.max_open_jobs:
+        raise TooMuchUnfinished(
+            f"{open_now.jobs - 1} jobs of the project wait or run, and at most "
+            f"{settings.max_open_jobs} may; submit this one when some have ended, or cancel some"
+        )
+    if open_now.runs > settings.max_open_runs:
+        left = job.n_runs - job.n_done
+        raise TooMuchUnfinished(
+            f"{open_now.runs - left} runs of the project are not done, and this job has {left} "
+            f"more; at most {settings.max_open_runs} may be open; submit it when some have ended, "
+            "or cancel some"
+        )
+
+
+def resume(session: Session, job_id: str, settings: Settings) -> Job:
+    """Queue a failed or cancelled job again.
+
+    Raises
+    ------
+    Conflict
+        If it is in another state.
+    TooMuchUnfinished
+        If its project has as much queued and running as it may.
+    """
+    job = JobRepository(session).resume(job_id)
+    check_limits(session, job, settings)
+    return job
+
+
+def clone(database: Database, job_id: str, settings: Settings) -> JobOut:
+    """Queue the same request as a new job."""
+    with database.read() as session:
+        old = JobRepository(session).get(job_id)
+    body = JobIn.model_validate({**old.spec, "name": old.name})
+    return submit_to(database, body, settings)
+
+
+def told(job: Job, *, with_request: bool = False, rms_unit: str | None = None) -> JobOut:
+    """A job as it is told."""
+    model = job.spec["model"]
+    return JobOut(
+        id=job.id, name=job.name, state=job.state.value, cancel_requested=job.cancel_requested,
+        created_at=job.created_at, started_at=job.started_at, finished_at=job.finished_at,
+        attempt=job.attempt, error=job.error,
+        model=model["name"] if isinstance(model, Mapping) else model, priority=job.priority,
+        progress=Progress(
+            runs=job.n_runs, finished=job.n_done, failed=job.n_failed, reused=job.n_reused,
+            best_rms=job.best_rms, evaluations=job.evaluations, generation=job.generation,
+            seconds_left=job.seconds_left,
+        ),
+        request=job.spec if with_request else None, rms_unit=rms_unit,
+    )  # fmt: skip
+
+
+def page(session: Session, cursor: str | None, limit: int, states: list[State]) -> Page[JobOut]:
+    """Jobs, latest first."""
+    found = JobRepository(session).page(cursor=cursor, limit=limit, states=states)
+    items = [told(job, rms_unit=unit_of(session, job.spec)) for job in found.items]
+    return Page(items=items, next=found.next)
+
+
+def _name(checker: JobChecker, spec: Mapping[str, Any]) -> str:
+    model = spec["model"]["name"] if isinstance(spec["model"], Mapping) else spec["model"]
+    data = checker.dataset(spec["datasets"][0])
+    return f"{model} on {data if isinstance(data, str) else data.name}"

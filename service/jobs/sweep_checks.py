@@ -1,0 +1,209 @@
+"""Faults of a job with axes: of the job itself, of every value that an axis gives, of its trend.
+
+Whether a trend can be made of a job's runs: every one needs its place on the axis.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence, Set
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+from sqlalchemy.orm import Session
+
+from service.core.errors import FieldError
+from service.core.json_pointer import body_of, value_at
+from service.core.wire import Seed, Sigma
+from service.jobs import warm_starts
+from service.jobs.axes import Cell, Step, axis_faults, count, grouped, steps_of
+from service.jobs.checks import NOTHING, JobChecker, value_faults
+from service.jobs.schemas import LEAST_PLACE, MOST_PLACE, PREVIOUS, JobIn, is_place
+from sysid.core.errors import nearest
+from sysid.models.model import Model
+
+
+def trend_faults(session: Session, job: JobIn, model: Model | None) -> Iterator[FieldError]:
+    """Labels that are missing or no numbers, what the model or the reference does not have."""
+    if job.warm_start == PREVIOUS and not job.sweep.axes:
+        yield FieldError("/warm_start", "'previous' needs a sweep; this job has one run")
+    if job.trend is None:
+        return
+    yield from _label_faults(job, job.trend.x)
+    if model is None:
+        return
+    yield from warm_starts.faults(session, job.trend.reference, model, "/trend/reference")
+    known = [one.name for one in model.parameters]
+    for index, name in enumerate(job.trend.parameters):
+        if name not in known:
+            yield FieldError(
+                f"/trend/parameters/{index}",
+                f"the model has no parameter {name!r}{nearest(name, known)}",
+            )
+
+
+def _label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
+    axes = [(n, axis.labels) for n, axis in enumerate(job.sweep.axes) if axis.labels]
+    named = [(n, labels) for n, labels in axes if any(x in one for one in labels)]
+    if not named:
+        known = sorted({name for _, labels in axes for one in labels for name in one})
+        there = f"there are {', '.join(known)}" if known else "no axis has labels"
+        yield FieldError(
+            "/trend/x",
+            f"no run has a label {x!r}{nearest(x, known)}; {there}; give an axis "
+            f'"labels": [{{"{x}": …}}, …], one for each value',
+        )
+    for n, labels in named:
+        for position, one in enumerate(labels):
+            value = one.get(x)
+            if not isinstance(value, float | int):
+                found = f"found {one[x]!r}" if x in one else "it is missing"
+                needed = "a number here"
+            elif not is_place(value):
+                found = f"found {value!r}"
+                needed = f"0, or a size from {LEAST_PLACE:g} to {MOST_PLACE:g}"
+            else:
+                continue
+            yield FieldError(
+                f"/sweep/axes/{n}/labels/{position}", f"{x}: {found}; a trend needs {needed}"
+            )
+
+
+# Fields that no other field depends on: their values are checked alone, a whole body for each of
+# a hundred thousand seeds would only take time.
+ALONE: Mapping[str, TypeAdapter[Any]] = {
+    "/seed": TypeAdapter(Seed),
+    "/noise/seed": TypeAdapter(Seed),
+    "/noise/sigma": TypeAdapter(Sigma),
+}
+MOST_TOLD = 200
+"""Values that cannot be used, after which no more are looked at: of some that takes 2 ms each."""
+SINGLE = ("/trend/parameters", "/trend/reference")
+"""Fields of a trend that do not depend on the axes."""
+
+
+def faults_of_job(
+    session: Session, checker: JobChecker, body: JobIn, most_runs: int, unread: Set[str] = NOTHING
+) -> list[FieldError]:
+    """Every fault that can be known before the job runs.
+
+    Values of axes are looked at where the axes are sound, and no more than `most_runs` of them.
+    `unread` are fields that could not be read, for which their defaults stand: nothing is told
+    that depends on them.
+    """
+    document = body.normal_form()
+    found = list(axis_faults(body))
+    known = checker.errors(body_of(document, {}), unread)
+    if not found and "sweep" not in unread:
+        groups = grouped(body.sweep.axes)
+        n_runs = count(body, groups)
+        if n_runs > most_runs:
+            found.append(FieldError(
+                "/sweep/axes", f"the sweep has {n_runs} runs; at most {most_runs} a job"
+            ))  # fmt: skip
+        else:
+            steps = steps_of(body.sweep.axes, groups)
+            wrong = list(_sweep_faults(checker, document, steps, frozenset(known), unread))
+            found += wrong
+            if len(wrong) < MOST_TOLD:
+                found += _repeated_recordings(checker, body)
+    model = checker.model(body.model)
+    trend = trend_faults(session, body, None if isinstance(model, list) else model[0])
+    are_axes_known = unread.isdisjoint({"sweep", "trend"})
+    found += [one for one in trend if are_axes_known or one.pointer.startswith(SINGLE)]
+    return list(dict.fromkeys([*known, *found]))
+
+
+def faults_of_rest(
+    session: Session, body: JobIn, most_runs: int, unread: Set[str]
+) -> list[FieldError]:
+    """Faults of a body of which fields are `unread`: those that stand whatever these say."""
+    return faults_of_job(session, JobChecker(session), body, most_runs, unread)
+
+
+def _repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldError]:
+    """Recordings that a trend would take for measured at two places, or twice at one."""
+    if body.trend is None:
+        return
+    for number, axis in enumerate(body.sweep.axes):
+        if axis.path != "/datasets" or not axis.values or not axis.labels:
+            continue
+        first: dict[str, tuple[int, tuple[Any, str]]] = {}
+        for position, (given, labels) in enumerate(zip(axis.values, axis.labels, strict=True)):
+            x = labels.get(body.trend.x)
+            names = given if isinstance(given, list) else [given]
+            for name in (one for one in names if isinstance(one, str)):  # others are told before
+                dataset = checker.dataset(name)
+                key = dataset if isinstance(dataset, str) else dataset.sha256
+                at, before = first.setdefault(key, (position, (x, name)))
+                if at != position:
+                    yield FieldError(
+                        f"/sweep/axes/{number}/values/{position}",
+                        f"{name!r} at {body.trend.x} = {x} is the same recording as {before[1]!r} "
+                        f"at {body.trend.x} = {before[0]}: one of them is another file",
+                    )
+
+
+def _sweep_faults(
+    checker: JobChecker,
+    document: dict[str, Any],
+    groups: Sequence[Sequence[Step]],
+    known: Set[FieldError],
+    unread: Set[str],
+) -> Iterator[FieldError]:
+    """Faults of the values; of a range or a logarithmic axis, those of its first bad value.
+
+    What the job has without its axes is `known`, and not told of every value again; nor is what a
+    value makes of a field of which a part is `unread`.
+    """
+    told: set[str] = set()
+    n_wrong = 0
+    for step in (step for group in groups for step in group):
+        if step.pointer in told or _is_good_alone(step.cell):
+            continue
+        if n_wrong == MOST_TOLD:
+            yield FieldError("", f"{MOST_TOLD} values of axes are told; the rest is not looked at")
+            return
+        found = list(_step_faults(checker, document, step, known, unread))
+        if found:
+            told.add(step.pointer)
+            n_wrong += 1
+        yield from found
+
+
+def _of_another_type(step: Step, whole: dict[str, Any]) -> Iterator[FieldError]:
+    """Values that a body would take for others, as '3' for 3: workers take a cell's as they are."""
+    for path, value in step.cell.values.items():
+        if not isinstance(value, str | bool | float):
+            continue
+        taken = value_at(whole, path)
+        if not isinstance(taken, type(value) | list):
+            yield FieldError(step.pointer, f"{path}: found {value!r}; write {taken!r}")
+
+
+def _is_good_alone(cell: Cell) -> bool:
+    return all(path in ALONE and _fits(ALONE[path], value) for path, value in cell.values.items())
+
+
+def _fits(kind: TypeAdapter[Any], value: Any) -> bool:
+    try:
+        kind.validate_python(value, strict=True)
+    except ValidationError:
+        return False
+    return True
+
+
+def _step_faults(
+    checker: JobChecker,
+    document: dict[str, Any],
+    step: Step,
+    known: Set[FieldError],
+    unread: Set[str],
+) -> Iterator[FieldError]:
+    body = body_of(document, step.cell.values)
+    wrong = value_faults(step.pointer, body)
+    yield from wrong
+    if wrong:
+        return
+    whole = JobIn.model_validate(body).normal_form()
+    yield from _of_another_type(step, whole)
+    for fault in checker.errors(whole, unread):
+        if fault not in known and fault.pointer.split("/")[1:2] not in ([one] for one in unread):
+            yield FieldError(step.pointer, str(fault), fault.column)

@@ -1,0 +1,63 @@
+"""From the documents that are stored and sent to the values of the numerical core.
+
+It stands apart from the wire types, so that a client loads no NumPy.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from sysid.core.settings import (
+    GeneticAlgorithm,
+    IslandChange,
+    Loss,
+    Migration,
+    SequenceSearch,
+    Stop,
+)
+
+
+def algorithm_of(document: Mapping[str, Any]) -> GeneticAlgorithm:
+    """Settings of the search, from the ``algorithm`` of a job body in its normal form.
+
+    Raises
+    ------
+    InvalidSettings
+        With the pointer of the field that cannot be used.
+    """
+    fields = dict(document)
+    fields["mutation"] = _schedule(fields["mutation"])
+    fields["sequence"] = SequenceSearch(**fields["sequence"])
+    fields["migration"] = Migration(**fields["migration"])
+    fields["stop"] = Stop(**fields["stop"])
+    if isinstance(fields["islands"], list):
+        fields["islands"] = tuple(_island(change) for change in fields["islands"])
+    return GeneticAlgorithm(**fields)
+
+
+def loss_of(document: Mapping[str, Any]) -> Loss:
+    """What is minimised, from the ``loss`` of a job body.
+
+    Raises
+    ------
+    InvalidSettings
+        If its kind or scale cannot be used.
+    """
+    return Loss(**document)
+
+
+def noise_model_of(document: Mapping[str, Any]) -> str:
+    """The noise model that the estimates of a result document are of, whatever was asked for."""
+    return "ar1" if any((document.get("correlation_times") or {}).values()) else "white"
+
+
+def _island(change: Mapping[str, Any]) -> IslandChange:
+    mutation = change.get("mutation")
+    return IslandChange(
+        method=change.get("method"),
+        bits=change.get("bits"),
+        mutation=None if mutation is None else _schedule(mutation),
+    )
+
+
+def _schedule(pairs: Any) -> tuple[tuple[int, float], ...]:
+    return tuple((int(generation), float(rate)) for generation, rate in pairs)

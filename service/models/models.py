@@ -1,0 +1,187 @@
+"""Use cases of models: the catalogue, own models with versions, and the check of a document.
+
+Whether runs are of one model: their estimates then stand for the same quantities.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service.core.errors import InvalidRequest, NotFound, faults_of
+from service.core.json_pointer import body_of
+from service.core.wire import FieldProblem, Page
+from service.models.schemas import CheckOut, ModelOut
+from service.repositories.jobs import JobRepository
+from service.repositories.models import ModelRepository
+from service.storage import errors as storage_errors
+from service.storage.tables import Job, Run
+from service.storage.tables import Model as StoredModel
+from sysid.core.errors import SysidError, UnknownModel, nearest
+from sysid.models.catalogue import load as library
+from sysid.models.model import Model
+from sysid.models.parse import parse_model, with_terms
+
+
+def page(session: Session, cursor: str | None, limit: int) -> Page[ModelOut]:
+    """Built-in models on the first page, then every version of own ones, latest first."""
+    own = ModelRepository(session).page(cursor=cursor, limit=limit)
+    built_in = [] if cursor else catalogue()
+    return Page(items=built_in + [_stored(row) for row in own.items], next=own.next)
+
+
+def catalogue() -> list[ModelOut]:
+    """The built-in models."""
+    return [_built_in(name) for name in library.catalogue()]
+
+
+def one(session: Session, reference: str) -> ModelOut:
+    """A model by ``name`` or ``name@version``.
+
+    Raises
+    ------
+    NotFound
+        With the nearest known name.
+    """
+    if reference in library.catalogue():
+        return _built_in(reference, with_document=True)
+    return _stored(_own(session, reference), with_document=True)
+
+
+def add(session: Session, document: Mapping[str, Any]) -> ModelOut:
+    """Store an own model; the same document again gives the same version.
+
+    Raises
+    ------
+    InvalidRequest
+        If it has faults, or its name is that of a built-in model.
+    """
+    model = parse_model(document, is_new=True)
+    if model.name in library.catalogue():
+        raise InvalidRequest.at(
+            "/name", f"{model.name!r} is the name of a built-in model; choose another"
+        )
+    stored = ModelRepository(session).add(model.name, dict(model.document))
+    return _stored(stored.model, with_document=True)
+
+
+def check(document: Any) -> CheckOut:
+    """Whether a model document can be used, and every fault in it."""
+    if not isinstance(document, Mapping):
+        found = f"a model is an object with 'equations' and more; found {document!r:.60}"
+        return CheckOut(valid=False, errors=[FieldProblem(pointer="", detail=found)])
+    try:
+        model = parse_model(document, is_new=True)
+    except SysidError as error:
+        problems = [FieldProblem(**fault.as_dict()) for fault in faults_of(error)]
+        return CheckOut(valid=False, errors=problems)
+    return CheckOut(valid=True, errors=[], normal_form=dict(model.document))
+
+
+def resolve(session: Session, reference: Any, *, is_new: bool = False) -> tuple[Model, Any]:
+    """The model that a job names, and what to store for it.
+
+    A built-in model stays a name; an own one is stored as its document, so that a later version
+    does not change what was submitted. `is_new`: see `sysid.models.parse.parse_model`.
+
+    Raises
+    ------
+    InvalidModel, UnknownModel
+        If a document has faults, or no model has that name.
+    """
+    if isinstance(reference, Mapping):
+        model = parse_model(reference, is_new=is_new)
+        return model, dict(reference)
+    if reference in library.catalogue():
+        return library.load_model(reference), reference
+    try:
+        row = _own(session, reference)
+    except NotFound:
+        raise UnknownModel(reference, _names(session)) from None
+    return parse_model(row.document, is_new=is_new), row.document
+
+
+def model_of_run(session: Session, run: Run, job: Job) -> Model:
+    """The model of one run, its terms as they were selected on the run's data.
+
+    Until a run with a term selection has its result, the model has all candidates, and a `rule`.
+
+    Raises
+    ------
+    InvalidModel, UnknownModel
+        If the stored model cannot be read any more.
+    """
+    model, _ = resolve(session, body_of(job.spec, run.cell)["model"])
+    return resolved(model, run.result)
+
+
+def resolved(model: Model, result: Mapping[str, Any] | None) -> Model:
+    """A model with the terms that a run's result document says were selected, if it does."""
+    if model.rule is None or not (result or {}).get("selection"):
+        return model
+    return with_terms(model, [one["term"] for one in (result or {})["selection"]])
+
+
+def _own(session: Session, reference: str) -> StoredModel:
+    try:
+        return ModelRepository(session).get(reference)
+    except storage_errors.NotFound:
+        raise NotFound("model", reference, nearest(reference, _names(session))) from None
+
+
+def _names(session: Session) -> set[str]:
+    own = ModelRepository(session).page(limit=1000).items
+    return {*library.catalogue(), *(row.name for row in own)}
+
+
+def _built_in(name: str, *, with_document: bool = False) -> ModelOut:
+    return _told(library.load_model(name), 0, library.document(name) if with_document else None)
+
+
+def _stored(row: StoredModel, *, with_document: bool = False) -> ModelOut:
+    document = row.document if with_document else None
+    return _told(parse_model(row.document), row.version, document)
+
+
+def _told(model: Model, version: int, document: Mapping[str, Any] | None) -> ModelOut:
+    return ModelOut(
+        name=model.name,
+        version=version,
+        builtin=version == 0,
+        title=model.title,
+        form=model.form,
+        inputs={quantity.name: quantity.unit for quantity in model.inputs},
+        outputs={output.name: output.unit for output in model.outputs},
+        parameters={
+            p.name: {"lower": p.lower, "upper": p.upper, "unit": p.unit, "scale": p.scale,
+                     "fixed": p.fixed, "tied": p.tied}
+            for p in model.parameters
+        },
+        document=None if document is None else dict(document),
+    )  # fmt: skip
+
+
+_BESIDES = ("name", "title", "description", "source", "parameters", "initial", "solver")
+"""Of a model's document, what does not say what its parameters mean."""
+
+
+def model_in(session: Session, run: Run) -> Model | None:
+    """The model of a run; None if this version of the program cannot read it any more."""
+    job = JobRepository(session).get(run.job_id)
+    try:
+        return resolve(session, body_of(job.spec, run.cell)["model"])[0]
+    except SysidError:
+        return None
+
+
+def says_the_same(one: Model, other: Model) -> bool:
+    """Whether two models have the same equations of the same parameters, in the same units.
+
+    Names and texts, bounds, initial states and the solver may differ.
+    """
+    return bool(_meaning(one) == _meaning(other))
+
+
+def _meaning(model: Model) -> Any:
+    document = {key: value for key, value in model.document.items() if key not in _BESIDES}
+    return document, [(one.name, one.unit) for one in model.parameters]

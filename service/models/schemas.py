@@ -1,0 +1,27 @@
+"""What is told about models."""
+
+from typing import Any
+
+from service.core.wire import Answer, FieldProblem
+
+
+class ModelOut(Answer):
+    """A model: built in (`version` 0) or stored by a user."""
+
+    name: str
+    version: int
+    builtin: bool
+    title: str
+    form: str
+    inputs: dict[str, str]
+    outputs: dict[str, str]
+    parameters: dict[str, dict[str, Any]]
+    document: dict[str, Any] | None = None
+
+
+class CheckOut(Answer):
+    """Whether a model document can be used, and every error in it."""
+
+    valid: bool
+    errors: list[FieldProblem]
+    normal_form: dict[str, Any] | None = None

@@ -1,0 +1,145 @@
+"""The cells of a sweep as a grid by its axes: what a page shows instead of thousands of runs."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
+
+from sqlalchemy.orm import Session
+
+from service.figures import formats
+from service.figures.noise import SIGMA
+from service.repositories.summaries import Group, GroupKey, Quantity
+from service.storage.columns import to_json
+from service.storage.tables import Job, State
+from service.sweeps.groups import groups_of
+
+LISTED = 50
+"""Runs that a page lists one by one; of more it shows the grid."""
+MOST_CELLS = 2_000
+MOST_COLUMNS = 12
+MIDDLE = 2  # place of the median among the quantiles
+
+Key = tuple[Any, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CellView:
+    """The runs of one cell of the grid."""
+
+    href: str
+    text: str
+    count_text: str
+    state: str
+    share: float
+    is_chosen: bool
+
+
+@dataclass(frozen=True, slots=True)
+class GridView:
+    """Rows by all axes but the last, columns by the last one; an absent cell is None."""
+
+    quantity: str
+    row_names: Sequence[str]
+    column_name: str
+    columns: Sequence[str]
+    rows: Sequence[tuple[Sequence[str], Sequence[CellView | None]]]
+    is_cut: bool
+
+
+def grid_of(session: Session, job: Job, chosen: Mapping[str, Any]) -> GridView | None:
+    """The grid of a job; None where its runs are few, or differ by nothing but seeds."""
+    paths = [axis["path"] for axis in job.spec.get("sweep", {}).get("axes", [])]
+    keys = [path for path in paths if not path.endswith("/seed")]
+    if job.n_runs <= LISTED or not keys:
+        return None
+    error = Quantity("rms_noise_free" if SIGMA in keys else "rms")
+    named = [GroupKey("axis", path) for path in keys]
+    found = groups_of(session, job, named, [error], MOST_CELLS)
+    is_cut, found = len(found) > MOST_CELLS, found[:MOST_CELLS]
+    split = len(keys) - 1 if _fits_across([one.key[-1] for one in found]) else len(keys)
+    columns = _distinct([one.key[split:] for one in found])
+    shares = _shares(found, error)
+    cells = {
+        to_json(one.key): _cell(one, keys, error, share, chosen)
+        for one, share in zip(found, shares, strict=True)
+    }
+    rows = [
+        ([_text(value) for value in row],
+         [cells.get(to_json((*row, *column))) for column in columns])
+        for row in _distinct([one.key[:split] for one in found])
+    ]  # fmt: skip
+    return GridView(
+        quantity="RMS error against the record without noise" if SIGMA in keys else "RMS",
+        row_names=[_name(path) for path in keys[:split]],
+        column_name=_name(keys[-1]) if split < len(keys) else "",
+        columns=[_text(column[0]) if column else "all" for column in columns],
+        rows=rows, is_cut=is_cut,
+    )  # fmt: skip
+
+
+def query_of(cell: Mapping[str, Any]) -> str:
+    """Query that chooses the runs of a cell."""
+    pairs = [("cell", f"{path}={json.dumps(value)}") for path, value in cell.items()]
+    return f"?{urlencode(pairs)}" if pairs else ""
+
+
+def _fits_across(values: Sequence[Any]) -> bool:
+    return len({to_json(one) for one in values}) <= MOST_COLUMNS
+
+
+def _distinct(keys: Sequence[Key]) -> list[Key]:
+    return list({to_json(key): key for key in keys}.values())
+
+
+def _cell(
+    group: Group, keys: Sequence[str], error: Quantity, share: float, chosen: Mapping[str, Any]
+) -> CellView:
+    cell = dict(zip(keys, group.key, strict=True))
+    quantiles = group.quantiles.get(error)
+    total = sum(group.states.values())
+    over = sum(n for state, n in group.states.items() if state.is_terminal)
+    failed = group.states[State.FAILED]
+    count = formats.count(total) if over == total else f"{over} of {total}"
+    return CellView(
+        href=query_of(cell),
+        text="–" if quantiles is None else formats.number(quantiles[MIDDLE], 3),
+        count_text=f"{count} runs{f', {failed} failed' if failed else ''}",
+        state=_state(group, over == total),
+        share=share,
+        is_chosen=bool(chosen) and cell == dict(chosen),
+    )
+
+
+def _state(group: Group, is_over: bool) -> str:
+    if not is_over:
+        return "running" if group.states[State.RUNNING] or _any_over(group) else "queued"
+    for state in (State.FAILED, State.CANCELLED):
+        if group.states[state]:
+            return state.value
+    return State.SUCCEEDED.value
+
+
+def _any_over(group: Group) -> bool:
+    return any(n for state, n in group.states.items() if state.is_terminal)
+
+
+def _shares(found: Sequence[Group], error: Quantity) -> list[float]:
+    """How dark each cell is, from 0 to 1: the rank of its median among all."""
+    medians = [one.quantiles[error][MIDDLE] if error in one.quantiles else None for one in found]
+    ranked = sorted({value for value in medians if value is not None})
+    place = {value: number / max(len(ranked) - 1, 1) for number, value in enumerate(ranked)}
+    return [0.0 if value is None else place[value] for value in medians]
+
+
+def _name(path: str) -> str:
+    return "σ" if path == SIGMA else path.rsplit("/", 1)[-1]
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, dict):
+        return str(value.get("name", "…"))
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -1,0 +1,59 @@
+"""The datasets of a job as pages and reports name them: each with its role, and its label."""
+
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service.pages.views import DATASETS, axes_of
+from service.repositories.datasets import DatasetRepository
+from service.repositories.lineage import LineageRepository
+from service.storage.columns import Document
+from service.storage.errors import NotFound
+from service.storage.tables import Job
+
+MOST = 100
+"""Datasets of a job that are named."""
+
+
+def dataset_links(session: Session, job: Job) -> list[dict[str, Any]]:
+    """Datasets of a job, each with its role, label, name and parents."""
+    lineage = LineageRepository(session)
+    return [
+        {"role": role, "label": label, "id": one, "name": _name(session, one),
+         "parents": [e.parent for e in lineage.ancestors(one) if e.child == one]}
+        for role, label, one in islice(_of(job.spec), MOST)
+    ]  # fmt: skip
+
+
+def unnamed(job: Job) -> int:
+    """How many datasets of a job are not named."""
+    return max(0, sum(1 for _ in _of(job.spec)) - MOST)
+
+
+def _of(spec: Document) -> Iterator[tuple[str, str, str]]:
+    """Role, label and identifier of each; those of an axis stand for the job's own."""
+    axes = [axis for axis in axes_of(spec) if axis["path"] == DATASETS and axis.get("values")]
+    for axis in axes:
+        labels = axis.get("labels") or [{}] * len(axis["values"])
+        for value, label in zip(axis["values"], labels, strict=True):
+            for one in [value] if isinstance(value, str) else value:
+                yield "estimation", _label(label), one
+    if not axes:
+        for one in spec.get("datasets", []):
+            yield "estimation", "", one
+    for one in (spec.get("validation") or {}).get("datasets") or []:
+        yield "validation", "", one
+
+
+def _label(label: Document) -> str:
+    texts = {name: f"{v:g}" if isinstance(v, float) else str(v) for name, v in label.items()}
+    return ", ".join(f"{name} = {text}" for name, text in texts.items())
+
+
+def _name(session: Session, dataset_id: str) -> str:
+    try:
+        return DatasetRepository(session).get(dataset_id).name
+    except NotFound:
+        return "deleted"

@@ -1,0 +1,143 @@
+"""What pages show of the evidence beside the estimates: residual tests, onset delays, criteria."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from service.figures import formats
+from service.figures.data import CorrelationTrace
+from service.figures.plotly import Figure
+from service.figures.residuals import residuals
+from service.runs.residuals import Tested
+from sysid.residuals.residual_tests import Correlation
+
+Document = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class TestView:
+    """One residual test as a line of a table."""
+
+    experiment: int
+    output: str
+    what: str
+    inside95: str
+    inside99: str
+    p: str
+    outcome: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class OnsetView:
+    """The onset delay of one output behind one input."""
+
+    pair: str
+    text: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class SelectedView:
+    """One selected term of a polynomial."""
+
+    term: str
+    err: str
+    left: str
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """All of it for one run; empty where a result does not tell it.
+
+    `verdict` is ``passed``, ``failed`` or ``not tested``, or empty without tests.
+    """
+
+    verdict: str
+    data: str
+    tests: Sequence[TestView]
+    n_figures: int
+    onsets: Sequence[OnsetView]
+    groups: Sequence[str]
+    criteria: Mapping[str, float | None]
+    selection: Sequence[SelectedView] = ()
+
+
+def findings_of(result: Document) -> Findings:
+    """From a result document; results of older versions lack some of its fields."""
+    tested = result.get("residual_tests") or {}
+    tests = tested.get("tests") or []
+    onsets = result.get("onset_delays") or []
+    groups = (result.get("identifiability") or {}).get("groups") or []
+    several = len({one["experiment"] for one in onsets}) > 1
+    verdicts = {True: "passed", False: "failed", None: "not tested"}
+    return Findings(
+        verdict=verdicts[tested.get("passed")] if tests else "", data=tested.get("data", ""),
+        tests=[_test(one) for one in tests],
+        n_figures=sum(one["experiment"] == 0 and one["outcome"] != "not tested" for one in tests),
+        onsets=[_onset(one, several) for one in onsets],
+        groups=[_group(one) for one in groups if isinstance(one, dict)],
+        criteria=result.get("criteria") or {},
+        selection=[
+            SelectedView(one["term"], formats.number(one["err"]),
+                         formats.number(max(1.0 - one["cumulated"], 0.0)))
+            for one in result.get("selection") or ()
+        ],
+    )  # fmt: skip
+
+
+def correlation_trace(one: Correlation) -> CorrelationTrace:
+    """A correlation function as its figure wants it."""
+    test = one.test
+    of = "" if test.input is None else f" with {test.input}"
+    kind = "autocorrelation" if test.input is None else "correlation"
+    title = f"{kind} of the residual of {test.output}{of}: {test.outcome}"
+    return CorrelationTrace(
+        title, test.input is None, one.period, one.lags, one.values, one.band95, one.band99
+    )
+
+
+def residual_figure(tested: Tested, experiment: int, columns: int = 2) -> Figure:
+    """Correlation functions of the residuals of one experiment; empty where none was tested."""
+    functions = [
+        correlation_trace(one)
+        for one in tested.found
+        if one.test.experiment == experiment and one.values.size
+    ]
+    return residuals(functions, columns, tested.names)
+
+
+def chance(p: float | None) -> str:
+    """A probability of a test."""
+    if p is None:
+        return formats.DASH
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def _test(one: Document) -> TestView:
+    what = "white" if one["test"] == "whiteness" else f"independent of {one['input']}"
+    return TestView(
+        experiment=one["experiment"] + 1, output=one["output"], what=what,
+        inside95=_share(one.get("inside95")), inside99=_share(one.get("inside99")),
+        p=chance(one.get("p")), outcome=one["outcome"], reason=one.get("reason") or "",
+    )  # fmt: skip
+
+
+def _share(part: float | None) -> str:
+    return formats.DASH if part is None else f"{100 * part:.0f}\u202f%"
+
+
+def _onset(one: Document, several: bool) -> OnsetView:
+    where = f", experiment {one['experiment'] + 1}" if several else ""
+    pair = f"{one['output']} behind {one['input']}{where}"
+    if one["delay"] is None:
+        return OnsetView(pair, "", one.get("reason") or "")
+    value, spread = formats.estimate(one["delay"], one.get("spread"))
+    steps = "one step" if one["events"] == 1 else f"{one['events']} steps"
+    scatter = f", spread {spread}\u202fs" if spread else ""
+    return OnsetView(pair, f"{value}\u202fs", f"{steps}{scatter}")
+
+
+def _group(one: Document) -> str:
+    value, stderr = formats.estimate(one["value"], one.get("stderr"))
+    return f"{one['expression']} = {value}{f' ± {stderr}' if stderr else ''}"

@@ -1,0 +1,105 @@
+"""Use cases of figures: a figure of a run or of a dataset, as a request chose it."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+from sqlalchemy.orm import Session
+
+from service.core.errors import NotFound
+from service.datasets.rms_unit import unit_of
+from service.figures import plotly as figures
+from service.figures import signals as figures_signals
+from service.figures.noise import noise_keys, noise_sweep
+from service.figures.plotly import Abscissa, Figure
+from service.figures.theme import Theme
+from service.figures.trend import trend_figure
+from service.pages.diagnostics import residual_figure
+from service.pages.figure_data import evidence_of, experiments_of, traces_of
+from service.pages.trend import trend_of
+from service.repositories.datasets import DatasetRepository
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunRepository
+from service.runs.residuals import residuals_of
+from service.storage.objects import ObjectStore
+from service.sweeps.summary import summary
+
+FigureName = Literal["history", "convergence", "response", "residuals", "correlation", "waterfall"]
+
+
+class FigureChoice(BaseModel):
+    """What a request may choose about a figure."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    theme: Theme = Field(default="light", description="light or dark paper")
+    format: Literal["json", "csv"] = Field(default="json", description="Plotly JSON or numbers")
+    abscissa: Abscissa = Field(default="generations", description="of the RMS history")
+    columns: int = Field(default=3, ge=1, le=8, description="small plots side by side")
+    experiment: int = Field(default=0, ge=0, description="number of the record, from 0")
+    start: float | None = Field(default=None, allow_inf_nan=False, description="from here on, s")
+    stop: float | None = Field(default=None, allow_inf_nan=False, description="up to here, s")
+
+
+def run_figure(
+    session: Session, store: ObjectStore, run_id: str, name: FigureName, choice: FigureChoice
+) -> Figure:
+    """One figure of a run; empty where the run has nothing to show yet.
+
+    Raises
+    ------
+    NotFound
+        If the run, or the experiment that was asked for, is not there.
+    """
+    run = RunRepository(session).get(run_id)
+    job = JobRepository(session).get(run.job_id)
+    if name == "response":
+        experiments = experiments_of(session, store, job, run)
+        if not experiments:
+            return {"data": [], "layout": figures.layout(200)}
+        _check_experiment(choice.experiment, len(experiments))
+        figure = figures_signals.response(experiments[choice.experiment], choice.start, choice.stop)
+        figure["layout"]["meta"]["experiments"] = [one.name for one in experiments]
+        return figure
+    if name == "residuals":
+        tested = residuals_of(session, store, job, run)
+        if tested is None:
+            return {"data": [], "layout": figures.layout(200)}
+        _check_experiment(choice.experiment, len(tested.names))
+        return residual_figure(tested, choice.experiment, min(choice.columns, 2))
+    evidence = evidence_of(session, job, run)
+    if name == "history":
+        return figures.history(evidence, choice.abscissa)
+    if name == "convergence":
+        return figures.convergence(evidence, choice.columns)
+    return figures.correlation(evidence) if name == "correlation" else figures.waterfall(evidence)
+
+
+def job_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
+    """Errors against the noise of a job; empty where σ is no axis of it, or nothing ended yet."""
+    job = JobRepository(session).get(job_id)
+    keys = noise_keys(job.spec.get("sweep", {}).get("axes", []))
+    if keys is None:
+        return {"data": [], "layout": figures.layout(200)}
+    found = summary(session, job.id, keys, errors_only=True)
+    return noise_sweep(found, unit_of(session, job.spec), min(choice.columns, 2))
+
+
+def trend_of_job(session: Session, job_id: str, choice: FigureChoice) -> Figure:
+    """Estimates over the label of a batch; empty where the job asks for no trend."""
+    found = trend_of(session, JobRepository(session).get(job_id))
+    if found is None:
+        return {"data": [], "layout": figures.layout(200)}
+    return trend_figure(found, min(choice.columns, 2))
+
+
+def _check_experiment(number: int, count: int) -> None:
+    if number >= count:
+        raise NotFound("experiment", str(number), f"; the last is {count - 1}")
+
+
+def dataset_figure(
+    session: Session, store: ObjectStore, dataset_id: str, choice: FigureChoice
+) -> Figure:
+    """The signals of a dataset."""
+    dataset = DatasetRepository(session).get(dataset_id)
+    return figures_signals.signals(traces_of(store, dataset), choice.start, choice.stop)

@@ -1,0 +1,329 @@
+"""The page on which an identified model is simulated; its address carries the whole request."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+from urllib.parse import urlencode
+
+from pydantic import ValidationError
+from sqlalchemy.orm import Session
+
+from service.control import simulate as run_simulations
+from service.control.schemas import RunSimulateIn, RunSimulationOut, StepMetricsOut
+from service.core.errors import FieldError, InvalidRequest, ServiceError, Unavailable, faults_of
+from service.core.json_pointer import body_of
+from service.core.validation import explained
+from service.figures.data import Experiment, OutputTraces, Trace
+from service.figures.embed import as_json, bare, templates
+from service.figures.formats import bracketed
+from service.figures.plotly import Figure, as_csv
+from service.figures.signals import response
+from service.figures.simulation import in_units, simulation
+from service.figures.theme import MAX_POINTS
+from service.jobs.record_checks import signals_of
+from service.models.models import model_of_run
+from service.pages.render import render
+from service.pages.simulate_form import (
+    KINDS,
+    TUNINGS,
+    Asked,
+    Kind,
+    asked,
+    at_home,
+    is_asked,
+    kind_of,
+    label_of,
+)
+from service.repositories.datasets import DatasetRepository
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunRepository
+from service.runs import free_run as free_runs
+from service.runs.free_run import FreeRun
+from service.runs.schemas import FreeRunIn
+from service.storage.errors import StorageError
+from service.storage.objects import ObjectStore
+from service.storage.sessions import Database
+from service.storage.tables import Dataset, Run
+from sysid.core.errors import SysidError
+from sysid.core.units import multiplied
+from sysid.data.records import Record
+from sysid.models.model import Model
+
+DATASETS_LISTED = 200
+RECORDS_LISTED = 50
+MOST_DEFAULT_SAMPLES = 5000
+TAKEN = {"amplitude": "1", "offset": "0", "time": "0"}
+"""What an address without them means; a form that is still empty suggests others."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """What the form is made from."""
+
+    run: str
+    title: str
+    job: str
+    job_name: str
+    model: Model
+    datasets: Sequence[Dataset]
+    has_estimates: bool
+    units: Mapping[str, str]
+    defaults: Mapping[str, str]
+
+    @property
+    def inputs(self) -> list[tuple[str, str]]:
+        """Choices of an input."""
+        return [(one.name, one.name) for one in self.model.inputs]
+
+    @property
+    def outputs(self) -> list[tuple[str, str]]:
+        """Choices of an output."""
+        return [(one.name, one.name) for one in self.model.outputs]
+
+    @property
+    def gain_unit(self) -> str:
+        """Unit of the gain, where there is one input and one output to choose."""
+        if len(self.model.inputs) != 1 or len(self.model.outputs) != 1:
+            return ""
+        above, below = (self.units[one[0].name] for one in (self.model.inputs, self.model.outputs))
+        if "1" in (above, below):
+            return above if below == "1" else f"1/{below}"
+        return "" if above == below else f"{above}/({below})"
+
+    @property
+    def recordings(self) -> list[tuple[str, str]]:
+        """Choices of a stored recording."""
+        return [("", "choose one…"), *((one.id, one.name) for one in self.datasets)]
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """The answer to a request: a page, or the numbers of its figure."""
+
+    text: str
+    is_csv: bool
+    status: int = 200
+
+
+def simulate_page(
+    database: Database, store: ObjectStore, run_id: str, query: Mapping[str, str], base_url: str
+) -> Shown:
+    """The form, and what the model does where the query asks for it.
+
+    Raises
+    ------
+    NotFound
+        If there is no such run.
+    """
+    with database.read() as session:
+        known = _known(session, run_id, query)
+    kind: Kind = "loop"
+    context: dict[str, Any] = {}
+    faults: list[FieldError] = []
+    status = 200
+    try:
+        kind = kind_of(query)
+        if is_asked(query):
+            wanted = asked(known.model, query)
+            figure, context = _simulated(database, store, known, wanted)
+            if query.get("format") == "csv":
+                return Shown(as_csv(figure), is_csv=True)
+            context |= _figure_context(figure) | _request(known.run, wanted, base_url)
+    except (ServiceError, StorageError, SysidError) as error:
+        faults = [at_home(one) for one in _faults(error)]
+        status = error.status if isinstance(error, Unavailable) else 422
+    page = render(
+        "simulate.html", known=known, kind=kind, kinds=KINDS, tunings=TUNINGS,
+        values={**known.defaults, **(_late(known.defaults) if kind == "loop" else {}),
+                **(TAKEN if is_asked(query) else {}), **query,
+                **_numbers(context.get("result"))},
+        faults={f.pointer[1:]: f.detail for f in faults},
+        lines=[_line(one) for one in faults], query=_address(query), label_of=label_of,
+        times=multiplied, bracket=bracketed,
+        **{"result": None, "free": None, "figure": None, **context},
+    )  # fmt: skip
+    return Shown(page, is_csv=False, status=status)
+
+
+def _known(session: Session, run_id: str, query: Mapping[str, str]) -> _Known:
+    run = RunRepository(session).get(run_id)
+    job = JobRepository(session).get(run.job_id)
+    request = body_of(job.spec, run.cell)
+    model = model_of_run(session, run, job)
+    datasets = list(DatasetRepository(session).page(limit=DATASETS_LISTED).items)
+    for wanted in (query.get("dataset"), request["datasets"][0]):
+        if wanted and wanted not in [one.id for one in datasets]:
+            datasets += _one(session, wanted)
+    fitted = next((one for one in datasets if one.id == request["datasets"][0]), None)
+    return _Known(
+        run=run.id, title=f"run {run.number + 1}", job=job.id, job_name=job.name, model=model,
+        datasets=datasets, has_estimates=bool((run.result or {}).get("parameters")),
+        units=_units(model, request, fitted),
+        defaults=_defaults(model, request, fitted) | _step(model, run),
+    )  # fmt: skip
+
+
+def _one(session: Session, dataset: str) -> list[Dataset]:
+    try:
+        return [DatasetRepository(session).get(dataset)]
+    except StorageError:  # deleted since, or never there: the form says so where it is chosen
+        return []
+
+
+def _units(model: Model, request: Mapping[str, Any], fitted: Dataset | None) -> dict[str, str]:
+    """Unit of every signal: the model's, or where it leaves it open that of the recording."""
+    recorded = {one["name"]: str(one["unit"]) for one in (fitted.channels if fitted else [])}
+    own = {one.name: one.unit for one in model.inputs} | {o.name: o.unit for o in model.outputs}
+    channels = request.get("channels", {})
+    return {
+        name: recorded.get(channels.get(name, name), unit) if unit == "1" else unit
+        for name, unit in own.items()
+    }
+
+
+def _defaults(model: Model, request: Mapping[str, Any], fitted: Dataset | None) -> dict[str, str]:
+    period = (fitted.sample_time or _mean_period(fitted)) if fitted else None
+    period = period or model.solver.step or 0.01
+    duration = min(fitted.duration if fitted else 10.0, MOST_DEFAULT_SAMPLES * period)
+    channels = request.get("channels", {})
+    return {
+        "input": model.inputs[0].name if model.inputs else "", "output": model.outputs[0].name,
+        "gain": "1", "amplitude": "1", "time": "0", "offset": "0", "skip": "0",
+        "duration": f"{duration:.6g}", "sample_time": f"{period:.6g}",
+        **{f"channel.{name}": channels.get(name, name) for name in chain(*signals_of(model))},
+    }  # fmt: skip
+
+
+def _mean_period(irregular: Dataset) -> float | None:
+    """A period (s) for a recording that has none: of as many samples over the same time."""
+    if irregular.n_samples < 2 or not irregular.duration > 0:
+        return None
+    return float(f"{irregular.duration / (irregular.n_samples - 1):.2g}")
+
+
+def _step(model: Model, run: Run) -> dict[str, str]:
+    """A step of the reference within what was measured: half the span of the first output.
+
+    A step from 0 to 1 would lie outside it for most plants, with an output's offset or in Pa.
+    """
+    told = ((run.result or {}).get("agreement") or {}).get("estimation", [])
+    of_output = (one for one in told if one["output"] == model.outputs[0].name)
+    spans = [one["span"] for one in of_output if None not in one["span"]]
+    if not spans:
+        return {}
+    low, high = min(span[0] for span in spans), max(span[1] for span in spans)
+    return {"offset": _round(low + (high - low) / 4), "amplitude": _round((high - low) / 2)}
+
+
+def _late(defaults: Mapping[str, str]) -> dict[str, str]:
+    """The step one record later: the model starts at rest, not at the reference before the step."""
+    if defaults["offset"] == "0":
+        return {}
+    duration = float(defaults["duration"])
+    return {"time": f"{duration:.6g}", "duration": f"{2 * duration:.6g}"}
+
+
+def _round(value: float) -> str:
+    """Two significant digits, without a power of ten as long as that can be read."""
+    return f"{float(f'{value:.2g}'):.10g}"
+
+
+def _simulated(
+    database: Database, store: ObjectStore, known: _Known, wanted: Asked
+) -> tuple[Figure, dict[str, Any]]:
+    if wanted.kind == "recording":
+        body = _valid(FreeRunIn, wanted.body)
+        free = free_runs.judged(database, store, known.run, body)
+        name = next((d.name for d in known.datasets if d.id == free.dataset), free.dataset)
+        return response(_experiment(free)), {"free": free, "dataset_name": name,
+                                             "records": RECORDS_LISTED}  # fmt: skip
+    body = _valid(RunSimulateIn, wanted.body)
+    told = run_simulations.simulate(database, store, known.run, body, MAX_POINTS)
+    found = in_units(told, known.units)
+    since = wanted.body["control"]["reference"]["time"] if wanted.kind == "loop" else None
+    entered = known.units.get(wanted.body["control"]["input"], "1") if since is not None else "1"
+    return simulation(found, since), {"result": found, "verdict": _verdict(found),
+                                      "command_unit": entered}  # fmt: skip
+
+
+def _valid(kind: type[Any], body: Mapping[str, Any]) -> Any:
+    try:
+        return kind.model_validate(body)
+    except ValidationError as error:
+        raise InvalidRequest(explained(error.errors(), body, kind)) from None
+
+
+def _numbers(found: RunSimulationOut | None) -> dict[str, str]:
+    """What a rule chose, as the form's own numbers: to go on from there by hand."""
+    if found is None or found.tuning is None or found.controller is None:
+        return {}
+    used = found.controller
+    chosen = {"gain": used.gain, "integral_time": used.integral_time,
+              "derivative_time": used.derivative_time or None}  # fmt: skip
+    return {name: "" if value is None else f"{value:.6g}" for name, value in chosen.items()}
+
+
+def _verdict(found: RunSimulationOut) -> tuple[str, str]:
+    """The verdict on a step response as the sheet styles it, and in words."""
+    metrics: StepMetricsOut | None = found.metrics
+    if metrics is None:
+        return "", ""
+    if metrics.runs_away:
+        return "failed", "runs away"
+    if metrics.swing is not None:
+        return "failed", "keeps swinging"
+    return ("passed", "settles") if metrics.is_settled else ("apart", "does not settle")
+
+
+def _experiment(free: FreeRun) -> Experiment:
+    """The first record; a table tells the agreement of all."""
+    record, simulated = free.records[0], free.simulated[0]
+    outputs = tuple(
+        OutputTraces(Trace(one.name, one.unit, one.times, one.values), values)
+        for one, values in zip(record.outputs, simulated, strict=True)
+    )
+    return Experiment("record 1", outputs, _inputs(record))
+
+
+def _inputs(record: Record) -> tuple[Trace, ...]:
+    return tuple(
+        Trace(one.name, one.unit, one.times, one.values, one.hold == "zero")
+        for one in record.inputs
+    )
+
+
+def _figure_context(figure: Figure) -> dict[str, Any]:
+    return {"figure": as_json(bare(figure)), "height": figure["layout"]["height"],
+            "templates": templates()}  # fmt: skip
+
+
+def _request(run: str, wanted: Asked, base_url: str) -> dict[str, str]:
+    """The same over REST."""
+    verb = "validate" if wanted.kind == "recording" else "simulate"
+    body = json.dumps(wanted.body, indent=2, ensure_ascii=False)
+    url = f"{base_url.rstrip('/')}/v1/runs/{run}:{verb}"
+    return {
+        "curl": f"curl -X POST {url} -H 'Content-Type: application/json' "
+        f"--data-binary @- <<'LAGID'\n{body}\nLAGID"
+    }
+
+
+def _faults(error: ServiceError | StorageError | SysidError) -> Iterator[FieldError]:
+    if isinstance(error, SysidError):
+        yield from faults_of(error)
+    elif isinstance(error, ServiceError) and error.errors:
+        yield from error.errors
+    else:
+        yield FieldError("", str(error))
+
+
+def _line(fault: FieldError) -> str:
+    field = fault.pointer.removeprefix("?")
+    column = f" (column {fault.column})" if fault.column else ""
+    return f"{label_of(field)}: {fault.detail}{column}" if field else f"{fault.detail}{column}"
+
+
+def _address(query: Mapping[str, str]) -> str:
+    return urlencode({name: value for name, value in query.items() if name != "format"})

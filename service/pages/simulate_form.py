@@ -1,0 +1,260 @@
+"""The form of a simulation: what a query asks for, as the body that the REST interface takes."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import chain
+from math import isfinite
+from typing import Any, Literal
+
+from service.core.errors import FieldError, InvalidRequest
+from service.datasets.schemas import MAX_SIMULATED
+from service.jobs.record_checks import signals_of
+from sysid.core.errors import nearest
+from sysid.models.model import Model
+
+Kind = Literal["loop", "recording", "signal"]
+KINDS: Mapping[Kind, str] = {
+    "loop": "Closed loop: a step of the reference",
+    "recording": "Free run over a recording",
+    "signal": "Free run on a signal",
+}
+LABELS = {
+    "kind": "kind", "input": "controlled input", "output": "controlled output", "gain": "gain",
+    "integral_time": "integral time", "derivative_time": "derivative time",
+    "derivative_filter": "derivative filter N", "derivative_on": "derivative on",
+    "setpoint_weight": "setpoint weight", "tuning": "tuning",
+    "closed_loop_time_constant": "closed-loop time constant", "lower": "lower limit",
+    "upper": "upper limit", "anti_windup": "anti-windup", "tracking_time": "tracking time",
+    "limit": "limit of the command", "amplitude": "height of the step", "time": "time of the step",
+    "offset": "reference before the step", "transport_gain": "transport gain",
+    "time_constant": "transport time constant", "transport_delay": "transport time lag",
+    "duration": "duration", "sample_time": "sampling period", "dataset": "recording",
+    "skip": "samples not judged",
+}  # fmt: skip
+BY_HAND = "by hand"
+TUNINGS = {
+    BY_HAND: "by hand", "simc PI": "SIMC, PI", "simc PID": "SIMC, PID",
+    "amigo PI": "AMIGO, PI", "amigo PID": "AMIGO, PID",
+}  # fmt: skip
+"""Rule and controller: a rule chooses gain and times itself."""
+_NUMBERS = ("derivative_filter", "setpoint_weight", "limit", "lower", "upper", "tracking_time")
+_TUNED = ("gain", "integral_time", "derivative_time")
+_CHOSEN = ("derivative_on", "anti_windup")
+_PLACES = {
+    "/control/tuning/closed_loop_time_constant": "closed_loop_time_constant",
+    **{f"/control/{name}": name for name in ("tuning", *_TUNED, *_NUMBERS, *_CHOSEN)},
+    "/control/input": "input", "/control/output": "output",
+    "/control/transport/gain": "transport_gain",
+    "/control/transport/time_constant": "time_constant",
+    "/control/transport/delay": "transport_delay", "/control/reference/amplitude": "amplitude",
+    "/control/reference/time": "time", "/control/reference/offset": "offset",
+    "/sample_time": "sample_time", "/samples": "duration", "/dataset": "dataset",
+    "/skip": "skip",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A query that can be read: its kind, and the body for it."""
+
+    kind: Kind
+    body: Mapping[str, Any]
+
+
+def kind_of(query: Mapping[str, str]) -> Kind:
+    """What is to be simulated; a closed loop if the query does not say.
+
+    Raises
+    ------
+    InvalidRequest
+        If it says something else.
+    """
+    wanted = query.get("kind", "loop")
+    for kind in KINDS:
+        if kind == wanted:
+            return kind
+    raise InvalidRequest.at("?kind", f"found {wanted!r}; need one of {', '.join(KINDS)}")
+
+
+def is_asked(query: Mapping[str, str]) -> bool:
+    """Whether something is to be simulated, or only the form to be shown."""
+    return any(name not in ("kind", "format") for name in query)
+
+
+def fields_of(model: Model, kind: Kind) -> list[str]:
+    """Names of the fields of a form."""
+    inputs = [f"input.{one.name}" for one in model.inputs]
+    if kind == "recording":
+        signals = list(chain(*signals_of(model)))
+        return ["dataset", "skip", *(f"channel.{name}" for name in signals)]
+    if kind == "signal":
+        return [*inputs, "duration", "sample_time"]
+    return ["input", "output", "tuning", "closed_loop_time_constant", *_TUNED, *_NUMBERS, *_CHOSEN,
+            "amplitude", "time", "offset", "transport_gain", "time_constant", "transport_delay",
+            *inputs, "duration", "sample_time"]  # fmt: skip
+
+
+def asked(model: Model, query: Mapping[str, str]) -> Asked:
+    """What a query asks for.
+
+    Raises
+    ------
+    InvalidRequest
+        With every field that is unknown or no number, its pointer ``?name``.
+    """
+    kind = kind_of(query)
+    known = fields_of(model, kind)
+    faults = [
+        FieldError(f"?{name}", f"there is no such field{nearest(name, known)}")
+        for name in query
+        if name not in (*known, "kind", "format")
+    ]
+    reader = _Reader(query)
+    make = {"loop": _loop, "recording": _recording, "signal": _signal}[kind]
+    body = make(reader, model)
+    faults += reader.faults
+    if faults:
+        raise InvalidRequest(faults)
+    return Asked(kind, body)
+
+
+def at_home(fault: FieldError) -> FieldError:
+    """A fault of the body at the field of the form that it comes from."""
+    if fault.pointer.startswith("?"):
+        return fault
+    for theirs, field in _PLACES.items():
+        if fault.pointer == theirs or fault.pointer.startswith(f"{theirs}/"):
+            return FieldError(f"?{field}", fault.detail, fault.column)
+    for theirs, prefix in (("/inputs/", "input."), ("/channels/", "channel.")):
+        if fault.pointer.startswith(theirs):
+            name = fault.pointer.removeprefix(theirs).partition("/")[0]
+            return FieldError(f"?{prefix}{name}", fault.detail, fault.column)
+    return fault
+
+
+def label_of(field: str) -> str:
+    """How the form calls a field."""
+    head, _, name = field.partition(".")
+    return f"{head} {name}" if name else LABELS.get(field, field)
+
+
+class _Reader:
+    """Numbers and texts of a query; what cannot be read is kept as a fault."""
+
+    def __init__(self, query: Mapping[str, str]) -> None:
+        self._query = query
+        self.faults: list[FieldError] = []
+
+    def text(self, name: str, default: str = "") -> str:
+        return self._query.get(name, "").strip() or default
+
+    def number(self, name: str, default: float | None = None) -> float | None:
+        """A number; the default where the field is empty, and where there is a fault."""
+        given = self.text(name)
+        if not given:
+            return default
+        try:
+            value = float(given)
+        except ValueError:
+            value = float("nan")
+        if isfinite(value):
+            return value
+        self.faults.append(FieldError(f"?{name}", f"found {given!r}; need a number"))
+        return default
+
+    def samples(self) -> tuple[int, float]:
+        """Number of samples and sampling period (s) of a duration; both fields are needed."""
+        duration, period = self.number("duration"), self.number("sample_time")
+        for name, value in (("duration", duration), ("sample_time", period)):
+            if any(one.pointer == f"?{name}" for one in self.faults):
+                continue
+            if value is None or value <= 0:
+                found = "it is missing" if value is None else f"found {value:g}"
+                self.faults.append(FieldError(f"?{name}", f"{found}; need a time above 0 s"))
+        if not duration or not period or self.faults:
+            return 2, 1.0
+        count = duration / period
+        if not 1 <= count < MAX_SIMULATED:
+            self.faults.append(FieldError(
+                "?duration",
+                f"{duration:g} s in steps of {period:g} s are {count:.3g} samples; need 2 to "
+                f"{MAX_SIMULATED}",
+            ))  # fmt: skip
+            return 2, 1.0
+        return round(count) + 1, period
+
+
+def _loop(reader: _Reader, model: Model) -> dict[str, Any]:
+    control: dict[str, Any] = {
+        "input": reader.text("input", model.inputs[0].name if model.inputs else ""),
+        "output": reader.text("output", model.outputs[0].name),
+        **_controller(reader),
+        "reference": {
+            "kind": "step", "amplitude": reader.number("amplitude", 1.0),
+            "time": reader.number("time", 0.0), "offset": reader.number("offset", 0.0),
+        },
+    }  # fmt: skip
+    transport = {
+        "gain": reader.number("transport_gain"), "time_constant": reader.number("time_constant"),
+        "delay": reader.number("transport_delay"),
+    }  # fmt: skip
+    given = {name: value for name, value in transport.items() if value is not None}
+    if given:
+        control["transport"] = given
+    samples, period = reader.samples()
+    others = [one.name for one in model.inputs if one.name != control["input"]]
+    return {"control": control, "inputs": dict(_expressions(reader, others, "0")),
+            "samples": samples, "sample_time": period}  # fmt: skip
+
+
+def _controller(reader: _Reader) -> dict[str, Any]:
+    """The controller's numbers; with a rule, which chooses them, those that it leaves."""
+    tuning = reader.text("tuning", BY_HAND)
+    found: dict[str, Any] = {}
+    if tuning == BY_HAND:
+        found["gain"] = reader.number("gain", 1.0)
+        names: tuple[str, ...] = (*_TUNED[1:], *_NUMBERS)
+    else:
+        rule, _, controller = tuning.partition(" ")
+        found["tuning"] = {"rule": rule, "controller": controller}
+        wanted = reader.number("closed_loop_time_constant")
+        if wanted is not None:
+            found["tuning"]["closed_loop_time_constant"] = wanted
+        names = _NUMBERS
+        if tuning not in TUNINGS:
+            known = ", ".join(TUNINGS)
+            reader.faults.append(FieldError("?tuning", f"found {tuning!r}; need one of {known}"))
+    given = {name: reader.number(name) for name in names}
+    found |= {name: value for name, value in given.items() if value is not None}
+    return found | {name: text for name in _CHOSEN if (text := reader.text(name))}
+
+
+def _signal(reader: _Reader, model: Model) -> dict[str, Any]:
+    names = [one.name for one in model.inputs]
+    samples, period = reader.samples()
+    return {"inputs": dict(_expressions(reader, names, "")), "samples": samples,
+            "sample_time": period}  # fmt: skip
+
+
+def _expressions(
+    reader: _Reader, names: list[str], default: str
+) -> Iterator[tuple[str, dict[str, str]]]:
+    for name in names:
+        text = reader.text(f"input.{name}", default)
+        if text:
+            yield name, {"kind": "expression", "expression": text}
+        else:
+            fault = "it is missing; give an expression of t in s, such as 10*cos(5*t)"
+            reader.faults.append(FieldError(f"?input.{name}", fault))
+
+
+def _recording(reader: _Reader, model: Model) -> dict[str, Any]:
+    dataset = reader.text("dataset")
+    if not dataset:
+        reader.faults.append(FieldError("?dataset", "it is missing; choose a stored recording"))
+    chosen = {name: reader.text(f"channel.{name}") for name in chain(*signals_of(model))}
+    skip = reader.number("skip", 0.0) or 0.0
+    if skip != int(skip):
+        reader.faults.append(FieldError("?skip", f"found {skip:g}; need a whole number"))
+    return {"dataset": dataset, "channels": {k: v for k, v in chosen.items() if v},
+            "skip": int(skip)}  # fmt: skip

@@ -1,0 +1,1 @@
+"""Leases, fencing, admission, reuse, wake-up, orphaned jobs."""

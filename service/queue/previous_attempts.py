@@ -1,0 +1,63 @@
+"""What a leased job had from its earlier attempts, and what of it must go."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+
+from sqlalchemy import delete, func, select
+from sqlalchemy.orm import Session
+
+from service.queue.leases import Lease, Queue
+from service.storage.statements import chunks
+from service.storage.tables import OPEN, Checkpoint, MigrationLog, Run, RunHistory, State
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What is behind a job that is claimed.
+
+    Attributes
+    ----------
+    evaluations, generations : int
+        Of the runs that have ended: the sum and the largest.
+    reasons : tuple of str
+        Some of those for which runs failed, each once.
+    waiting : dict
+        Evaluations in the checkpoints of unfinished runs, by run.
+    """
+
+    evaluations: int = 0
+    generations: int = 0
+    reasons: tuple[str, ...] = ()
+    waiting: dict[str, int] = field(default_factory=dict)
+
+
+def tally(session: Session, lease: Lease, n_reasons: int) -> Tally:
+    """Add up what earlier attempts left; `LeaseLost` when the lease is not held."""
+    Queue(session).hold(lease)
+    mine = Run.job_id == lease.job_id
+    sums = select(
+        func.coalesce(func.sum(Run.evaluations), 0), func.coalesce(func.max(Run.generations), 0)
+    ).where(mine, Run.state.not_in(OPEN))
+    evaluations, generations = session.execute(sums).one()
+    failed = select(Run.error).where(mine, Run.state == State.FAILED, Run.error.is_not(None))
+    first = failed.group_by(Run.error).order_by(func.min(Run.number)).limit(n_reasons)
+    kept = select(Checkpoint.run_id, Checkpoint.evaluations).where(
+        Checkpoint.job_id == lease.job_id
+    )
+    return Tally(
+        int(evaluations),
+        int(generations),
+        tuple(str(reason) for reason in session.scalars(first)),
+        dict(session.execute(kept).all()),
+    )
+
+
+def forget_progress(session: Session, lease: Lease, run_ids: Collection[str]) -> None:
+    """Delete checkpoint and history of runs that begin anew.
+
+    Another version of the program may find other numbers, and history is only ever added to.
+    """
+    Queue(session).hold(lease)
+    for chunk in chunks(run_ids):
+        for table in (Checkpoint, RunHistory, MigrationLog):
+            session.execute(delete(table).where(table.run_id.in_(chunk)))

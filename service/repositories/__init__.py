@@ -1,0 +1,1 @@
+"""SQL reads and writes per entity."""

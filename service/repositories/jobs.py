@@ -1,0 +1,217 @@
+"""Jobs as users see them: submit, read, list, cancel, resume, delete."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import func, select, text, update
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session
+
+from service.repositories.events import EventRepository
+from service.storage.columns import Document, utc_now
+from service.storage.errors import Conflict, KeyReused, NotFound
+from service.storage.statements import IN_PLACE, Page, new_id, page_of
+from service.storage.tables import DEFAULT_PROJECT, OPEN, IdempotencyKey, Job, Run, State
+
+QUEUE_CHANNEL = "lagid_queue"
+"""PostgreSQL's notification channel that wakes the dispatchers."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewJob:
+    """A job to submit: `spec` is the whole validated body, `n_runs` the cells of its sweep."""
+
+    name: str
+    spec: Document
+    n_runs: int = 1
+    priority: int = 0
+    max_attempts: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Submission:
+    """A job, and whether it is new or was submitted before under the same key."""
+
+    job: Job
+    is_new: bool
+
+
+class JobRepository:
+    """One project's jobs in one session. Whoever opened the session commits."""
+
+    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
+        self._session, self._project_id = session, project_id
+
+    def submit(self, new: NewJob, *, key: str | None = None, request_hash: str = "") -> Submission:
+        """Queue a job; with a `key` that was used before, give the job of that time.
+
+        Raises
+        ------
+        KeyReused
+            When the key was used with another request.
+        """
+        if key is None:
+            return Submission(self._add(new), True)
+        known = self._submitted(key, request_hash)
+        if known is not None:
+            return Submission(known, False)
+        try:
+            # Two requests with one key at once: the later one fails here and finds the other's.
+            with self._session.begin_nested():
+                job = self._add(new)
+                self._session.add(
+                    IdempotencyKey(
+                        project_id=self._project_id, key=key, request_hash=request_hash,
+                        job_id=job.id,
+                    )
+                )  # fmt: skip
+        except IntegrityError:
+            known = self._submitted(key, request_hash)
+            if known is None:
+                raise
+            return Submission(known, False)
+        return Submission(job, True)
+
+    def is_used(self, key: str) -> bool:
+        """Whether a job was submitted under this key."""
+        found = select(IdempotencyKey.key).where(
+            IdempotencyKey.project_id == self._project_id, IdempotencyKey.key == key
+        )
+        return self._session.scalar(found) is not None
+
+    def get(self, job_id: str) -> Job:
+        """A job of this project that was not deleted; `NotFound` otherwise."""
+        job = self._session.get(Job, job_id, populate_existing=True)
+        if job is None or job.project_id != self._project_id or job.deleted_at is not None:
+            raise NotFound("job", job_id)
+        return job
+
+    def state_of(self, job_id: str) -> State:
+        """The state of such a job, without the rest of it; `NotFound` as `get` does."""
+        found = select(Job.state).where(Job.id == job_id, *self._mine())
+        state = self._session.scalar(found)
+        if state is None:
+            raise NotFound("job", job_id)
+        return state
+
+    def page(
+        self, *, cursor: str | None = None, limit: int = 50, states: Sequence[State] = ()
+    ) -> Page[Job]:
+        """Jobs, latest first. The pages stay put while new jobs arrive."""
+        query = select(Job).where(*self._mine()).order_by(Job.id.desc()).limit(limit + 1)
+        if cursor is not None:
+            query = query.where(Job.id < cursor)
+        if states:
+            query = query.where(Job.state.in_(states))
+        found = self._session.scalars(query).all()
+        return page_of(found, limit, (job.id for job in found))
+
+    def counts(self) -> dict[State, int]:
+        """How many jobs are in each state."""
+        query = select(Job.state, func.count()).where(*self._mine()).group_by(Job.state)
+        found = dict(self._session.execute(query).all())
+        return {state: found.get(state, 0) for state in State}
+
+    def cancel(self, job_id: str) -> Job:
+        """Cancel a queued job at once, or ask the dispatcher of a running one to stop.
+
+        Raises
+        ------
+        Conflict
+            When the job has already succeeded or failed. A cancelled one stays as it is.
+        """
+        job = self._locked(job_id)
+        if job.state is State.CANCELLED:
+            return job
+        if job.state not in OPEN:
+            raise Conflict(
+                f"{job_id} is {job.state}; only a queued or running job can be cancelled"
+            )
+        job.cancel_requested = True
+        if job.state is State.QUEUED:
+            job.state, job.finished_at = State.CANCELLED, utc_now()
+            close_runs(self._session, job_id, State.CANCELLED, None)
+            EventRepository(self._session).append_state(job)
+        self._session.flush()
+        return job
+
+    def resume(self, job_id: str) -> Job:
+        """Queue a failed or cancelled job again; runs that succeeded keep their results.
+
+        The one way out of a terminal state, and only a user's wish takes it.
+        """
+        job = self._locked(job_id)
+        if job.state not in (State.FAILED, State.CANCELLED):
+            raise Conflict(
+                f"{job_id} is {job.state}; only a failed or cancelled job can be resumed"
+            )
+        again = update(Run).where(Run.job_id == job_id, Run.state != State.SUCCEEDED)
+        self._session.execute(
+            again.values(state=State.QUEUED, error=None, finished_at=None, kills=0),
+            execution_options=IN_PLACE,
+        )
+        job.state, job.cancel_requested = State.QUEUED, False
+        job.error = job.finished_at = None
+        job.lost_leases = job.n_failed = 0
+        job.n_done = self._session.scalar(
+            select(func.count()).where(Run.job_id == job_id, Run.state == State.SUCCEEDED)
+        ) or 0  # fmt: skip
+        EventRepository(self._session).append_state(job)
+        notify_queue(self._session)
+        return job
+
+    def delete(self, job_id: str) -> None:
+        """Hide a finished job; what only it refers to becomes garbage."""
+        job = self._locked(job_id)
+        if job.state in OPEN:
+            raise Conflict(f"{job_id} is {job.state}; cancel it before deleting it")
+        job.deleted_at = utc_now()
+        self._session.flush()
+
+    def _mine(self) -> tuple[Any, ...]:
+        return Job.project_id == self._project_id, Job.deleted_at.is_(None)
+
+    def _locked(self, job_id: str) -> Job:
+        lock = select(Job).where(Job.id == job_id, *self._mine()).with_for_update(key_share=True)
+        job = self._session.scalar(lock, execution_options={"populate_existing": True})
+        if job is None:
+            raise NotFound("job", job_id)
+        return job
+
+    def _add(self, new: NewJob) -> Job:
+        job = Job(
+            id=new_id("job"), project_id=self._project_id, name=new.name, spec=new.spec,
+            n_runs=new.n_runs, priority=new.priority, max_attempts=new.max_attempts,
+            state=State.QUEUED, attempt=0,
+        )  # fmt: skip
+        self._session.add(job)
+        self._session.flush()
+        EventRepository(self._session).append_state(job)
+        notify_queue(self._session)
+        return job
+
+    def _submitted(self, key: str, request_hash: str) -> Job | None:
+        used = self._session.get(
+            IdempotencyKey, {"project_id": self._project_id, "key": key}, populate_existing=True
+        )
+        if used is None:
+            return None
+        if used.request_hash != request_hash:
+            raise KeyReused(key)
+        return self._session.get_one(Job, used.job_id)
+
+
+def close_runs(session: Session, job_id: str, state: State, error: str | None) -> None:
+    """Move a job's unfinished runs to a terminal state."""
+    unfinished = update(Run).where(Run.job_id == job_id, Run.state.in_(OPEN))
+    session.execute(
+        unfinished.values(state=state, error=error, finished_at=utc_now()),
+        execution_options=IN_PLACE,
+    )
+
+
+def notify_queue(session: Session) -> None:
+    """Wake the dispatchers when this transaction commits. SQLite has none to wake: they poll."""
+    if session.get_bind().dialect.name == "postgresql":
+        session.execute(text("SELECT pg_notify(:channel, '')"), {"channel": QUEUE_CHANNEL})

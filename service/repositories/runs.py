@@ -1,0 +1,201 @@
+"""Runs as users see them: read, list, count, and the columns that summaries need."""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
+
+from sqlalchemy import (
+    ColumnElement,
+    Select,
+    cast,
+    exists,
+    func,
+    literal,
+    or_,
+    select,
+    true,
+    type_coerce,
+)
+from sqlalchemy.dialects.postgresql import JSONB
+from sqlalchemy.orm import InstrumentedAttribute, Session
+
+from service.repositories.history import HistoryPoint, MigrantPoint, history_of, migrants_of
+from service.storage.columns import Document, to_json
+from service.storage.errors import InvalidCursor, NotFound
+from service.storage.statements import Page, page_of
+from service.storage.tables import DEFAULT_PROJECT, MigrationLog, Run, RunHistory, State
+
+RunOrder = Literal[
+    "number", "best_rms", "fit_estimation", "fit_validation", "sigma", "seconds", "evaluations"
+]
+_ORDERS: dict[RunOrder, InstrumentedAttribute[Any]] = {
+    "number": Run.number, "best_rms": Run.best_rms, "fit_estimation": Run.fit_estimation,
+    "fit_validation": Run.fit_validation, "sigma": Run.sigma, "seconds": Run.seconds,
+    "evaluations": Run.evaluations,
+}  # fmt: skip
+
+
+class RunRow(NamedTuple):
+    """The columns of a run that summaries and plots need; `estimates` as in the table."""
+
+    id: str
+    number: int
+    cell: Document
+    labels: Document
+    state: State
+    valid: bool | None
+    best_rms: float | None
+    fit_estimation: float | None
+    fit_validation: float | None
+    sigma: float | None
+    method: str | None
+    seed: int | None
+    evaluations: int
+    generations: int
+    seconds: float | None
+    estimates: Document | None
+
+
+class RunRepository:
+    """One project's runs in one session."""
+
+    def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
+        self._session, self._project_id = session, project_id
+
+    def get(self, run_id: str) -> Run:
+        """A run of this project; `NotFound` otherwise."""
+        run = self._session.get(Run, run_id, populate_existing=True)
+        if run is None or run.project_id != self._project_id:
+            raise NotFound("run", run_id)
+        return run
+
+    def page(
+        self,
+        job_id: str,
+        *,
+        cursor: str | None = None,
+        limit: int = 50,
+        states: Sequence[State] = (),
+        cell: Mapping[str, Any] | None = None,
+        labels: Mapping[str, Any] | None = None,
+        order: RunOrder = "number",
+        descending: bool = False,
+    ) -> Page[Run]:
+        """Runs of a job, by a column; runs without a value in it come last.
+
+        `cell` keeps the runs whose axes have these values, such as ``{"/noise/sigma": 0.1}``.
+        The pages stay put while runs finish, as far as their values in the column do.
+        """
+        query = select(Run).where(*self._of(job_id)).limit(limit + 1)
+        if states:
+            query = query.where(Run.state.in_(states))
+        for column, wanted in ((Run.cell, cell), (Run.labels, labels)):
+            for key, value in (wanted or {}).items():
+                query = query.where(entry_equals(self._session, column, key, value))
+        found = self._session.scalars(_ordered(query, _ORDERS[order], descending, cursor)).all()
+        cursors = (json.dumps([getattr(run, order), run.number]) for run in found)
+        return page_of(found, limit, cursors)
+
+    def n_made(self, job_id: str) -> int:
+        """How many runs of a job have been made: always its first ones."""
+        last = self._session.scalar(select(func.max(Run.number)).where(*self._of(job_id)))
+        return 0 if last is None else int(last) + 1
+
+    def counts(self, job_id: str) -> dict[State, int]:
+        """How many runs of a job are in each state."""
+        query = select(Run.state, func.count()).where(*self._of(job_id)).group_by(Run.state)
+        found = dict(self._session.execute(query).all())
+        return {state: found.get(state, 0) for state in State}
+
+    def table(self, job_id: str) -> list[RunRow]:
+        """The columns of all runs of a job that summaries need, in the order of the sweep."""
+        columns = [getattr(Run, name) for name in RunRow._fields]
+        query = select(*columns).where(*self._of(job_id)).order_by(Run.number)
+        return [RunRow(*row) for row in self._session.execute(query)]
+
+    def estimated(self, job_id: str) -> list[tuple[str, str]]:
+        """Names and units of all parameters in the results of a job's runs, the earliest first."""
+        if self._session.get_bind().dialect.name == "postgresql":
+            told = func.jsonb_array_elements(Run.result["parameters"]).table_valued("value")
+            each, entry = told.render_derived(), func.jsonb_extract_path_text
+            name, unit = (entry(each.c.value, key) for key in ("name", "unit"))
+        else:
+            each = func.json_each(Run.result, "$.parameters").table_valued("value")
+            name, unit = (func.json_extract(each.c.value, f"$.{key}") for key in ("name", "unit"))
+        found = select(name, unit, func.min(Run.number)).select_from(Run).join(each, true())
+        query = found.where(*self._of(job_id), Run.result.is_not(None)).group_by(name, unit)
+        rows = sorted(self._session.execute(query), key=lambda row: row[2])
+        return [(row[0], row[1]) for row in rows]
+
+    def history(self, run_id: str) -> list[HistoryPoint]:
+        """Better champions of a run, island by island, in the order they were found."""
+        parts = select(RunHistory.points, RunHistory.n_parameters).where(
+            RunHistory.run_id == self.get(run_id).id
+        )
+        return history_of(run_id, ((row[0], row[1]) for row in self._session.execute(parts)))
+
+    def migrations(self, run_id: str) -> list[MigrantPoint]:
+        """Migrants of a run, in order."""
+        parts = select(MigrationLog.migrants).where(MigrationLog.run_id == self.get(run_id).id)
+        return migrants_of(run_id, self._session.scalars(parts))
+
+    def _of(self, job_id: str) -> tuple[ColumnElement[bool], ...]:
+        return Run.job_id == job_id, Run.project_id == self._project_id
+
+
+def entry_equals(
+    session: Session, column: InstrumentedAttribute[Document], key: str, value: object
+) -> ColumnElement[bool]:
+    """Whether a document has this value under a key."""
+    if session.get_bind().dialect.name == "postgresql":
+        return type_coerce(column, JSONB)[key] == cast(literal(to_json(value)), JSONB)
+    return _sqlite_entry_equals(column, key, value)
+
+
+def _sqlite_entry_equals(
+    column: InstrumentedAttribute[Document], key: str, value: object
+) -> ColumnElement[bool]:
+    each = func.json_each(column).table_valued("key", "value", "type")
+    # SQLite's own numbers for true and false are 1 and 0: only the type tells them apart.
+    if value is None or isinstance(value, bool):
+        return exists(select(1).where(each.c.key == key, each.c.type == to_json(value)))
+    types = ("integer", "real") if isinstance(value, int | float) else ("text",)
+    stored: object = value
+    if isinstance(value, list | dict):
+        types, stored = ("array", "object"), to_json(value)
+    return exists(
+        select(1).where(each.c.key == key, each.c.value == stored, each.c.type.in_(types))
+    )
+
+
+def _ordered(
+    query: Select[Run],
+    column: InstrumentedAttribute[Any],
+    descending: bool,
+    cursor: str | None,
+) -> Select[Run]:
+    by = column.desc() if descending else column.asc()
+    if column is Run.number:  # never NULL and no two alike: plain, so that its index serves
+        query = query.order_by(by)
+    else:
+        query = query.order_by(column.is_(None), by, Run.number)
+    if cursor is None:
+        return query
+    value, number = _position(cursor)
+    if value is None:
+        return query.where(column.is_(None), Run.number > number)
+    beyond = column < value if descending else column > value
+    if column is Run.number:
+        return query.where(beyond)
+    beside = (column == value) & (Run.number > number)
+    return query.where(or_(beyond, beside, column.is_(None)))
+
+
+def _position(cursor: str) -> tuple[float | None, int]:
+    try:
+        value, number = json.loads(cursor)
+    except (ValueError, TypeError):
+        raise InvalidCursor(cursor) from None
+    if not isinstance(value, int | float | None) or not isinstance(number, int):
+        raise InvalidCursor(cursor)
+    return value, number

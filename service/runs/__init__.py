@@ -1,0 +1,1 @@
+"""A run read back: result, residuals, profiles, comparison, export, validation."""

@@ -1,0 +1,308 @@
+"""Use case: the identified model of a run, run freely over another recording and judged by it.
+
+What was identified is kept as it is. A start of a state belongs to its record: where the model
+does not fix it, it is found on the record, alone, as on the validation data of a job.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from math import isfinite
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from sqlalchemy.orm import Session
+
+from service.core.concurrency import simulating
+from service.core.errors import Conflict, FieldError, InvalidRequest
+from service.core.json_pointer import body_of
+from service.datasets.datasets import series
+from service.datasets.recordings import recording_of
+from service.jobs.record_checks import signals_of
+from service.models.models import model_of_run
+from service.repositories.datasets import DatasetRepository
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunRepository
+from service.runs.schemas import AgreementOut, ExperimentOut, FreeRunIn, FreeRunOut
+from service.storage.errors import StorageError
+from service.storage.objects import ObjectStore
+from service.storage.sessions import Database
+from service.storage.tables import Dataset, Run
+from sysid.core.errors import InvalidRecord, RecordTooShort, nearest
+from sysid.core.types import FloatArray
+from sysid.data.records import Channel, Record
+from sysid.models.model import Model, initial_name, initial_parameters
+from sysid.models.units import SignalUnits
+from sysid.simulation.metrics import Metrics
+
+if TYPE_CHECKING:
+    from sysid.simulation.problem import Problem
+
+
+MOST_SAMPLES = 1_000_000
+MOST_RECORDS = 2000
+MOST_STEPS = 1_000_000_000
+"""Of integration or recursion, in a search for starts: some ten seconds."""
+LEAST_SIMULATIONS = 100
+MOST_WORK = 30_000_000
+"""Measured values times starts that are searched together: their derivatives are in memory."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeRun:
+    """The records, what the model gives for every output of each, and how well they agree."""
+
+    run: str
+    dataset: str
+    records: tuple[Record, ...]
+    simulated: tuple[tuple[FloatArray, ...], ...]
+    metrics: Metrics
+    starts: dict[str, float]
+
+
+def free_run(
+    database: Database, store: ObjectStore, run_id: str, body: FreeRunIn, max_points: int
+) -> FreeRunOut:
+    """Run a run's model over a dataset.
+
+    Raises
+    ------
+    NotFound
+        If there is no such run or dataset.
+    Conflict
+        If the run has no estimates.
+    InvalidRequest
+        If the recording does not have what the model needs, or the simulation diverges.
+    """
+    found = judged(database, store, run_id, body)
+    return FreeRunOut(
+        id=found.run, dataset=found.dataset, unit=found.metrics.unit, rms=found.metrics.rms,
+        fit_percent=_finite(found.metrics.fit_percent), starts=found.starts,
+        agreement=[
+            AgreementOut(
+                experiment=one.experiment + 1, output=one.output, unit=one.unit,
+                samples=one.samples, rms=one.rms, fit_percent=_finite(one.fit_percent),
+            )
+            for one in found.metrics.channels
+        ],
+        experiments=list(_experiments(found, max_points)),
+    )  # fmt: skip
+
+
+@simulating.one()
+def judged(database: Database, store: ObjectStore, run_id: str, body: FreeRunIn) -> FreeRun:
+    """The same as arrays; raises as `free_run` does."""
+    with database.read() as session:
+        problem, run, row = _read(session, store, run_id, body)
+    return _judged(problem, run, row)
+
+
+def _read(
+    session: Session, store: ObjectStore, run_id: str, body: FreeRunIn
+) -> "tuple[Problem, Run, Dataset]":
+    run = RunRepository(session).get(run_id)
+    if run.result is None or not run.result.get("parameters"):
+        raise Conflict(f"run {run_id} is {run.state.value} and has no estimates to simulate with")
+    job = JobRepository(session).get(run.job_id)
+    request = body_of(job.spec, run.cell)
+    model = model_of_run(session, run, job)
+    row = DatasetRepository(session, job.project_id).get(body.dataset)
+    channels = {**request["channels"], **body.channels}
+    faults = [*_channel_faults(model, row, channels), *_unit_faults(session, model, row, request,
+                                                                    channels)]  # fmt: skip
+    if faults:
+        raise InvalidRequest(faults)
+    records = _records(store, model, row, request, channels)
+    return _problem(model, records, run, request, body.skip), run, row
+
+
+def _channel_faults(
+    model: Model, row: Dataset, channels: Mapping[str, str]
+) -> Iterator[FieldError]:
+    signals = list(chain(*signals_of(model)))
+    recorded = [str(one["name"]) for one in row.channels]
+    for name in channels:
+        if name not in signals:
+            detail = f"the model has no signal {name!r}{nearest(name, signals)}"
+            yield FieldError(f"/channels/{name}", detail)
+    for name in signals:
+        wanted = channels.get(name, name)
+        if wanted not in recorded:
+            yield FieldError(
+                f"/channels/{name}",
+                f"{row.name!r} has no channel {wanted!r}{nearest(wanted, recorded)}; it has "
+                f"{', '.join(recorded)}",
+            )
+    if row.n_samples > MOST_SAMPLES:
+        yield FieldError(
+            "/dataset",
+            f"{row.name!r} has {row.n_samples} samples; at most {MOST_SAMPLES} are simulated for "
+            "a request: derive a shorter one with 'trim' or 'resample'",
+        )
+
+
+def _unit_faults(
+    session: Session, model: Model, row: Dataset, request: Mapping[str, Any],
+    channels: Mapping[str, str],
+) -> Iterator[FieldError]:  # fmt: skip
+    """Channels in another unit than the model's, or than what the run was fitted to."""
+    units = SignalUnits(model)
+    signals = list(chain(*signals_of(model)))
+    try:
+        fitted = DatasetRepository(session).get(request["datasets"][0])
+    except StorageError:  # deleted since: its units are not known any more
+        fitted = row
+    for signal in signals:
+        before = request["channels"].get(signal, signal)
+        units.fault(signal, before, _unit(fitted, before), f"{fitted.name!r}")
+        name = channels.get(signal, signal)
+        fault = units.fault(signal, name, _unit(row, name), f"{row.name!r}")
+        if fault:
+            yield FieldError(f"/channels/{signal}", fault)
+
+
+def _unit(row: Dataset, channel: str) -> str | None:
+    return next((str(one["unit"]) for one in row.channels if one["name"] == channel), None)
+
+
+def _records(
+    store: ObjectStore, model: Model, row: Dataset, request: Mapping[str, Any],
+    channels: Mapping[str, str],
+) -> tuple[Record, ...]:  # fmt: skip
+    inputs, outputs = (
+        {name: channels.get(name, name) for name in group} for group in signals_of(model)
+    )
+    holds = {channels.get(name, name): hold for name, hold in request.get("hold", {}).items()}
+    try:
+        recording = recording_of(store, row.sha256).held(holds)
+        found = recording.records(inputs, outputs, row.name)
+    except InvalidRecord as error:
+        raise InvalidRequest.at("/dataset", str(error)) from None
+    if len(found) > MOST_RECORDS:
+        raise InvalidRequest.at(
+            "/dataset",
+            f"{row.name!r} has {len(found)} segments; at most {MOST_RECORDS} are simulated for a "
+            "request: derive a recording of some of them with 'select' or 'trim'",
+        )
+    return found
+
+
+def _problem(
+    model: Model, records: tuple[Record, ...], run: Run, request: Mapping[str, Any], skip: int
+) -> "Problem":
+    """All that was identified fixed, so that at most starts of states are free."""
+    # The compiler comes with this import, and most requests never need it.
+    from sysid.simulation.problem import Problem
+
+    own = {one.name for one in model.parameters}
+    values = {one["name"]: one for one in (run.result or {})["parameters"] if one["name"] in own}
+    starts = {one.name for one in initial_parameters(model, len(records))}
+    changes = {name: f for name, f in request["parameters"].items() if name in starts}
+    fixed = {name: _fixed(one) for name, one in values.items()}
+    try:
+        return Problem.build(
+            model, records, parameters={**changes, **fixed}, weights=request["weights"], skip=skip
+        )
+    except (InvalidRecord, RecordTooShort) as error:
+        raise InvalidRequest.at("/dataset", str(error)) from None
+
+
+def _fixed(estimate: Mapping[str, Any]) -> dict[str, Any]:
+    """An estimate as a fixed value; that of a tie may lie outside its parameter's bounds."""
+    value = float(estimate["value"])
+    known = [float(estimate[k]) for k in ("lower", "upper") if estimate.get(k) is not None]
+    return {
+        "fixed": value, "scale": "linear", "lower": min([value, *known]),
+        "upper": max([value, *known]),
+    }  # fmt: skip
+
+
+def _starts(problem: "Problem") -> FloatArray:
+    """The starts (D,) that fit best.
+
+    Those of a record touch no other, so each record is searched alone: all at once the effort
+    would grow with the cube of their number.
+    """
+    most = max(LEAST_SIMULATIONS, MOST_STEPS // problem.n_steps)
+    changes = problem.arguments[2]
+    if len(problem.records) == 1 or any("tied" in fields for fields in changes.values()):
+        return _searched(problem, most)
+    return np.concatenate([_searched(one, most) for one in _alone(problem)])
+
+
+def _alone(problem: "Problem") -> "Iterator[Problem]":
+    """Each record of a problem by itself, its starts by the names of the first."""
+    model, records, changes, *_ = problem.arguments
+    fixed = {one.name: changes[one.name] for one in model.parameters if one.name in changes}
+    for number, record in enumerate(records):
+        names = {initial_name(one.name, 0): initial_name(one.name, number) for one in model.states}
+        starts = {own: changes[name] for own, name in names.items() if name in changes}
+        yield problem.build(
+            model, [record], parameters=fixed | starts, weights=problem.output_weights,
+            skip=problem.arguments[6],
+        )  # fmt: skip
+
+
+def _searched(problem: "Problem", simulations: int) -> FloatArray:
+    from sysid.search.refine import refine
+
+    if not problem.space:
+        return np.zeros(0)
+    work = problem.evaluator.n_measured * len(problem.space)
+    if work > MOST_WORK:
+        raise InvalidRequest.at(
+            "/dataset",
+            f"{len(problem.space)} starts are to be found on {problem.evaluator.n_measured} "
+            f"measured values: their product may be {MOST_WORK:.3g}; derive a shorter recording",
+        )
+    middle: FloatArray = 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
+    found = refine(problem, [middle], simulations)[0]
+    return middle if found is None else found.theta
+
+
+def _judged(problem: "Problem", run: Run, row: Dataset) -> FreeRun:
+    from sysid.simulation.problem import metrics_of
+
+    theta = _starts(problem)
+    predicted = problem.predictions(theta[None])[0]
+    metrics = _in_units(metrics_of(problem, predicted), problem.records)
+    if not isfinite(metrics.rms):
+        raise InvalidRequest.at(
+            "/dataset",
+            f"over {row.name!r} the simulation of {run.id} diverges: the recording goes beyond "
+            "what the model was identified for",
+        )
+    names = [one.name for one in problem.model.outputs]
+    return FreeRun(
+        run=run.id, dataset=row.id, records=problem.records,
+        simulated=tuple(tuple(p[name] for name in names) for p in problem.split(predicted)),
+        metrics=metrics,
+        starts=dict(zip((one.name for one in problem.space), theta.tolist(), strict=True)),
+    )  # fmt: skip
+
+
+def _in_units(metrics: Metrics, records: Sequence[Record]) -> Metrics:
+    """Of an output that may be in any unit, in that of the recording."""
+    known = {one.name: one.unit for one in records[0].outputs}
+    channels = tuple(
+        replace(one, unit=known[one.output]) if one.unit == "1" else one for one in metrics.channels
+    )
+    alone = metrics.unit == "1" and len(known) == 1
+    return replace(metrics, channels=channels, unit=channels[0].unit if alone else metrics.unit)
+
+
+def _experiments(found: FreeRun, max_points: int) -> Iterator[ExperimentOut]:
+    for number, (record, outputs) in enumerate(zip(found.records, found.simulated, strict=True), 1):
+        simulated = [
+            Channel(one.name, one.times, values, one.unit)
+            for one, values in zip(record.outputs, outputs, strict=True)
+        ]
+        yield ExperimentOut(
+            name=f"record {number}",
+            measured=[series(one, max_points) for one in record.outputs],
+            simulated=[series(one, max_points) for one in simulated],
+        )
+
+
+def _finite(value: float) -> float | None:
+    return value if isfinite(value) else None

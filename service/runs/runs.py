@@ -1,0 +1,178 @@
+"""Use cases of runs: their pages, results, history and migrations."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service.core.errors import InvalidRequest
+from service.core.json_pointer import body_of
+from service.core.wire import Page
+from service.datasets.rms_unit import unit_of
+from service.jobs.job_parameters import parameters_of_job
+from service.models.models import model_of_run
+from service.repositories.jobs import JobRepository
+from service.repositories.lineage import Reached, reached
+from service.repositories.runs import RunOrder, RunRepository
+from service.runs.schemas import HistoryOut, ImprovementOut, MigrantOut, MigrationsOut, RunOut
+from service.storage.tables import Job, Run, State
+from sysid.models.parameters import Parameter, override
+
+ALMOST = 0.99  # what a run that is not over shows at most: refinement is still to come
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Which runs of a job are wanted, and in which order."""
+
+    states: Sequence[State] = ()
+    cell: Sequence[str] = ()
+    labels: Sequence[str] = ()
+    order: RunOrder = "number"
+    descending: bool = False
+
+
+def page(
+    session: Session, job_id: str, cursor: str | None, limit: int, choice: Choice
+) -> Page[RunOut]:
+    """Runs of a job."""
+    job = JobRepository(session).get(job_id)
+    found = RunRepository(session).page(
+        job.id, cursor=cursor, limit=limit, states=choice.states,
+        cell=wanted("cell", choice.cell), labels=wanted("label", choice.labels),
+        order=choice.order, descending=choice.descending,
+    )  # fmt: skip
+    known = reached(session, [run.id for run in found.items if run.result is None])
+    items = [told(run, job, known.get(run.id)) for run in found.items]
+    return Page(items=items, next=found.next)
+
+
+def one(session: Session, run_id: str) -> RunOut:
+    """One run with its result document."""
+    run = RunRepository(session).get(run_id)
+    job = JobRepository(session).get(run.job_id)
+    known = reached(session, [run.id]) if run.result is None else {}
+    unit = unit_of(session, body_of_run(run, job))
+    answer = told(run, job, known.get(run.id)).model_copy(update={"rms_unit": unit})
+    if run.result is not None or not run.state.is_terminal:
+        return answer
+    return answer.model_copy(update={"parameters": _best_so_far(session, run, job)})
+
+
+def told(run: Run, job: Job, known: Reached | None = None) -> RunOut:
+    """A run as it is told: its result document, or how far it is."""
+    so_far: dict[str, Any] = {
+        "rms": run.best_rms, "evaluations": run.evaluations, "generations": run.generations,
+    }  # fmt: skip
+    if known is not None:
+        so_far = {
+            "rms": known.rms, "evaluations": known.evaluations, "generations": known.generation,
+        }  # fmt: skip
+    return RunOut.model_validate(
+        {
+            **so_far, **(run.result or {}), "id": run.id, "job": run.job_id,
+            "number": run.number, "cell": run.cell, "labels": run.labels,
+            "state": run.state.value, "progress": _progress(run, job, known), "error": run.error,
+            "created_at": run.created_at, "started_at": run.started_at,
+            "finished_at": run.finished_at, "has_signals": run.signals_sha256 is not None,
+        }
+    )  # fmt: skip
+
+
+def body_of_run(run: Run, job: Job) -> dict[str, Any]:
+    """The exact request of one run: the job's with the cell's values in it."""
+    return body_of(job.spec, run.cell)
+
+
+def history(session: Session, run_id: str) -> HistoryOut:
+    """Improvements of every island's champion, in the order in which they were found."""
+    repository = RunRepository(session)
+    run = repository.get(run_id)
+    islands: list[list[ImprovementOut]] = []
+    for row in repository.history(run_id):
+        while len(islands) <= row.island:
+            islands.append([])
+        islands[row.island].append(
+            ImprovementOut(
+                generation=row.generation, evaluations=row.evaluations, rms=row.rms,
+                phase=row.phase, parameters=list(row.parameters),
+            )
+        )  # fmt: skip
+    return HistoryOut(id=run.id, names=_free_names(session, run), islands=islands)
+
+
+def migrations(session: Session, run_id: str) -> MigrationsOut:
+    """The migration log."""
+    migrants = [
+        MigrantOut(
+            epoch=row.epoch, source=row.source, destination=row.destination, fitness=row.fitness
+        )
+        for row in RunRepository(session).migrations(run_id)
+    ]
+    return MigrationsOut(id=run_id, migrants=migrants)
+
+
+def _best_so_far(session: Session, run: Run, job: Job) -> list[dict[str, Any]]:
+    """What a run that ended without a result had found, without standard errors."""
+    points = RunRepository(session).history(run.id)
+    if not points:
+        return []
+    best = min(points, key=lambda point: point.rms)
+    reason = f"the run was {run.state.value} before its standard errors were computed"
+    return [
+        {
+            "name": one.name, "unit": one.unit, "value": value, "lower": one.lower,
+            "upper": one.upper, "stderr": None, "interval95": None, "status": "unfinished",
+            "reason": reason,
+        }
+        for one, value in zip(_sought(session, run, job), best.parameters, strict=False)
+    ]  # fmt: skip
+
+
+def _free_names(session: Session, run: Run) -> list[str]:
+    if run.result is not None:
+        known = ("fixed", "tied")
+        return [one["name"] for one in run.result["parameters"] if one["status"] not in known]
+    return [one.name for one in _sought(session, run, JobRepository(session).get(run.job_id))]
+
+
+def _sought(session: Session, run: Run, job: Job) -> list[Parameter]:
+    """The free parameters of a run, in the order of its history's columns."""
+    body = body_of_run(run, job)
+    model = model_of_run(session, run, job)
+    if model.rule is not None:  # which of its candidates are sought is told with the result
+        return []
+    everything = parameters_of_job(session, model, body)
+    return [one for one in override(everything, body["parameters"]) if one.is_free]
+
+
+def _progress(run: Run, job: Job, known: Reached | None) -> float:
+    if run.state.is_terminal:
+        return 1.0
+    # A single run's generation is the job's; the history lags behind where nothing gets better.
+    of_job = job.generation if job.n_runs == 1 else 0
+    reached_so_far = max(of_job, known.generation if known is not None else 0)
+    generations: int = body_of_run(run, job)["algorithm"]["generations"]
+    return min(reached_so_far / generations, ALMOST)
+
+
+def wanted(name: str, filters: Sequence[str]) -> Mapping[str, Any]:
+    """Values asked for as ``key=value``; a value that is not JSON is a text.
+
+    Raises
+    ------
+    InvalidRequest
+        If one is not of that form; `name` is that of the query's field.
+    """
+    found: dict[str, Any] = {}
+    for text in filters:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise InvalidRequest.at(f"?{name}", f"found {text!r}; need path=value")
+        try:
+            found[key] = json.loads(value)
+        except ValueError:
+            found[key] = value
+    return found

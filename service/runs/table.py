@@ -1,0 +1,130 @@
+"""Use case: all runs of a job as one CSV table, written as it is read."""
+
+import csv
+import io
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from service.datasets.rms_unit import unit_of
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunRepository
+from service.storage.sessions import Database
+from service.storage.tables import Run
+
+AT_ONCE = 500
+FORMULA = (*"=+-@\t\r\n", *"\uff1d\uff0b\uff0d\uff20")  # the last: in full width
+"""What a formula begins with, in one spreadsheet or another."""
+_NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
+COLUMNS = ("number", "id", "state", "valid", "best_rms", "fit_estimation", "fit_validation",
+           "evaluations", "generations", "seconds", "error")  # fmt: skip
+UNITS = {"fit_estimation": "%", "fit_validation": "%"}
+"""Of columns that do not have it in their name, and not from the job."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """What the columns of a job's table are; `parameters` are names with their units."""
+
+    paths: tuple[str, ...]
+    labels: tuple[str, ...]
+    parameters: tuple[tuple[str, str], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters, those of several units once."""
+        return tuple(dict.fromkeys(name for name, _ in self.parameters))
+
+
+def table(database: Database, job_id: str) -> Iterator[str]:
+    """Lines of the table, some hundred runs at a time, each part read in a session of its own.
+
+    One row a run in the order of the sweep: its columns, the values of the axes by their paths,
+    its labels, and estimate, standard error and status of every parameter that a run has. A
+    heading has the unit behind the name, ``L [s]``, and none where there is no dimension; a
+    parameter that has several units, with several models, has columns for each. A text that a
+    spreadsheet would take for a formula begins with an apostrophe, which it hides.
+
+    Raises
+    ------
+    NotFound
+        If there is no such job; at the call, before the first line.
+    """
+    with database.read() as session:
+        spec = JobRepository(session).get(job_id).spec
+        runs = RunRepository(session)
+        best = runs.page(job_id, limit=1, order="best_rms").items
+        first = [(one["name"], one["unit"]) for run in best for one in _told(run)]
+        parameters = tuple(dict.fromkeys([*first, *runs.estimated(job_id)]))
+        units = {**UNITS, "best_rms": unit_of(session, spec)}
+    axes = (spec.get("sweep") or {}).get("axes") or []
+    labels = dict.fromkeys(
+        name for axis in axes for one in axis.get("labels") or [] for name in one
+    )
+    layout = _Layout(tuple(axis["path"] for axis in axes), tuple(labels), parameters)
+    return _parts(database, job_id, layout, units)
+
+
+def _parts(
+    database: Database, job_id: str, layout: _Layout, units: Mapping[str, str]
+) -> Iterator[str]:
+    fixed = [_heading(name, units.get(name, "1")) for name in COLUMNS]
+    estimates = [
+        _heading(what + name, unit)
+        for name, unit in layout.parameters
+        for what in ("", "stderr of ")
+    ]
+    statuses = [f"status of {name}" for name in layout.names]
+    yield _lines([[*fixed, *layout.paths, *layout.labels, *estimates, *statuses]])
+    cursor: str | None = None
+    while True:
+        with database.read() as session:
+            page = RunRepository(session).page(job_id, cursor=cursor, limit=AT_ONCE)
+            rows = [_row(run, layout) for run in page.items]
+        yield _lines(rows)
+        cursor = page.next
+        if cursor is None:
+            return
+
+
+def _row(run: Run, layout: _Layout) -> list[Any]:
+    told = {(one["name"], one["unit"]): one for one in _told(run)}
+    statuses = {one["name"]: one["status"] for one in _told(run)}
+    found = [told.get(key) or {} for key in layout.parameters]
+    return [
+        run.number, run.id, run.state.value, *(getattr(run, name) for name in COLUMNS[3:]),
+        *(_plain(run.cell.get(path)) for path in layout.paths),
+        *(_plain(run.labels.get(name)) for name in layout.labels),
+        *(one.get(what) for one in found for what in ("value", "stderr")),
+        *(statuses.get(name) for name in layout.names),
+    ]  # fmt: skip
+
+
+def _told(run: Run) -> list[dict[str, Any]]:
+    """The estimates of a run's result."""
+    found: list[dict[str, Any]] = (run.result or {}).get("parameters", [])
+    return found
+
+
+def _heading(name: str, unit: str) -> str:
+    return name if unit == "1" else f"{name} [{unit}]"
+
+
+def _plain(value: object) -> object:
+    return json.dumps(value) if isinstance(value, dict | list) else value
+
+
+def _lines(rows: Iterable[Sequence[Any]]) -> str:
+    sink = io.StringIO()
+    csv.writer(sink, lineterminator="\n").writerows(map(_inert, row) for row in rows)
+    return sink.getvalue()
+
+
+def _inert(value: object) -> object:
+    """A value that no spreadsheet carries out, and no reader takes for two lines."""
+    if not isinstance(value, str):
+        return value
+    is_formula = value.startswith(FORMULA) and not _NUMBER.fullmatch(value)
+    return ("'" if is_formula else "") + value.replace("\r", " ")

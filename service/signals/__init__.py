@@ -1,1 +1,0 @@
-"""Recordings in and out: CSV, MCAP, derivations."""

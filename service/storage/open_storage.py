@@ -1,0 +1,27 @@
+"""Opening the database and the object store, for the web process; imports no web framework."""
+
+import tempfile
+from pathlib import Path
+
+from service.core import temporary_files as temporary
+from service.core.settings import Settings
+from service.storage import migrate
+from service.storage.objects import ObjectStore, open_store
+from service.storage.sessions import Database
+
+
+def open_storage(settings: Settings) -> tuple[Database, ObjectStore]:
+    """Open both, making the data folder and the tables where needed; clears what the dead left.
+
+    Raises
+    ------
+    Misconfigured, StorageError
+        If the data folder is not writable, or the address of the store is of an unknown kind.
+    SQLAlchemyError
+        If the database cannot be opened.
+    """
+    settings.prepare_folder()
+    temporary.clear(Path(tempfile.gettempdir()))
+    database = Database(settings.database)
+    migrate.upgrade(database)
+    return database, open_store(settings.store)

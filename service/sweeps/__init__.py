@@ -1,0 +1,1 @@
+"""The recipes (noise sweep, re-identification) and their summaries."""

@@ -1,0 +1,177 @@
+"""Groups of a job's runs with those that have not been made yet: counted, not made.
+
+The runs of a job are made in their order, so what is missing are the cells from some number on.
+How many of them belong to a group follows from the lengths of the axes.
+
+Groups of the runs of jobs that have ended, kept in memory: their numbers change no more.
+
+To group 100,000 runs takes seconds, and a page asks for the same again and again.
+"""
+
+from collections import OrderedDict
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from itertools import product
+from math import prod
+from threading import Lock
+from typing import Any, NamedTuple
+
+from sqlalchemy.orm import Session
+
+from service.jobs.axes import Cell, Steps, positions_of
+from service.jobs.stored_cells import stored_groups
+from service.repositories.runs import RunRepository
+from service.repositories.summaries import Group, GroupKey, Quantity, groups
+from service.storage.columns import to_json
+from service.storage.tables import Job, State
+
+SIGMA = "/noise/sigma"
+
+
+def all_groups(
+    session: Session, job: Job, keys: Sequence[GroupKey], quantities: Sequence[Quantity], limit: int
+) -> list[Group]:
+    """Groups of all runs of a job in the order of the sweep, at most `limit` + 1 of them.
+
+    A run that has not been made counts as queued; in a job that ended without it, as ended alike.
+    """
+    found = groups(session, job.id, keys, quantities, limit, job.project_id)
+    made = RunRepository(session, job.project_id).n_made(job.id)
+    if made >= job.n_runs or len(found) > limit:
+        return found
+    sweep = _Sweep(job.spec, keys)
+    # By their first runs: a database may round the numbers in a key.
+    known = {to_json(sweep.key_of(group.first)): group for group in found}
+    state = job.state if job.state.is_terminal else State.QUEUED
+    for part in sweep.parts(made):
+        text = to_json(part.key)
+        if text not in known:
+            if len(found) > limit:
+                break
+            known[text] = _empty(part, keys)
+            found.append(known[text])
+        known[text].states[state] += part.size
+    return found
+
+
+class Part(NamedTuple):
+    """Runs that are not made and have one position in each group of axes that the keys ask for."""
+
+    key: tuple[Any, ...]
+    first: int
+    size: int
+
+
+class _Sweep:
+    """The crossed groups of axes of a job, seen by the keys that its runs are grouped by."""
+
+    def __init__(self, spec: Mapping[str, Any], keys: Sequence[GroupKey]) -> None:
+        self._keys = keys
+        self._groups = stored_groups(spec)
+        self._lengths = [len(steps) for steps in self._groups]
+        self._places = [place for place, steps in enumerate(self._groups)
+                        if any(_decides(steps, key) for key in keys)]  # fmt: skip
+
+    def key_of(self, number: int) -> tuple[Any, ...]:
+        """The key of the group that a run belongs to."""
+        positions = positions_of(number, self._lengths)
+        return self._key([positions[place] for place in self._places])
+
+    def parts(self, start: int) -> Iterator[Part]:
+        """The runs from number `start` on, part by part in the order of the sweep."""
+        lengths = self._lengths
+        total = prod(lengths)
+        for positions in product(*(range(lengths[place]) for place in self._places)):
+            fixed = dict(zip(self._places, positions, strict=True))
+            size = below(total, lengths, fixed) - below(start, lengths, fixed)
+            if size:
+                first = sum(at * prod(lengths[place + 1 :]) for place, at in fixed.items())
+                yield Part(self._key(positions), first, size)
+
+    def _key(self, positions: Sequence[int]) -> tuple[Any, ...]:
+        cells = [self._groups[place][position].cell
+                 for place, position in zip(self._places, positions, strict=True)]  # fmt: skip
+        return tuple(_value(cells, key) for key in self._keys)
+
+
+def below(end: int, lengths: Sequence[int], fixed: Mapping[int, int]) -> int:
+    """How many cells before number `end` have the `fixed` positions, given by place."""
+    count = 0
+    for place, _ in enumerate(lengths):
+        later = range(place + 1, len(lengths))
+        free = prod(lengths[one] for one in later if one not in fixed)
+        position, end = divmod(end, prod(lengths[one] for one in later))
+        wanted = fixed.get(place)
+        if wanted is None:
+            count += position * free
+        elif wanted != position:
+            return count + (free if wanted < position else 0)
+    return count + end  # without axes there is one cell
+
+
+def _decides(steps: Steps, key: GroupKey) -> bool:
+    if key.kind == "axis":
+        return any(axis.path == key.name for _, axis, _ in steps.columns)
+    return any(key.name in labels for _, axis, _ in steps.columns for labels in axis.labels or [])
+
+
+def _value(cells: Sequence[Cell], key: GroupKey) -> Any:
+    """As the cell of the run would have it: of two labels of one name the later one counts."""
+    value = None
+    for cell in cells:
+        value = (cell.values if key.kind == "axis" else cell.labels).get(key.name, value)
+    return value
+
+
+def _empty(part: Part, keys: Sequence[GroupKey]) -> Group:
+    swept = dict(zip((key.name for key in keys), part.key, strict=True)).get(SIGMA)
+    sigma = None if swept is None else (float(swept), float(swept))
+    return Group(
+        key=part.key, first=part.first, states=dict.fromkeys(State, 0), n_valid=0, sigma=sigma,
+        mean_evaluations=None, mean_seconds=None,
+    )  # fmt: skip
+
+
+KEPT = 32
+MOST_GROUPS = 2_000
+"""Groups of more than so many are not kept."""
+
+
+class _Kept:
+    """What was asked for last."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._found: OrderedDict[Hashable, list[Group]] = OrderedDict()
+
+    def get(self, key: Hashable) -> list[Group] | None:
+        with self._lock:
+            if key in self._found:
+                self._found.move_to_end(key)
+            return self._found.get(key)
+
+    def put(self, key: Hashable, groups: list[Group]) -> None:
+        with self._lock:
+            self._found[key] = groups
+            while len(self._found) > KEPT:
+                self._found.popitem(last=False)
+
+
+_kept = _Kept()
+
+
+def groups_of(
+    session: Session, job: Job, keys: Sequence[GroupKey], quantities: Sequence[Quantity], limit: int
+) -> list[Group]:
+    """`service.sweeps.groups.all_groups`, from memory where the job has ended since.
+
+    A job that is resumed ends at another time; then its groups are made anew.
+    """
+    if not job.state.is_terminal:
+        return all_groups(session, job, keys, quantities, limit)
+    asked = (job.id, job.attempt, job.finished_at, tuple(keys), tuple(quantities), limit)
+    found = _kept.get(asked)
+    if found is None:
+        found = all_groups(session, job, keys, quantities, limit)
+        if len(found) <= MOST_GROUPS:
+            _kept.put(asked, found)
+    return found

@@ -1,0 +1,73 @@
+"""How far an output varies: the unit of a relative σ."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from service.core.errors import InvalidRequest
+from service.datasets.recordings import recording_of
+from service.storage.objects import ObjectStore
+from service.storage.tables import Dataset
+from sysid.data.records import Recording
+from sysid.models.model import Model
+
+MOST_VALUES = 10_000_000
+"""Values that are read for it, over all channels: a request must not take minutes."""
+
+
+def check_relative(model: Model, rows: Sequence[Dataset]) -> None:
+    """Refuse a relative σ for several outputs at once, or of more values than are read.
+
+    Raises
+    ------
+    InvalidRequest
+        At ``/relative``.
+    """
+    names = [one.name for one in model.outputs]
+    if len(names) > 1:
+        raise InvalidRequest.at(
+            "/relative",
+            f"the model has the outputs {', '.join(names)}, and σ is one number for all; "
+            "give σ in their unit, with relative: false",
+        )
+    count = sum(row.n_samples * row.n_channels for row in rows)
+    if count > MOST_VALUES:
+        raise InvalidRequest.at(
+            "/relative",
+            f"the datasets have {count} values in all, and at most {MOST_VALUES} are read to find "
+            "what σ is relative to; give σ in the output's unit, with relative: false",
+        )
+
+
+def spread(
+    store: ObjectStore, rows: Sequence[Dataset], channel: str, made: Recording | None = None
+) -> float:
+    """Standard deviation of a channel about its mean in each dataset, over all of them.
+
+    Parameters
+    ----------
+    made : Recording, optional
+        The recording of the only row, where it is not stored.
+
+    Raises
+    ------
+    InvalidRequest
+        At ``/relative``, if the channel does not vary.
+    """
+    squares, count, largest = 0.0, 0, 0.0
+    for row in rows:
+        recording = recording_of(store, row.sha256) if made is None else made
+        values = recording.channel(channel).values
+        known = values[np.isfinite(values)]
+        if known.size:
+            squares += float(np.sum(np.square(known - np.mean(known))))
+            count += known.size
+            largest = max(largest, float(np.max(np.abs(known))))
+    found = float(np.sqrt(squares / count)) if count else 0.0
+    if not found > 1e-12 * largest:
+        raise InvalidRequest.at(
+            "/relative",
+            f"the output {channel!r} does not vary (its standard deviation is {found:g}), so "
+            "that there is nothing σ could be relative to; give σ in its unit",
+        )
+    return found

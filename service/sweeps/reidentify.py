@@ -1,0 +1,138 @@
+"""Batch re-identification: one run for each value of a label, warm-started, with a trend."""
+
+import re
+from collections.abc import Iterator, Set
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service.core.errors import FieldError, InvalidRequest
+from service.core.settings import Settings
+from service.core.text_checks import fault_of
+from service.jobs import submit as jobs
+from service.jobs import sweep_checks
+from service.jobs.schemas import PREVIOUS, REFERENCE, RUN, JobIn, JobOut
+from service.storage.sessions import Database
+from service.sweeps.schemas import ReidentifyIn
+
+FIRST_AXIS = "/sweep/axes/0"
+IN_DATASETS = re.compile(r"/datasets(?P<place>/\d+): ")
+"""How the fault of a value of the axis begins that is one of its recordings'."""
+MADE_OF = {"batch": ("datasets", "sweep"), "label": ("sweep", "trend"), "look_at": ("trend",),
+           "predict": ("trend",), "reference": ("trend", "warm_start")}  # fmt: skip
+"""Fields of the job that each field of this body makes; the others have the same name."""
+
+
+def submit(
+    database: Database, body: ReidentifyIn, settings: Settings, key: str | None = None
+) -> JobOut:
+    """Queue the batch as an ordinary job.
+
+    Raises
+    ------
+    InvalidRequest
+        With every fault that can be known before the job runs, at its place in this body.
+    KeyReused
+        If the idempotency key was used with another body.
+    """
+    order = order_of(body)
+    job = job_of(body, order)
+    own = list(_own_faults(body))
+    try:
+        if own:
+            with database.read() as session:
+                jobs.check(session, job, settings)
+        else:
+            return jobs.submit_to(database, job, settings, key)
+    except InvalidRequest as error:
+        own += [_at_home(one, order) for one in error.errors]
+    raise InvalidRequest(dict.fromkeys(own))
+
+
+def faults_of_rest(
+    session: Session, body: ReidentifyIn, most_runs: int, unread: Set[str]
+) -> list[FieldError]:
+    """Faults of a body of which fields are `unread`: those that stand whatever these say."""
+    order = order_of(body)
+    theirs = {name for ours in unread for name in MADE_OF.get(ours, (ours,))}
+    found = sweep_checks.faults_of_rest(session, job_of(body, order), most_runs, theirs)
+    return [*_own_faults(body), *(_at_home(one, order) for one in found)]
+
+
+def order_of(body: ReidentifyIn) -> list[int]:
+    """Places in the batch, in the order of x."""
+    return sorted(range(len(body.batch)), key=lambda number: body.batch[number].x)
+
+
+def _own_faults(body: ReidentifyIn) -> Iterator[FieldError]:
+    if body.warm_start == "reference" and body.reference is None:
+        yield FieldError("/warm_start", "'reference' needs one: name the reference too")
+
+
+def job_of(body: ReidentifyIn, order: list[int]) -> JobIn:
+    """The job, its cells in the order of x: neighbours begin where their neighbours ended."""
+    chosen = [body.batch[number] for number in order]
+    axis = {
+        "path": "/datasets",
+        "values": [one.datasets for one in chosen],
+        "labels": [{body.label: one.x} for one in chosen],
+    }
+    reference = _reference(body.reference)
+    trend = {
+        "x": body.label, "parameters": body.look_at, "predict": body.predict,
+        "reference": reference,
+    }  # fmt: skip
+    return JobIn.model_validate({
+        "name": f"{_model_name(body.model)} over {body.label}"[:200],
+        **body.shared,
+        "datasets": chosen[0].datasets,
+        "sweep": {"axes": [axis]},
+        "warm_start": _warm_start(body, reference),
+        "trend": trend,
+    })  # fmt: skip
+
+
+def _model_name(model: Any) -> str:
+    """What a batch of this model is called; a text that no text is, is told with the model."""
+    name = model.get("name") if isinstance(model, dict) else model
+    return name if isinstance(name, str) and fault_of(name) is None else "model"
+
+
+def _reference(given: str | None) -> str | None:
+    """As a job names it: runs by their id, all else is the name of an accepted reference."""
+    if given is None or given.startswith((RUN, REFERENCE)):
+        return given
+    return REFERENCE + given
+
+
+def _warm_start(body: ReidentifyIn, reference: str | None) -> str | None:
+    wanted = body.warm_start or ("previous" if reference is None else "reference")
+    if wanted == "reference":
+        return reference
+    return PREVIOUS if wanted == "previous" else None
+
+
+def _at_home(error: FieldError, order: list[int]) -> FieldError:
+    """The fault of the job at the place of this body that it comes from."""
+    place = _place(error.pointer, order)
+    inner = IN_DATASETS.match(error.detail)
+    if inner and place.startswith("/batch/"):
+        return FieldError(place + inner["place"], error.detail[inner.end() :], error.column)
+    return FieldError(place, error.detail, error.column)
+
+
+def _place(pointer: str, order: list[int]) -> str:
+    parts: list[Any] = pointer.split("/")
+    if pointer.startswith(f"{FIRST_AXIS}/values/"):
+        return f"/batch/{order[int(parts[5])]}/datasets"
+    if pointer.startswith(f"{FIRST_AXIS}/labels/"):
+        return "/label"
+    if pointer.startswith("/datasets"):
+        return "/".join([f"/batch/{order[0]}", *parts[1:]])
+    for theirs, ours in (
+        ("/trend/parameters", "/look_at"), ("/trend/reference", "/reference"),
+        ("/trend/predict", "/predict"), ("/trend/x", "/label"), ("/warm_start", "/reference"),
+    ):  # fmt: skip
+        if pointer.startswith(theirs):
+            return ours + pointer.removeprefix(theirs)
+    return pointer

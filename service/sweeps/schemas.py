@@ -1,0 +1,185 @@
+"""What is told about many runs at once.
+
+The body of the noise sweep, as clients send it.
+
+The body of a batch re-identification, as clients send it.
+"""
+
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from service.core.wire import Answer, Body, Seed, Sigma
+from service.datasets.schemas import MAX_SIMULATED_SAMPLES, InputIn, SampleTime
+from service.jobs.schemas import IdentificationIn, PlaceIn, ValidationIn
+
+MOST_REPLICATES = 1_000_000
+"""Seeds of replicate r are `seed` times this plus r, so that no two sweeps share one by chance."""
+
+Method = Literal["simple", "improved-paper", "improved"]
+
+
+def _distinct(found: list[Any]) -> list[Any]:
+    seen: set[Any] = set()
+    for one in found:
+        if one in seen:
+            raise PydanticCustomError("distinct", "{one} is there twice", {"one": str(one)})
+        seen.add(one)
+    return found
+
+
+class TruthIn(Body):
+    """What the record without noise is simulated from, as ``POST /v1/datasets:simulate`` does."""
+
+    parameters: dict[str, float]
+    inputs: dict[str, InputIn] = Field(default={})
+    samples: int = Field(ge=2, le=MAX_SIMULATED_SAMPLES)
+    sample_time: SampleTime
+
+
+class NoiseSweepIn(IdentificationIn):
+    """Identification under noise: σ × replicates × methods in one job.
+
+    The record is simulated from `truth`, or it is that of `datasets`. Replicate r takes noise and
+    search from the seeds `seed` · 10⁶ + r, at every σ and for every method, so that another grid
+    or more replicates leave the other runs as they are; those are not computed again.
+
+    `relative`: σ is in standard deviations of the output. The other fields are those of a job.
+    """
+
+    truth: TruthIn | None = None
+    datasets: list[str] | None = Field(default=None, min_length=1, max_length=1000)
+    sigma: Annotated[
+        list[Sigma], Field(min_length=1, max_length=100_000), AfterValidator(_distinct)
+    ]
+    relative: bool = False
+    replicates: int = Field(default=20, ge=1, lt=MOST_REPLICATES)
+    methods: Annotated[list[Method], AfterValidator(_distinct)] = Field(
+        default=["simple", "improved"], min_length=1
+    )
+    seed: int = Field(default=1, ge=0, lt=2**32)
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if (self.truth is None) == (self.datasets is None):
+            raise PydanticCustomError(
+                "one_of",
+                "give either 'truth' (true parameters and an input, to simulate) or 'datasets'",
+            )
+        return self
+
+    @property
+    def shared(self) -> dict[str, Any]:
+        """The fields that the job has as well, as they were given."""
+        return self.given()
+
+
+class ExperimentsIn(Body):
+    """What was measured at one value of the label: `datasets` are fitted together, as one run."""
+
+    x: PlaceIn
+    datasets: list[str] = Field(min_length=1, max_length=1000)
+
+
+class ReidentifyIn(IdentificationIn):
+    """Identify a model anew for several values of a label, such as the lengths of a tube.
+
+    One run for each entry of `batch`, in the order of x; entries of one x are runs of their own
+    and are pooled. `reference` is a run (run_…) or the name of an accepted reference, which the
+    batch is compared with. `warm_start`: every run begins at the reference, or each at the result
+    of the one before; the reference by default where there is one.
+
+    `look_at` are the parameters of the trend, `predict` the values of x to predict at. The other
+    fields are those of a job.
+    """
+
+    label: str = Field(min_length=1, max_length=64)
+    batch: list[ExperimentsIn] = Field(min_length=1, max_length=5000)
+    reference: str | None = Field(default=None, min_length=1, max_length=200)
+    warm_start: Literal["reference", "previous", "none"] | None = None
+    look_at: list[str] = Field(default=[], max_length=100)
+    predict: list[PlaceIn] = Field(default=[], max_length=100)
+    validation: ValidationIn | None = None
+    seed: Seed = 1
+
+    @property
+    def shared(self) -> dict[str, Any]:
+        """The fields that the job has as well, as they were given."""
+        return self.given("validation", "seed")
+
+
+class ParameterSummaryOut(Answer):
+    """One parameter over the runs of a group, in its unit."""
+
+    name: str
+    unit: str
+    value: list[float] = Field(description="quantiles of the estimates")
+    stderr: float | None = Field(
+        description="median standard error: the Cramér–Rao floor where the runs reach the optimum"
+    )
+    reference: float | None = Field(default=None, description="what errors are told against")
+    error: list[float] | None = Field(
+        default=None, description="quantiles of estimate minus reference"
+    )
+    floor: float | None = Field(
+        default=None, description="Cramér–Rao floor: least standard deviation under the added noise"
+    )
+
+
+class GroupOut(Answer):
+    """The runs that share the values of the grouping keys."""
+
+    key: dict[str, Any]
+    runs: int
+    succeeded: int
+    failed: int
+    success_rate: float = Field(description="runs that succeeded with a valid model, of those over")
+    sigma: float | None = Field(
+        default=None, description="of the noise added, where all have the same"
+    )
+    evaluations: float | None = Field(description="mean")
+    seconds: float | None = Field(description="mean compute time")
+    rms: list[float] | None = Field(description="quantiles, in the output's unit")
+    rms_noise_free: list[float] | None = Field(
+        default=None, description="quantiles of the RMS against the records before noise was added"
+    )
+    rms_floor: float | None = Field(
+        default=None, description="that of estimates at the Cramér–Rao floor: σ√(r/n)"
+    )
+    fit_percent: dict[str, list[float] | None]
+    parameters: list[ParameterSummaryOut]
+
+
+class ReferenceOut(Answer):
+    """What the errors of the runs with these values of the axes are told against.
+
+    `kind` is ``truth`` (the data were simulated from these values) or ``estimate``: that of `run`,
+    the best valid run with the least noise, `sigma`.
+    """
+
+    cell: dict[str, Any]
+    kind: Literal["truth", "estimate"] | None
+    run: str | None
+    sigma: float | None
+    parameters: dict[str, float]
+    note: str
+
+
+class SummaryOut(Answer):
+    """Aggregates over the runs of a job.
+
+    References and floors are there once a job with noise has ended.
+    """
+
+    job: str
+    by: list[str]
+    quantiles: list[float]
+    groups: list[GroupOut]
+    runs: int = 0
+    reused: int = Field(default=0, description="runs taken over from ones computed before")
+    rms_unit: str | None = Field(
+        default=None, description="of each RMS; σ: of several outputs together"
+    )
+    references: list[ReferenceOut] = Field(default=[])
+    notes: list[str] = Field(default=[], description="what the numbers mean")

@@ -1,0 +1,44 @@
+"""The true parameters of simulated recordings, where they are known."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service.models import models
+from service.storage.tables import Dataset
+from sysid.models.model import EstimatedInitial, Model, initial_name
+
+
+def truth_of(session: Session, reference: Any, datasets: Sequence[Dataset]) -> (
+    dict[str, float] | None
+):  # fmt: skip
+    """True values of a model's parameters and starts, by their names in a result.
+
+    None unless every dataset was simulated from this very model with the same parameters: another
+    model's parameters may have the same names and mean something else.
+    """
+    model, stored = models.resolve(session, reference)
+    truths = [_of_one(model, stored, row, number) for number, row in enumerate(datasets)]
+    if not truths or any(one is None for one in truths):
+        return None
+    known: dict[str, float] = {}
+    for one in truths:
+        for name, value in (one or {}).items():
+            if known.setdefault(name, value) != value:
+                return None
+    return known
+
+
+def _of_one(model: Model, stored: Any, row: Dataset, number: int) -> dict[str, float] | None:
+    source = row.details.get("simulation") if row.kind == "simulate" else None
+    if not isinstance(source, Mapping) or source.get("model") != stored:
+        return None
+    given: Mapping[str, float] = row.details.get("true_parameters") or {}
+    own = {p.name: p.fixed for p in model.parameters if p.fixed is not None}
+    names = {p.name for p in model.parameters}
+    own |= {name: float(value) for name, value in given.items() if name in names}
+    for state, start in zip(model.states, model.initial, strict=True):
+        if isinstance(start, EstimatedInitial):
+            own[initial_name(state.name, number)] = float(given.get(f"{state.name}(0)", 0.0))
+    return own

@@ -1,0 +1,1 @@
+"""Trend of a batch: points, drift, notes."""

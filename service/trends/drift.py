@@ -1,0 +1,90 @@
+"""What a batch is compared with: a reference run, the trend of its job, and how it was made."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import isfinite
+from typing import Any, Literal
+
+import numpy as np
+
+from service.storage.tables import Run
+from service.trends.points import Quantity, onset_estimates
+from service.trends.schemas import DriftOut
+from sysid.trends.trend import Drift, Estimate, Trend, drift, drifts_from_law
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The run a batch is compared with, and the trend of its job, quantity by quantity.
+
+    Attributes
+    ----------
+    x : float or None
+        Its place on the axis of the batch.
+    why_no_trend : str
+        Why there is no trend of its job to compare with; empty where there is one.
+    names : tuple of str
+        Under which it was accepted.
+    """
+
+    run: Run
+    x: float | None
+    trends: Mapping[str, tuple[Trend, Quantity]] = field(default_factory=dict)
+    why_no_trend: str = ""
+    names: tuple[str, ...] = ()
+
+    def note(self, x: str, places: Mapping[float, Any]) -> str:
+        """What a reader needs to know where less is compared than may be expected."""
+        if self.trends:
+            return ""
+        if self.x is not None and self.x in places:
+            return f"{self.why_no_trend}: compared with the reference run only"
+        where = (
+            f"the reference run has no label {x!r}" if self.x is None
+            else f"the reference run is at {x} = {self.x:g}, where this batch has none"
+        )  # fmt: skip
+        return f"{where}, and {self.why_no_trend}: nothing to compare with"
+
+
+def drifts_of(
+    one: Quantity, reference: Reference | None, comparisons: int
+) -> dict[float, list[DriftOut]]:
+    """What is told of each point, by its x."""
+    found: dict[float, list[DriftOut]] = {}
+    if reference is None:
+        return found
+    new = [(point.x, point.estimate) for point in one.points if point.estimate is not None]
+    old = _estimate(reference.run, one.name)
+    for x, estimate in new:
+        if x == reference.x and old is not None:
+            found[x] = [_told("run", old.value, drift(estimate, old, comparisons))]
+    fitted, theirs = reference.trends.get(one.name, (None, None))
+    if fitted is None or theirs is None or fitted.chosen is None:
+        return found
+    used = [(p.x, p.estimate.stderr) for p in theirs.points if p.estimate is not None]
+    places, errors = np.array([x for x, _ in used]), np.array([error for _, error in used])
+    at = np.array([x for x, _ in new])
+    moved = drifts_from_law(
+        [estimate for _, estimate in new], fitted.chosen, places, errors, at, comparisons
+    )
+    for (x, estimate), so_far in zip(new, moved, strict=True):
+        if isfinite(so_far.difference):
+            expected = estimate.value - so_far.difference
+            found.setdefault(x, []).append(_told("trend", expected, so_far))
+    return found
+
+
+def _estimate(run: Run, name: str) -> Estimate | None:
+    """Of a parameter or an onset delay, with its standard error."""
+    one: Any = (run.estimates or {}).get(name)
+    if one is None:
+        return onset_estimates((run.result or {}).get("onset_delays") or []).get(name)
+    return Estimate(one["value"], one["stderr"]) if one["stderr"] else None
+
+
+def _told(kind: Literal["run", "trend"], expected: float, moved: Drift) -> DriftOut:
+    z = max(min(moved.z, 1e300), -1e300)
+    return DriftOut(
+        kind=kind, expected=expected, difference=moved.difference, z=z, limit=moved.limit,
+        drifted=moved.has_drifted,
+    )  # fmt: skip

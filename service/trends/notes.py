@@ -1,0 +1,104 @@
+"""What the laws and predictions of one quantity need beside them, in words."""
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from service.jobs.to_core import noise_model_of
+from service.repositories.trends import TrendRow
+from service.trends.points import Quantity
+from sysid.trends.trend import Place, Trend
+
+REAL_SCATTER = 1.5  # Birge ratios below that happen by chance in small batches
+
+
+def quantity_notes(one: Quantity, fitted: Trend) -> list[str]:
+    """All of them: of the points, of the laws, of what is predicted."""
+    return [*_of_points(one), *_of_laws(one, fitted), *_of_predictions(one, fitted)]
+
+
+def noise_model_note(x: str, places: Mapping[float, Sequence[TrendRow]], reference: str) -> str:
+    """Which estimates are of another noise model than others; empty where all are of one.
+
+    Parameters
+    ----------
+    x : str
+        The label's name.
+    reference : str
+        Noise model of the reference run; empty where there is none.
+    """
+    found = {at: {noise_model_of(row._asdict()) for row in rows} for at, rows in places.items()}
+    if len({reference, *(one for models in found.values() for one in models)} - {""}) < 2:
+        return ""
+    whitened = [f"{at:g}" for at, models in found.items() if "ar1" in models]
+    where = f"{x} = {', '.join(whitened)}" if whitened else "the reference run"
+    if whitened and reference == "ar1":
+        where += " and of the reference run"
+    return (
+        f"estimates of {where} are of the noise model ar1 and others of squares: their RMS and "
+        "fits do not compare, and where the model lacks dynamics the estimates differ, too; "
+        "loss: {noise_model: white} has all of squares"
+    )
+
+
+def _of_points(one: Quantity) -> Iterator[str]:
+    without = [f"{point.x:g}" for point in one.points if point.estimate is None]
+    if without:
+        yield f"no standard error at {', '.join(without)}: the laws leave this out"
+    if one.between is not None and one.between > 1:
+        yield (
+            f"runs of one label differ by {one.between:.2g} times what their standard errors say; "
+            "the errors shown hold that"
+        )
+
+
+def _of_laws(one: Quantity, fitted: Trend) -> Iterator[str]:
+    chosen = fitted.chosen
+    if chosen is None:
+        return
+    if chosen.birge > REAL_SCATTER:
+        yield (
+            f"the points scatter about the law by {chosen.birge:.2g} times their errors "
+            "(Birge ratio); band and intervals are wider by that"
+        )
+    if all(law.kind != "power" for law in fitted.laws):
+        wrong = [f"{x:g}" for x in _used(one) if not x > 0]
+        yield "no power law: " + (
+            f"it needs x above 0, found {', '.join(wrong)}" if wrong
+            else "these points do not determine one"
+        )  # fmt: skip
+    _, (_, value, error) = chosen.coefficients
+    if error > abs(value):
+        name = "slope" if chosen.kind == "line" else "exponent"
+        yield (
+            f"the {name} of the chosen law, {value:.2g}, is smaller than its error, {error:.2g}: "
+            "the points tell no dependence on x, and the law is no more than their mean"
+        )
+
+
+def _of_predictions(one: Quantity, fitted: Trend) -> Iterator[str]:
+    outside = [f"{at.x:g}" for at in fitted.predictions if at.is_outside]
+    if outside:
+        yield f"{', '.join(outside)} is outside the measured range: an extrapolation"
+    used = _used(one)
+    beyond = [f"{at.x:g}" for at in fitted.predictions if not at.x > 0]
+    if beyond and used and min(used) > 0:
+        yield f"{', '.join(beyond)} is not above 0, as all that was measured is"
+    for at in fitted.predictions:
+        yield from _against_bounds(one, at)
+
+
+def _used(one: Quantity) -> list[float]:
+    return [point.x for point in one.points if point.estimate is not None]
+
+
+def _against_bounds(one: Quantity, at: Place) -> Iterator[str]:
+    """Predictions that no run could have given, or that lack part of their interval."""
+    lower, upper = one.bounds
+    unit = "" if one.unit in ("", "1") else f" {one.unit}"
+    limits = f"{lower:g} to {upper:g}{unit}" if upper < float("inf") else f"{lower:g}{unit} or more"
+    if not lower <= at.value <= upper and at.value == at.value:
+        yield (
+            f"{at.value:.4g}{unit}, predicted at {at.x:g}, is outside the bounds of {one.name} "
+            f"({limits}): the law does not hold there"
+        )
+    elif at.lower < lower or at.upper > upper:
+        yield f"the interval at {at.x:g} reaches beyond the bounds of {one.name} ({limits})"

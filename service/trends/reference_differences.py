@@ -1,0 +1,118 @@
+"""How a reference was made otherwise than a batch: an estimate means little under another hold."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from service.core.json_pointer import body_of
+from service.jobs.record_checks import signals_of
+from service.models import models
+from service.repositories.datasets import DatasetRepository
+from service.repositories.jobs import JobRepository
+from service.storage.tables import Run
+from service.trends.points import Channels
+from sysid.core.errors import SysidError
+from sysid.models.model import Model
+from sysid.models.parameters import override
+
+Body = Mapping[str, Any]
+Facts = Mapping[str, str]
+
+_NONE = "none"
+
+
+def differences(session: Session, run: Run, bodies: Sequence[Body], known: Channels) -> str:
+    """What a reference run was made with that the runs of a batch were not; empty if nothing.
+
+    Parameters
+    ----------
+    bodies : sequence of dict
+        Of the runs of the batch.
+    known : Channels
+        Channels of the datasets of these.
+    """
+    body = body_of(JobRepository(session).get(run.job_id).spec, run.cell)
+    theirs = _facts(session, body, channels_of(session, set(body["datasets"])))
+    told: dict[str, None] = {}
+    for ours in _different(session, bodies, known):
+        for name in dict.fromkeys([*theirs, *ours]):
+            one, other = theirs.get(name, _NONE), ours.get(name, _NONE)
+            if one != other:
+                told[f"{name} = {one} (here {other})"] = None
+    return f"the reference was made with {', '.join(told)}" if told else ""
+
+
+def channels_of(session: Session, datasets: set[str]) -> Channels:
+    """The channels of datasets, by name."""
+    found = DatasetRepository(session).get_all(sorted(datasets)) if datasets else ()
+    return {one.id: {channel["name"]: channel for channel in one.channels} for one in found}
+
+
+def _different(session: Session, bodies: Sequence[Body], known: Channels) -> Iterator[Facts]:
+    """The facts of a batch, each set of them once."""
+    told: set[str] = set()
+    for body in bodies:
+        settings = {name: body.get(name) for name in _SETTINGS}
+        kinds = [
+            sorted((one["name"], str(one.get("unit")), one.get("hold", "first"))
+                   for one in known.get(dataset, {}).values())
+            for dataset in body["datasets"]
+        ]  # fmt: skip
+        key = repr((settings, kinds))
+        if key not in told:
+            told.add(key)
+            yield _facts(session, body, known)
+
+
+_SETTINGS = (
+    "model", "channels", "hold", "loss", "weights", "prediction", "skip", "noise", "parameters",
+)  # fmt: skip
+
+
+def _facts(session: Session, body: Body, known: Channels) -> Facts:
+    """What an estimate depends on besides the data, in words."""
+    try:
+        model, _ = models.resolve(session, body["model"])
+    except SysidError:
+        return {}  # a model that this version cannot read any more
+    inputs, outputs = signals_of(model)
+    found = {"model": model.name}
+    for signal in (*inputs, *outputs):
+        channel = (body.get("channels") or {}).get(signal, signal)
+        stored = [known[one][channel] for one in body["datasets"] if channel in known.get(one, {})]
+        found[signal] = channel
+        found[f"unit of {signal}"] = ", ".join(_each(str(one.get("unit") or 1) for one in stored))
+        if signal in inputs:
+            given = (body.get("hold") or {}).get(signal)
+            held = [given or one.get("hold", "first") for one in stored]
+            found[f"hold of {signal}"] = ", ".join(_each(held))
+    return {**found, **dict(_settings(body)), **dict(_given(model, body))}
+
+
+def _each(words: Any) -> list[str]:
+    return list(dict.fromkeys(words)) or ["unknown"]
+
+
+def _settings(body: Body) -> Iterator[tuple[str, str]]:
+    loss, weights = body["loss"], body.get("weights")
+    scale = "" if loss["kind"] == "squares" else f" of scale {loss['scale']:g}"
+    yield "loss", loss["kind"] + scale
+    yield "weights", (
+        ", ".join(f"{name} {value:g}" for name, value in sorted(weights.items()))
+        if weights else "by standard deviation"
+    )  # fmt: skip
+    yield "prediction", body.get("prediction", "simulation")
+    yield "skip", f"{body.get('skip', 0):d}"
+    yield "added noise", f"{(body.get('noise') or {}).get('sigma', 0.0):g}"
+
+
+def _given(model: Model, body: Body) -> Iterator[tuple[str, str]]:
+    """Parameters that are not sought."""
+    own = {one.name for one in model.parameters}
+    changes = {name: one for name, one in (body.get("parameters") or {}).items() if name in own}
+    for one in override(model.parameters, changes):
+        if one.fixed is not None:
+            yield one.name, f"{one.fixed:g}, fixed"
+        elif one.tied is not None:
+            yield one.name, f"{one.tied}, tied"

@@ -1,0 +1,188 @@
+"""Use case of trends: a batch of re-identifications over one label, and against its reference."""
+
+from collections.abc import Sequence
+from math import isfinite
+
+from sqlalchemy.orm import Session
+
+from service.core.errors import Conflict, InvalidRequest
+from service.core.json_pointer import body_of
+from service.jobs.to_core import noise_model_of
+from service.repositories.jobs import JobRepository
+from service.repositories.lineage import references_of
+from service.repositories.runs import RunRepository
+from service.repositories.trends import TrendRow, count_succeeded, trend_rows
+from service.storage.tables import Job
+from service.trends.drift import Reference, drifts_of
+from service.trends.notes import noise_model_note, quantity_notes
+from service.trends.points import Point, Quantity, by_label, place, quantities
+from service.trends.reference_differences import channels_of, differences
+from service.trends.schemas import (
+    CoefficientOut,
+    DriftOut,
+    LawOut,
+    PlaceOut,
+    PointOut,
+    QuantityOut,
+    TrendOut,
+)
+from sysid.trends.laws import FORMULAS, Law
+from sysid.trends.trend import Influence, Place, Trend, fit_trend
+
+MOST_RUNS = 5_000
+
+
+def has_trend(job: Job) -> bool:
+    """Whether a job asks for one."""
+    return bool(job.spec.get("trend"))
+
+
+def trend(session: Session, job_id: str) -> TrendOut:
+    """The trend that a job asks for, from the runs that have succeeded so far.
+
+    Raises
+    ------
+    NotFound
+        If there is no such job.
+    Conflict
+        If the job asks for no trend.
+    InvalidRequest
+        If it has too many runs for one.
+    """
+    job = JobRepository(session).get(job_id)
+    if not has_trend(job):
+        raise Conflict(
+            f'{job.id} has no trend; submit it with "trend": {{"x": …}}, the name of a label'
+        )
+    asked = job.spec["trend"]
+    places, found = _gathered(session, job)
+    bodies = {row.id: body_of(job.spec, row.cell) for rows in places.values() for row in rows}
+    datasets = {run: body["datasets"] for run, body in bodies.items()}
+    known = channels_of(session, {one for many in datasets.values() for one in many})
+    reference = _reference(session, job, asked.get("reference"))
+    told = [_told(one, asked["predict"], reference, found) for one in found]
+    theirs = "" if reference is None else noise_model_of(reference.run.result or {})
+    notes = [noise_model_note(asked["x"], places, theirs)]
+    if reference is not None:
+        notes += [
+            reference.note(asked["x"], places),
+            differences(session, reference.run, list(bodies.values()), known),
+        ]
+    return TrendOut(
+        job=job.id, x=asked["x"],
+        reference=None if reference is None else reference.run.id,
+        reference_x=None if reference is None else reference.x,
+        reference_names=[] if reference is None else list(reference.names),
+        places=[
+            place(x, rows, datasets, known, bodies[rows[0].id]["channels"])
+            for x, rows in places.items()
+        ],
+        quantities=told, missing=job.n_runs - count_succeeded(session, job.id),
+        notes=[note for note in notes if note],
+    )  # fmt: skip
+
+
+def _gathered(session: Session, job: Job) -> tuple[dict[float, list[TrendRow]], list[Quantity]]:
+    if job.n_runs > MOST_RUNS:
+        raise InvalidRequest.at(
+            "", f"{job.id} has {job.n_runs} runs; a trend is made of at most {MOST_RUNS}"
+        )
+    asked = job.spec["trend"]
+    places = by_label(trend_rows(session, job.id, MOST_RUNS), asked["x"])
+    return places, quantities(places, asked["parameters"])
+
+
+def _reference(session: Session, job: Job, run_id: str | None) -> Reference | None:
+    """The reference of a batch, and the laws of its job where that asks for the same trend."""
+    if run_id is None:
+        return None
+    run = RunRepository(session).get(run_id)
+    theirs = JobRepository(session).get(run.job_id)
+    x = job.spec["trend"]["x"]
+    label = run.labels.get(x)
+    at = float(label) if isinstance(label, int | float) else None
+    names = tuple(references_of(session, run.id))
+    why = _why_no_trend(theirs, x)
+    if why:
+        return Reference(run, at, why_no_trend=why, names=names)
+    _, known = _gathered(session, theirs)
+    trends = {one.name: (_fitted(one, ()), one) for one in known}
+    return Reference(run, at, trends, names=names)
+
+
+def _why_no_trend(theirs: Job, x: str) -> str:
+    """Why there is none over the axis x to compare with; empty if there is."""
+    if not has_trend(theirs):
+        return "its job has no trend"
+    if theirs.spec["trend"]["x"] != x:
+        return f"the trend of its job is over {theirs.spec['trend']['x']!r}"
+    if theirs.n_runs > MOST_RUNS:
+        return (
+            f"the reference batch {theirs.id} has {theirs.n_runs} runs, and a trend is made of at "
+            f"most {MOST_RUNS}"
+        )
+    return ""
+
+
+def _fitted(one: Quantity, predict: Sequence[float]) -> Trend:
+    used = [(point.x, point.estimate) for point in one.points if point.estimate is not None]
+    return fit_trend(
+        [x for x, _ in used], [e.value for _, e in used], [e.stderr for _, e in used], predict
+    )
+
+
+def _told(
+    one: Quantity, predict: Sequence[float], reference: Reference | None, all_: Sequence[Quantity]
+) -> QuantityOut:
+    fitted = _fitted(one, predict)
+    influences = iter(fitted.influences)
+    n = sum(point.estimate is not None for other in all_ for point in other.points)
+    drifts = drifts_of(one, reference, n)
+    points = [
+        _point(point, next(influences, None) if point.estimate is not None else None,
+               drifts.get(point.x, []), bool(fitted.laws))
+        for point in one.points
+    ]  # fmt: skip
+    return QuantityOut(
+        name=one.name, unit=one.unit, kind=one.kind, points=points, between_runs=one.between,
+        laws=[_law(law, law is fitted.chosen) for law in fitted.laws], reason=fitted.reason,
+        band=[_place(at) for at in fitted.band],
+        predictions=[_place(at) for at in fitted.predictions],
+        notes=quantity_notes(one, fitted),
+    )  # fmt: skip
+
+
+def _point(
+    point: Point, influence: Influence | None, drifts: list[DriftOut], has_laws: bool
+) -> PointOut:
+    error = None if point.estimate is None else _finite(point.estimate.stderr)
+    return PointOut(
+        x=point.x, value=point.value, stderr=error, runs=list(point.runs), status=point.status,
+        is_used=has_laws and point.estimate is not None,
+        studentised=None if influence is None else _finite(influence.studentised),
+        p_value=None if influence is None else influence.p_value,
+        is_outlier=influence is not None and influence.is_outlier, drifts=drifts,
+    )  # fmt: skip
+
+
+def _law(law: Law, is_chosen: bool) -> LawOut:
+    return LawOut(
+        law=law.kind, formula=FORMULAS[law.kind], is_chosen=is_chosen,
+        coefficients=[
+            CoefficientOut(name=name, value=value, stderr=error)
+            for name, value, error in law.coefficients
+        ],
+        chi_squared=law.chi_squared, degrees=law.degrees, birge=law.birge, aic=law.aic,
+        aicc=_finite(law.aicc),
+    )  # fmt: skip
+
+
+def _place(at: Place) -> PlaceOut:
+    return PlaceOut(
+        x=at.x, value=_finite(at.value), stderr=_finite(at.stderr), lower=_finite(at.lower),
+        upper=_finite(at.upper), is_outside=at.is_outside,
+    )  # fmt: skip
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not isfinite(value) else value
