@@ -87,7 +87,7 @@ class StoredRun:
         parameters = parameters_of_job(session, self.model, self.body)
         return override(parameters, self._changes(parameters))
 
-    def recorded(
+    def read_datasets(
         self, session: Session, store: ObjectStore, datasets: Sequence[str]
     ) -> tuple[Record, ...]:
         """Read datasets as records of the model, held as the job says.
@@ -102,7 +102,7 @@ class StoredRun:
 
     def records(self, session: Session, store: ObjectStore) -> list[Record]:
         """Read the records that the run was fitted to: without validation, with added noise."""
-        records: Sequence[Record] = self.recorded(session, store, self.body["datasets"])
+        records: Sequence[Record] = self.read_datasets(session, store, self.body["datasets"])
         fraction = (self.body["validation"] or {}).get("fraction")
         if fraction is not None:
             records = [split_record(record, fraction)[0] for record in records]

@@ -202,7 +202,7 @@ def _inputs(
     """Inputs of every record; a dataset that is gone takes only its own inputs off the plot."""
     for name in datasets:
         try:
-            for record in stored.recorded(session, store, [name]):
+            for record in stored.read_datasets(session, store, [name]):
                 yield tuple(_trace(channel) for channel in record.inputs)
         except (StorageError, SysidError):
             yield ()

@@ -158,6 +158,6 @@ def _inputs(
     kept = stored.body["validation"] or {}
     names = kept["datasets"] if is_validation and kept.get("datasets") else stored.body["datasets"]
     try:
-        return [record.inputs for record in stored.recorded(session, store, names)], ""
+        return [record.inputs for record in stored.read_datasets(session, store, names)], ""
     except (SysidError, ServiceError, StorageError) as error:
         return [], f"the inputs are not to be had any more, so independence is not tested: {error}"
