@@ -314,16 +314,15 @@ def _model(name: str) -> "Model":
 
 
 def _records(recording: "Recording", path: Path, model: "Model", body: "JobIn") -> "list[Record]":
-    inputs, outputs = [one.name for one in model.inputs], [one.name for one in model.outputs]
-    chosen = {signal: body.channels.get(signal, signal) for signal in (*inputs, *outputs)}
-    for signal, channel in chosen.items():
+    from service.datasets.signal_channels import map_channels
+
+    channels = map_channels(model, body.channels, body.hold)
+    for signal, channel in channels.by_signal.items():
         if channel not in recording.names:
             given = f"--channels {signal}" if signal in body.channels else "--channels"
             fail(f"{given}: {path} has no channel {channel!r} for signal {signal!r} of the model"
                  f"{nearest(channel, recording.names)}")  # fmt: skip
-    roles = ({one: chosen[one] for one in inputs}, {one: chosen[one] for one in outputs})
-    held = recording.held({chosen[one]: hold for one, hold in body.hold.items()})
-    return list(held.records(*roles, path.stem))
+    return list(channels.cut_records(recording, path.stem))
 
 
 def _pairs(text: str | None) -> dict[str, str]:

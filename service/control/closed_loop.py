@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +14,7 @@ from service.control.schemas import (
     TuningIn,
     TuningOut,
 )
+from service.core.documents import to_finite
 from service.core.errors import FieldError, InvalidRequest
 from service.datasets.schemas import StepInput
 from service.datasets.simulated import check_finite
@@ -175,7 +175,7 @@ def _tuned(
         rule=found.rule, controller=found.controller,
         closed_loop_time_constant=found.closed_loop_time_constant,
         process_gain=process.gain, process_delay=process.delay,
-        process_time_constant=_known(process.time_constant),
+        process_time_constant=to_finite(process.time_constant),
         process_second_time_constant=process.second_time_constant,
         formulas=list(found.formulas), reference=found.reference,
     )  # fmt: skip
@@ -192,10 +192,10 @@ def _margins(identified: "Identified", control: "PidControl") -> MarginsOut | No
     except NotLinear:
         return None
     return MarginsOut(
-        is_stable=found.is_stable, gain_margin=_known(found.gain_margin),
-        phase_margin=_known(found.phase_margin), delay_margin=_known(found.delay_margin),
-        crossover_frequency=_known(found.crossover_frequency),
-        sensitivity_peak=_known(found.sensitivity_peak),
+        is_stable=found.is_stable, gain_margin=to_finite(found.gain_margin),
+        phase_margin=to_finite(found.phase_margin), delay_margin=to_finite(found.delay_margin),
+        crossover_frequency=to_finite(found.crossover_frequency),
+        sensitivity_peak=to_finite(found.sensitivity_peak),
     )  # fmt: skip
 
 
@@ -254,19 +254,15 @@ def _metrics(
         times, output.values, at=step.time, before=step.offset, after=step.offset + step.amplitude
     )
     return StepMetricsOut(
-        output=output.name, unit=output.unit, rise_time=_known(found.rise_time),
-        overshoot_percent=_known(found.overshoot_percent),
-        overshoot_of_final_percent=_known(found.overshoot_of_final_percent),
-        settling_time=_known(found.settling_time), band=found.band,
-        steady_error=_known(found.steady_error), final_value=_known(found.final_value),
+        output=output.name, unit=output.unit, rise_time=to_finite(found.rise_time),
+        overshoot_percent=to_finite(found.overshoot_percent),
+        overshoot_of_final_percent=to_finite(found.overshoot_of_final_percent),
+        settling_time=to_finite(found.settling_time), band=found.band,
+        steady_error=to_finite(found.steady_error), final_value=to_finite(found.final_value),
         runs_away=found.runs_away, is_settled=found.is_settled,
-        iae=_known(found.iae), itae=_known(found.itae),
-        swing=_known(found.swing), swing_period=_known(found.swing_period),
+        iae=to_finite(found.iae), itae=to_finite(found.itae),
+        swing=to_finite(found.swing), swing_period=to_finite(found.swing_period),
     )  # fmt: skip
-
-
-def _known(value: float) -> float | None:
-    return value if isfinite(value) else None
 
 
 def _tuning_notes(tuning: TuningOut) -> Iterator[str]:

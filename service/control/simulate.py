@@ -10,20 +10,16 @@ from sqlalchemy.orm import Session
 from service.control.closed_loop import Loop, check_transport, closed, control_faults
 from service.control.schemas import LATER_FIELDS, ControlIn, RunSimulateIn, RunSimulationOut
 from service.core.concurrency import simulating
-from service.core.errors import Conflict, FieldError, InvalidRequest
-from service.core.json_pointer import body_of
+from service.core.errors import FieldError, InvalidRequest
 from service.datasets.datasets import add_recording, key_of, series, told
 from service.datasets.schemas import DatasetOut
 from service.datasets.simulated import check_finite, check_lags_at
 from service.datasets.waveforms import Signals, sampled
-from service.models.models import model_of_run
+from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from service.storage.tables import Run
 from sysid.core.errors import nearest
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
@@ -96,16 +92,13 @@ def simulate(
 
 
 def _asked(session: Session, store: ObjectStore, run_id: str, body: RunSimulateIn) -> _Asked:
-    run = RunRepository(session).get(run_id)
-    if run.result is None or not run.result.get("parameters"):
-        raise Conflict(f"run {run_id} is {run.state.value} and has no estimates to simulate with")
-    job = JobRepository(session).get(run.job_id)
-    model = model_of_run(session, run, job)
+    stored = load_estimated_run(session, run_id, "simulate with")
+    model = stored.model
     faults = [*_parameter_faults(model, body.parameters), *_input_faults(model, body)]
     if faults:
         raise InvalidRequest(faults)
     check_lags_at(model, body.parameters)
-    period, notes = _period(session, model, body_of(job.spec, run.cell), body)
+    period, notes = _period(session, stored, body)
     times = np.arange(body.samples, dtype=np.float64) * period
     check_transport(body.control, float(times[-1]))
     signals = Signals(session, store, times)
@@ -119,7 +112,7 @@ def _asked(session: Session, store: ObjectStore, run_id: str, body: RunSimulateI
         unit = next((o.unit for o in model.outputs if o.name == body.control.output), "1")
         at = "/control/reference"
         reference = signals.channel(at, "reference", unit, body.control.reference)
-    values = _values(model, run, body.parameters)
+    values = _values(stored, body.parameters)
     given = inputs if reference is None else [*inputs, reference]
     notes = [*notes, *_early_notes(model, given, period)]
     return _Asked(model, values, times, inputs, reference, signals.parents, notes)
@@ -136,12 +129,10 @@ def _early_notes(model: Model, given: Sequence[Channel], period: float) -> list[
     ]
 
 
-def _period(
-    session: Session, model: Model, job: Mapping[str, Any], body: RunSimulateIn
-) -> tuple[float, list[str]]:
+def _period(session: Session, stored: StoredRun, body: RunSimulateIn) -> tuple[float, list[str]]:
     """The sampling period in s, and what is to be said of it."""
     try:
-        known = DatasetRepository(session).get(job["datasets"][0]).sample_time
+        known = DatasetRepository(session).get(stored.body["datasets"][0]).sample_time
     except StorageError:  # it was deleted since; the run can still be simulated
         known = None
     period = body.sample_time or known
@@ -149,9 +140,10 @@ def _period(
         raise InvalidRequest.at(
             "/sample_time", "is missing, and the run's data do not tell one; give it in s"
         )
-    if model.form == "differential" or known is None or abs(period / known - 1) < 1e-3:
+    form = stored.model.form
+    if form == "differential" or known is None or abs(period / known - 1) < 1e-3:
         return period, []
-    if model.form == "polynomial":
+    if form == "polynomial":
         raise InvalidRequest.at(
             "/sample_time",
             f"found {period:g} s; the terms of this polynomial are samples of {known:g} s: "
@@ -163,18 +155,18 @@ def _period(
     ]
 
 
-def _values(model: Model, run: Run, given: Mapping[str, float]) -> dict[str, float]:
+def _values(stored: StoredRun, given: Mapping[str, float]) -> dict[str, float]:
     """Value of every parameter and of every start that the model does not fix."""
+    model = stored.model
     rest = {
         f"{state.name}(0)": 0.0
         for state, start in zip(model.states, model.initial, strict=True)
         if not isinstance(start, FixedInitial)
     }
     own = {parameter.name for parameter in model.parameters}
-    result = run.result or {}
-    found = {p["name"]: p["value"] for p in result["parameters"] if p["name"] in own}
+    found = {p["name"]: p["value"] for p in stored.estimates if p["name"] in own}
     # What is tied follows the parameters it is tied to, unless a value is given for itself.
-    tied = {p["name"] for p in result["parameters"] if p["status"] == "tied"} if given else set()
+    tied = {p["name"] for p in stored.estimates if p["status"] == "tied"} if given else set()
     by_document = {p.name for p in model.parameters if p.tied is not None}
     kept = {name: value for name, value in found.items() if name not in tied & by_document}
     return {**rest, **kept, **given}

@@ -1,6 +1,7 @@
 """Reading JSON and YAML that users write: data only, with the place of what cannot be read."""
 
 import json
+from math import isfinite
 from typing import Any
 
 from service.core.errors import FieldError, InvalidRequest, TooLarge
@@ -49,6 +50,11 @@ def read_json(text: bytes) -> Any:
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
         raise InvalidRequest.at("", f"the body is not JSON: {error}") from None
     return _storable(found)
+
+
+def to_finite(value: float | None) -> float | None:
+    """Give the number, or None where it is not finite: JSON has no such numbers."""
+    return None if value is None or not isfinite(value) else float(value)
 
 
 def _storable(document: Any) -> Any:

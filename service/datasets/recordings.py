@@ -1,11 +1,14 @@
 """Recordings from the object store; the last few stay in memory."""
 
 from collections import OrderedDict
+from collections.abc import Iterable
 from threading import Lock
 
+from service.datasets.signal_channels import SignalChannels
 from service.formats.mcap import read_recording
 from service.storage.objects import ObjectStore
-from sysid.data.records import Recording
+from service.storage.tables import Dataset
+from sysid.data.records import Record, Recording
 
 KEPT = 4
 LARGEST_KEPT = 2_000_000  # samples over all channels: 32 MB
@@ -49,3 +52,22 @@ def recording_of(store: ObjectStore, sha256: str) -> Recording:
         found = read_recording(store.get(sha256))
         _kept.put(sha256, found)
     return found
+
+
+def read_records(
+    store: ObjectStore, rows: Iterable[Dataset], channels: SignalChannels
+) -> tuple[Record, ...]:
+    """Read the records of a model's signals from datasets, one for each segment.
+
+    Raises
+    ------
+    ObjectMissing
+        If the store has lost a dataset.
+    InvalidRecord
+        If a channel is not there, or cannot be that signal.
+    """
+    return tuple(
+        record
+        for row in rows
+        for record in channels.cut_records(recording_of(store, row.sha256), row.name)
+    )

@@ -1,34 +1,15 @@
 """The unit of a body's RMS."""
 
-import json
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any
 
 from sqlalchemy.orm import Session
 
+from service.models.models import load_stored_model
 from service.repositories.datasets import DatasetRepository
 from service.storage.errors import NotFound
-from sysid.core.errors import SysidError
-from sysid.models.catalogue.load import load_model
-from sysid.models.model import Model
-from sysid.models.parse import parse_model
 
 Body = Mapping[str, Any]
-
-
-def model_of(body: Body) -> Model | None:
-    """The model of a body; None if this version of the program cannot read it any more."""
-    return _model(json.dumps(body["model"]))
-
-
-@lru_cache(maxsize=256)
-def _model(reference: str) -> Model | None:
-    try:
-        source = json.loads(reference)
-        return load_model(source) if isinstance(source, str) else parse_model(source)
-    except SysidError:
-        return None
 
 
 def unit_of(session: Session, body: Body) -> str:
@@ -36,9 +17,7 @@ def unit_of(session: Session, body: Body) -> str:
 
     A model that fits any unit says "1"; then the unit is that of the recorded channel.
     """
-    model = model_of(body)
-    if model is None:
-        return "1"
+    model = load_stored_model(body["model"])
     if len(model.outputs) > 1:
         return "σ"
     output = model.outputs[0]

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 from weakref import WeakSet
 
-from service.formats.mcap import FittedOutput, write_fit
+from service.formats.mcap import FitRole, FittedOutput, write_fit
 from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import ObjectStore
 from sysid.core.types import FloatArray
@@ -28,6 +28,10 @@ class Place(NamedTuple):
     sha256: str
     start: int | None = None
     size: int | None = None
+
+
+FittedPart = tuple[FitRole, Records, tuple[tuple[FloatArray, ...], ...]]
+"""What the records are for, the records, and the simulated outputs of each."""
 
 
 class _PatientStore:
@@ -140,7 +144,7 @@ class Shelf:
 def save_fit(
     shelf: Shelf,
     run: str,
-    parts: Sequence[tuple[str, Records, tuple[tuple[FloatArray, ...], ...]]],
+    parts: Sequence[FittedPart],
 ) -> Shelved:
     """What a run's model gives beside what was measured, as a file on the shelf.
 
@@ -156,11 +160,11 @@ def save_fit(
 
 
 def _fits(
-    role: str, records: Sequence[Record], simulated: tuple[tuple[FloatArray, ...], ...]
+    role: FitRole, records: Sequence[Record], simulated: tuple[tuple[FloatArray, ...], ...]
 ) -> Iterator[FittedOutput]:
     for number, (record, outputs) in enumerate(zip(records, simulated, strict=True), 1):
         for channel, values in zip(record.outputs, outputs, strict=True):
             yield FittedOutput(
-                f"{role} {number}", channel.name, channel.unit, channel.times, channel.values,
+                role, number, channel.name, channel.unit, channel.times, channel.values,
                 values,
             )  # fmt: skip

@@ -9,14 +9,15 @@ from typing import Any, NamedTuple
 
 from service.core.errors import ServiceError
 from service.core.json_pointer import body_of
-from service.datasets.recordings import recording_of
+from service.datasets.recordings import read_records
+from service.datasets.signal_channels import SignalChannels, map_channels
 from service.dispatch.checkpoints import unpacked
-from service.dispatch.fitted_signals import Shelf, Shelved, save_fit
+from service.dispatch.fitted_signals import FittedPart, Shelf, Shelved, save_fit
 from service.dispatch.warm_starts import OpenChains, WarmStarts
 from service.jobs.axes import Steps
 from service.jobs.stored_cells import stored_cells, stored_groups
 from service.jobs.to_core import algorithm_of, loss_of
-from service.models import models
+from service.models.models import load_stored_model
 from service.queue.leases import Claim
 from service.queue.previous_attempts import forget_progress
 from service.queue.reuse import computed, mark
@@ -31,7 +32,6 @@ from service.storage.statements import CHUNK
 from service.storage.tables import Dataset, Run
 from sysid.core.errors import SysidError
 from sysid.data.noise import Noise
-from sysid.data.records import Hold
 from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.models.model import Model
@@ -60,12 +60,10 @@ KEPT_SAMPLES = 1_000_000
 
 
 class DataKey(NamedTuple):
-    """Which datasets, which of their channels is which signal of the model, and how it is held."""
+    """Which datasets, and which of their channels are the signals of the model."""
 
     datasets: tuple[str, ...]
-    inputs: tuple[tuple[str, str], ...]
-    outputs: tuple[tuple[str, str], ...]
-    holds: tuple[tuple[str, Hold], ...]
+    channels: SignalChannels
 
 
 class JobRuns:
@@ -81,7 +79,6 @@ class JobRuns:
         self._store = store
         self._shelf = Shelf(store)
         self._problems: dict[str, ProblemSpec] = {}
-        self._models: dict[str, Model] = {}
         self._data: dict[str, DataKey] = {}
         self._read: OrderedDict[str, Records] = OrderedDict()
         self._warm = WarmStarts(database, claim.job)
@@ -147,7 +144,7 @@ class JobRuns:
             If its settings cannot be used, or its model is not there.
         """
         body = body_of(self._job.spec, cell)
-        model = self._model(body["model"])
+        model = load_stored_model(body["model"])
         validation = body["validation"] or {}
         kept = validation.get("datasets")
         problem = ProblemSpec(
@@ -189,16 +186,10 @@ class JobRuns:
         return sum(channel.known_samples for channel in channels)
 
     def _from_store(self, key: str) -> Records:
-        datasets, inputs, outputs, holds = self._data[key]
+        datasets, channels = self._data[key]
         try:
             rows = patiently(partial(self._datasets, datasets))
-            return tuple(
-                record
-                for row in rows
-                for record in recording_of(self._store, row.sha256)
-                .held(dict(holds))
-                .records(dict(inputs), dict(outputs), row.name)
-            )
+            return read_records(self._store, rows, channels)
         except (SysidError, ServiceError, StorageError) as error:
             raise RecordsUnavailable(str(error)) from error
 
@@ -218,7 +209,7 @@ class JobRuns:
         problem = self._problems.pop(run)
         records = {key: self.records(key) for key in problem.needs}
         estimation, validation = prepared(problem, records)
-        parts = [("estimation", estimation, found.simulated)]
+        parts: list[FittedPart] = [("estimation", estimation, found.simulated)]
         if validation is not None:
             parts.append(("validation", validation, found.simulated_validation))
         return save_fit(self._shelf, run, parts)
@@ -293,21 +284,9 @@ class JobRuns:
             known = computed(session, set(hashes.values()), self._job.project_id)
         return {run: known[one] for run, one in hashes.items() if one in known}
 
-    def _model(self, reference: Any) -> Model:
-        name = reference if isinstance(reference, str) else repr(reference)
-        if name not in self._models:
-            with self._database.read() as session:
-                self._models[name] = models.resolve(session, reference)[0]
-        return self._models[name]
-
     def _key(self, datasets: list[str], body: Mapping[str, Any], model: Model) -> str:
-        channels = body["channels"]
-        data = DataKey(
-            tuple(datasets),
-            tuple((one.name, channels.get(one.name, one.name)) for one in model.inputs),
-            tuple((one.name, channels.get(one.name, one.name)) for one in model.outputs),
-            tuple((channels.get(name, name), hold) for name, hold in body["hold"].items()),
-        )
+        channels = map_channels(model, body["channels"], body["hold"])
+        data = DataKey(tuple(datasets), channels)
         key = repr(data)
         self._data[key] = data
         return key

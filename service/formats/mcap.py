@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import BinaryIO, Literal, Protocol, cast
 
 import numpy as np
 
@@ -45,16 +45,28 @@ class Writable(Protocol):
 Target = str | os.PathLike[str] | Writable
 
 
+FitRole = Literal["estimation", "validation"]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedOutput:
-    """One output of one experiment: measured and simulated at the measured times (s)."""
+    """One output of one experiment: measured and simulated at the measured times (s).
 
-    experiment: str
+    `number` counts the experiments of a role from 1.
+    """
+
+    role: FitRole
+    number: int
     name: str
     unit: str
     times: FloatArray
     measured: FloatArray
     simulated: FloatArray
+
+    @property
+    def experiment(self) -> str:
+        """Name of the experiment, such as ``estimation 2``."""
+        return f"{self.role} {self.number}"
 
 
 def write_recording(
@@ -193,8 +205,17 @@ def read_fit(source: Readable, limits: Limits = DEFAULT_LIMITS) -> tuple[FittedO
             continue
         experiment, _, name = named.partition("/")
         measured = recording.channel(f"{named}/measured").values
+        role, _, number = experiment.partition(" ")
         fits.append(
-            FittedOutput(experiment, name, channel.unit, channel.times, measured, channel.values)
+            FittedOutput(
+                cast(FitRole, role),
+                int(number),
+                name,
+                channel.unit,
+                channel.times,
+                measured,
+                channel.values,
+            )
         )
     if not fits:
         raise InvalidUpload("the file holds no fitted signals")

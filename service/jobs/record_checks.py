@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.core.errors import FieldError, faults_of
+from service.datasets.signal_channels import map_channels
 from service.jobs.to_core import algorithm_of, loss_of
 from service.storage.tables import Dataset
 from sysid.core.errors import RecordTooShort, SysidError, nearest
@@ -50,9 +51,7 @@ def channel_faults(
 ) -> Iterator[FieldError]:
     """Signals of the model for which a dataset has no channel."""
     known = [channel["name"] for channel in dataset.channels]
-    inputs, outputs = signals_of(model)
-    for signal in (*inputs, *outputs):
-        channel = channels.get(signal, signal)
+    for signal, channel in map_channels(model, channels).by_signal.items():
         if channel not in known:
             yield FieldError(
                 f"/channels/{signal}" if signal in channels else "/channels",
@@ -63,8 +62,8 @@ def channel_faults(
 
 def given_both_ways(channels: Mapping[str, str], model: Model) -> Iterator[FieldError]:
     """Inputs to which the channel of an output is given."""
-    given = [{one: channels.get(one, one) for one in group} for group in signals_of(model)]
-    for signal, fault in both_ways(*given).items():
+    mapped = map_channels(model, channels)
+    for signal, fault in both_ways(dict(mapped.inputs), dict(mapped.outputs)).items():
         yield FieldError(f"/channels/{signal}" if signal in channels else "/channels", fault)
 
 
@@ -79,11 +78,10 @@ def unit_faults(
         Each with its place in the job body.
     """
     units = SignalUnits(model)
-    roles = [(signal, channels.get(signal, signal)) for group in signals_of(model)
-             for signal in group]  # fmt: skip
+    by_signal = map_channels(model, channels).by_signal
     for pointer, dataset in datasets:
         found = {channel["name"]: channel.get("unit") for channel in dataset.channels}
-        for signal, channel in roles:
+        for signal, channel in by_signal.items():
             fault = units.fault(signal, channel, found.get(channel), f"dataset {dataset.name!r}")
             if fault:
                 yield FieldError(pointer, fault)

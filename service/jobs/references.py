@@ -7,7 +7,8 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest
 from service.core.wire import Page
 from service.jobs.schemas import REFERENCE, RUN, AcceptedOut, ReferenceIn, ReferenceOut
-from service.models.models import model_in, says_the_same
+from service.jobs.stored_run import load_run
+from service.models.models import says_the_same
 from service.repositories.references import InUse, ReferenceRepository
 from service.repositories.runs import RunRepository
 from service.storage.errors import NotFound
@@ -90,9 +91,9 @@ def _check_model(session: Session, name: str, run: Run) -> None:
         latest = ReferenceRepository(session).latest(name)
     except NotFound:
         return
-    before = model_in(session, RunRepository(session).get(latest.run_id))
-    new = model_in(session, run)
-    if before is not None and new is not None and not says_the_same(before, new):
+    before = load_run(session, latest.run_id).requested_model
+    new = load_run(session, run.id).requested_model
+    if not says_the_same(before, new):
         raise InvalidRequest.at(
             "/run",
             f"run {run.id} is of the model {new.name!r}, and {name!r} stands for runs of another, "

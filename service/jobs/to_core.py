@@ -45,11 +45,6 @@ def loss_of(document: Mapping[str, Any]) -> Loss:
     return Loss(**document)
 
 
-def noise_model_of(document: Mapping[str, Any]) -> str:
-    """The noise model that the estimates of a result document are of, whatever was asked for."""
-    return "ar1" if any((document.get("correlation_times") or {}).values()) else "white"
-
-
 def _island(change: Mapping[str, Any]) -> IslandChange:
     mutation = change.get("mutation")
     return IslandChange(

@@ -8,7 +8,8 @@ from sqlalchemy.orm import Session
 from service.core.errors import FieldError, InvalidRequest
 from service.jobs import references
 from service.jobs.schemas import PREVIOUS, REFERENCE
-from service.models.models import model_in, says_the_same
+from service.jobs.stored_run import load_run
+from service.models.models import says_the_same
 from service.storage.tables import Run
 from sysid.models.model import Model
 
@@ -43,8 +44,8 @@ def resolved(session: Session, reference: str | None) -> str | None:
 
 
 def _of_other_equations(session: Session, run: Run, model: Model) -> str:
-    theirs = model_in(session, run)
-    if theirs is None or says_the_same(theirs, model):
+    theirs = load_run(session, run.id).requested_model
+    if says_the_same(theirs, model):
         return ""
     return (
         f"run {run.id} is of another model, {theirs.name!r}, whose equations are not those of "
@@ -60,10 +61,10 @@ def _of_another_model(session: Session, run: Run, model: Model) -> str:
         names = [name for name in names if name in known] or names[:1]
     missing = [name for name in names if name not in known]
     if missing:
-        theirs = model_in(session, run)
-        whose = "" if theirs is None else f" of {theirs.name!r}"
+        theirs = load_run(session, run.id).requested_model
         return (
-            f"run {run.id}{whose} is of another model: it has the parameters {_listed(known)}, "
+            f"run {run.id} of {theirs.name!r} is of another model: "
+            f"it has the parameters {_listed(known)}, "
             f"{model.name!r} has {_listed(names)}; need a run with {_listed(missing)}"
         )
     for one in model.parameters:

@@ -3,19 +3,18 @@
 Whether runs are of one model: their estimates then stand for the same quantities.
 """
 
+import json
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest, NotFound, faults_of
-from service.core.json_pointer import body_of
 from service.core.wire import FieldProblem, Page
 from service.models.schemas import CheckOut, ModelOut
-from service.repositories.jobs import JobRepository
 from service.repositories.models import ModelRepository
 from service.storage import errors as storage_errors
-from service.storage.tables import Job, Run
 from service.storage.tables import Model as StoredModel
 from sysid.core.errors import SysidError, UnknownModel, nearest
 from sysid.models.catalogue import load as library
@@ -101,18 +100,22 @@ def resolve(session: Session, reference: Any, *, is_new: bool = False) -> tuple[
     return parse_model(row.document, is_new=is_new), row.document
 
 
-def model_of_run(session: Session, run: Run, job: Job) -> Model:
-    """The model of one run, its terms as they were selected on the run's data.
-
-    Until a run with a term selection has its result, the model has all candidates, and a `rule`.
+def load_stored_model(reference: Any) -> Model:
+    """Load the model of a stored body: the name of a built-in one, or a document.
 
     Raises
     ------
     InvalidModel, UnknownModel
-        If the stored model cannot be read any more.
+        If the document has faults, or no built-in model has that name.
     """
-    model, _ = resolve(session, body_of(job.spec, run.cell)["model"])
-    return resolved(model, run.result)
+    if isinstance(reference, str):
+        return library.load_model(reference)
+    return _parse_stored(json.dumps(reference))
+
+
+@lru_cache(maxsize=256)
+def _parse_stored(document: str) -> Model:
+    return parse_model(json.loads(document))
 
 
 def resolved(model: Model, result: Mapping[str, Any] | None) -> Model:
@@ -163,15 +166,6 @@ def _told(model: Model, version: int, document: Mapping[str, Any] | None) -> Mod
 
 _BESIDES = ("name", "title", "description", "source", "parameters", "initial", "solver")
 """Of a model's document, what does not say what its parameters mean."""
-
-
-def model_in(session: Session, run: Run) -> Model | None:
-    """The model of a run; None if this version of the program cannot read it any more."""
-    job = JobRepository(session).get(run.job_id)
-    try:
-        return resolve(session, body_of(job.spec, run.cell)["model"])[0]
-    except SysidError:
-        return None
 
 
 def says_the_same(one: Model, other: Model) -> bool:

@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.core.json_pointer import body_of
 from service.datasets.recordings import recording_of
-from service.datasets.rms_unit import Body, model_of, unit_of
 from service.figures.data import (
     Experiment,
     Floats,
@@ -23,70 +21,54 @@ from service.figures.data import (
     SoughtParameter,
     Trace,
 )
-from service.formats.mcap import FittedOutput
-from service.jobs.job_parameters import parameters_of_job
-from service.repositories.datasets import DatasetRepository
+from service.formats.mcap import FitRole, FittedOutput
+from service.jobs.results import is_free
+from service.jobs.stored_run import StoredRun
 from service.repositories.runs import RunRepository
 from service.runs.fitted import fits_of
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
-from service.storage.tables import Dataset, Job, Run
+from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
-from sysid.data.records import Channel, Recording
-from sysid.models.model import Model
-from sysid.models.parameters import Parameter, Scale, override
-
-__all__ = ["Body", "evidence_of", "fitness_of", "model_of", "run_body", "sought_parameters",
-           "unit_of"]  # fmt: skip
+from sysid.data.records import Channel
+from sysid.models.parameters import Parameter, Scale
 
 
-def run_body(job: Job, run: Run) -> dict[str, Any]:
-    """The body of one run: the job's, with the values of the run's cell."""
-    return body_of(job.spec, run.cell)
-
-
-def fitness_of(body: Body) -> str:
+def fitness_of(body: Mapping[str, Any]) -> str:
     """What the search minimises, as figures of it call it: with soft-l1 it is not J."""
     robust = (body.get("loss") or {}).get("kind") == "soft-l1"
     return "soft-l1 loss, as RMS" if robust else "RMS"
 
 
-def sought_parameters(session: Session, run: Run, body: Body) -> list[SoughtParameter]:
+def sought_parameters(session: Session, stored: StoredRun) -> list[SoughtParameter]:
     """The free parameters in the order of the history's columns.
 
     The result names them once the run has ended; until then the model and the request do.
     """
-    model = model_of(body)
-    everything = parameters_of_job(session, model, body) if model else ()
-    known = override(everything, body.get("parameters", {}))
-    result = (run.result or {}).get("parameters")
-    if result:
+    known = stored.parameters(session)
+    if stored.estimates:
         scales = {one.name: one.scale for one in known}
-        return [
-            _estimated(one, scales) for one in result if one.get("status") not in ("fixed", "tied")
-        ]
-    if model is not None and model.rule is not None:
+        return [_estimated(one, scales) for one in stored.estimates if is_free(one)]
+    if stored.model.rule is not None:
         return []  # which of the candidates are sought is told with the result
     return [_sought(one) for one in known if one.is_free]
 
 
-def evidence_of(session: Session, job: Job, run: Run) -> RunEvidence:
+def evidence_of(session: Session, stored: StoredRun) -> RunEvidence:
     """All that is known of a run's search and result."""
-    body = run_body(job, run)
+    job, run, body = stored.job, stored.run, stored.body
     runs = RunRepository(session)
     history = _islands(runs.history(run.id))
-    algorithm = body.get("algorithm", {})
-    result = run.result or {}
     return RunEvidence(
-        id=run.id, unit=unit_of(session, body), fitness=fitness_of(body),
+        id=run.id, unit=stored.rms_unit(session), fitness=fitness_of(body),
         generations=run.generations or (job.generation if job.n_runs == 1 else 0),
         evaluations=run.evaluations, history=history,
-        parameters=_covering(sought_parameters(session, run, body), history),
-        epoch=int((algorithm.get("migration") or {}).get("every", 0)),
+        parameters=_covering(sought_parameters(session, stored), history),
+        epoch=int((body["algorithm"].get("migration") or {}).get("every", 0)),
         migrations=sorted({one.epoch for one in runs.migrations(run.id)}),
         islands=[(_or(one.get("champion_rms"), inf), one.get("refined_rms"))
-                 for one in result.get("islands", ())],
-        correlation=_correlation(result.get("correlation")),
+                 for one in stored.result.get("islands", ())],
+        correlation=_correlation(stored.result.get("correlation")),
     )  # fmt: skip
 
 
@@ -150,44 +132,35 @@ def traces_of(store: ObjectStore, dataset: Dataset) -> list[Trace]:
     return [_trace(channel) for channel in recording_of(store, dataset.sha256).channels]
 
 
-def experiments_of(session: Session, store: ObjectStore, job: Job, run: Run) -> list[Experiment]:
+def experiments_of(session: Session, store: ObjectStore, stored: StoredRun) -> list[Experiment]:
     """What a run was fitted to, record by record; empty as long as nothing is stored."""
-    if run.signals_sha256 is None:
+    if stored.run.signals_sha256 is None:
         return []
-    body = run_body(job, run)
-    fitted = _by_name(fits_of(store, run))
-    kept = body.get("validation") or {}
-    inputs = list(_inputs(session, store, body, body["datasets"]))
+    fitted = _by_experiment(fits_of(store, stored.run))
+    estimation, validation = fitted["estimation"], fitted["validation"]
+    kept = stored.body["validation"] or {}
+    inputs = list(_inputs(session, store, stored, stored.body["datasets"]))
     found = [
         Experiment(f"estimation {number}", _outputs(parts), _at(inputs, number))
-        for number, parts in _of_role(fitted, "estimation")
+        for number, parts in estimation.items()
     ]
-    validation = _of_role(fitted, "validation")
     if kept.get("fraction") is not None:
-        return [_joined(one, dict(validation).get(n, ())) for n, one in enumerate(found, 1)]
-    other = list(_inputs(session, store, body, kept.get("datasets") or []))
+        return [_joined(one, validation.get(n, ())) for n, one in enumerate(found, 1)]
+    other = list(_inputs(session, store, stored, kept.get("datasets") or []))
     return found + [
         Experiment(f"validation {number}", _outputs(parts), _at(other, number), -inf)
-        for number, parts in validation
+        for number, parts in validation.items()
     ]
 
 
-def _by_name(fits: Iterable[FittedOutput]) -> dict[str, list[FittedOutput]]:
-    found: dict[str, list[FittedOutput]] = {}
-    for one in fits:
-        found.setdefault(one.experiment, []).append(one)
-    return found
-
-
-def _of_role(
-    fitted: Mapping[str, Sequence[FittedOutput]], role: str
-) -> list[tuple[int, Sequence[FittedOutput]]]:
-    """Number (from 1) and outputs of the experiments in one role."""
-    named = [(name.partition(" "), parts) for name, parts in fitted.items()]
-    return sorted(
-        ((int(number), parts) for (kind, _, number), parts in named if kind == role),
-        key=lambda one: one[0],
-    )
+def _by_experiment(
+    fits: Iterable[FittedOutput],
+) -> dict[FitRole, dict[int, Sequence[FittedOutput]]]:
+    """Of each role, the outputs of its experiments by number, in order."""
+    found: dict[FitRole, dict[int, list[FittedOutput]]] = {"estimation": {}, "validation": {}}
+    for fit in fits:
+        found[fit.role].setdefault(fit.number, []).append(fit)
+    return {role: dict(sorted(numbered.items())) for role, numbered in found.items()}
 
 
 def _outputs(parts: Iterable[FittedOutput]) -> tuple[OutputTraces, ...]:
@@ -224,27 +197,15 @@ def _at(inputs: Sequence[tuple[Trace, ...]], number: int) -> tuple[Trace, ...]:
 
 
 def _inputs(
-    session: Session, store: ObjectStore, body: Mapping[str, Any], datasets: Sequence[str]
+    session: Session, store: ObjectStore, stored: StoredRun, datasets: Sequence[str]
 ) -> Iterator[tuple[Trace, ...]]:
     """Inputs of every record; a dataset that is gone takes only its own inputs off the plot."""
-    model = model_of(body)
-    if model is None:
-        return
     for name in datasets:
         try:
-            dataset = DatasetRepository(session).get(name)
-            yield from _records(recording_of(store, dataset.sha256), model, body["channels"])
+            for record in stored.read_datasets(session, store, [name]):
+                yield tuple(_trace(channel) for channel in record.inputs)
         except (StorageError, SysidError):
             yield ()
-
-
-def _records(
-    recording: Recording, model: Model, channels: Mapping[str, str]
-) -> Iterator[tuple[Trace, ...]]:
-    signals = [[one.name for one in kind] for kind in (model.inputs, model.outputs)]
-    inputs, outputs = ({name: channels.get(name, name) for name in kind} for kind in signals)
-    for record in recording.records(inputs, outputs):
-        yield tuple(_trace(channel) for channel in record.inputs)
 
 
 def _trace(channel: Channel) -> Trace:

@@ -13,12 +13,12 @@ from service.figures.noise import noise_keys, noise_sweep
 from service.figures.plotly import Abscissa, Figure
 from service.figures.theme import Theme
 from service.figures.trend import trend_figure
+from service.jobs.stored_run import load_run
 from service.pages.diagnostics import residual_figure
 from service.pages.figure_data import evidence_of, experiments_of, traces_of
 from service.pages.trend import trend_of
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
 from service.runs.residuals import residuals_of
 from service.storage.objects import ObjectStore
 from service.sweeps.summary import summary
@@ -50,10 +50,9 @@ def run_figure(
     NotFound
         If the run, or the experiment that was asked for, is not there.
     """
-    run = RunRepository(session).get(run_id)
-    job = JobRepository(session).get(run.job_id)
+    stored = load_run(session, run_id)
     if name == "response":
-        experiments = experiments_of(session, store, job, run)
+        experiments = experiments_of(session, store, stored)
         if not experiments:
             return {"data": [], "layout": figures.layout(200)}
         _check_experiment(choice.experiment, len(experiments))
@@ -61,12 +60,12 @@ def run_figure(
         figure["layout"]["meta"]["experiments"] = [one.name for one in experiments]
         return figure
     if name == "residuals":
-        tested = residuals_of(session, store, job, run)
+        tested = residuals_of(session, store, stored)
         if tested is None:
             return {"data": [], "layout": figures.layout(200)}
         _check_experiment(choice.experiment, len(tested.names))
         return residual_figure(tested, choice.experiment, min(choice.columns, 2))
-    evidence = evidence_of(session, job, run)
+    evidence = evidence_of(session, stored)
     if name == "history":
         return figures.history(evidence, choice.abscissa)
     if name == "convergence":

@@ -12,19 +12,20 @@ from urllib.parse import urlencode
 import yaml
 from sqlalchemy.orm import Session
 
-from service.datasets.rms_unit import model_of, unit_of
+from service.datasets.rms_unit import unit_of
 from service.figures import formats
 from service.figures import signals as figures_signals
 from service.figures.noise import noise_height, noise_keys
 from service.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
 from service.figures.residuals import residuals_height
+from service.jobs.stored_run import StoredRun
 from service.models import models
 from service.models.schemas import ModelOut
 from service.pages.api_reference import operations
 from service.pages.cell_grid import grid_of
 from service.pages.dataset_links import dataset_links, unnamed
 from service.pages.diagnostics import findings_of
-from service.pages.figure_data import run_body, sought_parameters
+from service.pages.figure_data import sought_parameters
 from service.pages.render import render
 from service.pages.trend import TrendView, trend_of, trend_view
 from service.pages.views import JobView, RunView, cell_text, event_view, job_view, run_view
@@ -87,14 +88,16 @@ def job_page(
         job.id, cursor=cursor, limit=RUNS_PER_PAGE if is_listed else 1, cell=chosen_cell
     )
     chosen = runs.get(run_id) if run_id else _best(runs, job)
+    stored = StoredRun.from_rows(job, chosen) if chosen else None
     view = job_view(job, unit_of(session, job.spec), datetime.now(UTC))
     return render(
-        "job.html", job=view, runs=[run_summary(session, job, run) for run in page.items],
-        run=run_in_full(session, job, chosen) if chosen else None,
+        "job.html", job=view,
+        runs=[run_summary(session, StoredRun.from_rows(job, run)) for run in page.items],
+        run=run_in_full(session, stored) if stored else None,
         next_runs=_query({"cell": cell, "cursor": page.next}) if page.next else "",
         grid=grid, is_listed=is_listed,
         cell_title=cell_text(chosen_cell, {}),
-        noise_height=_noise_height(session, job, chosen), trend=_trend(session, job),
+        noise_height=_noise_height(session, job, stored), trend=_trend(session, job),
         comparable=_comparable(page.items),
         datasets=dataset_links(session, job), more_datasets=unnamed(job),
         commands=_commands(view, base_url),
@@ -166,35 +169,30 @@ def _as_yaml(document: dict[str, Any] | None) -> str:
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
 
 
-def run_summary(session: Session, job: Job, run: Run) -> RunView:
+def run_summary(session: Session, stored: StoredRun) -> RunView:
     """A run as a line of a table."""
-    return run_view(run, unit_of(session, run_body(job, run)), {})
+    return run_view(stored.run, stored.rms_unit(session), {})
 
 
-def run_in_full(session: Session, job: Job, run: Run) -> RunView:
+def run_in_full(session: Session, stored: StoredRun) -> RunView:
     """A run with what its plots need to be laid out before they are drawn."""
-    body = run_body(job, run)
-    sought = sought_parameters(session, run, body)
-    result = run.result or {}
+    run, result, model = stored.run, stored.result, stored.model
+    sought = sought_parameters(session, stored)
+    counts = len(model.outputs), len(model.inputs)
     # What comes with the end of the run lies below the live plots and takes its room then.
     heights = {
-        "response": figures_signals.response_height(*_counts(body)) if run.signals_sha256 else 0,
+        "response": figures_signals.response_height(*counts) if run.signals_sha256 else 0,
         "convergence": convergence_height(len(sought), columns=3),
         "correlation": correlation_height(len(sought)) if result.get("correlation") else 0,
         "residuals": _residuals_height(result) if run.signals_sha256 else 0,
         "waterfall": WATERFALL_HEIGHT if result.get("islands") else 0,
     }
-    return run_view(run, unit_of(session, body), heights)
+    return run_view(run, stored.rms_unit(session), heights)
 
 
 def _residuals_height(result: Mapping[str, Any]) -> int:
     n_figures = findings_of(result).n_figures
     return residuals_height(n_figures) if n_figures else 0
-
-
-def _counts(body: dict[str, Any]) -> tuple[int, int]:
-    model = model_of(body)
-    return (len(model.outputs), len(model.inputs)) if model else (1, 1)
 
 
 def _comparable(runs: Sequence[Run]) -> str:
@@ -207,12 +205,11 @@ def _comparable(runs: Sequence[Run]) -> str:
     return urlencode([("run", one) for one in chosen]) if len(chosen) > 1 else ""
 
 
-def _noise_height(session: Session, job: Job, run: Run | None) -> int:
+def _noise_height(session: Session, job: Job, stored: StoredRun | None) -> int:
     """Height (px) of the figure of a sweep over σ; 0 where it is none."""
     if job.n_runs == 1 or noise_keys(job.spec.get("sweep", {}).get("axes", [])) is None:
         return 0
-    body = job.spec if run is None else run_body(job, run)
-    sought = sought_parameters(session, run, body) if run is not None else []
+    sought = sought_parameters(session, stored) if stored is not None else []
     return noise_height(1 + len(sought), columns=2)
 
 

@@ -23,6 +23,7 @@ from service.figures.embed import as_json, bare, templates
 from service.figures.plotly import Figure
 from service.figures.svg import drawing, is_drawable
 from service.figures.trend import trend_figure
+from service.jobs.stored_run import StoredRun
 from service.pages import render as assets
 from service.pages.cell_grid import LISTED, GridView, grid_of
 from service.pages.dataset_links import dataset_links, unnamed
@@ -73,7 +74,7 @@ def large_report(
     grid = grid_of(session, job, {})
     shown = [("The best run", best[:1]), ("The worst run that succeeded", worst[:1])]
     summaries = {
-        name: [run_summary(session, job, run) for run in found]
+        name: [run_summary(session, StoredRun.from_rows(job, run)) for run in found]
         for name, found in (("best", best), ("worst", worst), ("failed", failed))
     }
     return render(
@@ -82,7 +83,10 @@ def large_report(
         hidden_rows=max(len(grid.rows) - ROWS_SHOWN, 0) if grid else 0,
         trend=None if trend is None else trend_view(trend),
         drawings=_overview(session, job, trend),
-        sections=[_section(session, store, job, why, run) for why, runs in shown for run in runs],
+        sections=[
+            _section(session, store, StoredRun.from_rows(job, run), why)
+            for why, runs in shown for run in runs
+        ],
         datasets=dataset_links(session, job), more_datasets=unnamed(job),
         address=f"{base_url.rstrip('/')}/v1/jobs/{job.id}", policy=POLICY, style=style(),
     )  # fmt: skip
@@ -116,13 +120,13 @@ def _overview(session: Session, job: Job, trend: TrendOut | None) -> list[tuple[
     return _drawn(found)
 
 
-def _section(session: Session, store: ObjectStore, job: Job, why: str, run: Run) -> _Section:
-    evidence = evidence_of(session, job, run)
+def _section(session: Session, store: ObjectStore, stored: StoredRun, why: str) -> _Section:
+    evidence = evidence_of(session, stored)
     made = [("Progress of every island", figures.history(evidence))]
-    experiments = experiments_of(session, store, job, run)[:1]
+    experiments = experiments_of(session, store, stored)[:1]
     made += [("Measured against identified", figures_signals.response(one)) for one in experiments]
     made.append(("Convergence of the parameters", figures.convergence(evidence)))
-    return _Section(why, run_in_full(session, job, run), _drawn(made))
+    return _Section(why, run_in_full(session, stored), _drawn(made))
 
 
 def _drawn(made: list[tuple[str, Figure]]) -> list[tuple[str, Markup]]:
@@ -147,12 +151,14 @@ def job_report(session: Session, store: ObjectStore, job_id: str, base_url: str 
     is_in_order = view.is_batch or len(runs) <= RUNS_IN_FULL
     order: RunOrder = "number" if is_in_order else "best_rms"
     chosen = RunRepository(session).page(job.id, limit=RUNS_IN_FULL, order=order).items
+    full = [StoredRun.from_rows(job, run) for run in chosen]
     return render(
         "report.html", job=view, made=made,
-        runs=[run_summary(session, job, run) for run in runs], overview=_full_overview(session,
-        job), trend=None if batch is None else trend_view(batch), trend_figure=None if batch is None
-        else as_json(bare(trend_figure(batch))), sections=[
-            (run_in_full(session, job, run), _figures(session, store, job, run)) for run in chosen
+        runs=[run_summary(session, StoredRun.from_rows(job, run)) for run in runs],
+        overview=_full_overview(session, job), trend=None if batch is None else trend_view(batch),
+        trend_figure=None if batch is None else as_json(bare(trend_figure(batch))),
+        sections=[
+            (run_in_full(session, stored), _figures(session, store, stored)) for stored in full
         ],
         datasets=dataset_links(session, job), more_datasets=unnamed(job),
         policy=policy(), style=style(),
@@ -179,15 +185,15 @@ def _full_overview(session: Session, job: Job) -> list[tuple[str, int, Markup]]:
 
 
 def _figures(
-    session: Session, store: ObjectStore, job: Job, run: Run
+    session: Session, store: ObjectStore, stored: StoredRun
 ) -> list[tuple[str, int, Markup]]:
     """Title, height (px) and Plotly JSON of a run's figures, those with something to show."""
-    evidence = evidence_of(session, job, run)
+    evidence = evidence_of(session, stored)
     made = [("Progress of every island", figures.history(evidence))]
-    for experiment in experiments_of(session, store, job, run)[:EXPERIMENTS_SHOWN]:
+    for experiment in experiments_of(session, store, stored)[:EXPERIMENTS_SHOWN]:
         title = f"Measured against identified: {experiment.name}"
         made.append((title, figures_signals.response(experiment)))
-    tested = residuals_of(session, store, job, run)
+    tested = residuals_of(session, store, stored)
     if tested is not None:
         made += [
             (f"Correlation of the residuals: {name}", residual_figure(tested, number))

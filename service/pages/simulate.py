@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any
 from urllib.parse import urlencode
 
@@ -13,7 +12,6 @@ from sqlalchemy.orm import Session
 from service.control import simulate as run_simulations
 from service.control.schemas import RunSimulateIn, RunSimulationOut, StepMetricsOut
 from service.core.errors import FieldError, InvalidRequest, ServiceError, Unavailable, faults_of
-from service.core.json_pointer import body_of
 from service.core.validation import explained
 from service.figures.data import Experiment, OutputTraces, Trace
 from service.figures.embed import as_json, bare, templates
@@ -22,8 +20,7 @@ from service.figures.plotly import Figure, as_csv
 from service.figures.signals import response
 from service.figures.simulation import in_units, simulation
 from service.figures.theme import MAX_POINTS
-from service.jobs.record_checks import signals_of
-from service.models.models import model_of_run
+from service.jobs.stored_run import StoredRun, load_run
 from service.pages.render import render
 from service.pages.simulate_form import (
     KINDS,
@@ -37,15 +34,13 @@ from service.pages.simulate_form import (
     label_of,
 )
 from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
 from service.runs import free_run as free_runs
 from service.runs.free_run import FreeRun
 from service.runs.schemas import FreeRunIn
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from service.storage.tables import Dataset, Run
+from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
 from sysid.core.units import multiplied
 from sysid.data.records import Record
@@ -148,20 +143,17 @@ def simulate_page(
 
 
 def _known(session: Session, run_id: str, query: Mapping[str, str]) -> _Known:
-    run = RunRepository(session).get(run_id)
-    job = JobRepository(session).get(run.job_id)
-    request = body_of(job.spec, run.cell)
-    model = model_of_run(session, run, job)
+    stored = load_run(session, run_id)
+    run, job, fitted_to = stored.run, stored.job, stored.body["datasets"][0]
     datasets = list(DatasetRepository(session).page(limit=DATASETS_LISTED).items)
-    for wanted in (query.get("dataset"), request["datasets"][0]):
+    for wanted in (query.get("dataset"), fitted_to):
         if wanted and wanted not in [one.id for one in datasets]:
             datasets += _one(session, wanted)
-    fitted = next((one for one in datasets if one.id == request["datasets"][0]), None)
+    fitted = next((one for one in datasets if one.id == fitted_to), None)
     return _Known(
-        run=run.id, title=f"run {run.number + 1}", job=job.id, job_name=job.name, model=model,
-        datasets=datasets, has_estimates=bool((run.result or {}).get("parameters")),
-        units=_units(model, request, fitted),
-        defaults=_defaults(model, request, fitted) | _step(model, run),
+        run=run.id, title=f"run {run.number + 1}", job=job.id, job_name=job.name,
+        model=stored.model, datasets=datasets, has_estimates=bool(stored.estimates),
+        units=_units(stored, fitted), defaults=_defaults(stored, fitted) | _step(stored),
     )  # fmt: skip
 
 
@@ -172,27 +164,27 @@ def _one(session: Session, dataset: str) -> list[Dataset]:
         return []
 
 
-def _units(model: Model, request: Mapping[str, Any], fitted: Dataset | None) -> dict[str, str]:
+def _units(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]:
     """Unit of every signal: the model's, or where it leaves it open that of the recording."""
     recorded = {one["name"]: str(one["unit"]) for one in (fitted.channels if fitted else [])}
+    model, by_signal = stored.model, stored.channels.by_signal
     own = {one.name: one.unit for one in model.inputs} | {o.name: o.unit for o in model.outputs}
-    channels = request.get("channels", {})
     return {
-        name: recorded.get(channels.get(name, name), unit) if unit == "1" else unit
+        name: recorded.get(by_signal[name], unit) if unit == "1" else unit
         for name, unit in own.items()
     }
 
 
-def _defaults(model: Model, request: Mapping[str, Any], fitted: Dataset | None) -> dict[str, str]:
+def _defaults(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]:
+    model = stored.model
     period = (fitted.sample_time or _mean_period(fitted)) if fitted else None
     period = period or model.solver.step or 0.01
     duration = min(fitted.duration if fitted else 10.0, MOST_DEFAULT_SAMPLES * period)
-    channels = request.get("channels", {})
     return {
         "input": model.inputs[0].name if model.inputs else "", "output": model.outputs[0].name,
         "gain": "1", "amplitude": "1", "time": "0", "offset": "0", "skip": "0",
         "duration": f"{duration:.6g}", "sample_time": f"{period:.6g}",
-        **{f"channel.{name}": channels.get(name, name) for name in chain(*signals_of(model))},
+        **{f"channel.{name}": one for name, one in stored.channels.by_signal.items()},
     }  # fmt: skip
 
 
@@ -203,13 +195,13 @@ def _mean_period(irregular: Dataset) -> float | None:
     return float(f"{irregular.duration / (irregular.n_samples - 1):.2g}")
 
 
-def _step(model: Model, run: Run) -> dict[str, str]:
+def _step(stored: StoredRun) -> dict[str, str]:
     """A step of the reference within what was measured: half the span of the first output.
 
     A step from 0 to 1 would lie outside it for most plants, with an output's offset or in Pa.
     """
-    told = ((run.result or {}).get("agreement") or {}).get("estimation", [])
-    of_output = (one for one in told if one["output"] == model.outputs[0].name)
+    told = (stored.result.get("agreement") or {}).get("estimation", [])
+    of_output = (one for one in told if one["output"] == stored.model.outputs[0].name)
     spans = [one["span"] for one in of_output if None not in one["span"]]
     if not spans:
         return {}

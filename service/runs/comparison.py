@@ -2,20 +2,15 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
-from service.core.json_pointer import body_of
-from service.jobs.to_core import noise_model_of
-from service.models.models import model_of_run
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
+from service.jobs.results import is_free, read_noise_model
+from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import ComparedParameter, ComparedRun, ComparedValue, ComparisonOut
 from service.storage.errors import NotFound
-from service.storage.tables import Job, Run
-from sysid.models.model import Model
 
 Document = Mapping[str, Any]
 
@@ -26,17 +21,6 @@ _DATA = {
     "skip": "another number of skipped samples",
     "noise": "other added noise",
 }
-
-
-class _Candidate(NamedTuple):
-    """A run that is compared, and what its result is made from."""
-
-    run: Run
-    job: Job
-    body: Document
-    result: Document
-    model: Model
-    name: str
 
 
 def compare(session: Session, runs: Sequence[str]) -> ComparisonOut:
@@ -60,7 +44,7 @@ def compare(session: Session, runs: Sequence[str]) -> ComparisonOut:
     )  # fmt: skip
 
 
-def _candidates(session: Session, runs: Sequence[str]) -> list[_Candidate]:
+def _candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
     found, faults = [], []
     for number, name in enumerate(runs):
         pointer = f"/runs/{number}"
@@ -68,42 +52,34 @@ def _candidates(session: Session, runs: Sequence[str]) -> list[_Candidate]:
             faults.append(FieldError(pointer, f"run {name!r} is named twice"))
             continue
         try:
-            run = RunRepository(session).get(name)
+            stored = load_run(session, name)
         except NotFound as error:
             faults.append(FieldError(pointer, str(error)))
             continue
-        if run.result is None:
-            detail = f"run {name!r} is {run.state.value}; only runs with a result are compared"
+        if stored.run.result is None:
+            state = stored.run.state.value
+            detail = f"run {name!r} is {state}; only runs with a result are compared"
             faults.append(FieldError(pointer, detail))
             continue
-        job = JobRepository(session).get(run.job_id)
-        body = body_of(job.spec, run.cell)
-        found.append(
-            _Candidate(run, job, body, run.result, model_of_run(session, run, job), _name(body))
-        )
+        found.append(stored)
     if faults:
         raise InvalidRequest(faults)
     return found
 
 
-def _name(body: Document) -> str:
-    model = body["model"]
-    return model if isinstance(model, str) else str(model.get("name", "own equations"))
-
-
-def _data_of(one: _Candidate) -> dict[str, Any]:
+def _data_of(one: StoredRun) -> dict[str, Any]:
     """What must be the same: else the RMS of two runs say nothing about their models."""
-    channels = one.body["channels"]
+    body = one.body
     return {
-        "datasets": one.body["datasets"],
-        "outputs": sorted(channels.get(output.name, output.name) for output in one.model.outputs),
-        "validation": {k: v for k, v in (one.body["validation"] or {}).items() if v is not None},
-        "skip": one.body["skip"],
-        "noise": one.body["noise"],
+        "datasets": body["datasets"],
+        "outputs": sorted(channel for _, channel in one.channels.outputs),
+        "validation": {k: v for k, v in (body["validation"] or {}).items() if v is not None},
+        "skip": body["skip"],
+        "noise": body["noise"],
     }
 
 
-def _check_same_data(candidates: Sequence[_Candidate]) -> None:
+def _check_same_data(candidates: Sequence[StoredRun]) -> None:
     first = _data_of(candidates[0])
     faults = []
     for number, one in enumerate(candidates[1:], 1):
@@ -119,26 +95,22 @@ def _check_same_data(candidates: Sequence[_Candidate]) -> None:
         raise InvalidRequest(faults)
 
 
-def _titles(ordered: Sequence[_Candidate]) -> dict[str, str]:
+def _titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
     """Name of each run: its model, and the run's number where two have the same model."""
-    names = [one.name for one in ordered]
+    names = [one.model.name for one in ordered]
     return {
-        one.run.id: one.name if names.count(one.name) == 1 else f"{one.name}, run {_number(one)}"
-        for one in ordered
+        one.run.id: name if names.count(name) == 1 else f"{name}, run {one.run.number + 1}"
+        for one, name in zip(ordered, names, strict=True)
     }
 
 
-def _number(one: _Candidate) -> int:
-    return int(one.run.number) + 1
-
-
-def _row(one: _Candidate, title: str) -> ComparedRun:
+def _row(one: StoredRun, title: str) -> ComparedRun:
     result = one.result
     criteria, tests = result.get("criteria") or {}, result.get("residual_tests") or {}
     fit = result.get("fit_percent") or {}
     return ComparedRun(
-        run=one.run.id, job=one.job.id, number=one.run.number, model=one.name, title=title,
-        cell=one.run.cell, parameters=criteria.get("parameters", _count_free(result)),
+        run=one.run.id, job=one.job.id, number=one.run.number, model=one.model.name,
+        title=title, cell=one.run.cell, parameters=criteria.get("parameters", _count_free(result)),
         samples=criteria.get("samples", _count_samples(result)), rms=result.get("rms"),
         rms_validation=result.get("rms_validation"), fit_estimation=fit.get("estimation"),
         fit_validation=fit.get("validation"), aic=criteria.get("aic"), bic=criteria.get("bic"),
@@ -148,7 +120,7 @@ def _row(one: _Candidate, title: str) -> ComparedRun:
 
 
 def _count_free(result: Document) -> int:
-    return sum(one["status"] not in ("fixed", "tied") for one in result["parameters"])
+    return sum(is_free(one) for one in result["parameters"])
 
 
 def _count_samples(result: Document) -> int:
@@ -157,10 +129,10 @@ def _count_samples(result: Document) -> int:
 
 
 def _parameters(
-    ordered: Sequence[_Candidate], titles: Mapping[str, str]
+    ordered: Sequence[StoredRun], titles: Mapping[str, str]
 ) -> Iterator[ComparedParameter]:
     """Parameters that have the same name and unit in two runs or more."""
-    kept: dict[tuple[str, str], list[tuple[_Candidate, Document]]] = {}
+    kept: dict[tuple[str, str], list[tuple[StoredRun, Document]]] = {}
     for one in ordered:
         for estimate in one.result["parameters"]:
             kept.setdefault((estimate["name"], estimate["unit"]), []).append((one, estimate))
@@ -171,7 +143,7 @@ def _parameters(
         note = ""
         if pair is not None:
             note = _note(name, unit, [(titles[found[i][0].run.id], found[i][1]) for i in pair],
-                         same_model=len({one.name for one, _ in found}) == 1)  # fmt: skip
+                         same_model=len({one.model.name for one, _ in found}) == 1)  # fmt: skip
         known = sum(_has_ends(estimate["interval95"]) for _, estimate in found)
         yield ComparedParameter(
             name=name, unit=unit, differs=None if known < 2 else pair is not None, note=note,
@@ -218,7 +190,7 @@ def _plus_minus(estimate: Document) -> str:
     return f"{value:.{decimals}f} ± {stderr:.{decimals}f}"
 
 
-def _unit(ordered: Sequence[_Candidate]) -> str:
+def _unit(ordered: Sequence[StoredRun]) -> str:
     """Unit of the RMS of all, if it is the same: several outputs are weighted together."""
     units = set()
     for one in ordered:
@@ -228,14 +200,14 @@ def _unit(ordered: Sequence[_Candidate]) -> str:
     return units.pop() if len(units) == 1 else "1"
 
 
-def _notes(ordered: Sequence[_Candidate]) -> Iterator[str]:
+def _notes(ordered: Sequence[StoredRun]) -> Iterator[str]:
     """What keeps numbers of the table from being compared."""
     if len({one.body["prediction"] for one in ordered}) > 1:
         yield (
             "some runs predict one step ahead and some simulate: "
             "their RMS, fits and criteria do not compare"
         )
-    losses = ({**one.body["loss"], "noise_model": noise_model_of(one.result)} for one in ordered)
+    losses = ({**one.body["loss"], "noise_model": read_noise_model(one.result)} for one in ordered)
     if len({repr(sorted(loss.items())) for loss in losses}) > 1:
         yield "the runs were fitted with different losses, which favour each its own measure"
     counts = {(one.result.get("criteria") or {}).get("samples") for one in ordered}

@@ -8,19 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.core.errors import Conflict, InvalidRequest
-from service.core.json_pointer import body_of
-from service.models.models import model_of_run
+from service.core.errors import InvalidRequest
+from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
 from service.storage.errors import StorageError
-from service.storage.tables import Dataset, Job, Run
+from service.storage.tables import Dataset
 from sysid.control.linear_form import Covariance, Identified, NotLinear, Value
 from sysid.core.errors import InvalidSettings
 from sysid.data.records import Hold
 from sysid.export.export import Format, written
-from sysid.models.model import Model
 
 Body = Mapping[str, Any]
 
@@ -52,31 +48,26 @@ def exported(session: Session, run_id: str, format: Format, pade_order: int) -> 
     InvalidRequest
         If the model cannot be written in that format; the reason names the term in the way.
     """
-    run = RunRepository(session).get(run_id)
-    if run.result is None or not run.result.get("parameters"):
-        raise Conflict(f"run {run_id} is {run.state.value} and has no estimates to export")
-    job = JobRepository(session).get(run.job_id)
+    stored = load_estimated_run(session, run_id, "export")
     try:
-        text = written(_identified(session, run, job), format, pade_order)
+        text = written(_identified(session, stored), format, pade_order)
     except NotLinear as error:
         raise InvalidRequest.at("?format", f"{format!r} is not possible: {error}") from error
     except InvalidSettings as error:
         name = error.pointer.removeprefix("/")
         raise InvalidRequest.at(f"?{name}" if name == "pade_order" else "", str(error)) from error
     media_type, ending = _KINDS[format]
-    stem = re.sub(r"[^A-Za-z0-9]+", "_", model_of_run(session, run, job).name)
+    stem = re.sub(r"[^A-Za-z0-9]+", "_", stored.model.name)
     return Exported(text, media_type, stem + ending)
 
 
-def _identified(session: Session, run: Run, job: Job) -> Identified:
-    model = model_of_run(session, run, job)
-    body = body_of(job.spec, run.cell)
-    rows = _datasets(session, body)
-    values = tuple(_values(run.result or {}))
+def _identified(session: Session, stored: StoredRun) -> Identified:
+    rows = _datasets(session, stored.body)
+    values = tuple(_values(stored))
     return Identified(
-        model, values, _covariance(run.result or {}, values), _period(model, body, rows),
-        {one.name: _hold(one.name, body, rows) for one in model.inputs}, version("lagid"),
-        _provenance(run, job, body, rows),
+        stored.model, values, _covariance(stored.result, values), _period(stored, rows),
+        {one.name: _hold(one.name, stored, rows) for one in stored.model.inputs},
+        version("lagid"), _provenance(stored, rows),
     )  # fmt: skip
 
 
@@ -91,8 +82,8 @@ def _datasets(session: Session, body: Body) -> list[Dataset]:
     return found
 
 
-def _values(result: Body) -> Iterator[Value]:
-    for one in result["parameters"]:
+def _values(stored: StoredRun) -> Iterator[Value]:
+    for one in stored.estimates:
         yield Value(one["name"], one["value"], one["unit"], one["stderr"], one["status"])
 
 
@@ -107,31 +98,32 @@ def _covariance(result: Body, values: tuple[Value, ...]) -> Covariance | None:
     return Covariance(tuple(found["names"]), matrix * np.outer(deviations, deviations))
 
 
-def _channels(name: str, body: Body, rows: list[Dataset]) -> Iterator[Mapping[str, Any]]:
+def _channels(name: str, stored: StoredRun, rows: list[Dataset]) -> Iterator[Mapping[str, Any]]:
     """What the datasets say of the recorded channels of a signal of the model."""
-    recorded = body["channels"].get(name, name)
+    recorded = stored.channels.by_signal[name]
     for row in rows:
         yield from (one for one in row.channels if one["name"] == recorded)
 
 
-def _period(model: Model, body: Body, rows: list[Dataset]) -> float | None:
+def _period(stored: StoredRun, rows: list[Dataset]) -> float | None:
     """The sampling period that all measured outputs have; None if they have no common one."""
     periods = [
-        one["sample_time"] for output in model.outputs
-        for one in _channels(output.name, body, rows)
+        one["sample_time"] for output in stored.model.outputs
+        for one in _channels(output.name, stored, rows)
     ]  # fmt: skip
     if not periods or None in periods or max(periods) - min(periods) > 1e-6 * min(periods):
         return None
     return float(periods[0])
 
 
-def _hold(name: str, body: Body, rows: list[Dataset]) -> Hold:
-    stored = next(_channels(name, body, rows), None)
-    found: Hold = body["hold"].get(name) or (stored or {}).get("hold", "first")
+def _hold(name: str, stored: StoredRun, rows: list[Dataset]) -> Hold:
+    channel = next(_channels(name, stored, rows), None)
+    found: Hold = stored.body["hold"].get(name) or (channel or {}).get("hold", "first")
     return found
 
 
-def _provenance(run: Run, job: Job, body: Body, rows: list[Dataset]) -> dict[str, Any]:
+def _provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, Any]:
+    run, job = stored.run, stored.job
     known = {row.id: {"id": row.id, "name": row.name, "sha256": row.sha256} for row in rows}
     return {
         "run": run.id,
@@ -141,6 +133,6 @@ def _provenance(run: Run, job: Job, body: Body, rows: list[Dataset]) -> dict[str
         "method": run.method,
         "seed": run.seed,
         "rms": run.best_rms,
-        "fit_percent": (run.result or {}).get("fit_percent"),
-        "datasets": [known.get(name, {"id": name}) for name in body["datasets"]],
+        "fit_percent": stored.result.get("fit_percent"),
+        "datasets": [known.get(name, {"id": name}) for name in stored.body["datasets"]],
     }

@@ -6,7 +6,6 @@ does not fix it, it is found on the record, alone, as on the validation data of 
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
@@ -14,24 +13,22 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.concurrency import simulating
-from service.core.errors import Conflict, FieldError, InvalidRequest
-from service.core.json_pointer import body_of
+from service.core.documents import to_finite
+from service.core.errors import FieldError, InvalidRequest
 from service.datasets.datasets import series
-from service.datasets.recordings import recording_of
-from service.jobs.record_checks import signals_of
-from service.models.models import model_of_run
+from service.datasets.recordings import read_records
+from service.datasets.signal_channels import SignalChannels, map_channels
+from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
 from service.runs.schemas import AgreementOut, ExperimentOut, FreeRunIn, FreeRunOut
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from service.storage.tables import Dataset, Run
+from service.storage.tables import Dataset
 from sysid.core.errors import InvalidRecord, RecordTooShort, nearest
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.models.model import Model, initial_name, initial_parameters
+from sysid.models.model import initial_name, initial_parameters
 from sysid.models.units import SignalUnits
 from sysid.simulation.metrics import Metrics
 
@@ -77,11 +74,11 @@ def free_run(
     found = judged(database, store, run_id, body)
     return FreeRunOut(
         id=found.run, dataset=found.dataset, unit=found.metrics.unit, rms=found.metrics.rms,
-        fit_percent=_finite(found.metrics.fit_percent), starts=found.starts,
+        fit_percent=to_finite(found.metrics.fit_percent), starts=found.starts,
         agreement=[
             AgreementOut(
                 experiment=one.experiment + 1, output=one.output, unit=one.unit,
-                samples=one.samples, rms=one.rms, fit_percent=_finite(one.fit_percent),
+                samples=one.samples, rms=one.rms, fit_percent=to_finite(one.fit_percent),
             )
             for one in found.metrics.channels
         ],
@@ -93,40 +90,37 @@ def free_run(
 def judged(database: Database, store: ObjectStore, run_id: str, body: FreeRunIn) -> FreeRun:
     """The same as arrays; raises as `free_run` does."""
     with database.read() as session:
-        problem, run, row = _read(session, store, run_id, body)
-    return _judged(problem, run, row)
+        problem, row = _read(session, store, run_id, body)
+    return _judged(problem, run_id, row)
 
 
 def _read(
     session: Session, store: ObjectStore, run_id: str, body: FreeRunIn
-) -> "tuple[Problem, Run, Dataset]":
-    run = RunRepository(session).get(run_id)
-    if run.result is None or not run.result.get("parameters"):
-        raise Conflict(f"run {run_id} is {run.state.value} and has no estimates to simulate with")
-    job = JobRepository(session).get(run.job_id)
-    request = body_of(job.spec, run.cell)
-    model = model_of_run(session, run, job)
-    row = DatasetRepository(session, job.project_id).get(body.dataset)
-    channels = {**request["channels"], **body.channels}
-    faults = [*_channel_faults(model, row, channels), *_unit_faults(session, model, row, request,
-                                                                    channels)]  # fmt: skip
+) -> "tuple[Problem, Dataset]":
+    stored = load_estimated_run(session, run_id, "simulate with")
+    row = DatasetRepository(session, stored.job.project_id).get(body.dataset)
+    named = {**stored.body["channels"], **body.channels}
+    channels = map_channels(stored.model, named, stored.body["hold"])
+    faults = [
+        *_channel_faults(row, named, channels),
+        *_unit_faults(session, stored, row, channels),
+    ]
     if faults:
         raise InvalidRequest(faults)
-    records = _records(store, model, row, request, channels)
-    return _problem(model, records, run, request, body.skip), run, row
+    records = _records(store, row, channels)
+    return _problem(stored, records, body.skip), row
 
 
 def _channel_faults(
-    model: Model, row: Dataset, channels: Mapping[str, str]
+    row: Dataset, named: Mapping[str, str], channels: SignalChannels
 ) -> Iterator[FieldError]:
-    signals = list(chain(*signals_of(model)))
+    signals = list(channels.by_signal)
     recorded = [str(one["name"]) for one in row.channels]
-    for name in channels:
+    for name in named:
         if name not in signals:
             detail = f"the model has no signal {name!r}{nearest(name, signals)}"
             yield FieldError(f"/channels/{name}", detail)
-    for name in signals:
-        wanted = channels.get(name, name)
+    for name, wanted in channels.by_signal.items():
         if wanted not in recorded:
             yield FieldError(
                 f"/channels/{name}",
@@ -142,20 +136,18 @@ def _channel_faults(
 
 
 def _unit_faults(
-    session: Session, model: Model, row: Dataset, request: Mapping[str, Any],
-    channels: Mapping[str, str],
-) -> Iterator[FieldError]:  # fmt: skip
+    session: Session, stored: StoredRun, row: Dataset, channels: SignalChannels
+) -> Iterator[FieldError]:
     """Channels in another unit than the model's, or than what the run was fitted to."""
-    units = SignalUnits(model)
-    signals = list(chain(*signals_of(model)))
+    units = SignalUnits(stored.model)
     try:
-        fitted = DatasetRepository(session).get(request["datasets"][0])
+        fitted = DatasetRepository(session).get(stored.body["datasets"][0])
     except StorageError:  # deleted since: its units are not known any more
         fitted = row
-    for signal in signals:
-        before = request["channels"].get(signal, signal)
+    before_by_signal = stored.channels.by_signal
+    for signal, name in channels.by_signal.items():
+        before = before_by_signal[signal]
         units.fault(signal, before, _unit(fitted, before), f"{fitted.name!r}")
-        name = channels.get(signal, signal)
         fault = units.fault(signal, name, _unit(row, name), f"{row.name!r}")
         if fault:
             yield FieldError(f"/channels/{signal}", fault)
@@ -165,37 +157,28 @@ def _unit(row: Dataset, channel: str) -> str | None:
     return next((str(one["unit"]) for one in row.channels if one["name"] == channel), None)
 
 
-def _records(
-    store: ObjectStore, model: Model, row: Dataset, request: Mapping[str, Any],
-    channels: Mapping[str, str],
-) -> tuple[Record, ...]:  # fmt: skip
-    inputs, outputs = (
-        {name: channels.get(name, name) for name in group} for group in signals_of(model)
-    )
-    holds = {channels.get(name, name): hold for name, hold in request.get("hold", {}).items()}
+def _records(store: ObjectStore, row: Dataset, channels: SignalChannels) -> tuple[Record, ...]:
     try:
-        recording = recording_of(store, row.sha256).held(holds)
-        found = recording.records(inputs, outputs, row.name)
+        records = read_records(store, [row], channels)
     except InvalidRecord as error:
         raise InvalidRequest.at("/dataset", str(error)) from None
-    if len(found) > MOST_RECORDS:
+    if len(records) > MOST_RECORDS:
         raise InvalidRequest.at(
             "/dataset",
-            f"{row.name!r} has {len(found)} segments; at most {MOST_RECORDS} are simulated for a "
+            f"{row.name!r} has {len(records)} segments; at most {MOST_RECORDS} are simulated for a "
             "request: derive a recording of some of them with 'select' or 'trim'",
         )
-    return found
+    return records
 
 
-def _problem(
-    model: Model, records: tuple[Record, ...], run: Run, request: Mapping[str, Any], skip: int
-) -> "Problem":
+def _problem(stored: StoredRun, records: tuple[Record, ...], skip: int) -> "Problem":
     """All that was identified fixed, so that at most starts of states are free."""
     # The compiler comes with this import, and most requests never need it.
     from sysid.simulation.problem import Problem
 
+    model, request = stored.model, stored.body
     own = {one.name for one in model.parameters}
-    values = {one["name"]: one for one in (run.result or {})["parameters"] if one["name"] in own}
+    values = {one["name"]: one for one in stored.estimates if one["name"] in own}
     starts = {one.name for one in initial_parameters(model, len(records))}
     changes = {name: f for name, f in request["parameters"].items() if name in starts}
     fixed = {name: _fixed(one) for name, one in values.items()}
@@ -260,7 +243,7 @@ def _searched(problem: "Problem", simulations: int) -> FloatArray:
     return middle if found is None else found.theta
 
 
-def _judged(problem: "Problem", run: Run, row: Dataset) -> FreeRun:
+def _judged(problem: "Problem", run_id: str, row: Dataset) -> FreeRun:
     from sysid.simulation.problem import metrics_of
 
     theta = _starts(problem)
@@ -269,12 +252,12 @@ def _judged(problem: "Problem", run: Run, row: Dataset) -> FreeRun:
     if not isfinite(metrics.rms):
         raise InvalidRequest.at(
             "/dataset",
-            f"over {row.name!r} the simulation of {run.id} diverges: the recording goes beyond "
+            f"over {row.name!r} the simulation of {run_id} diverges: the recording goes beyond "
             "what the model was identified for",
         )
     names = [one.name for one in problem.model.outputs]
     return FreeRun(
-        run=run.id, dataset=row.id, records=problem.records,
+        run=run_id, dataset=row.id, records=problem.records,
         simulated=tuple(tuple(p[name] for name in names) for p in problem.split(predicted)),
         metrics=metrics,
         starts=dict(zip((one.name for one in problem.space), theta.tolist(), strict=True)),
@@ -302,7 +285,3 @@ def _experiments(found: FreeRun, max_points: int) -> Iterator[ExperimentOut]:
             measured=[series(one, max_points) for one in record.outputs],
             simulated=[series(one, max_points) for one in simulated],
         )
-
-
-def _finite(value: float) -> float | None:
-    return value if isfinite(value) else None

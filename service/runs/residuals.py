@@ -12,24 +12,16 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.errors import NotFound, ServiceError
-from service.core.json_pointer import body_of
-from service.datasets.recordings import recording_of
 from service.formats.mcap import FittedOutput
-from service.models.models import model_of_run
-from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
-from service.repositories.runs import RunRepository
+from service.jobs.stored_run import StoredRun, load_run
 from service.runs.fitted import fits_of
 from service.runs.result import test_document
 from service.runs.schemas import CorrelationOut, ResidualsOut
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
-from service.storage.tables import Job, Run
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel
-from sysid.models.model import Model
-from sysid.models.parameters import override
 from sysid.residuals.past_outputs import coefficients_on_past_outputs
 from sysid.residuals.residual_tests import (
     LEVEL,
@@ -64,32 +56,29 @@ def residuals(session: Session, store: ObjectStore, run_id: str) -> ResidualsOut
     NotFound
         If the run has no signals: it has not succeeded, or not yet.
     """
-    run = RunRepository(session).get(run_id)
-    job = JobRepository(session).get(run.job_id)
-    tested = residuals_of(session, store, job, run)
+    stored = load_run(session, run_id)
+    tested = residuals_of(session, store, stored)
     if tested is None:
-        raise NotFound("residuals of run", run_id, f"; the run is {run.state.value}")
+        raise NotFound("residuals of run", run_id, f"; the run is {stored.run.state.value}")
     return ResidualsOut(
-        id=run.id, data=tested.verdict.data, passed=tested.verdict.passed, level=LEVEL,
+        id=run_id, data=tested.verdict.data, passed=tested.verdict.passed, level=LEVEL,
         note=tested.missing, tests=[_out(one) for one in tested.found],
     )  # fmt: skip
 
 
-def residuals_of(session: Session, store: ObjectStore, job: Job, run: Run) -> Tested | None:
+def residuals_of(session: Session, store: ObjectStore, stored: StoredRun) -> Tested | None:
     """The same as values; None as long as no signals are stored."""
-    if run.signals_sha256 is None:
+    if stored.run.signals_sha256 is None:
         return None
-    body = body_of(job.spec, run.cell)
-    fits = fits_of(store, run)
-    kept = [fit for fit in fits if fit.experiment.startswith("validation")]
-    model = model_of_run(session, run, job)
-    inputs, missing = _inputs(session, store, model, body, bool(kept))
-    counts = {} if kept else _coefficients(model, body)
-    times = (run.result or {}).get("correlation_times") or {}
+    fits = fits_of(store, stored.run)
+    kept = [fit for fit in fits if fit.role == "validation"]
+    inputs, missing = _inputs(session, store, stored, bool(kept))
+    counts = {} if kept else _coefficients(session, stored)
+    times = stored.result.get("correlation_times") or {}
     found = correlations(
         [
             one._replace(coefficients=counts.get(one.output, 0))
-            for one in _series(body, kept or list(fits), fits, inputs, times)
+            for one in _series(stored.body, kept or list(fits), fits, inputs, times)
         ]
     )
     names = [name for name, _ in groupby(fit.experiment for fit in kept or fits)]
@@ -97,13 +86,11 @@ def residuals_of(session: Session, store: ObjectStore, job: Job, run: Run) -> Te
     return Tested(names, found, verdict(found, data), missing)  # type: ignore[arg-type]
 
 
-def _coefficients(model: Model, body: Body) -> dict[str, int]:
+def _coefficients(session: Session, stored: StoredRun) -> dict[str, int]:
     """Of each output, the coefficients on past outputs of a prediction one step ahead."""
-    if body["prediction"] != "one-step":
+    if stored.body["prediction"] != "one-step":
         return {}
-    names = {one.name for one in model.parameters}
-    changes = {name: fields for name, fields in body["parameters"].items() if name in names}
-    return coefficients_on_past_outputs(model, override(model.parameters, changes))
+    return coefficients_on_past_outputs(stored.model, stored.parameters(session))
 
 
 def _out(one: Correlation) -> CorrelationOut:
@@ -126,8 +113,8 @@ def _series(
     weights = _weights(body, fits)
     before = _earlier(body, fits)
     for fit in tested:
-        number = int(fit.experiment.partition(" ")[2]) - 1
-        first = before.get((number, fit.name), 0)
+        number = fit.number - 1
+        first = before.get((fit.number, fit.name), 0)
         scored = np.arange(first, first + fit.times.size) >= body["skip"]
         weight = weights[fit.name]
         yield series(
@@ -141,8 +128,7 @@ def _earlier(body: Body, fits: Sequence[FittedOutput]) -> dict[tuple[int, str], 
     """Samples of a record that lie before the part that was kept for validation."""
     if (body["validation"] or {}).get("fraction") is None:
         return {}
-    estimation = (fit for fit in fits if fit.experiment.startswith("estimation"))
-    return {(int(f.experiment.partition(" ")[2]) - 1, f.name): f.times.size for f in estimation}
+    return {(f.number, f.name): f.times.size for f in fits if f.role == "estimation"}
 
 
 def _weights(body: Body, fits: Sequence[FittedOutput]) -> dict[str, float]:
@@ -158,7 +144,7 @@ def _reciprocal(body: Body, fits: Sequence[FittedOutput], name: str) -> float:
     parts = [
         fit.measured[body["skip"] :]
         for fit in fits
-        if fit.name == name and fit.experiment.startswith("estimation")
+        if fit.name == name and fit.role == "estimation"
     ]
     values: FloatArray = np.concatenate(parts)
     deviation = float(np.std(values[np.isfinite(values)]))
@@ -166,24 +152,12 @@ def _reciprocal(body: Body, fits: Sequence[FittedOutput], name: str) -> float:
 
 
 def _inputs(
-    session: Session, store: ObjectStore, model: Model, body: Body, is_validation: bool
+    session: Session, store: ObjectStore, stored: StoredRun, is_validation: bool
 ) -> tuple[list[tuple[Channel, ...]], str]:
     """Inputs of every tested record, and a note if they are not to be had any more."""
-    kept = body["validation"] or {}
-    names = kept["datasets"] if is_validation and kept.get("datasets") else body["datasets"]
-    channels = body["channels"]
-    inputs, outputs = (
-        {one.name: channels.get(one.name, one.name) for one in kind}
-        for kind in (model.inputs, model.outputs)
-    )
-    holds = {channels.get(name, name): hold for name, hold in body.get("hold", {}).items()}
+    kept = stored.body["validation"] or {}
+    names = kept["datasets"] if is_validation and kept.get("datasets") else stored.body["datasets"]
     try:
-        return [
-            record.inputs
-            for row in DatasetRepository(session).get_all(names)
-            for record in recording_of(store, row.sha256)
-            .held(holds)
-            .records(inputs, outputs, row.name)
-        ], ""
+        return [record.inputs for record in stored.read_datasets(session, store, names)], ""
     except (SysidError, ServiceError, StorageError) as error:
         return [], f"the inputs are not to be had any more, so independence is not tested: {error}"

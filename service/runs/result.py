@@ -3,12 +3,12 @@
 Residual tests and onset delays as documents: what a result stores of them, and the answers.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from service.core.documents import to_finite
 from sysid.identifiability.combinations import Group
 from sysid.identification.result import Identification
 from sysid.residuals.onset_delay import OnsetDelay
@@ -40,11 +40,11 @@ def test_document(one: ResidualTest) -> dict[str, Any]:
         "reason": one.reason,
         "samples": one.samples,
         "lags_tested": one.lags,
-        "inside95": _finite(one.inside95),
-        "inside99": _finite(one.inside99),
-        "statistic": _finite(one.statistic),
-        "degrees": _finite(one.degrees),
-        "p": _finite(one.p),
+        "inside95": to_finite(one.inside95),
+        "inside99": to_finite(one.inside99),
+        "statistic": to_finite(one.statistic),
+        "degrees": to_finite(one.degrees),
+        "p": to_finite(one.p),
     }
 
 
@@ -55,19 +55,15 @@ def onset_document(found: Sequence[OnsetDelay]) -> list[dict[str, Any]]:
             "experiment": one.experiment,
             "input": one.input,
             "output": one.output,
-            "delay": _finite(one.delay),
+            "delay": to_finite(one.delay),
             "unit": "s",
-            "spread": _finite(one.spread),
+            "spread": to_finite(one.spread),
             "events": one.events,
-            "threshold": _finite(one.threshold),
+            "threshold": to_finite(one.threshold),
             "reason": one.reason,
         }
         for one in found
     ]
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)
 
 
 def result_document(found: Identification, seconds: float) -> dict[str, Any]:
@@ -75,11 +71,11 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
     return {
         "valid": found.valid,
         "parameters": [_estimate(one) for one in found.estimates],
-        "rms": finite(found.rms),
-        "rms_validation": finite(found.rms_validation),
+        "rms": to_finite(found.rms),
+        "rms_validation": to_finite(found.rms_validation),
         "fit_percent": {
-            "estimation": finite(found.fit_percent),
-            "validation": finite(found.fit_percent_validation),
+            "estimation": to_finite(found.fit_percent),
+            "validation": to_finite(found.fit_percent_validation),
         },
         "agreement": {
             "estimation": [_agreement(one) for one in found.agreement],
@@ -90,17 +86,17 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
         "seconds": seconds,
         "islands": [
             {
-                "champion_rms": finite(island.champion_rms),
-                "refined_rms": finite(island.refined_rms),
+                "champion_rms": to_finite(island.champion_rms),
+                "refined_rms": to_finite(island.refined_rms),
                 "evaluations": island.evaluations,
-                "parameters": [finite(value) for value in island.parameters],
+                "parameters": [to_finite(value) for value in island.parameters],
             }
             for island in found.islands
         ],
         "identifiability": _identifiability(found.uncertainty),
         "criteria": _criteria(found.criteria),
         "correlation": _correlation(found.uncertainty),
-        "noise_sd": None if found.uncertainty is None else finite(found.uncertainty.noise_sd),
+        "noise_sd": None if found.uncertainty is None else to_finite(found.uncertainty.noise_sd),
         "noise_colour": None if found.uncertainty is None else found.uncertainty.noise_colour,
         "noise_model": found.noise_model,
         "correlation_times": dict(found.correlation_times),
@@ -122,8 +118,8 @@ def _estimate(one: Estimate) -> dict[str, Any]:
         "value": float(one.value),
         "lower": float(one.lower),
         "upper": float(one.upper),
-        "stderr": finite(one.stderr),
-        "interval95": None if one.interval95 is None else [finite(v) for v in one.interval95],
+        "stderr": to_finite(one.stderr),
+        "interval95": None if one.interval95 is None else [to_finite(v) for v in one.interval95],
         "status": one.status,
         "reason": one.reason,
     }
@@ -135,9 +131,9 @@ def _agreement(one: ChannelMetrics) -> dict[str, Any]:
         "output": one.output,
         "unit": one.unit,
         "samples": one.samples,
-        "rms": finite(one.rms),
-        "fit_percent": finite(one.fit_percent),
-        "span": [finite(value) for value in one.span],
+        "rms": to_finite(one.rms),
+        "fit_percent": to_finite(one.fit_percent),
+        "span": [to_finite(value) for value in one.span],
     }
 
 
@@ -145,9 +141,9 @@ def _identifiability(uncertainty: Uncertainty | None) -> dict[str, Any]:
     if uncertainty is None:
         return {"condition": None, "groups": [], "singular_values": []}
     return {
-        "condition": finite(uncertainty.condition),
+        "condition": to_finite(uncertainty.condition),
         "groups": [_group(one) for one in uncertainty.groups],
-        "singular_values": [finite(value) for value in uncertainty.singular_values],
+        "singular_values": [to_finite(value) for value in uncertainty.singular_values],
     }
 
 
@@ -155,8 +151,8 @@ def _group(one: Group) -> dict[str, Any]:
     return {
         "members": list(one.members),
         "expression": one.expression,
-        "value": finite(one.value),
-        "stderr": finite(one.stderr),
+        "value": to_finite(one.value),
+        "stderr": to_finite(one.stderr),
     }
 
 
@@ -164,9 +160,9 @@ def _criteria(one: Criteria | None) -> dict[str, Any] | None:
     if one is None:
         return None
     return {
-        "aic": finite(one.aic),
-        "aicc": finite(one.aicc),
-        "bic": finite(one.bic),
+        "aic": to_finite(one.aic),
+        "aicc": to_finite(one.aicc),
+        "bic": to_finite(one.bic),
         "samples": one.samples,
         "parameters": one.parameters,
     }
@@ -176,10 +172,5 @@ def _correlation(uncertainty: Uncertainty | None) -> dict[str, Any] | None:
     if uncertainty is None:
         return None
     rows = np.asarray(uncertainty.correlation)
-    matrix = [[finite(value) for value in row] for row in rows]
+    matrix = [[to_finite(value) for value in row] for row in rows]
     return {"names": list(uncertainty.names), "matrix": matrix}
-
-
-def finite(value: float | None) -> float | None:
-    """The number, or None where it is not finite: JSON has no such numbers."""
-    return None if value is None or not math.isfinite(value) else float(value)

@@ -10,15 +10,14 @@ from sqlalchemy.orm import Session
 from service.core.errors import InvalidRequest
 from service.core.json_pointer import body_of
 from service.core.wire import Page
-from service.datasets.rms_unit import unit_of
-from service.jobs.job_parameters import parameters_of_job
-from service.models.models import model_of_run
+from service.jobs.results import is_free
+from service.jobs.stored_run import StoredRun, load_run
 from service.repositories.jobs import JobRepository
 from service.repositories.lineage import Reached, reached
 from service.repositories.runs import RunOrder, RunRepository
 from service.runs.schemas import HistoryOut, ImprovementOut, MigrantOut, MigrationsOut, RunOut
 from service.storage.tables import Job, Run, State
-from sysid.models.parameters import Parameter, override
+from sysid.models.parameters import Parameter
 
 ALMOST = 0.99  # what a run that is not over shows at most: refinement is still to come
 
@@ -51,14 +50,14 @@ def page(
 
 def one(session: Session, run_id: str) -> RunOut:
     """One run with its result document."""
-    run = RunRepository(session).get(run_id)
-    job = JobRepository(session).get(run.job_id)
+    stored = load_run(session, run_id)
+    run = stored.run
     known = reached(session, [run.id]) if run.result is None else {}
-    unit = unit_of(session, body_of_run(run, job))
-    answer = told(run, job, known.get(run.id)).model_copy(update={"rms_unit": unit})
+    answer = told(run, stored.job, known.get(run.id))
+    answer = answer.model_copy(update={"rms_unit": stored.rms_unit(session)})
     if run.result is not None or not run.state.is_terminal:
         return answer
-    return answer.model_copy(update={"parameters": _best_so_far(session, run, job)})
+    return answer.model_copy(update={"parameters": _best_so_far(session, stored)})
 
 
 def told(run: Run, job: Job, known: Reached | None = None) -> RunOut:
@@ -81,17 +80,11 @@ def told(run: Run, job: Job, known: Reached | None = None) -> RunOut:
     )  # fmt: skip
 
 
-def body_of_run(run: Run, job: Job) -> dict[str, Any]:
-    """The exact request of one run: the job's with the cell's values in it."""
-    return body_of(job.spec, run.cell)
-
-
 def history(session: Session, run_id: str) -> HistoryOut:
     """Improvements of every island's champion, in the order in which they were found."""
-    repository = RunRepository(session)
-    run = repository.get(run_id)
+    stored = load_run(session, run_id)
     islands: list[list[ImprovementOut]] = []
-    for row in repository.history(run_id):
+    for row in RunRepository(session).history(run_id):
         while len(islands) <= row.island:
             islands.append([])
         islands[row.island].append(
@@ -100,7 +93,7 @@ def history(session: Session, run_id: str) -> HistoryOut:
                 phase=row.phase, parameters=list(row.parameters),
             )
         )  # fmt: skip
-    return HistoryOut(id=run.id, names=_free_names(session, run), islands=islands)
+    return HistoryOut(id=stored.run.id, names=_free_names(session, stored), islands=islands)
 
 
 def migrations(session: Session, run_id: str) -> MigrationsOut:
@@ -114,38 +107,34 @@ def migrations(session: Session, run_id: str) -> MigrationsOut:
     return MigrationsOut(id=run_id, migrants=migrants)
 
 
-def _best_so_far(session: Session, run: Run, job: Job) -> list[dict[str, Any]]:
+def _best_so_far(session: Session, stored: StoredRun) -> list[dict[str, Any]]:
     """What a run that ended without a result had found, without standard errors."""
-    points = RunRepository(session).history(run.id)
+    points = RunRepository(session).history(stored.run.id)
     if not points:
         return []
     best = min(points, key=lambda point: point.rms)
-    reason = f"the run was {run.state.value} before its standard errors were computed"
+    reason = f"the run was {stored.run.state.value} before its standard errors were computed"
     return [
         {
             "name": one.name, "unit": one.unit, "value": value, "lower": one.lower,
             "upper": one.upper, "stderr": None, "interval95": None, "status": "unfinished",
             "reason": reason,
         }
-        for one, value in zip(_sought(session, run, job), best.parameters, strict=False)
+        for one, value in zip(_sought(session, stored), best.parameters, strict=False)
     ]  # fmt: skip
 
 
-def _free_names(session: Session, run: Run) -> list[str]:
-    if run.result is not None:
-        known = ("fixed", "tied")
-        return [one["name"] for one in run.result["parameters"] if one["status"] not in known]
-    return [one.name for one in _sought(session, run, JobRepository(session).get(run.job_id))]
+def _free_names(session: Session, stored: StoredRun) -> list[str]:
+    if stored.run.result is not None:
+        return [one["name"] for one in stored.estimates if is_free(one)]
+    return [one.name for one in _sought(session, stored)]
 
 
-def _sought(session: Session, run: Run, job: Job) -> list[Parameter]:
+def _sought(session: Session, stored: StoredRun) -> list[Parameter]:
     """The free parameters of a run, in the order of its history's columns."""
-    body = body_of_run(run, job)
-    model = model_of_run(session, run, job)
-    if model.rule is not None:  # which of its candidates are sought is told with the result
+    if stored.model.rule is not None:  # which of its candidates are sought the result tells
         return []
-    everything = parameters_of_job(session, model, body)
-    return [one for one in override(everything, body["parameters"]) if one.is_free]
+    return [one for one in stored.parameters(session) if one.is_free]
 
 
 def _progress(run: Run, job: Job, known: Reached | None) -> float:
@@ -154,7 +143,7 @@ def _progress(run: Run, job: Job, known: Reached | None) -> float:
     # A single run's generation is the job's; the history lags behind where nothing gets better.
     of_job = job.generation if job.n_runs == 1 else 0
     reached_so_far = max(of_job, known.generation if known is not None else 0)
-    generations: int = body_of_run(run, job)["algorithm"]["generations"]
+    generations: int = body_of(job.spec, run.cell)["algorithm"]["generations"]
     return min(reached_so_far / generations, ALMOST)
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 
-from service.jobs.to_core import noise_model_of
+from service.jobs.results import read_noise_model
 from service.repositories.trends import TrendRow
 from service.trends.points import Quantity
 from sysid.trends.trend import Place, Trend
@@ -25,7 +25,7 @@ def noise_model_note(x: str, places: Mapping[float, Sequence[TrendRow]], referen
     reference : str
         Noise model of the reference run; empty where there is none.
     """
-    found = {at: {noise_model_of(row._asdict()) for row in rows} for at, rows in places.items()}
+    found = {at: {read_noise_model(row._asdict()) for row in rows} for at, rows in places.items()}
     if len({reference, *(one for models in found.values() for one in models)} - {""}) < 2:
         return ""
     whitened = [f"{at:g}" for at, models in found.items() if "ar1" in models]

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Literal
 
+from service.jobs.results import is_free
 from service.repositories.trends import TrendRow
 from service.trends.schemas import BatchPlaceOut, SpanOut
 from sysid.trends.trend import Estimate, pooled
@@ -89,7 +90,7 @@ def quantities(places: Mapping[float, Sequence[TrendRow]], names: Sequence[str])
     for x, rows in places.items():
         for row in rows:
             for one in row.parameters:
-                if one["name"] in names or (not names and one["status"] not in ("fixed", "tied")):
+                if one["name"] in names or (not names and is_free(one)):
                     entry = _Entry(row.id, one["value"], one["stderr"], one["status"])
                     column = _add(columns, one["name"], one["unit"], "parameter", x, entry)
                     column.widen(one.get("lower"), one.get("upper"))

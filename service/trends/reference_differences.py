@@ -5,11 +5,10 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.core.json_pointer import body_of
 from service.jobs.record_checks import signals_of
+from service.jobs.stored_run import load_run
 from service.models import models
 from service.repositories.datasets import DatasetRepository
-from service.repositories.jobs import JobRepository
 from service.storage.tables import Run
 from service.trends.points import Channels
 from sysid.core.errors import SysidError
@@ -32,7 +31,7 @@ def differences(session: Session, run: Run, bodies: Sequence[Body], known: Chann
     known : Channels
         Channels of the datasets of these.
     """
-    body = body_of(JobRepository(session).get(run.job_id).spec, run.cell)
+    body = load_run(session, run.id).body
     theirs = _facts(session, body, channels_of(session, set(body["datasets"])))
     told: dict[str, None] = {}
     for ours in _different(session, bodies, known):

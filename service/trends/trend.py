@@ -1,13 +1,13 @@
 """Use case of trends: a batch of re-identifications over one label, and against its reference."""
 
 from collections.abc import Sequence
-from math import isfinite
 
 from sqlalchemy.orm import Session
 
+from service.core.documents import to_finite
 from service.core.errors import Conflict, InvalidRequest
 from service.core.json_pointer import body_of
-from service.jobs.to_core import noise_model_of
+from service.jobs.results import read_noise_model
 from service.repositories.jobs import JobRepository
 from service.repositories.lineage import references_of
 from service.repositories.runs import RunRepository
@@ -61,7 +61,7 @@ def trend(session: Session, job_id: str) -> TrendOut:
     known = channels_of(session, {one for many in datasets.values() for one in many})
     reference = _reference(session, job, asked.get("reference"))
     told = [_told(one, asked["predict"], reference, found) for one in found]
-    theirs = "" if reference is None else noise_model_of(reference.run.result or {})
+    theirs = "" if reference is None else read_noise_model(reference.run.result or {})
     notes = [noise_model_note(asked["x"], places, theirs)]
     if reference is not None:
         notes += [
@@ -155,11 +155,11 @@ def _told(
 def _point(
     point: Point, influence: Influence | None, drifts: list[DriftOut], has_laws: bool
 ) -> PointOut:
-    error = None if point.estimate is None else _finite(point.estimate.stderr)
+    error = None if point.estimate is None else to_finite(point.estimate.stderr)
     return PointOut(
         x=point.x, value=point.value, stderr=error, runs=list(point.runs), status=point.status,
         is_used=has_laws and point.estimate is not None,
-        studentised=None if influence is None else _finite(influence.studentised),
+        studentised=None if influence is None else to_finite(influence.studentised),
         p_value=None if influence is None else influence.p_value,
         is_outlier=influence is not None and influence.is_outlier, drifts=drifts,
     )  # fmt: skip
@@ -173,16 +173,12 @@ def _law(law: Law, is_chosen: bool) -> LawOut:
             for name, value, error in law.coefficients
         ],
         chi_squared=law.chi_squared, degrees=law.degrees, birge=law.birge, aic=law.aic,
-        aicc=_finite(law.aicc),
+        aicc=to_finite(law.aicc),
     )  # fmt: skip
 
 
 def _place(at: Place) -> PlaceOut:
     return PlaceOut(
-        x=at.x, value=_finite(at.value), stderr=_finite(at.stderr), lower=_finite(at.lower),
-        upper=_finite(at.upper), is_outside=at.is_outside,
+        x=at.x, value=to_finite(at.value), stderr=to_finite(at.stderr), lower=to_finite(at.lower),
+        upper=to_finite(at.upper), is_outside=at.is_outside,
     )  # fmt: skip
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not isfinite(value) else value

@@ -13,7 +13,7 @@ import numpy as np
 
 from service.core.settings import Settings
 from service.datasets.datasets import add_recording
-from service.formats.mcap import FittedOutput, write_fit
+from service.formats.mcap import FitRole, FittedOutput, write_fit
 from service.jobs import submit as jobs
 from service.jobs.schemas import JobIn
 from service.queue.leases import Claim, Progress, Queue
@@ -207,9 +207,13 @@ def _tested(kind: str, signal: str | None, inside: float, p: float) -> dict[str,
 
 def _end(database: Database, store: ObjectStore, claim: Claim, recording: Recording) -> str:
     u, y = recording.channel("P1"), recording.channel("P2")
+    parts: list[tuple[FitRole, slice]] = [
+        ("estimation", slice(0, 2100)),
+        ("validation", slice(2100, None)),
+    ]
     fits = [
-        FittedOutput(name, "p", "kPa", y.times[part], y.values[part], _simulated(u.values)[part])
-        for name, part in (("estimation 1", slice(0, 2100)), ("validation 1", slice(2100, None)))
+        FittedOutput(role, 1, "p", "kPa", y.times[part], y.values[part], _simulated(u.values)[part])
+        for role, part in parts
     ]
     with database.write() as session:
         run = _first(session, claim)

@@ -15,8 +15,9 @@ from fastapi.testclient import TestClient
 
 from service.api.app import create_app
 from service.core.concurrency import AT_ONCE, WAITING, simulating
+from service.jobs.stored_run import StoredRun
 from service.pages.simulate import _defaults, _Known
-from service.storage.tables import Dataset
+from service.storage.tables import Dataset, Job, Run
 from sysid.models.catalogue.load import load_model
 from sysid.search import refine as refinement
 from sysid.search.refine import refine
@@ -153,10 +154,12 @@ def test_the_form_is_shown_with_the_values_of_the_run(place: Place) -> None:
 
 def test_of_an_irregular_recording_the_form_suggests_its_own_duration_and_density() -> None:
     oven = Dataset(n_samples=586, duration=3600.0, sample_time=None, channels=[])
-    found = _defaults(load_model("fopdt"), {}, oven)
+    job = Job(spec={"model": "fopdt", "channels": {}, "hold": {}})
+    stored = StoredRun.from_rows(job, Run(cell={}))
+    found = _defaults(stored, oven)
     assert (found["duration"], found["sample_time"]) == ("3600", "6.2")
     single = Dataset(n_samples=1, duration=0.0, sample_time=None, channels=[])
-    assert _defaults(load_model("fopdt"), {}, single)["sample_time"] == "0.01"
+    assert _defaults(stored, single)["sample_time"] == "0.01"
 
 
 def test_the_form_suggests_a_step_within_what_was_measured(place: Place) -> None:

@@ -143,9 +143,9 @@ def test_fitted_signals_come_back_and_have_the_residual_as_a_field() -> None:
     rng = np.random.default_rng(1)
     later = np.array([0.0, 0.5, 0.5])
     fits = [
-        FittedOutput("1", "y", "m", TIMES, rng.normal(size=40), rng.normal(size=40)),
-        FittedOutput("1", "v", "m/s", TIMES, rng.normal(size=40), rng.normal(size=40)),
-        FittedOutput("2", "y", "m", later, np.array([1, np.nan, 2.0]), np.zeros(3)),
+        FittedOutput("estimation", 1, "y", "m", TIMES, rng.normal(size=40), rng.normal(size=40)),
+        FittedOutput("estimation", 1, "v", "m/s", TIMES, rng.normal(size=40), rng.normal(size=40)),
+        FittedOutput("validation", 2, "y", "m", later, np.array([1, np.nan, 2.0]), np.zeros(3)),
     ]
     stream = BytesIO()
     write_fit("run_1", fits, stream)

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
-from service.models.models import model_of_run
+from service.jobs.stored_run import StoredRun
 from service.storage.tables import Job, Run, State
 from sysid.models.parse import parse_model, with_terms
 from tests.polynomials import document, frols
@@ -61,7 +61,8 @@ def test_the_model_of_a_run_has_the_terms_that_were_selected_on_its_data() -> No
     stored = Job(id="job", spec={"model": asked}, state=State.SUCCEEDED)
     run = Run(id="run", job_id="job", number=0, cell={}, state=State.SUCCEEDED)
     run.result = {"selection": [{"term": "u(k-1)"}, {"term": "y(k-1)"}]}
-    found = model_of_run(None, run, stored)  # type: ignore[arg-type] - a document needs no session
-    assert found == with_terms(parse_model(asked), ["u(k-1)", "y(k-1)"])
+    assert StoredRun.from_rows(stored, run).model == with_terms(
+        parse_model(asked), ["u(k-1)", "y(k-1)"]
+    )
     run.result = None
-    assert model_of_run(None, run, stored).rule is not None  # type: ignore[arg-type]
+    assert StoredRun.from_rows(stored, run).model.rule is not None

@@ -205,7 +205,7 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
     def lost(store: ObjectStore, sha256: str) -> Recording:
         raise ObjectMissing(sha256)
 
-    monkeypatch.setattr("service.runs.residuals.recording_of", lost)
+    monkeypatch.setattr("service.datasets.recordings.recording_of", lost)
     asked = served.server.get(f"/v1/runs/{served.runs[0]}/residuals").json()
     assert [one["test"] for one in asked["tests"]] == ["whiteness"]
     assert "not to be had any more" in asked["note"]
@@ -315,3 +315,23 @@ def test_what_is_computed_again_is_what_was_stored_whatever_the_job(
         assert one["samples"] == kept["samples"]
         assert one["statistic"] == pytest.approx(kept["statistic"], rel=1e-6)
         assert one["degrees"] == pytest.approx(kept["degrees"], rel=1e-6)
+
+
+def input_shapes(figure: dict[str, Any]) -> set[str]:
+    inputs = (one for one in figure["data"] if one.get("name") == "u")
+    return {one["line"].get("shape", "linear") for one in inputs}
+
+
+def test_figures_draw_an_input_as_the_job_holds_it(served: Served) -> None:
+    figure = served.server.get(f"/v1/runs/{served.runs[0]}/figures/response").json()
+    assert input_shapes(figure) == {"hv"}
+
+
+def test_a_report_draws_an_input_as_the_job_holds_it(served: Served) -> None:
+    job = served.server.get(f"/v1/runs/{served.other}").json()["job"]
+    page = served.server.get(f"/v1/jobs/{job}/report").text
+    texts = re.findall(r'<script type="application/json"[^>]*>(.*?)</script>', page, re.DOTALL)
+    figures = [json.loads(html.unescape(one)) for one in texts]
+    shapes = [input_shapes(one) for one in figures if isinstance(one, dict) and "data" in one]
+    assert {"hv"} in shapes
+    assert {"linear"} not in shapes

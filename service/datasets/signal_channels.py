@@ -1,0 +1,57 @@
+"""Which channel of a recording is which signal of a model, and how its inputs are held."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from sysid.data.records import Hold, Record, Recording
+from sysid.models.model import Model
+
+
+@dataclass(frozen=True, slots=True)
+class SignalChannels:
+    """The channels of a model's signals.
+
+    Attributes
+    ----------
+    inputs, outputs : tuple of (signal, channel)
+        In the order of the model.
+    holds : tuple of (channel, hold)
+        Channels whose hold is not that of the recording.
+    """
+
+    inputs: tuple[tuple[str, str], ...]
+    outputs: tuple[tuple[str, str], ...]
+    holds: tuple[tuple[str, Hold], ...] = ()
+
+    @property
+    def by_signal(self) -> dict[str, str]:
+        """The channel of every signal, inputs first."""
+        return dict((*self.inputs, *self.outputs))
+
+    def cut_records(self, recording: Recording, name: str) -> tuple[Record, ...]:
+        """Give the records of a recording, one for each segment.
+
+        Raises
+        ------
+        InvalidRecord
+            If a channel is not there, or cannot be that signal.
+        """
+        held = recording.held(dict(self.holds))
+        return tuple(held.records(dict(self.inputs), dict(self.outputs), name))
+
+
+def map_channels(
+    model: Model, channels: Mapping[str, str], hold: Mapping[str, Hold] | None = None
+) -> SignalChannels:
+    """Find the channel of every signal of a model; it has the signal's name if none is named.
+
+    Parameters
+    ----------
+    channels, hold : mapping
+        ``channels`` and ``hold`` of a job body, by the names of the signals.
+    """
+    return SignalChannels(
+        inputs=tuple((one.name, channels.get(one.name, one.name)) for one in model.inputs),
+        outputs=tuple((one.name, channels.get(one.name, one.name)) for one in model.outputs),
+        holds=tuple((channels.get(name, name), kind) for name, kind in (hold or {}).items()),
+    )

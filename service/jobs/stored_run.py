@@ -1,0 +1,167 @@
+"""A run as it is stored: its rows, its own request, and its model.
+
+It lies in `jobs`, because a run's request is its job's; all that uses runs lies above.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from sqlalchemy.orm import Session
+
+from service.core.errors import Conflict
+from service.core.json_pointer import body_of
+from service.datasets.recordings import read_records
+from service.datasets.rms_unit import unit_of
+from service.datasets.signal_channels import SignalChannels, map_channels
+from service.jobs.job_parameters import parameters_of_job
+from service.jobs.results import read_noise_model
+from service.jobs.to_core import loss_of
+from service.models.models import load_stored_model, resolved
+from service.repositories.datasets import DatasetRepository
+from service.repositories.jobs import JobRepository
+from service.repositories.runs import RunRepository
+from service.storage.objects import ObjectStore
+from service.storage.tables import Job, Run
+from sysid.data.noise import Noise, with_noise
+from sysid.data.records import Record
+from sysid.data.splitting import split_record
+from sysid.models.model import Model, initial_parameters
+from sysid.models.parameters import Parameter, override
+
+if TYPE_CHECKING:
+    from sysid.simulation.problem import Problem
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredRun:
+    """A run with what it means.
+
+    Attributes
+    ----------
+    body : mapping
+        The job's request with the values of the run's cell in it.
+    model : Model
+        With the terms that were selected on the run's data. A run that selects terms has all
+        candidates and a `rule` until it has its result.
+    """
+
+    job: Job
+    run: Run
+    body: Mapping[str, Any]
+    model: Model
+
+    @classmethod
+    def from_rows(cls, job: Job, run: Run) -> "StoredRun":
+        """Make the value from the rows of a run and its job."""
+        body = body_of(job.spec, run.cell)
+        return cls(job, run, body, resolved(load_stored_model(body["model"]), run.result))
+
+    @property
+    def requested_model(self) -> Model:
+        """The model as the request has it: with all its candidate terms."""
+        return load_stored_model(self.body["model"])
+
+    @property
+    def result(self) -> Mapping[str, Any]:
+        """The result document; empty as long as there is none."""
+        return self.run.result or {}
+
+    @property
+    def estimates(self) -> Sequence[Mapping[str, Any]]:
+        """The entries ``parameters`` of the result."""
+        estimates: Sequence[Mapping[str, Any]] = self.result.get("parameters") or ()
+        return estimates
+
+    @property
+    def channels(self) -> SignalChannels:
+        """The channels of the model's signals, and how the job holds its inputs."""
+        return map_channels(self.model, self.body["channels"], self.body["hold"])
+
+    def rms_unit(self, session: Session) -> str:
+        """Find the unit of the RMS."""
+        return unit_of(session, self.body)
+
+    def parameters(self, session: Session) -> tuple[Parameter, ...]:
+        """Give all parameters with the job's changes, starts of all experiments included."""
+        parameters = parameters_of_job(session, self.model, self.body)
+        return override(parameters, self._changes(parameters))
+
+    def read_datasets(
+        self, session: Session, store: ObjectStore, datasets: Sequence[str]
+    ) -> tuple[Record, ...]:
+        """Read datasets as records of the model, held as the job says.
+
+        Raises
+        ------
+        NotFound, ObjectMissing, InvalidRecord
+            If a dataset is not there, or has no such channel.
+        """
+        rows = DatasetRepository(session, self.job.project_id).get_all(datasets)
+        return read_records(store, rows, self.channels)
+
+    def records(self, session: Session, store: ObjectStore) -> list[Record]:
+        """Read the records that the run was fitted to: without validation, with added noise."""
+        records: Sequence[Record] = self.read_datasets(session, store, self.body["datasets"])
+        fraction = (self.body["validation"] or {}).get("fraction")
+        if fraction is not None:
+            records = [split_record(record, fraction)[0] for record in records]
+        noise = Noise(float(self.body["noise"]["sigma"]), int(self.body["noise"]["seed"]))
+        return [with_noise(record, noise, number) for number, record in enumerate(records)]
+
+    def problem(self, session: Session, store: ObjectStore) -> "Problem":
+        """Build the problem that the run solved."""
+        # The compiler comes with this import.
+        from sysid.simulation.problem import Problem
+
+        body, records = self.body, self.records(session, store)
+        parameters = (*self.model.parameters, *initial_parameters(self.model, len(records)))
+        loss = {**body["loss"], "noise_model": read_noise_model(self.result)}
+        return Problem.build(
+            self.model,
+            records,
+            parameters=self._changes(parameters),
+            prediction=body["prediction"],
+            loss=loss_of(loss),
+            weights=body["weights"],
+            skip=body["skip"],
+        )
+
+    def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
+        """Changes of these parameters; the request may name terms that were not selected."""
+        names = {parameter.name for parameter in parameters}
+        return {name: one for name, one in self.body["parameters"].items() if name in names}
+
+
+def load_run(session: Session, run_id: str) -> StoredRun:
+    """Load a run with its job.
+
+    Raises
+    ------
+    NotFound
+        If there is no such run.
+    """
+    run = RunRepository(session).get(run_id)
+    return StoredRun.from_rows(JobRepository(session).get(run.job_id), run)
+
+
+def load_estimated_run(session: Session, run_id: str, purpose: str) -> StoredRun:
+    """Load a run that has estimates.
+
+    Parameters
+    ----------
+    purpose : str
+        What the estimates are for, as the message says: "to …".
+
+    Raises
+    ------
+    NotFound
+        If there is no such run.
+    Conflict
+        If it has no estimates.
+    """
+    stored = load_run(session, run_id)
+    if not stored.estimates:
+        state = stored.run.state.value
+        raise Conflict(f"run {run_id} is {state} and has no estimates to {purpose}")
+    return stored
