@@ -32,7 +32,7 @@ TIMEOUT_S = 60.0
 PAGE = 500
 
 
-def key_header(key: str | None) -> dict[str, str]:
+def make_auth_header(key: str | None) -> dict[str, str]:
     """The header that carries an API key."""
     return {"Authorization": f"Bearer {key}"} if key else {}
 

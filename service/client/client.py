@@ -53,7 +53,7 @@ class Client:
         self.url, self._retries = url.rstrip("/"), retries
         self._http = httpx.Client(
             base_url=self.url,
-            headers=calls.key_header(key),
+            headers=calls.make_auth_header(key),
             timeout=calls.TIMEOUT_S,
             transport=transport,
         )
@@ -72,13 +72,13 @@ class Client:
         """Send one call; errors are raised. A stream is read and closed by the caller."""
         left = calls.pauses(call, self._retries)
         while True:
-            answer = self._answer(call, stream)
+            answer = self._send_once(call, stream)
             pause = calls.pause_after(answer, left)
             if pause is None:
                 return calls.checked(answer)
             time.sleep(pause)
 
-    def _answer(self, call: Call, stream: bool) -> httpx.Response:
+    def _send_once(self, call: Call, stream: bool) -> httpx.Response:
         source = call.content
         file: AbstractContextManager[BinaryIO | bytes | None]
         file = source.open("rb") if isinstance(source, Path) else nullcontext(source)
@@ -92,14 +92,14 @@ class Client:
                 raise ServerUnreachable(self.url, error) from error
         return answer
 
-    def _document(self, call: Call) -> Document:
+    def _fetch_document(self, call: Call) -> Document:
         document: Document = self.send(call).json()
         return document
 
-    def _list(self, call: Call, at_most: int | None = None) -> list[Document]:
+    def _fetch_list(self, call: Call, at_most: int | None = None) -> list[Document]:
         pages, items = calls.Pages(call, at_most), []
         while (page := pages.next()) is not None:
-            items += pages.take(self._document(page))
+            items += pages.take(self._fetch_document(page))
         return items
 
     # ---- datasets
@@ -112,32 +112,32 @@ class Client:
         sample_time: float | None = None,
     ) -> Document:
         """Store a recording, CSV or MCAP, from a file or from bytes."""
-        return self._document(calls.upload(source, name, segments, sample_time))
+        return self._fetch_document(calls.upload(source, name, segments, sample_time))
 
     def simulate_dataset(self, body: Mapping[str, Any]) -> Document:
         """Make a dataset from a model, its true parameters, inputs and noise."""
-        return self._document(calls.SIMULATE_DATASET(json=body))
+        return self._fetch_document(calls.SIMULATE_DATASET(json=body))
 
     def derive(self, dataset: str, steps: list[Document], name: str | None = None) -> Document:
         """Make a dataset from another: noise, resample, trim, select, pool, and so on."""
         body = {"name": name, "steps": steps}
-        return self._document(calls.DERIVE(dataset, json=body))
+        return self._fetch_document(calls.DERIVE(dataset, json=body))
 
     def datasets(self) -> list[Document]:
         """All datasets, newest first."""
-        return self._list(calls.DATASETS())
+        return self._fetch_list(calls.DATASETS())
 
     def dataset(self, name: str) -> Document:
         """One dataset by id."""
-        return self._document(calls.DATASET(name))
+        return self._fetch_document(calls.DATASET(name))
 
     def signals(self, dataset: str, max_points: int = 1000) -> Document:
         """Signals of a dataset, reduced to at most so many points a channel."""
-        return self._document(calls.SIGNALS(dataset, max_points=max_points))
+        return self._fetch_document(calls.SIGNALS(dataset, max_points=max_points))
 
     def lineage(self, dataset: str) -> Document:
         """What a dataset was made from, and what was made from it."""
-        return self._document(calls.LINEAGE(dataset))
+        return self._fetch_document(calls.LINEAGE(dataset))
 
     def content(self, dataset: str) -> bytes:
         """A dataset as an MCAP file."""
@@ -146,56 +146,56 @@ class Client:
     # ---- models
     def models(self) -> list[Document]:
         """Catalogue and own models."""
-        return self._list(calls.MODELS())
+        return self._fetch_list(calls.MODELS())
 
     def model(self, name: str) -> Document:
         """One model with its document."""
-        return self._document(calls.MODEL(name))
+        return self._fetch_document(calls.MODEL(name))
 
     def add_model(self, document: Mapping[str, Any]) -> Document:
         """Store an own model; a changed document becomes its next version."""
-        return self._document(calls.ADD_MODEL(json=document))
+        return self._fetch_document(calls.ADD_MODEL(json=document))
 
     def check_model(self, document: Mapping[str, Any]) -> Document:
         """Whether a model document can be used, with every error and its column."""
-        return self._document(calls.CHECK_MODEL(json=document))
+        return self._fetch_document(calls.CHECK_MODEL(json=document))
 
     # ---- jobs
     def submit(self, job: Mapping[str, Any], *, idempotency_key: str | None = None) -> Document:
         """Queue a job."""
-        return self._document(calls.queue(calls.SUBMIT, job, idempotency_key))
+        return self._fetch_document(calls.queue(calls.SUBMIT, job, idempotency_key))
 
     def noise_sweep(
         self, body: Mapping[str, Any], *, idempotency_key: str | None = None
     ) -> Document:
         """Queue a noise sweep: σ × replicates × methods as one job."""
-        return self._document(calls.queue(calls.NOISE_SWEEP, body, idempotency_key))
+        return self._fetch_document(calls.queue(calls.NOISE_SWEEP, body, idempotency_key))
 
     def reidentify(
         self, body: Mapping[str, Any], *, idempotency_key: str | None = None
     ) -> Document:
         """Queue a batch re-identification: a run for each value of a label, with a trend."""
-        return self._document(calls.queue(calls.REIDENTIFY, body, idempotency_key))
+        return self._fetch_document(calls.queue(calls.REIDENTIFY, body, idempotency_key))
 
     def jobs(self, limit: int | None = None, state: Sequence[str] | None = None) -> list[Document]:
         """Jobs, newest first: all, or at most `limit`, or those in some states."""
-        return self._list(calls.JOBS(state=state), limit)
+        return self._fetch_list(calls.JOBS(state=state), limit)
 
     def job(self, name: str) -> Document:
         """One job with its state and progress."""
-        return self._document(calls.JOB(name))
+        return self._fetch_document(calls.JOB(name))
 
     def cancel(self, job: str) -> Document:
         """Cancel a job; what it has found so far stays."""
-        return self._document(calls.CANCEL(job))
+        return self._fetch_document(calls.CANCEL(job))
 
     def resume(self, job: str) -> Document:
         """Queue a failed or cancelled job again, from where it stopped."""
-        return self._document(calls.RESUME(job))
+        return self._fetch_document(calls.RESUME(job))
 
     def clone(self, job: str) -> Document:
         """Queue the same request as a new job."""
-        return self._document(calls.CLONE(job))
+        return self._fetch_document(calls.CLONE(job))
 
     def report(self, job: str) -> str:
         """The report of a job, as HTML."""
@@ -227,31 +227,31 @@ class Client:
     # ---- runs
     def runs(self, job: str, *, at_most: int | None = None, **filters: Any) -> list[Document]:
         """All runs of a job, or the first `at_most` that the filters leave."""
-        return self._list(calls.RUNS(job, **filters), at_most)
+        return self._fetch_list(calls.RUNS(job, **filters), at_most)
 
     def summary(self, job: str, by: Sequence[str] | None = None) -> Document:
         """Quantiles over the values of axes or labels; by default over all axes but seeds."""
-        return self._document(calls.SUMMARY(job, by=by))
+        return self._fetch_document(calls.SUMMARY(job, by=by))
 
     def trend(self, job: str) -> Document:
         """Estimates over the label of a batch: law, band, predictions, outliers, drift."""
-        return self._document(calls.TREND(job))
+        return self._fetch_document(calls.TREND(job))
 
     def run(self, name: str) -> Document:
         """One run's result."""
-        return self._document(calls.RUN(name))
+        return self._fetch_document(calls.RUN(name))
 
     def history(self, run: str) -> Document:
         """Improvements of each island's champion."""
-        return self._document(calls.HISTORY(run))
+        return self._fetch_document(calls.HISTORY(run))
 
     def response(self, run: str, max_points: int = 1000) -> Document:
         """Measured and simulated outputs."""
-        return self._document(calls.RESPONSE(run, max_points=max_points))
+        return self._fetch_document(calls.RESPONSE(run, max_points=max_points))
 
     def simulate_run(self, run: str, body: Mapping[str, Any], max_points: int = 1000) -> Document:
         """Simulate the identified model on a new input or under P, PI or PID control."""
-        return self._document(calls.SIMULATE_RUN(run, json=body, max_points=max_points))
+        return self._fetch_document(calls.SIMULATE_RUN(run, json=body, max_points=max_points))
 
     def validate_run(
         self,
@@ -264,20 +264,20 @@ class Client:
     ) -> Document:
         """Run the identified model freely over another recording: RMS and fit there."""
         body = {"dataset": dataset, "channels": dict(channels or {}), "skip": skip}
-        return self._document(calls.VALIDATE_RUN(run, json=body, max_points=max_points))
+        return self._fetch_document(calls.VALIDATE_RUN(run, json=body, max_points=max_points))
 
     def migrations(self, run: str) -> Document:
         """The migration log."""
-        return self._document(calls.MIGRATIONS(run))
+        return self._fetch_document(calls.MIGRATIONS(run))
 
     def profile(self, run: str, *parameters: str, points: int = 21) -> Document:
         """Profile likelihood of some free parameters, of all if none is named."""
         body = {"parameters": parameters or None, "points": points}
-        return self._document(calls.PROFILE(run, json=body))
+        return self._fetch_document(calls.PROFILE(run, json=body))
 
     def residuals(self, run: str) -> Document:
         """Correlation functions of the residuals with their bands and tests."""
-        return self._document(calls.RESIDUALS(run))
+        return self._fetch_document(calls.RESIDUALS(run))
 
     def export(self, run: str, format: str = "json", pade_order: int = 3) -> str:
         """The identified model as text: json, python, c or control."""
@@ -285,20 +285,20 @@ class Client:
 
     def compare(self, *runs: str) -> Document:
         """Runs on the same data side by side, the best first."""
-        return self._document(calls.COMPARE(json={"runs": runs}))
+        return self._fetch_document(calls.COMPARE(json={"runs": runs}))
 
     # ---- references
     def references(self) -> list[Document]:
         """The references in use, by name."""
-        return self._list(calls.REFERENCES())
+        return self._fetch_list(calls.REFERENCES())
 
     def reference(self, name: str) -> Document:
         """One reference with its history."""
-        return self._document(calls.REFERENCE(name))
+        return self._fetch_document(calls.REFERENCE(name))
 
     def accept_reference(
         self, name: str, run: str, *, by: str | None = None, note: str | None = None
     ) -> Document:
         """Make a run the reference of a name; the one before stays in the history."""
         body = {"run": run, "by": by, "note": note}
-        return self._document(calls.ACCEPT_REFERENCE(name, json=body))
+        return self._fetch_document(calls.ACCEPT_REFERENCE(name, json=body))
