@@ -24,10 +24,10 @@ def body(dataset: str, runs: int) -> dict[str, Any]:
     return {**paper_example.job(dataset, 0), "algorithm": SMALL, "sweep": {"axes": axes}}
 
 
-def milliseconds(client: Client, *parts: str, **filters: int) -> float:
+def milliseconds(client: Client, call: calls.Call) -> float:
     """Time of one request, its answer read."""
     start = time.perf_counter()
-    client.send(calls.read(*parts, **filters))
+    client.send(call)
     return 1e3 * (time.perf_counter() - start)
 
 
@@ -51,8 +51,8 @@ def main() -> None:
         state = "queued"
         while state in ("queued", "running"):
             time.sleep(BETWEEN_SECONDS)
-            waits["progress"].append(milliseconds(client, "jobs", job))
-            waits["list"].append(milliseconds(client, "jobs", job, "runs", limit=50))
+            waits["progress"].append(milliseconds(client, calls.JOB(job)))
+            waits["list"].append(milliseconds(client, calls.RUNS(job, limit=50)))
             for name, size in memory_megabytes().items():
                 peaks[name] = max(peaks.get(name, 0.0), size)
             state = client.job(job)["state"]

@@ -19,8 +19,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from service.dispatch.supervisor import find_session_processes
 from sysid.core.code_cache import cache_folder
-from workers.processes import kill, of_session
+from workers.ray_folders import kill_processes
 
 
 class TwoNodes:
@@ -63,7 +64,7 @@ def two_nodes(folder: Path) -> Iterator[TwoNodes]:
         address = json.loads(child.stdout.readline())["address"]
         yield TwoNodes(address, token, child.stdin, child.stdout)
     finally:
-        kill(of_session(child.pid))
+        kill_processes(find_session_processes(child.pid))
         _kill_with(str(temporary))
         child.wait()
         for pipe in (child.stdin, child.stdout, log):

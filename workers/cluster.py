@@ -10,9 +10,12 @@ import os
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from sysid.identification.fingerprint import program
 from workers.errors import ClusterLost, ClusterUnavailable, PackCancelled, PackFailed, WorkerDied
@@ -20,7 +23,7 @@ from workers.joining import check_address, reason
 from workers.limits import advance_within, memory_for_each
 from workers.local_ray import COMMON, ENVIRONMENT, ONE_THREAD, REFUSALS, LocalRay
 from workers.ports import Done, Handle, Item, Records
-from workers.processes import children, is_running, kill, of_folder
+from workers.ray_folders import find_folder_processes, kill_processes
 from workers.warming import warm
 
 _log = logging.getLogger(__name__)
@@ -84,7 +87,7 @@ class RayCrew:
         self._flying: set[Any] = set()
         self._probe: Any = None
         self._heard = self._felt = time.monotonic()
-        self._vital = () if settings.address else children(VITAL)
+        self._vital = () if settings.address else _find_vital_processes()
         self._most_slots = settings.cpus
         self.slots = self._count_slots()
         self._memory = settings.memory_bytes
@@ -198,7 +201,7 @@ class RayCrew:
 
     def is_alive(self) -> bool:
         """Whether the processes of a local Ray are there; of a joined one nothing is known."""
-        return all(map(is_running, self._vital))
+        return all(map(_is_running, self._vital))
 
     def free_slots(self) -> int:
         """Cores without a task at this moment."""
@@ -213,7 +216,7 @@ class RayCrew:
     def abandon(self) -> None:
         """Let go of a cluster that is lost, without asking it anything."""
         if self._local is not None:
-            kill(of_folder(os.getpid()))
+            kill_processes(find_folder_processes(os.getpid()))
             self._forget_folder()
 
     def _feel(self, *, at_once: bool = False) -> None:
@@ -243,6 +246,22 @@ class RayCrew:
     def _forget_folder(self) -> None:
         if self._local is not None:
             self._local.forget_folder()
+
+
+def _find_vital_processes() -> tuple[psutil.Process, ...]:
+    vital = []
+    for child in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):
+            if child.name() in VITAL:
+                vital.append(child)
+    return tuple(vital)
+
+
+def _is_running(process: psutil.Process) -> bool:
+    try:
+        return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
 
 
 def _join(ray: Any, address: str) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 from workers.errors import ClusterUnavailable
 from workers.joining import reason
-from workers.processes import clear_after_the_dead, folder_of
+from workers.ray_folders import clear_dead_dispatchers, get_ray_folder
 
 OBJECT_STORE_BYTES = 200 * 2**20
 """Records are small; the default of Ray, 30 % of the memory, is not."""
@@ -99,8 +99,8 @@ def fresh_folder() -> Path:
     ClusterUnavailable
         If it cannot be made, or somebody else has made it.
     """
-    clear_after_the_dead()
-    folder = folder_of(os.getpid())
+    clear_dead_dispatchers()
+    folder = get_ray_folder(os.getpid())
     shutil.rmtree(folder, ignore_errors=True)
     try:
         folder.mkdir(mode=0o700)  # fails for whatever is there, so that it is ours and new

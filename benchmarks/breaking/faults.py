@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
 from sqlalchemy import select
 
 from benchmarks.breaking.audit import owners, steps
 from benchmarks.breaking.stand import Stand, until
 from benchmarks.breaking.work import Stream
 from service.storage.tables import Dispatcher
-from workers.processes import standing
 
 LIMIT_SECONDS = 300.0
 PAUSED_SECONDS = 11.0
@@ -85,7 +85,7 @@ def kill_postgres(bench: Bench) -> float:
     def restart() -> None:
         killed = bench.postgres.get_pid()
         kill([killed])
-        until(lambda: standing(killed) is None, "it was buried", LIMIT_SECONDS)
+        until(lambda: not psutil.pid_exists(killed), "it was buried", LIMIT_SECONDS)
         status = bench.stand.answers()
         if status not in (200, 503, None):
             raise AssertionError(f"the web answered {status} while its database was away")

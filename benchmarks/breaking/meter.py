@@ -1,14 +1,14 @@
 """Whose processor time a stretch of time had: a service's, others', or nobody's."""
 
-import os
 import threading
-from pathlib import Path
+from contextlib import suppress
 from typing import NamedTuple
+
+import psutil
 
 from benchmarks.breaking.processes import Family
 
 PAUSE_SECONDS = 0.5
-TICKS = os.sysconf("SC_CLK_TCK")
 
 
 class Reading(NamedTuple):
@@ -38,7 +38,7 @@ class Meter:
 
     def __init__(self, family: Family) -> None:
         self._family = family
-        self._seen: dict[tuple[int, int], float] = {}
+        self._seen: dict[psutil.Process, float] = {}
         self._lock, self._ending = threading.Lock(), threading.Event()
         self._thread = threading.Thread(target=self._go_on, daemon=True)
 
@@ -54,10 +54,10 @@ class Meter:
     def read(self) -> Reading:
         """What there was until now."""
         with self._lock:
-            for pid, one in self._family.members().items():
-                seconds = _seconds_of(pid)
-                if seconds is not None:
-                    self._seen[pid, one.started] = seconds
+            for process in self._family.members():
+                with suppress(psutil.NoSuchProcess):
+                    times = process.cpu_times()
+                    self._seen[process] = times.user + times.system
             own = sum(self._seen.values())
         busy, idle = _machine()
         return Reading(own, busy, idle)
@@ -67,18 +67,8 @@ class Meter:
             self.read()
 
 
-def _seconds_of(pid: int) -> float | None:
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text(errors="replace")
-    except OSError:
-        return None
-    fields = text.rpartition(")")[2].split()  # from the third on, as proc_pid_stat(5) counts them
-    return (int(fields[11]) + int(fields[12])) / TICKS
-
-
 def _machine() -> tuple[float, float]:
-    """Busy and idle seconds of all processors, as proc_stat(5) has them."""
-    first = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]
-    user, nice, system, idle, waiting, interrupts, soft, stolen = map(int, first)
-    busy = user + nice + system + interrupts + soft + stolen
-    return busy / TICKS, (idle + waiting) / TICKS
+    """Busy and idle seconds of all processors."""
+    times = psutil.cpu_times()
+    busy = times.user + times.nice + times.system + times.irq + times.softirq + times.steal
+    return busy, times.idle + times.iowait

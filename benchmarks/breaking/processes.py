@@ -1,11 +1,10 @@
 """Which processes belong to a service: by a mark in their environment, or by their session."""
 
-import contextlib
 import os
-import signal
-from pathlib import Path
+from collections.abc import Callable
+from contextlib import suppress
 
-from workers.processes import Standing, standing
+import psutil
 
 MARK = "LAGID_BROKEN_SERVICE"
 
@@ -14,47 +13,38 @@ class Family:
     """Every process of a service, those of dispatchers that are gone too."""
 
     def __init__(self, mark: str) -> None:
-        self._mark = f"{MARK}={mark}".encode()
+        self._mark = mark
         self._sessions: set[int] = set()  # Ray's workers write over their environment
 
-    def members(self) -> dict[int, Standing]:
-        """Those that are alive, by number."""
-        listed = [int(entry.name) for entry in Path("/proc").glob("[0-9]*")]
-        found = {pid: one for pid in listed if (one := standing(pid)) and not one.is_dead}
-        marked = {pid for pid in found if self._is_marked(pid)}
-        own = os.getsid(0)
-        self._sessions |= {found[pid].session for pid in marked} - {own}
-        return {
-            pid: one for pid, one in found.items()
-            if pid in marked or one.session in self._sessions
-        }  # fmt: skip
+    def members(self) -> list[psutil.Process]:
+        """Those that are alive."""
+        alive = {}
+        for process in psutil.process_iter(["name", "status", "environ"]):
+            if process.info["status"] not in (None, psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD):
+                with suppress(ProcessLookupError, PermissionError):
+                    alive[process] = os.getsid(process.pid)
+        marked = {one for one in alive if (one.info["environ"] or {}).get(MARK) == self._mark}
+        self._sessions |= {alive[one] for one in marked} - {os.getsid(0)}
+        return [one for one in alive if one in marked or alive[one] in self._sessions]
 
     def named(self, command: str) -> list[int]:
         """Members whose program's name begins so."""
-        found = self.members()
-        return sorted(pid for pid, one in found.items() if one.command.startswith(command))
+        return self._select(lambda process: process.name().startswith(command))
 
     def dispatchers(self) -> list[int]:
         """The dispatchers' processes."""
-        return sorted(
-            pid for pid in self.members() if b"service.dispatch.process" in _arguments(pid)
-        )
+        return self._select(lambda process: "service.dispatch.process" in process.cmdline())
 
     def kill(self) -> None:
         """End what is left."""
-        for pid in self.members():
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+        for process in self.members():
+            with suppress(psutil.NoSuchProcess):
+                process.kill()
 
-    def _is_marked(self, pid: int) -> bool:
-        try:
-            return self._mark in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-        except OSError:
-            return False
-
-
-def _arguments(pid: int) -> bytes:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return b""
+    def _select(self, is_meant: Callable[[psutil.Process], bool]) -> list[int]:
+        pids = []
+        for process in self.members():
+            with suppress(psutil.NoSuchProcess):
+                if is_meant(process):
+                    pids.append(process.pid)
+        return sorted(pids)

@@ -140,7 +140,7 @@ class Stand:
         return left
 
     def _left(self) -> list[str]:
-        found = [f"process {pid} {one.command}" for pid, one in self.family.members().items()]
+        found = [f"process {one.pid} {one.info['name']}" for one in self.family.members()]
         found += [f"shared memory {name}" for name in set(shared_memory()) - self._before]
         found += [f"temporary {path.name}" for path in self.temporary.glob("*")]
         unfinished = self.folder / "objects" / "tmp"

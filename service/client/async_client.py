@@ -1,34 +1,21 @@
-"""The asynchronous twin of the client; `service.client.client` gives both."""
+"""The asynchronous twin of the client."""
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import aclosing
-from types import TracebackType
-from typing import Any, Self, TypeAlias, TypeVar
+from pathlib import Path
+from typing import Any, Self
 
 import httpx
 
 from service.client import calls
-from service.client.calls import (
-    DEFAULT_URL,
-    POLL_S,
-    RETRIES,
-    TERMINAL,
-    Call,
-    Document,
-    options,
-    pause_after,
-    pauses,
-)
-from service.client.methods import Methods
+from service.client.calls import Call, Document, ServerUnreachable
 
-Found = TypeVar("Found")
-Awaited: TypeAlias = Coroutine[Any, Any, Found]
+BLOCK_BYTES = 1 << 20
+"""Bytes of a file that are read at once."""
 
 
-class AsyncClient(
-    Methods[Awaited[Document], Awaited[list[Document]], Awaited[str], Awaited[bytes]]
-):
+class AsyncClient:
     """The service from an asynchronous program; methods as those of `Client`, with ``await``.
 
     Parameters and errors are those of `Client`. `runs` and `events` are gone through with
@@ -37,24 +24,24 @@ class AsyncClient(
 
     def __init__(
         self,
-        url: str = DEFAULT_URL,
+        url: str = calls.DEFAULT_URL,
         key: str | None = None,
         *,
-        retries: int = RETRIES,
+        retries: int = calls.RETRIES,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self.url, self._retries = url.rstrip("/"), retries
-        self._http = httpx.AsyncClient(**options(self.url, key), transport=transport)
+        self._http = httpx.AsyncClient(
+            base_url=self.url,
+            headers=calls.make_auth_header(key),
+            timeout=calls.TIMEOUT_S,
+            transport=transport,
+        )
 
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
     async def close(self) -> None:
@@ -63,53 +50,158 @@ class AsyncClient(
 
     async def send(self, call: Call, *, stream: bool = False) -> httpx.Response:
         """Send one call; errors are raised. A stream is read and closed by the caller."""
-        left = pauses(call, self._retries)
+        left = calls.pauses(call, self._retries)
         while True:
-            answer = await self._answer(call, stream)
-            pause = pause_after(answer, left)
+            answer = await self._send_once(call, stream)
+            pause = calls.pause_after(answer, left)
             if pause is None:
                 return calls.checked(answer)
             await asyncio.sleep(pause)
 
-    async def _answer(self, call: Call, stream: bool) -> httpx.Response:
-        with calls.unreachable_told(self.url):
-            content = calls.pieces(call.content)
-            request = self._http.build_request(**calls.request(call, content, stream=stream))
+    async def _send_once(self, call: Call, stream: bool) -> httpx.Response:
+        content = _read_blocks(call.content) if isinstance(call.content, Path) else call.content
+        request = self._http.build_request(**call.request(content, stream=stream))
+        try:
             answer = await self._http.send(request, stream=stream)
             if not answer.is_success:
                 await answer.aread()
-            return answer
+        except httpx.TransportError as error:
+            raise ServerUnreachable(self.url, error) from error
+        return answer
 
-    async def _one(self, call: Call) -> Document:
+    async def _fetch_document(self, call: Call) -> Document:
         document: Document = (await self.send(call)).json()
         return document
 
-    async def _text(self, call: Call) -> str:
-        return (await self.send(call)).text
+    async def _iterate_items(
+        self, call: Call, at_most: int | None = None
+    ) -> AsyncIterator[Document]:
+        pages = calls.Pages(call, at_most)
+        while (page := pages.next()) is not None:
+            for item in pages.take(await self._fetch_document(page)):
+                yield item
 
-    async def _content(self, call: Call) -> bytes:
-        return (await self.send(call)).content
+    async def _fetch_list(self, call: Call, at_most: int | None = None) -> list[Document]:
+        return [item async for item in self._iterate_items(call, at_most)]
 
-    async def _all(self, *parts: str, at_most: int | None = None, **filters: Any) -> list[Document]:
-        pages = calls.Pages(parts, at_most, filters)
-        items: list[Document] = []
-        while (call := pages.next()) is not None:
-            items += pages.take(await self._one(call))
-        return items
+    # ---- datasets
+    async def add_dataset(
+        self,
+        source: str | Path | bytes,
+        name: str | None = None,
+        *,
+        segments: str | None = None,
+        sample_time: float | None = None,
+    ) -> Document:
+        """Store a recording, CSV or MCAP, from a file or from bytes."""
+        return await self._fetch_document(calls.upload(source, name, segments, sample_time))
+
+    async def simulate_dataset(self, body: Mapping[str, Any]) -> Document:
+        """Make a dataset from a model, its true parameters, inputs and noise."""
+        return await self._fetch_document(calls.SIMULATE_DATASET(json=body))
+
+    async def derive(
+        self, dataset: str, steps: list[Document], name: str | None = None
+    ) -> Document:
+        """Make a dataset from another: noise, resample, trim, select, pool, and so on."""
+        body = {"name": name, "steps": steps}
+        return await self._fetch_document(calls.DERIVE(dataset, json=body))
+
+    async def datasets(self) -> list[Document]:
+        """All datasets, newest first."""
+        return await self._fetch_list(calls.DATASETS())
+
+    async def dataset(self, name: str) -> Document:
+        """One dataset by id."""
+        return await self._fetch_document(calls.DATASET(name))
+
+    async def signals(self, dataset: str, max_points: int = 1000) -> Document:
+        """Signals of a dataset, reduced to at most so many points a channel."""
+        return await self._fetch_document(calls.SIGNALS(dataset, max_points=max_points))
+
+    async def lineage(self, dataset: str) -> Document:
+        """What a dataset was made from, and what was made from it."""
+        return await self._fetch_document(calls.LINEAGE(dataset))
+
+    async def content(self, dataset: str) -> bytes:
+        """A dataset as an MCAP file."""
+        return (await self.send(calls.CONTENT(dataset))).content
+
+    # ---- models
+    async def models(self) -> list[Document]:
+        """Catalogue and own models."""
+        return await self._fetch_list(calls.MODELS())
+
+    async def model(self, name: str) -> Document:
+        """One model with its document."""
+        return await self._fetch_document(calls.MODEL(name))
+
+    async def add_model(self, document: Mapping[str, Any]) -> Document:
+        """Store an own model; a changed document becomes its next version."""
+        return await self._fetch_document(calls.ADD_MODEL(json=document))
+
+    async def check_model(self, document: Mapping[str, Any]) -> Document:
+        """Whether a model document can be used, with every error and its column."""
+        return await self._fetch_document(calls.CHECK_MODEL(json=document))
+
+    # ---- jobs
+    async def submit(
+        self, job: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a job."""
+        return await self._fetch_document(calls.queue(calls.SUBMIT, job, idempotency_key))
+
+    async def noise_sweep(
+        self, body: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a noise sweep: σ × replicates × methods as one job."""
+        return await self._fetch_document(calls.queue(calls.NOISE_SWEEP, body, idempotency_key))
+
+    async def reidentify(
+        self, body: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a batch re-identification: a run for each value of a label, with a trend."""
+        return await self._fetch_document(calls.queue(calls.REIDENTIFY, body, idempotency_key))
+
+    async def jobs(
+        self, limit: int | None = None, state: Sequence[str] | None = None
+    ) -> list[Document]:
+        """Jobs, newest first: all, or at most `limit`, or those in some states."""
+        return await self._fetch_list(calls.JOBS(state=state), limit)
+
+    async def job(self, name: str) -> Document:
+        """One job with its state and progress."""
+        return await self._fetch_document(calls.JOB(name))
+
+    async def cancel(self, job: str) -> Document:
+        """Cancel a job; what it has found so far stays."""
+        return await self._fetch_document(calls.CANCEL(job))
+
+    async def resume(self, job: str) -> Document:
+        """Queue a failed or cancelled job again, from where it stopped."""
+        return await self._fetch_document(calls.RESUME(job))
+
+    async def clone(self, job: str) -> Document:
+        """Queue the same request as a new job."""
+        return await self._fetch_document(calls.CLONE(job))
+
+    async def report(self, job: str) -> str:
+        """The report of a job, as HTML."""
+        return (await self.send(calls.REPORT(job))).text
 
     async def wait(
         self,
         job: str,
         progress: Callable[[Document], object] | None = None,
         *,
-        poll: float = POLL_S,
+        poll: float = calls.POLL_S,
     ) -> Document:
         """Wait until a job has ended; `progress` hears its state at every look."""
         while True:
             state = await self.job(job)
             if progress is not None:
                 progress(state)
-            if state["state"] in TERMINAL:
+            if state["state"] in calls.TERMINAL:
                 return state
             await asyncio.sleep(poll)
 
@@ -122,11 +214,91 @@ class AsyncClient(
                 for event in parser.feed(line):
                     yield event
 
-    async def runs(
+    # ---- runs
+    def runs(
         self, job: str, *, at_most: int | None = None, **filters: Any
     ) -> AsyncIterator[Document]:
-        """Runs of a job, page by page."""
-        pages = calls.Pages(("jobs", job, "runs"), at_most, filters)
-        while (call := pages.next()) is not None:
-            for run in pages.take(await self._one(call)):
-                yield run
+        """All runs of a job, or the first `at_most` that the filters leave."""
+        return self._iterate_items(calls.RUNS(job, **filters), at_most)
+
+    async def summary(self, job: str, by: Sequence[str] | None = None) -> Document:
+        """Quantiles over the values of axes or labels; by default over all axes but seeds."""
+        return await self._fetch_document(calls.SUMMARY(job, by=by))
+
+    async def trend(self, job: str) -> Document:
+        """Estimates over the label of a batch: law, band, predictions, outliers, drift."""
+        return await self._fetch_document(calls.TREND(job))
+
+    async def run(self, name: str) -> Document:
+        """One run's result."""
+        return await self._fetch_document(calls.RUN(name))
+
+    async def history(self, run: str) -> Document:
+        """Improvements of each island's champion."""
+        return await self._fetch_document(calls.HISTORY(run))
+
+    async def response(self, run: str, max_points: int = 1000) -> Document:
+        """Measured and simulated outputs."""
+        return await self._fetch_document(calls.RESPONSE(run, max_points=max_points))
+
+    async def simulate_run(
+        self, run: str, body: Mapping[str, Any], max_points: int = 1000
+    ) -> Document:
+        """Simulate the identified model on a new input or under P, PI or PID control."""
+        return await self._fetch_document(calls.SIMULATE_RUN(run, json=body, max_points=max_points))
+
+    async def validate_run(
+        self,
+        run: str,
+        dataset: str,
+        channels: Mapping[str, str] | None = None,
+        *,
+        skip: int = 0,
+        max_points: int = 1000,
+    ) -> Document:
+        """Run the identified model freely over another recording: RMS and fit there."""
+        body = {"dataset": dataset, "channels": dict(channels or {}), "skip": skip}
+        return await self._fetch_document(calls.VALIDATE_RUN(run, json=body, max_points=max_points))
+
+    async def migrations(self, run: str) -> Document:
+        """The migration log."""
+        return await self._fetch_document(calls.MIGRATIONS(run))
+
+    async def profile(self, run: str, *parameters: str, points: int = 21) -> Document:
+        """Profile likelihood of some free parameters, of all if none is named."""
+        body = {"parameters": parameters or None, "points": points}
+        return await self._fetch_document(calls.PROFILE(run, json=body))
+
+    async def residuals(self, run: str) -> Document:
+        """Correlation functions of the residuals with their bands and tests."""
+        return await self._fetch_document(calls.RESIDUALS(run))
+
+    async def export(self, run: str, format: str = "json", pade_order: int = 3) -> str:
+        """The identified model as text: json, python, c or control."""
+        return (await self.send(calls.EXPORT(run, format=format, pade_order=pade_order))).text
+
+    async def compare(self, *runs: str) -> Document:
+        """Runs on the same data side by side, the best first."""
+        return await self._fetch_document(calls.COMPARE(json={"runs": runs}))
+
+    # ---- references
+    async def references(self) -> list[Document]:
+        """The references in use, by name."""
+        return await self._fetch_list(calls.REFERENCES())
+
+    async def reference(self, name: str) -> Document:
+        """One reference with its history."""
+        return await self._fetch_document(calls.REFERENCE(name))
+
+    async def accept_reference(
+        self, name: str, run: str, *, by: str | None = None, note: str | None = None
+    ) -> Document:
+        """Make a run the reference of a name; the one before stays in the history."""
+        body = {"run": run, "by": by, "note": note}
+        return await self._fetch_document(calls.ACCEPT_REFERENCE(name, json=body))
+
+
+async def _read_blocks(path: Path) -> AsyncIterator[bytes]:
+    with path.open("rb") as file:
+        while piece := await asyncio.to_thread(file.read, BLOCK_BYTES):
+            yield piece

@@ -1,18 +1,18 @@
-"""The REST calls as values, shared by the synchronous and the asynchronous client.
+"""The calls of the REST interface as values, shared by the two clients; loads no HTTP library.
 
-Whether a call that a server could not serve just now is sent again, and after what pause.
+The errors of the clients, the pages of a list, the events of a job, and which call is sent again.
 """
 
 import json
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from http import HTTPStatus
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypedDict
+from typing import TYPE_CHECKING, Any, TypeAlias
+from urllib.parse import quote
 from uuid import uuid4
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ Document: TypeAlias = dict[str, Any]
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 TERMINAL = frozenset({"succeeded", "failed", "cancelled"})
-PIECE = 1 << 20
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 MEDIA_TYPES = {".csv": "text/csv", ".txt": "text/csv", ".mcap": "application/x-mcap"}
 IDEMPOTENCY = "Idempotency-Key"
@@ -33,18 +32,9 @@ TIMEOUT_S = 60.0
 PAGE = 500
 
 
-class Options(TypedDict):
-    """What both clients tell httpx."""
-
-    base_url: str
-    headers: dict[str, str]
-    timeout: float
-
-
-def options(url: str, key: str | None) -> Options:
-    """The server's address and the key, as httpx takes them."""
-    headers = {"Authorization": f"Bearer {key}"} if key else {}
-    return Options(base_url=url, headers=headers, timeout=TIMEOUT_S)
+def make_auth_header(key: str | None) -> dict[str, str]:
+    """The header that carries an API key."""
+    return {"Authorization": f"Bearer {key}"} if key else {}
 
 
 class ClientError(Exception):
@@ -76,7 +66,8 @@ class ProblemError(ClientError):
 class ServerUnreachable(ClientError):
     """No server answers at the address."""
 
-    def __init__(self, url: str, reason: str) -> None:
+    def __init__(self, url: str, error: Exception) -> None:
+        reason = str(error) or type(error).__name__
         super().__init__(
             f"no lagid server answers at {url} ({reason}); start one with `lagid serve`, "
             "or name another with --url or LAGID_URL"
@@ -119,6 +110,12 @@ class Call:
     def __post_init__(self) -> None:
         _check_finite("", self.json)
 
+    def request(self, content: Any, *, stream: bool) -> dict[str, Any]:
+        """Arguments for httpx's ``build_request``; a stream has no time limit."""
+        request = {"method": self.method, "url": self.path, "content": content, "json": self.json}
+        limit = {"timeout": None} if stream else {}
+        return {**request, "params": dict(self.params), "headers": dict(self.headers), **limit}
+
 
 def _check_finite(pointer: str, value: Any) -> None:
     if isinstance(value, float) and not isfinite(value):
@@ -132,51 +129,86 @@ def _check_finite(pointer: str, value: Any) -> None:
             _check_finite(f"{pointer}/{index}", one)
 
 
-def read(*parts: str, **params: Any) -> Call:
-    """GET of a path made of parts; parameters that are None are left out."""
-    given = {name: value for name, value in params.items() if value is not None}
-    return Call("GET", "/v1/" + "/".join(_quoted(part) for part in parts), given)
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """A call without its values: the method, and the path below ``/v1/`` with ``{}`` for names."""
+
+    method: str
+    path: str
+
+    def __call__(self, *names: str, json: Any = None, **params: Any) -> Call:
+        """The call on the things with these names; parameters that are None are left out."""
+        path = self.path.format(*(quote(name, safe="") for name in names))
+        query = {key: _to_query(value) for key, value in params.items() if value is not None}
+        return Call(self.method, f"/v1/{path}", query, json)
 
 
-def act(what: str, name: str, verb: str, body: Any = None, **params: Any) -> Call:
-    """POST of an action upon one thing, such as ``/v1/jobs/job_…:cancel``."""
-    return Call("POST", f"/v1/{what}/{_quoted(name)}:{verb}", params, json=body)
+def _to_query(value: Any) -> Any:
+    is_list = isinstance(value, Sequence) and not isinstance(value, str)
+    return list(value) if is_list else value
 
 
-def profile(run: str, parameters: Sequence[str], points: int) -> Call:
-    """POST that asks for the profiles of a run's parameters, of all free ones if none is named."""
-    names = list(parameters) or None
-    return act("runs", run, "profile", {"parameters": names, "points": points})
+ADD_DATASET = Endpoint("POST", "datasets")
+SIMULATE_DATASET = Endpoint("POST", "datasets:simulate")
+DERIVE = Endpoint("POST", "datasets/{}:derive")
+DATASETS = Endpoint("GET", "datasets")
+DATASET = Endpoint("GET", "datasets/{}")
+SIGNALS = Endpoint("GET", "datasets/{}/signals")
+LINEAGE = Endpoint("GET", "datasets/{}/lineage")
+CONTENT = Endpoint("GET", "datasets/{}/content")
+
+MODELS = Endpoint("GET", "models")
+MODEL = Endpoint("GET", "models/{}")
+ADD_MODEL = Endpoint("POST", "models")
+CHECK_MODEL = Endpoint("POST", "models:check")
+
+SUBMIT = Endpoint("POST", "jobs")
+NOISE_SWEEP = Endpoint("POST", "recipes/noise-sweep")
+REIDENTIFY = Endpoint("POST", "recipes/reidentify")
+JOBS = Endpoint("GET", "jobs")
+JOB = Endpoint("GET", "jobs/{}")
+CANCEL = Endpoint("POST", "jobs/{}:cancel")
+RESUME = Endpoint("POST", "jobs/{}:resume")
+CLONE = Endpoint("POST", "jobs/{}:clone")
+EVENTS = Endpoint("GET", "jobs/{}/events")
+REPORT = Endpoint("GET", "jobs/{}/report")
+RUNS = Endpoint("GET", "jobs/{}/runs")
+SUMMARY = Endpoint("GET", "jobs/{}/summary")
+TREND = Endpoint("GET", "jobs/{}/trend")
+
+RUN = Endpoint("GET", "runs/{}")
+HISTORY = Endpoint("GET", "runs/{}/history")
+RESPONSE = Endpoint("GET", "runs/{}/response")
+SIMULATE_RUN = Endpoint("POST", "runs/{}:simulate")
+VALIDATE_RUN = Endpoint("POST", "runs/{}:validate")
+MIGRATIONS = Endpoint("GET", "runs/{}/migrations")
+PROFILE = Endpoint("POST", "runs/{}:profile")
+RESIDUALS = Endpoint("GET", "runs/{}/residuals")
+EXPORT = Endpoint("GET", "runs/{}/export")
+COMPARE = Endpoint("POST", "runs:compare")
+
+REFERENCES = Endpoint("GET", "references")
+REFERENCE = Endpoint("GET", "references/{}")
+ACCEPT_REFERENCE = Endpoint("PUT", "references/{}")
 
 
-def create(what: str, body: Any, headers: Mapping[str, str] | None = None) -> Call:
-    """POST of a new thing."""
-    return Call("POST", f"/v1/{what}", json=body, headers=headers or {})
-
-
-def queue(what: str, body: Mapping[str, Any], key: str | None) -> Call:
-    """POST that queues a job; the same idempotency key again gives the same job.
+def queue(endpoint: Endpoint, body: Mapping[str, Any], key: str | None) -> Call:
+    """A call that queues a job; the same idempotency key again gives the same job.
 
     Without a key it has one of its own, so that it can be sent again where no answer came.
     """
-    return create(what, body, {IDEMPOTENCY: key or uuid4().hex})
+    return replace(endpoint(json=body), headers={IDEMPOTENCY: key or uuid4().hex})
 
 
 def events(job: str, after: str | None) -> Call:
-    """GET of a job's events, those after a known one."""
-    call = read("jobs", job, "events")
-    return replace(call, headers={"Last-Event-ID": after}) if after else call
-
-
-def accept(name: str, run: str, by: str | None, note: str | None) -> Call:
-    """PUT of a run as the reference of a name."""
-    return Call("PUT", f"/v1/references/{_quoted(name)}", json={"run": run, "by": by, "note": note})
+    """The call for a job's events, or for those after a known one."""
+    return replace(EVENTS(job), headers={"Last-Event-ID": after} if after else {})
 
 
 def upload(
     source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
 ) -> Call:
-    """POST of a recording, from a file or from bytes; its kind follows from suffix or content."""
+    """The call that stores a file or bytes; the kind follows from the suffix or the content."""
     content: bytes | Path
     if isinstance(source, bytes):
         content = source
@@ -185,52 +217,15 @@ def upload(
         content = Path(source)
         kind = MEDIA_TYPES.get(content.suffix.lower(), "application/octet-stream")
         name = name or content.stem
-    given = {"name": name, "segments": segments, "sample_time": sample_time}
-    params = {key: value for key, value in given.items() if value is not None}
-    return Call("POST", "/v1/datasets", params, content=content, headers={"content-type": kind})
-
-
-@contextmanager
-def opened(content: bytes | Path | None) -> Iterator[bytes | BinaryIO | None]:
-    """Content to send; a file is read piece by piece while it is sent."""
-    if isinstance(content, Path):
-        with content.open("rb") as file:
-            yield file
-    else:
-        yield content
-
-
-def pieces(content: bytes | Path | None) -> bytes | AsyncIterator[bytes] | None:
-    """Content to send from an asynchronous client."""
-    return _read_pieces(content) if isinstance(content, Path) else content
-
-
-@contextmanager
-def unreachable_told(url: str) -> Iterator[None]:
-    """Raise `ServerUnreachable` where no answer comes."""
-    import httpx  # whoever sends has a client; a command without one starts sooner
-
-    try:
-        yield
-    except httpx.TransportError as error:
-        raise ServerUnreachable(url, str(error) or type(error).__name__) from error
-
-
-def request(call: Call, content: Any, *, stream: bool) -> dict[str, Any]:
-    """A call as httpx builds a request of it; a stream stays open as long as it has to."""
-    given = {"params": dict(call.params), "json": call.json, "headers": dict(call.headers)}
-    limit = {"timeout": None} if stream else {}
-    return {"method": call.method, "url": call.path, "content": content, **given, **limit}
+    call = ADD_DATASET(name=name, segments=segments, sample_time=sample_time)
+    return replace(call, content=content, headers={"content-type": kind})
 
 
 class Pages:
-    """What is listed under a path, page by page: `at_most` items, or all."""
+    """What a call lists, page by page: `at_most` items, or all."""
 
-    def __init__(
-        self, parts: Sequence[str], at_most: int | None, filters: Mapping[str, Any]
-    ) -> None:
-        self._parts, self._filters = parts, filters
-        self._left, self._limit = at_most, min(at_most or PAGE, PAGE)
+    def __init__(self, call: Call, at_most: int | None) -> None:
+        self._call, self._left, self._limit = call, at_most, min(at_most or PAGE, PAGE)
         self._cursor: str | None = None
         self._is_over = False
 
@@ -238,7 +233,9 @@ class Pages:
         """The call of the next page, until there is none."""
         if self._is_over:
             return None
-        return read(*self._parts, cursor=self._cursor, limit=self._limit, **self._filters)
+        position = {"cursor": self._cursor} if self._cursor else {}
+        params = {**self._call.params, "limit": self._limit, **position}
+        return replace(self._call, params=params)
 
     def take(self, page: Document) -> list[Document]:
         """The items of a page that answers the call."""
@@ -265,17 +262,9 @@ def checked(answer: "httpx.Response") -> "httpx.Response":
     except ValueError:
         document = None
     if not isinstance(document, dict):
-        document = {"title": answer.reason_phrase, "status": answer.status_code,
-                    "detail": answer.text[:200]}  # fmt: skip
+        title, detail = answer.reason_phrase, answer.text[:200]
+        document = {"title": title, "status": answer.status_code, "detail": detail}
     raise ProblemError(answer.status_code, document)
-
-
-async def _read_pieces(path: Path) -> AsyncIterator[bytes]:
-    import asyncio  # late, for commands that open no connection
-
-    with path.open("rb") as file:
-        while piece := await asyncio.to_thread(file.read, PIECE):
-            yield piece
 
 
 class EventParser:
@@ -303,12 +292,6 @@ class EventParser:
 def _fault(entry: Mapping[str, Any]) -> str:
     column = f", column {entry['column']}" if entry.get("column") is not None else ""
     return f"{entry.get('pointer') or 'body'}{column}: {entry.get('detail')}"
-
-
-def _quoted(part: str) -> str:
-    import httpx  # whoever quotes has a client; a command without one starts sooner
-
-    return httpx.URL("/").copy_with(path="/" + part).raw_path.decode().removeprefix("/")
 
 
 RETRIES = 4

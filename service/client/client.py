@@ -4,36 +4,18 @@ All methods take and return plain documents with the names of the REST interface
 """
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing
-from types import TracebackType
-from typing import Any, Self
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
+from pathlib import Path
+from typing import Any, BinaryIO, Self
 
 import httpx
 
 from service.client import calls
-from service.client.async_client import AsyncClient
-from service.client.calls import (
-    DEFAULT_URL,
-    POLL_S,
-    RETRIES,
-    TERMINAL,
-    Call,
-    ClientError,
-    Document,
-    NotFinite,
-    ProblemError,
-    ServerUnreachable,
-    options,
-    pause_after,
-    pauses,
-)
-from service.client.methods import Methods
-
-__all__ = ["AsyncClient", "Client", "ClientError", "NotFinite", "ProblemError", "ServerUnreachable"]
+from service.client.calls import Call, Document, ServerUnreachable
 
 
-class Client(Methods[Document, list[Document], str, bytes]):
+class Client:
     """The service from a program.
 
     Parameters
@@ -62,24 +44,24 @@ class Client(Methods[Document, list[Document], str, bytes]):
 
     def __init__(
         self,
-        url: str = DEFAULT_URL,
+        url: str = calls.DEFAULT_URL,
         key: str | None = None,
         *,
-        retries: int = RETRIES,
+        retries: int = calls.RETRIES,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         self.url, self._retries = url.rstrip("/"), retries
-        self._http = httpx.Client(**options(self.url, key), transport=transport)
+        self._http = httpx.Client(
+            base_url=self.url,
+            headers=calls.make_auth_header(key),
+            timeout=calls.TIMEOUT_S,
+            transport=transport,
+        )
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -88,52 +70,150 @@ class Client(Methods[Document, list[Document], str, bytes]):
 
     def send(self, call: Call, *, stream: bool = False) -> httpx.Response:
         """Send one call; errors are raised. A stream is read and closed by the caller."""
-        left = pauses(call, self._retries)
+        left = calls.pauses(call, self._retries)
         while True:
-            answer = self._answer(call, stream)
-            pause = pause_after(answer, left)
+            answer = self._send_once(call, stream)
+            pause = calls.pause_after(answer, left)
             if pause is None:
                 return calls.checked(answer)
             time.sleep(pause)
 
-    def _answer(self, call: Call, stream: bool) -> httpx.Response:
-        with calls.unreachable_told(self.url), calls.opened(call.content) as content:
-            request = self._http.build_request(**calls.request(call, content, stream=stream))
-            answer = self._http.send(request, stream=stream)
-            if not answer.is_success:
-                answer.read()
-            return answer
+    def _send_once(self, call: Call, stream: bool) -> httpx.Response:
+        source = call.content
+        file: AbstractContextManager[BinaryIO | bytes | None]
+        file = source.open("rb") if isinstance(source, Path) else nullcontext(source)
+        with file as content:
+            request = self._http.build_request(**call.request(content, stream=stream))
+            try:
+                answer = self._http.send(request, stream=stream)
+                if not answer.is_success:
+                    answer.read()
+            except httpx.TransportError as error:
+                raise ServerUnreachable(self.url, error) from error
+        return answer
 
-    def _one(self, call: Call) -> Document:
+    def _fetch_document(self, call: Call) -> Document:
         document: Document = self.send(call).json()
         return document
 
-    def _text(self, call: Call) -> str:
-        return self.send(call).text
-
-    def _content(self, call: Call) -> bytes:
-        return self.send(call).content
-
-    def _all(self, *parts: str, at_most: int | None = None, **filters: Any) -> list[Document]:
-        pages = calls.Pages(parts, at_most, filters)
-        items: list[Document] = []
-        while (call := pages.next()) is not None:
-            items += pages.take(self._one(call))
+    def _fetch_list(self, call: Call, at_most: int | None = None) -> list[Document]:
+        pages, items = calls.Pages(call, at_most), []
+        while (page := pages.next()) is not None:
+            items += pages.take(self._fetch_document(page))
         return items
+
+    # ---- datasets
+    def add_dataset(
+        self,
+        source: str | Path | bytes,
+        name: str | None = None,
+        *,
+        segments: str | None = None,
+        sample_time: float | None = None,
+    ) -> Document:
+        """Store a recording, CSV or MCAP, from a file or from bytes."""
+        return self._fetch_document(calls.upload(source, name, segments, sample_time))
+
+    def simulate_dataset(self, body: Mapping[str, Any]) -> Document:
+        """Make a dataset from a model, its true parameters, inputs and noise."""
+        return self._fetch_document(calls.SIMULATE_DATASET(json=body))
+
+    def derive(self, dataset: str, steps: list[Document], name: str | None = None) -> Document:
+        """Make a dataset from another: noise, resample, trim, select, pool, and so on."""
+        body = {"name": name, "steps": steps}
+        return self._fetch_document(calls.DERIVE(dataset, json=body))
+
+    def datasets(self) -> list[Document]:
+        """All datasets, newest first."""
+        return self._fetch_list(calls.DATASETS())
+
+    def dataset(self, name: str) -> Document:
+        """One dataset by id."""
+        return self._fetch_document(calls.DATASET(name))
+
+    def signals(self, dataset: str, max_points: int = 1000) -> Document:
+        """Signals of a dataset, reduced to at most so many points a channel."""
+        return self._fetch_document(calls.SIGNALS(dataset, max_points=max_points))
+
+    def lineage(self, dataset: str) -> Document:
+        """What a dataset was made from, and what was made from it."""
+        return self._fetch_document(calls.LINEAGE(dataset))
+
+    def content(self, dataset: str) -> bytes:
+        """A dataset as an MCAP file."""
+        return self.send(calls.CONTENT(dataset)).content
+
+    # ---- models
+    def models(self) -> list[Document]:
+        """Catalogue and own models."""
+        return self._fetch_list(calls.MODELS())
+
+    def model(self, name: str) -> Document:
+        """One model with its document."""
+        return self._fetch_document(calls.MODEL(name))
+
+    def add_model(self, document: Mapping[str, Any]) -> Document:
+        """Store an own model; a changed document becomes its next version."""
+        return self._fetch_document(calls.ADD_MODEL(json=document))
+
+    def check_model(self, document: Mapping[str, Any]) -> Document:
+        """Whether a model document can be used, with every error and its column."""
+        return self._fetch_document(calls.CHECK_MODEL(json=document))
+
+    # ---- jobs
+    def submit(self, job: Mapping[str, Any], *, idempotency_key: str | None = None) -> Document:
+        """Queue a job."""
+        return self._fetch_document(calls.queue(calls.SUBMIT, job, idempotency_key))
+
+    def noise_sweep(
+        self, body: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a noise sweep: σ × replicates × methods as one job."""
+        return self._fetch_document(calls.queue(calls.NOISE_SWEEP, body, idempotency_key))
+
+    def reidentify(
+        self, body: Mapping[str, Any], *, idempotency_key: str | None = None
+    ) -> Document:
+        """Queue a batch re-identification: a run for each value of a label, with a trend."""
+        return self._fetch_document(calls.queue(calls.REIDENTIFY, body, idempotency_key))
+
+    def jobs(self, limit: int | None = None, state: Sequence[str] | None = None) -> list[Document]:
+        """Jobs, newest first: all, or at most `limit`, or those in some states."""
+        return self._fetch_list(calls.JOBS(state=state), limit)
+
+    def job(self, name: str) -> Document:
+        """One job with its state and progress."""
+        return self._fetch_document(calls.JOB(name))
+
+    def cancel(self, job: str) -> Document:
+        """Cancel a job; what it has found so far stays."""
+        return self._fetch_document(calls.CANCEL(job))
+
+    def resume(self, job: str) -> Document:
+        """Queue a failed or cancelled job again, from where it stopped."""
+        return self._fetch_document(calls.RESUME(job))
+
+    def clone(self, job: str) -> Document:
+        """Queue the same request as a new job."""
+        return self._fetch_document(calls.CLONE(job))
+
+    def report(self, job: str) -> str:
+        """The report of a job, as HTML."""
+        return self.send(calls.REPORT(job)).text
 
     def wait(
         self,
         job: str,
         progress: Callable[[Document], object] | None = None,
         *,
-        poll: float = POLL_S,
+        poll: float = calls.POLL_S,
     ) -> Document:
         """Wait until a job has ended; `progress` hears its state at every look."""
         while True:
             state = self.job(job)
             if progress is not None:
                 progress(state)
-            if state["state"] in TERMINAL:
+            if state["state"] in calls.TERMINAL:
                 return state
             time.sleep(poll)
 
@@ -144,6 +224,81 @@ class Client(Methods[Document, list[Document], str, bytes]):
             for line in stream.iter_lines():
                 yield from parser.feed(line)
 
+    # ---- runs
     def runs(self, job: str, *, at_most: int | None = None, **filters: Any) -> list[Document]:
         """All runs of a job, or the first `at_most` that the filters leave."""
-        return self._all("jobs", job, "runs", at_most=at_most, **filters)
+        return self._fetch_list(calls.RUNS(job, **filters), at_most)
+
+    def summary(self, job: str, by: Sequence[str] | None = None) -> Document:
+        """Quantiles over the values of axes or labels; by default over all axes but seeds."""
+        return self._fetch_document(calls.SUMMARY(job, by=by))
+
+    def trend(self, job: str) -> Document:
+        """Estimates over the label of a batch: law, band, predictions, outliers, drift."""
+        return self._fetch_document(calls.TREND(job))
+
+    def run(self, name: str) -> Document:
+        """One run's result."""
+        return self._fetch_document(calls.RUN(name))
+
+    def history(self, run: str) -> Document:
+        """Improvements of each island's champion."""
+        return self._fetch_document(calls.HISTORY(run))
+
+    def response(self, run: str, max_points: int = 1000) -> Document:
+        """Measured and simulated outputs."""
+        return self._fetch_document(calls.RESPONSE(run, max_points=max_points))
+
+    def simulate_run(self, run: str, body: Mapping[str, Any], max_points: int = 1000) -> Document:
+        """Simulate the identified model on a new input or under P, PI or PID control."""
+        return self._fetch_document(calls.SIMULATE_RUN(run, json=body, max_points=max_points))
+
+    def validate_run(
+        self,
+        run: str,
+        dataset: str,
+        channels: Mapping[str, str] | None = None,
+        *,
+        skip: int = 0,
+        max_points: int = 1000,
+    ) -> Document:
+        """Run the identified model freely over another recording: RMS and fit there."""
+        body = {"dataset": dataset, "channels": dict(channels or {}), "skip": skip}
+        return self._fetch_document(calls.VALIDATE_RUN(run, json=body, max_points=max_points))
+
+    def migrations(self, run: str) -> Document:
+        """The migration log."""
+        return self._fetch_document(calls.MIGRATIONS(run))
+
+    def profile(self, run: str, *parameters: str, points: int = 21) -> Document:
+        """Profile likelihood of some free parameters, of all if none is named."""
+        body = {"parameters": parameters or None, "points": points}
+        return self._fetch_document(calls.PROFILE(run, json=body))
+
+    def residuals(self, run: str) -> Document:
+        """Correlation functions of the residuals with their bands and tests."""
+        return self._fetch_document(calls.RESIDUALS(run))
+
+    def export(self, run: str, format: str = "json", pade_order: int = 3) -> str:
+        """The identified model as text: json, python, c or control."""
+        return self.send(calls.EXPORT(run, format=format, pade_order=pade_order)).text
+
+    def compare(self, *runs: str) -> Document:
+        """Runs on the same data side by side, the best first."""
+        return self._fetch_document(calls.COMPARE(json={"runs": runs}))
+
+    # ---- references
+    def references(self) -> list[Document]:
+        """The references in use, by name."""
+        return self._fetch_list(calls.REFERENCES())
+
+    def reference(self, name: str) -> Document:
+        """One reference with its history."""
+        return self._fetch_document(calls.REFERENCE(name))
+
+    def accept_reference(
+        self, name: str, run: str, *, by: str | None = None, note: str | None = None
+    ) -> Document:
+        """Make a run the reference of a name; the one before stays in the history."""
+        body = {"run": run, "by": by, "note": note}
+        return self._fetch_document(calls.ACCEPT_REFERENCE(name, json=body))

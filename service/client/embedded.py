@@ -47,18 +47,8 @@ def embedded_service(
     data_dir.mkdir(parents=True, exist_ok=True)
     chosen = port or free_port()
     url = f"http://127.0.0.1:{chosen}"
-    command = [
-        sys.executable,
-        "-m",
-        "service.cli.main",
-        "serve",
-        "--host",
-        "127.0.0.1",
-        "--port",
-        str(chosen),
-        "--data-dir",
-        str(data_dir),
-    ]
+    command = [sys.executable, "-m", "service.cli.main", "serve", "--data-dir", str(data_dir)]
+    command += ["--host", "127.0.0.1", "--port", str(chosen)]
     command += ["--cpus", str(cpus)] if cpus else []
     log = data_dir / "serve.log"
     with log.open("ab") as sink:

@@ -11,7 +11,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from workers.processes import has_ended, standing, tag
+from service.core.processes import has_process_ended, read_start
+from sysid.core.machine import make_machine_tag
 
 STALE_SECONDS = 24 * 3600
 """After so long a file is nobody's, whichever machine it came from."""
@@ -19,8 +20,7 @@ STALE_SECONDS = 24 * 3600
 
 def prefix() -> str:
     """What the names of this process's temporary files begin with."""
-    here = standing(os.getpid())
-    return f"lagid-tmp-{tag()}-{os.getpid()}-{0 if here is None else here.started}-"
+    return f"lagid-tmp-{make_machine_tag()}-{os.getpid()}-{read_start(os.getpid()) or 0}-"
 
 
 def clear(folder: Path, pattern: str = "lagid-tmp-*") -> None:
@@ -32,8 +32,8 @@ def clear(folder: Path, pattern: str = "lagid-tmp-*") -> None:
 
 
 def _is_of_the_dead(name: str) -> bool:
-    found = re.match(rf"lagid-tmp-{tag()}-(\d+)-(\d+)-", name)
-    return found is not None and has_ended(int(found[1]), int(found[2]) or None)
+    found = re.match(rf"lagid-tmp-{make_machine_tag()}-(\d+)-(\d+)-", name)
+    return found is not None and has_process_ended(int(found[1]), int(found[2]) or None)
 
 
 def _is_stale(path: Path) -> bool:

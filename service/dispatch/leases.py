@@ -12,12 +12,13 @@ from functools import partial
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.core.processes import describe_process
 from service.queue.admission import Admission
 from service.queue.clocks import Clock
 from service.queue.dispatchers import LEASE_SECONDS, DispatcherRepository
 from service.queue.leases import Claim, Lease, Queue
 from service.queue.notifications import Signals, look
-from service.queue.orphaned_jobs import identity, reap
+from service.queue.orphaned_jobs import reap
 from service.storage.columns import Document
 from service.storage.errors import LeaseLost
 from service.storage.retry import patiently
@@ -66,7 +67,7 @@ class Leases:
 
     def start(self, details: dict[str, object]) -> None:
         """Announce the dispatcher and begin to beat."""
-        told = {LEASE_SECONDS: self._length.total_seconds(), **identity(), **details}
+        told = {LEASE_SECONDS: self._length.total_seconds(), **describe_process(), **details}
         patiently(partial(self._announce, told))
         self._thread.start()
 

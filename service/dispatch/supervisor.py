@@ -12,8 +12,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
+
+from service.core.processes import is_stopped
 from service.core.settings import Settings
-from workers.processes import clear_after, kill, of_session, standing
+from workers.ray_folders import clear_ray_remains, kill_processes
 
 _log = logging.getLogger(__name__)
 
@@ -154,8 +157,8 @@ def _end_of(child: "subprocess.Popen[bytes]") -> int:
         try:
             return child.wait(LOOK_SECONDS)
         except subprocess.TimeoutExpired:
-            found = standing(child.pid)
-        if found is None or not found.is_stopped:
+            pass
+        if not is_stopped(child.pid):
             awake = time.monotonic()
         elif time.monotonic() - awake > STOPPED_SECONDS:
             _log.warning("the dispatcher was stopped for %g s: it is killed", STOPPED_SECONDS)
@@ -164,5 +167,15 @@ def _end_of(child: "subprocess.Popen[bytes]") -> int:
 
 def clear_family(leader: int) -> None:
     """Kill every process of the session of a child that has ended; clear what its Ray left."""
-    kill(of_session(leader))
-    clear_after(leader)
+    kill_processes(find_session_processes(leader))
+    clear_ray_remains(leader)
+
+
+def find_session_processes(session: int) -> tuple[int, ...]:
+    """Numbers of the processes of a session."""
+    pids = []
+    for pid in psutil.pids():
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            if os.getsid(pid) == session:
+                pids.append(pid)
+    return tuple(pids)

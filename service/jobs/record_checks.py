@@ -7,12 +7,11 @@ It needs no database, so that the command line checks as the service does.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service.core.errors import FieldError, faults_of
 from service.datasets.signal_channels import map_channels
 from service.jobs.to_core import algorithm_of, loss_of
-from service.storage.tables import Dataset
 from sysid.core.errors import RecordTooShort, SysidError, nearest
 from sysid.data.records import both_ways
 from sysid.models.delays import check_length, longest_lag, past_signals
@@ -20,6 +19,9 @@ from sysid.models.model import Model
 from sysid.models.parameters import Parameter, override
 from sysid.models.sections import interval
 from sysid.models.units import SignalUnits
+
+if TYPE_CHECKING:
+    from service.storage.tables import Dataset
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +49,7 @@ def signals_of(model: Model) -> tuple[list[str], list[str]]:
 
 
 def channel_faults(
-    channels: Mapping[str, str], model: Model, dataset: Dataset
+    channels: Mapping[str, str], model: Model, dataset: "Dataset"
 ) -> Iterator[FieldError]:
     """Signals of the model for which a dataset has no channel."""
     known = [channel["name"] for channel in dataset.channels]
@@ -68,7 +70,7 @@ def given_both_ways(channels: Mapping[str, str], model: Model) -> Iterator[Field
 
 
 def unit_faults(
-    model: Model, channels: Mapping[str, str], datasets: Sequence[tuple[str, Dataset]]
+    model: Model, channels: Mapping[str, str], datasets: "Sequence[tuple[str, Dataset]]"
 ) -> Iterator[FieldError]:
     """Channels in another unit than the model has, or than a dataset before has.
 
@@ -87,7 +89,7 @@ def unit_faults(
                 yield FieldError(pointer, fault)
 
 
-def pieces_of(dataset: Dataset) -> list[Piece]:
+def pieces_of(dataset: "Dataset") -> list[Piece]:
     """The records that a dataset gives: its segments, or all of it."""
     period = dataset.sample_time
     spans = [one["stop"] - one["start"] for one in dataset.details.get("segments") or []]

@@ -6,48 +6,21 @@ that is seen to live and to be awake waits for something, and is not reaped for 
 """
 
 import logging
-import os
-import socket
 import threading
 from datetime import timedelta
 
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.core.processes import is_awake, is_gone
 from service.queue.clocks import Clock
 from service.queue.dispatchers import DispatcherRepository, length_of
 from service.queue.leases import HUNG, Owners, Queue, Reaped
-from service.storage.columns import Document
 from service.storage.sessions import Database
-from workers.processes import has_ended, machine, standing
 
 _log = logging.getLogger(__name__)
 
 PAUSE_SECONDS = 1.0
 """Between two looks of the web process."""
-
-
-def identity() -> Document:
-    """What a dispatcher tells of its process when it announces itself."""
-    here = standing(os.getpid())
-    return {
-        "host": socket.gethostname(),
-        "pid": os.getpid(),
-        "machine": machine(),
-        "started": None if here is None else here.started,
-    }
-
-
-def is_gone(details: Document) -> bool:
-    """Whether a dispatcher is known to have ended; False wherever this process cannot see it."""
-    return _is_visible(details) and has_ended(details["pid"], details["started"])
-
-
-def is_awake(details: Document) -> bool:
-    """Whether a dispatcher is seen to live and not to be stopped (SIGSTOP)."""
-    if not _is_visible(details) or is_gone(details):
-        return False
-    found = standing(details["pid"])
-    return found is not None and not found.is_stopped
 
 
 def reap(
@@ -85,13 +58,6 @@ def reap(
             dispatchers.leave(owner)
     _tell(reaped, owners)
     return reaped
-
-
-def _is_visible(details: Document) -> bool:
-    """Whether it told of a process that this one can see, if it is there."""
-    here = machine()
-    is_told = isinstance(details.get("pid"), int) and isinstance(details.get("started"), int)
-    return here is not None and details.get("machine") == here and is_told
 
 
 def _tell(reaped: Reaped, owners: Owners) -> None:

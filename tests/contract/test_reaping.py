@@ -11,17 +11,18 @@ from datetime import timedelta
 
 import pytest
 
+from service.core.processes import describe_process, is_awake, is_gone
 from service.dispatch.leases import Leases
 from service.queue.clocks import clock_of
 from service.queue.dispatchers import LEASE_SECONDS, DispatcherRepository
 from service.queue.leases import BESIDE_OTHERS, HUNG, Queue
-from service.queue.orphaned_jobs import Reaper, identity, is_awake, is_gone, reap
+from service.queue.orphaned_jobs import Reaper, reap
 from service.queue.run_writes import Cell, RunLedger, RunOutcome
 from service.storage.columns import utc_now
 from service.storage.tables import State
+from sysid.core.machine import read_machine_id
 from tests.dispatching import until
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
-from workers.processes import standing
 
 LEASE = timedelta(seconds=10)
 
@@ -38,13 +39,13 @@ def announce(database, owner: str, details) -> None:
 
 def of_a_process_that_has_ended():
     """What a dispatcher told that is no more."""
-    imports = "import json; from service.queue.orphaned_jobs import identity"
-    code = f"{imports}; print(json.dumps(identity()))"
+    imports = "import json; from service.core.processes import describe_process"
+    code = f"{imports}; print(json.dumps(describe_process()))"
     ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     return json.loads(ran.stdout)
 
 
-needs_proc = pytest.mark.skipif(standing(os.getpid()) is None, reason="there is no /proc")
+needs_proc = pytest.mark.skipif(read_machine_id() is None, reason="there is no /proc")
 
 
 @needs_proc
@@ -59,8 +60,8 @@ def test_jobs_of_a_dispatcher_whose_process_has_ended_are_given_back_at_once(dat
 
 
 def test_jobs_of_a_dispatcher_that_lives_or_that_cannot_be_seen_are_left_alone(database) -> None:
-    announce(database, "here", identity())
-    announce(database, "elsewhere", {**identity(), "machine": "another", "pid": 2**22 - 1})
+    announce(database, "here", describe_process())
+    announce(database, "elsewhere", {**describe_process(), "machine": "another", "pid": 2**22 - 1})
     announce(database, "unknown", {})
     jobs = {submit(database) for _ in range(3)}
     for owner in ("here", "elsewhere", "unknown"):
@@ -71,8 +72,8 @@ def test_jobs_of_a_dispatcher_that_lives_or_that_cannot_be_seen_are_left_alone(d
 
 @needs_proc
 def test_a_process_that_took_over_the_number_of_another_is_not_taken_for_it() -> None:
-    assert not is_gone(identity())
-    assert is_gone({**identity(), "started": 1})
+    assert not is_gone(describe_process())
+    assert is_gone({**describe_process(), "started": 1})
 
 
 def test_a_lease_written_before_the_clock_was_stepped_back_is_not_waited_for(
@@ -165,8 +166,8 @@ def expired(database, owner: str, details, seconds: float = 0.1) -> str:
 def test_a_dispatcher_that_lives_here_is_not_reaped_while_it_waits_for_the_database(
     database,
 ) -> None:
-    job = expired(database, "here", identity(), HUNG.total_seconds() - 10)
-    lost = expired(database, "elsewhere", {**identity(), "machine": "another"})
+    job = expired(database, "here", describe_process(), HUNG.total_seconds() - 10)
+    lost = expired(database, "elsewhere", {**describe_process(), "machine": "another"})
     assert reap(database, LEASE).requeued == (lost,)
     assert state_of(database, job) is State.RUNNING
     assert job_of(database, job).lost_leases == 0
@@ -176,7 +177,7 @@ def test_a_dispatcher_that_lives_here_is_not_reaped_while_it_waits_for_the_datab
 def test_a_dispatcher_that_lives_but_hangs_is_reaped_at_last_and_not_called_gone(
     database, caplog: pytest.LogCaptureFixture
 ) -> None:
-    job = expired(database, "here", identity(), HUNG.total_seconds() + 1)
+    job = expired(database, "here", describe_process(), HUNG.total_seconds() + 1)
     with caplog.at_level(logging.WARNING):
         assert reap(database, LEASE).requeued == (job,)
     (told,) = caplog.messages
@@ -188,8 +189,8 @@ def test_a_dispatcher_that_lives_but_hangs_is_reaped_at_last_and_not_called_gone
 @needs_proc
 def test_a_dispatcher_that_is_stopped_is_reaped_when_its_lease_ends(database) -> None:
     code = (
-        "import json; from service.queue.orphaned_jobs import identity\n"
-        "print(json.dumps(identity()), flush=True); input()"
+        "import json; from service.core.processes import describe_process\n"
+        "print(json.dumps(describe_process()), flush=True); input()"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

@@ -12,8 +12,7 @@ import pytest
 
 from service.core.settings import Settings
 from service.dispatch import supervisor as supervision
-from service.dispatch.supervisor import Supervisor, environment_of
-from workers.processes import of_session
+from service.dispatch.supervisor import Supervisor, environment_of, find_session_processes
 
 LIMIT_SECONDS = 40.0
 
@@ -65,7 +64,7 @@ def test_stopping_ends_the_child_and_every_process_it_started(tmp_path: Path) ->
     supervisor = Supervisor([sys.executable, "-c", CHILD, str(file)], {})
     supervisor.start()
     until(lambda: len(pids(file)) == 1, "the start")
-    family = of_session(pids(file)[0])
+    family = find_session_processes(pids(file)[0])
     supervisor.stop()
     assert len(family) == 2
     until(lambda: not any(map(is_alive, family)), "the end of all")
@@ -77,7 +76,7 @@ def test_a_killed_child_is_started_anew_and_its_orphans_are_killed(tmp_path: Pat
     supervisor = Supervisor([sys.executable, "-c", CHILD, str(file)], {})
     supervisor.start()
     until(lambda: len(pids(file)) == 1, "the start")
-    family = of_session(pids(file)[0])
+    family = find_session_processes(pids(file)[0])
     os.kill(pids(file)[0], signal.SIGKILL)
     until(lambda: len(pids(file)) == 2, "the second start")
     assert not any(map(is_alive, family))

@@ -1,5 +1,6 @@
 """The clients send a call again that a server could not serve just then, and only such a call."""
 
+import inspect
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
@@ -182,7 +183,23 @@ def test_events_of_a_server_that_is_not_there() -> None:
         list(client.events("job_1"))
 
 
+METHODS = [{name for name in dir(one) if not name.startswith("_")} for one in (Client, AsyncClient)]
+
+
 def test_both_clients_have_the_same_methods() -> None:
-    public = [{name for name in dir(one) if not name.startswith("_")}
-              for one in (Client, AsyncClient)]  # fmt: skip
-    assert public[0] == public[1]
+    assert METHODS[0] == METHODS[1]
+
+
+@pytest.mark.parametrize("name", sorted(METHODS[0]))
+def test_methods_of_both_clients_have_the_same_parameters_and_docstring(name: str) -> None:
+    plain, twin = getattr(Client, name), getattr(AsyncClient, name)
+    assert inspect.signature(plain).parameters == inspect.signature(twin).parameters
+    assert inspect.getdoc(plain) == inspect.getdoc(twin)
+    gives, twin_gives = (inspect.signature(one).return_annotation for one in (plain, twin))
+    iterates = {"events": "Iterator", "runs": "list"}.get(name)
+    if iterates is None:
+        assert inspect.iscoroutinefunction(twin)
+        assert gives == twin_gives
+    else:
+        assert str(twin_gives).startswith("collections.abc.AsyncIterator")
+        assert iterates in str(gives)

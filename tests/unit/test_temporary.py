@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from service.core import temporary_files as temporary
-from workers import local_ray, processes
+from sysid.core import machine
+from workers import local_ray, ray_folders
 from workers.errors import ClusterUnavailable
 
 LEAVE = """
@@ -53,24 +54,23 @@ def test_a_file_that_goes_while_it_is_looked_at_is_no_fault(
 def test_a_living_process_of_another_pid_namespace_keeps_its_files_and_rays_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ended: int
 ) -> None:
-    monkeypatch.setattr(processes, "_base", lambda: tmp_path)
+    monkeypatch.setattr(ray_folders, "_choose_base_folder", lambda: tmp_path)
     with monkeypatch.context() as there:  # its number is there one that has ended here
-        there.setattr(processes, "machine", lambda: ELSEWHERE)
+        there.setattr(machine, "read_machine_id", lambda: ELSEWHERE)
         there.setattr(os, "getpid", lambda: ended)
-        theirs = [tmp_path / f"{temporary.prefix()}file", processes.folder_of(ended)]
+        theirs = [tmp_path / f"{temporary.prefix()}file", ray_folders.get_ray_folder(ended)]
     for path in theirs:
         path.mkdir()
-    gone = processes.folder_of(ended)
+    gone = ray_folders.get_ray_folder(ended)
     gone.mkdir()
     temporary.clear(tmp_path)
-    processes.clear_after_the_dead()
+    ray_folders.clear_dead_dispatchers()
     assert set(tmp_path.iterdir()) == set(theirs)
 
 
-@pytest.mark.skipif(processes.standing(os.getpid()) is None, reason="there is no /proc")
 def test_files_of_a_process_whose_number_another_has_by_now_go(tmp_path: Path) -> None:
     number = os.getpid()
-    former = tmp_path / f"lagid-tmp-{processes.tag()}-{number}-1-file"
+    former = tmp_path / f"lagid-tmp-{machine.make_machine_tag()}-{number}-1-file"
     former.touch()
     temporary.clear(tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -79,8 +79,8 @@ def test_files_of_a_process_whose_number_another_has_by_now_go(tmp_path: Path) -
 def test_rays_folder_is_not_one_that_somebody_else_has_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes, "_base", lambda: tmp_path)
-    folder, target = processes.folder_of(os.getpid()), tmp_path / "elsewhere"
+    monkeypatch.setattr(ray_folders, "_choose_base_folder", lambda: tmp_path)
+    folder, target = ray_folders.get_ray_folder(os.getpid()), tmp_path / "elsewhere"
     target.mkdir()
     folder.symlink_to(target)  # as what another has made, it cannot be removed as a folder is
     with pytest.raises(ClusterUnavailable, match="cannot be made"):
@@ -92,10 +92,10 @@ def test_rays_folder_is_not_one_that_somebody_else_has_made(
 
 
 def test_the_paths_of_rays_sockets_are_short_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    base = "/" + "b" * (processes._LONGEST_BASE - 1)
-    monkeypatch.setattr(processes.tempfile, "gettempdir", lambda: base)
+    base = "/" + "b" * (ray_folders._MAX_BASE_LENGTH - 1)
+    monkeypatch.setattr(ray_folders.tempfile, "gettempdir", lambda: base)
     most = 2**22 - 1  # the highest number of a process
     session = f"session_2026-01-01_00-00-00_000000_{most}/sockets/plasma_store"
-    path = processes.folder_of(most) / session
+    path = ray_folders.get_ray_folder(most) / session
     assert str(path).startswith(base)
     assert len(str(path)) <= 107

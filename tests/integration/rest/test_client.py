@@ -1,5 +1,6 @@
 """The light client against the application, without a socket."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,23 @@ def test_models_are_read_checked_and_stored(client: Client) -> None:
     assert client.check_model(document)["valid"] is True
     assert client.add_model({**document, "name": "own"})["version"] == 1
     assert "own" in {one["name"] for one in client.models()}
+
+
+def test_every_call_is_one_of_the_interface(server: TestClient) -> None:
+    paths = server.get("/openapi.json").json()["paths"]
+    routes = {(verb.upper(), re.sub(r"{\w*}", "{}", path)) for path, verbs in paths.items()
+              for verb in verbs}  # fmt: skip
+    table = [one for one in vars(calls).values() if isinstance(one, calls.Endpoint)]
+    assert len(table) > 30
+    assert {(one.method, f"/v1/{one.path}") for one in table} <= routes
+
+
+@pytest.mark.parametrize("name", ["a b", "a/b?c#d", "100%", "é:x"])
+def test_a_name_in_a_path_is_sent_as_it_is(client: Client, name: str) -> None:
+    with pytest.raises(ProblemError) as refused:
+        client.model(name)
+    assert refused.value.status == 404
+    assert calls.MODEL(name).path.count("/") == 3
 
 
 def test_a_server_that_is_not_there_is_said_with_what_to_do() -> None:
