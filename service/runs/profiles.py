@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 from service.core.errors import Conflict, InvalidRequest
 from service.core.json_pointer import body_of
 from service.datasets.recordings import recording_of
-from service.jobs.to_core import loss_of, noise_model_of
+from service.jobs.to_core import fit_settings_of, noise_model_of
 from service.models.models import model_of_run
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
@@ -75,7 +75,7 @@ def profiles(database: Database, store: ObjectStore, run_id: str, body: ProfileI
 
 
 def _names(problem: "Problem", body: ProfileIn) -> list[str]:
-    free = [p.name for p in problem.space]
+    free = problem.free_names
     for place, name in enumerate(body.parameters or ()):
         if name not in free:
             raise InvalidRequest.at(
@@ -100,7 +100,7 @@ def _computed(
                 f"the profiles took more than {SECONDS:g} s and were stopped at {name!r}; ask for "
                 "fewer parameters or points, or use sysid.uncertainty.profile_likelihood.profile",
             )
-        others = [p.name for p in problem.space if p.name != name]
+        others = [free for free in problem.free_names if free != name]
         yield ProfileOut(
             name=name, unit=found.unit, estimate=found.estimate, interval95=found.interval,
             values=found.values.tolist(), ratio=_finite(found.ratio), rms=_finite(found.rms),
@@ -127,11 +127,9 @@ def _problem(session: Session, store: ObjectStore, run_id: str) -> "tuple[Proble
     known = {p.name for p in (*model.parameters, *initial_parameters(model, len(records)))}
     changes = {name: fields for name, fields in body["parameters"].items() if name in known}
     try:
-        problem = Problem.build(
-            model, records, parameters=changes, prediction=body["prediction"],
-            loss=loss_of({**body["loss"], "noise_model": noise_model_of(run.result)}),
-            weights=body["weights"], skip=body["skip"],
-        )  # fmt: skip
+        loss = {**body["loss"], "noise_model": noise_model_of(run.result)}
+        settings = fit_settings_of({**body, "parameters": changes, "loss": loss})
+        problem = Problem.from_settings(model, records, settings)
     except InvalidSettings as error:  # a job of an older version, with rules that were others
         raise Conflict(f"run {run_id} cannot be profiled: {error}") from error
     return problem, _estimate(problem, run)
@@ -139,7 +137,7 @@ def _problem(session: Session, store: ObjectStore, run_id: str) -> "tuple[Proble
 
 def _estimate(problem: "Problem", run: Run) -> Any:
     values = {one["name"]: one["value"] for one in (run.result or {})["parameters"]}
-    return np.array([values[p.name] for p in problem.space])
+    return np.array([values[name] for name in problem.free_names])
 
 
 def _records(
