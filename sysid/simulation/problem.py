@@ -82,15 +82,7 @@ class Problem:
         skip: int = 0,
         scored_from: Sequence[float] | None = None,
     ) -> "Problem":
-        """Lay the records out for the model and compile it; options as in `FitSettings`.
-
-        Raises
-        ------
-        InvalidRecord, RecordTooShort
-            If a record does not have what the model needs.
-        InvalidSettings, InvalidBounds
-            If an option cannot be used.
-        """
+        """A problem from the fields of `FitSettings`; raises as `from_settings` does."""
         since = None if scored_from is None else tuple(scored_from)
         settings = FitSettings(parameters or {}, prediction, loss or Loss(), weights, skip, since)
         return cls.from_settings(model, records, settings)
@@ -148,10 +140,7 @@ class Problem:
     ) -> "Problem":
         """The problem of another model, of other records, or with changed fields of its settings.
 
-        Raises
-        ------
-        InvalidRecord, RecordTooShort, InvalidSettings, InvalidBounds
-            As `from_settings`.
+        Raises as `from_settings` does.
         """
         return self.from_settings(
             self.untied_model if model is None else model,
