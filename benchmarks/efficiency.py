@@ -76,7 +76,7 @@ def record(y: NDArray[np.float64]) -> Record:
 def drawn(model: Model, truth: dict[str, float], draws: int) -> Draws:
     """Identify every draw."""
     problem = Problem.build(model, [record(np.zeros(SAMPLES))])
-    names = tuple(p.name for p in problem.space)
+    names = problem.free_names
     theta = np.array([truth[name] for name in names])
     clean = problem.predictions(theta[None])[0]
     found = []

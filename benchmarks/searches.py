@@ -104,7 +104,7 @@ def optimum(problem: Problem, starts: list[FloatArray]) -> float:
 def goal_of(system: System, problem: Problem, found: FloatArray | None = None) -> Goal:
     """The goal on a record, from least squares from the truth and from what was found."""
     truth = system.place(problem)
-    names = tuple(p.name for p in problem.space)
+    names = problem.free_names
     tolerances = None
     if system.noise == 0:
         tolerances = np.array([TOLERANCES[system.name[0]][name] for name in names])
@@ -123,7 +123,7 @@ def search(system: System, seed: int, method: SearchMethod = "improved") -> tupl
     found = conclude(problem, algorithm, state)
     seconds, after = searched - start, time.process_time() - searched
     values = {estimate.name: estimate.value for estimate in found.estimates}
-    best = np.array([values[p.name] for p in problem.space])
+    best = np.array([values[name] for name in problem.free_names])
     goal = goal_of(system, problem, best)
     generation = _hit(state, goal)
     if generation is None:

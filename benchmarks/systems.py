@@ -68,7 +68,7 @@ class System:
 
     def place(self, problem: Problem) -> FloatArray:
         """The true values in the order of the free parameters."""
-        return np.array([self.truth[parameter.name] for parameter in problem.space])
+        return np.array([self.truth[name] for name in problem.free_names])
 
     def problem(self, seed: int) -> Problem:
         """The system's record with the noise of that seed, ready to be fitted."""

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from sysid.core.settings import GeneticAlgorithm, Stop
+from sysid.core.settings import FitSettings, GeneticAlgorithm, Stop
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.result import Identification
@@ -56,7 +56,8 @@ def spec(
         }  # type: ignore[arg-type]
     )
     parameters = {"T": {"upper": 10.0}, "L": {"upper": 2.0}}
-    problem = ProblemSpec(document("fopdt"), records, parameters=parameters)
+    fit = FitSettings(parameters)
+    problem = ProblemSpec(document("fopdt"), records, settings=fit)
     return RunSpec(problem, algorithm, seed)
 
 

@@ -8,7 +8,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
-from sysid.core.settings import GeneticAlgorithm, Loss, Prediction
+from sysid.core.settings import FitSettings, GeneticAlgorithm
 from sysid.data.noise import Noise
 from sysid.data.records import Record
 from sysid.identification.fingerprint import program
@@ -38,19 +38,15 @@ class ProblemSpec:
         Key of the records kept for validation.
     validation_fraction : float or None
         Else the last fraction of each record that is kept for it.
-    skip : int
-        First samples of each output that are not scored.
+    noise : Noise
+        Added to the records that the model is fitted to.
     """
 
     model: Mapping[str, Any]
     records: str
     validation: str | None = None
     validation_fraction: float | None = None
-    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    prediction: Prediction = "simulation"
-    loss: Loss = field(default_factory=Loss)
-    weights: Mapping[str, float] | None = None
-    skip: int = 0
+    settings: FitSettings = field(default_factory=FitSettings)
     noise: Noise = field(default_factory=Noise)
 
     @cached_property

@@ -6,19 +6,22 @@ import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
-from typing import TypeAlias
+from functools import lru_cache
 
 from sysid.core.errors import SysidError
-from sysid.data.noise import Noise, with_noise
-from sysid.data.splitting import split_record, start_of_validation
+from sysid.data.noise import Noise
 from sysid.identification.conclude import conclude
+from sysid.identification.fit_problems import (
+    FitRecords,
+    ProblemPair,
+    build_problems,
+    prepare_records,
+)
 from sysid.identification.run import CALL_SECONDS, advance_island, begin, is_finished
 from sysid.identification.run import advance as advance_run
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.search.island import Island
-from sysid.selection.select import selected
 from sysid.simulation.problem import Problem, rms_against
 from workers.ports import (  # fmt: skip
     Advance,
@@ -41,10 +44,7 @@ PACK_LIMIT_SECONDS = 1.0
 
 CACHED_PROBLEMS, CACHED_MODELS = 8, 32
 
-Pair: TypeAlias = tuple[Problem, Problem | None]
-"""A problem, and that of its validation data if there are any."""
-
-_problems: OrderedDict[str, tuple[str, Pair]] = OrderedDict()
+_problems: OrderedDict[str, tuple[str, ProblemPair]] = OrderedDict()
 
 
 def advance(pack: Sequence[Item], keys: Sequence[str], *shared: Records) -> tuple[Done, ...]:
@@ -124,10 +124,12 @@ def _evolved(item: Evolve, problem: Problem) -> Island:
 
 def _without_noise(spec: ProblemSpec, records: Mapping[str, Records]) -> Records | None:
     """The records of the estimate before noise was added; None if none was."""
-    return None if spec.noise.sigma == 0 else prepared(replace(spec, noise=Noise()), records)[0]
+    if spec.noise.sigma == 0:
+        return None
+    return prepared(replace(spec, noise=Noise()), records).estimation
 
 
-def _problem(spec: ProblemSpec, records: Mapping[str, Records]) -> Pair:
+def _problem(spec: ProblemSpec, records: Mapping[str, Records]) -> ProblemPair:
     """The problem and its validation; the last few are kept, since slices of a run follow."""
     if spec.key in _problems:
         _problems.move_to_end(spec.key)
@@ -146,7 +148,9 @@ def _model(document: str) -> Model:
     return parse_model(json.loads(document))
 
 
-def build(spec: ProblemSpec, records: Mapping[str, Records], alike: Pair | None = None) -> Pair:
+def build(
+    spec: ProblemSpec, records: Mapping[str, Records], alike: ProblemPair | None = None
+) -> ProblemPair:
     """The problem and that of its validation data, if there are any.
 
     Parameters
@@ -159,34 +163,15 @@ def build(spec: ProblemSpec, records: Mapping[str, Records], alike: Pair | None 
     SysidError
         If model, records or settings cannot be used.
     """
-    estimation, validation = prepared(spec, records)
+    fit_records = prepared(spec, records)
     if alike is not None and alike[0].model.selection is None:  # else noise may select others
-        posed = alike[0].measured_anew(estimation)
+        posed = alike[0].measured_anew(fit_records.estimation)
         if posed.output_weights == alike[0].output_weights:  # which are those of the validation
             return posed, alike[1]
-    model = _model(json.dumps(spec.model))
-    model, parameters = selected(model, estimation, spec.parameters, spec.skip)
-
-    problem = partial(
-        Problem.build, model, parameters=parameters, prediction=spec.prediction,
-        loss=spec.loss, skip=spec.skip,
-    )  # fmt: skip
-    posed = problem(estimation, weights=spec.weights)
-    if validation is None:
-        return posed, None
-    since = None
-    if spec.validation_fraction is not None:  # the last part is simulated with all before it
-        validation = records[spec.records]
-        since = [start_of_validation(one, spec.validation_fraction) for one in validation]
-    return posed, problem(validation, weights=posed.output_weights, scored_from=since)
+    return build_problems(_model(json.dumps(spec.model)), fit_records, spec.settings)
 
 
-def prepared(spec: ProblemSpec, records: Mapping[str, Records]) -> tuple[Records, Records | None]:
+def prepared(spec: ProblemSpec, records: Mapping[str, Records]) -> FitRecords:
     """Records as a run sees them: noise added to those for the estimate, validation split off."""
-    estimation = records[spec.records]
     validation = None if spec.validation is None else records[spec.validation]
-    if spec.validation_fraction is not None:
-        parts = [split_record(record, spec.validation_fraction) for record in estimation]
-        estimation, validation = tuple(p[0] for p in parts), tuple(p[1] for p in parts)
-    noisy = (with_noise(record, spec.noise, number) for number, record in enumerate(estimation))
-    return tuple(noisy), validation
+    return prepare_records(records[spec.records], validation, spec.validation_fraction, spec.noise)

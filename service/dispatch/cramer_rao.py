@@ -10,6 +10,7 @@ meanwhile (`service.dispatch.background`).
 import logging
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -139,21 +140,22 @@ class _Floors:
         model = parse_model(spec.model)
         if model.rule is not None:
             return {"note": "there is no floor: the model selects its terms by the data"}
-        records, _ = prepared(
-            _without_noise(spec), {key: self._source.records(key) for key in spec.needs}
-        )
+        records = {key: self._source.records(key) for key in spec.needs}
         problem = Problem.build(
-            model, records, parameters=dict(_widened(spec, values)), skip=spec.skip,
+            model,
+            prepared(replace(spec, noise=Noise()), records).estimation,
+            parameters=dict(_widened(spec, values)),
+            skip=spec.settings.skip,
             weights={output.name: 1.0 for output in model.outputs},
-        )  # fmt: skip
-        unknown = [p.name for p in problem.space if p.name not in values]
+        )
+        unknown = [name for name in problem.free_names if name not in values]
         if unknown:
             return {"note": f"there is no floor: no value of {', '.join(unknown)} is known"}
         work = problem.n_scored * (2 * len(problem.space) + 1)
         if work > self._left:
             return {"note": "there is no floor: the records are too long to compute it here"}
         self._left -= work
-        theta: FloatArray = np.array([values[p.name] for p in problem.space])
+        theta: FloatArray = np.array([values[name] for name in problem.free_names])
         with one_thread():
             return _told(floor(problem, theta))
 
@@ -168,21 +170,14 @@ def _told(found: Floor) -> Document:
     return {"stderr": stderr, "rms": to_finite(found.response), "note": note}
 
 
-def _without_noise(spec: ProblemSpec) -> ProblemSpec:
-    # The cached key of a specification is no field: a new one is made from the fields.
-    return ProblemSpec(
-        spec.model, spec.records, spec.validation, spec.validation_fraction, spec.parameters,
-        skip=spec.skip, noise=Noise(),
-    )  # fmt: skip
-
-
 def _widened(
     spec: ProblemSpec, values: Mapping[str, float]
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """The changes of the parameters, with bounds between which the known values lie."""
     bounds = {p.name: (p.lower, p.upper) for p in parse_model(spec.model).parameters}
-    for name in {**bounds, **spec.parameters}:
-        change = dict(spec.parameters.get(name, {}))
+    changes = spec.settings.parameters
+    for name in {**bounds, **changes}:
+        change = dict(changes.get(name, {}))
         lower, upper = bounds.get(name, (-math.inf, math.inf))
         lower, upper = change.get("lower", lower), change.get("upper", upper)
         value = values.get(name)

@@ -16,7 +16,7 @@ from service.dispatch.fitted_signals import FittedPart, Shelf, Shelved, save_fit
 from service.dispatch.warm_starts import OpenChains, WarmStarts
 from service.jobs.axes import Steps
 from service.jobs.stored_cells import stored_cells, stored_groups
-from service.jobs.to_core import algorithm_of, loss_of
+from service.jobs.to_core import algorithm_of, fit_settings_of
 from service.models.models import load_stored_model
 from service.queue.leases import Claim
 from service.queue.previous_attempts import forget_progress
@@ -152,11 +152,7 @@ class JobRuns:
             records=self._key(body["datasets"], body, model),
             validation=None if kept is None else self._key(kept, body, model),
             validation_fraction=validation.get("fraction"),
-            parameters=body["parameters"],
-            prediction=body["prediction"],
-            loss=loss_of(body["loss"]),
-            weights=body["weights"],
-            skip=body["skip"],
+            settings=fit_settings_of(body),
             noise=Noise(float(body["noise"]["sigma"]), int(body["noise"]["seed"])),
         )
         return RunSpec(problem, algorithm_of(body["algorithm"]), int(body["seed"]), warm)
@@ -208,10 +204,10 @@ class JobRuns:
         self._warm.note(run, found)
         problem = self._problems.pop(run)
         records = {key: self.records(key) for key in problem.needs}
-        estimation, validation = prepared(problem, records)
-        parts: list[FittedPart] = [("estimation", estimation, found.simulated)]
-        if validation is not None:
-            parts.append(("validation", validation, found.simulated_validation))
+        fit_records = prepared(problem, records)
+        parts: list[FittedPart] = [("estimation", fit_records.estimation, found.simulated)]
+        if fit_records.validation is not None:
+            parts.append(("validation", fit_records.validation, found.simulated_validation))
         return save_fit(self._shelf, run, parts)
 
     def failed(self, run: str) -> None:

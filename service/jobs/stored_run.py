@@ -16,7 +16,7 @@ from service.datasets.rms_unit import unit_of
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.jobs.job_parameters import parameters_of_job
 from service.jobs.results import read_noise_model
-from service.jobs.to_core import loss_of
+from service.jobs.to_core import fit_settings_of
 from service.models.models import load_stored_model, resolved
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
@@ -114,18 +114,11 @@ class StoredRun:
         # The compiler comes with this import.
         from sysid.simulation.problem import Problem
 
-        body, records = self.body, self.records(session, store)
+        records = self.records(session, store)
         parameters = (*self.model.parameters, *initial_parameters(self.model, len(records)))
-        loss = {**body["loss"], "noise_model": read_noise_model(self.result)}
-        return Problem.build(
-            self.model,
-            records,
-            parameters=self._changes(parameters),
-            prediction=body["prediction"],
-            loss=loss_of(loss),
-            weights=body["weights"],
-            skip=body["skip"],
-        )
+        loss = {**self.body["loss"], "noise_model": read_noise_model(self.result)}
+        body = {**self.body, "parameters": self._changes(parameters), "loss": loss}
+        return Problem.from_settings(self.model, records, fit_settings_of(body))
 
     def _changes(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
         """Changes of these parameters; the request may name terms that were not selected."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from sysid.core.settings import (
+    FitSettings,
     GeneticAlgorithm,
     IslandChange,
     Loss,
@@ -43,6 +44,23 @@ def loss_of(document: Mapping[str, Any]) -> Loss:
         If its kind or scale cannot be used.
     """
     return Loss(**document)
+
+
+def fit_settings_of(body: Mapping[str, Any]) -> FitSettings:
+    """What a fit takes besides its model and its records, from a job body in its normal form.
+
+    Raises
+    ------
+    InvalidSettings
+        If a setting cannot be used.
+    """
+    return FitSettings(
+        parameters=body["parameters"],
+        prediction=body["prediction"],
+        loss=loss_of(body["loss"]),
+        weights=body["weights"],
+        skip=body["skip"],
+    )
 
 
 def _island(change: Mapping[str, Any]) -> IslandChange:

@@ -207,7 +207,7 @@ def _starts(problem: "Problem") -> FloatArray:
     would grow with the cube of their number.
     """
     most = max(LEAST_SIMULATIONS, MOST_STEPS // problem.n_steps)
-    changes = problem.arguments[2]
+    changes = problem.settings.parameters
     if len(problem.records) == 1 or any("tied" in fields for fields in changes.values()):
         return _searched(problem, most)
     return np.concatenate([_searched(one, most) for one in _alone(problem)])
@@ -215,15 +215,14 @@ def _starts(problem: "Problem") -> FloatArray:
 
 def _alone(problem: "Problem") -> "Iterator[Problem]":
     """Each record of a problem by itself, its starts by the names of the first."""
-    model, records, changes, *_ = problem.arguments
+    model, changes = problem.untied_model, problem.settings.parameters
     fixed = {one.name: changes[one.name] for one in model.parameters if one.name in changes}
-    for number, record in enumerate(records):
+    for number, record in enumerate(problem.records):
         names = {initial_name(one.name, 0): initial_name(one.name, number) for one in model.states}
         starts = {own: changes[name] for own, name in names.items() if name in changes}
-        yield problem.build(
-            model, [record], parameters=fixed | starts, weights=problem.output_weights,
-            skip=problem.arguments[6],
-        )  # fmt: skip
+        yield problem.rebuild(
+            records=[record], parameters=fixed | starts, weights=problem.output_weights
+        )
 
 
 def _searched(problem: "Problem", simulations: int) -> FloatArray:
@@ -260,7 +259,7 @@ def _judged(problem: "Problem", run_id: str, row: Dataset) -> FreeRun:
         run=run_id, dataset=row.id, records=problem.records,
         simulated=tuple(tuple(p[name] for name in names) for p in problem.split(predicted)),
         metrics=metrics,
-        starts=dict(zip((one.name for one in problem.space), theta.tolist(), strict=True)),
+        starts=dict(zip(problem.free_names, theta.tolist(), strict=True)),
     )  # fmt: skip
 
 

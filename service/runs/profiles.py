@@ -66,7 +66,7 @@ def profiles(database: Database, store: ObjectStore, run_id: str, body: ProfileI
 
 
 def _names(problem: "Problem", body: ProfileIn) -> list[str]:
-    free = [p.name for p in problem.space]
+    free = problem.free_names
     for place, name in enumerate(body.parameters or ()):
         if name not in free:
             raise InvalidRequest.at(
@@ -91,7 +91,7 @@ def _computed(
                 f"the profiles took more than {SECONDS:g} s and were stopped at {name!r}; ask for "
                 "fewer parameters or points, or use sysid.uncertainty.profile_likelihood.profile",
             )
-        others = [p.name for p in problem.space if p.name != name]
+        others = [free for free in problem.free_names if free != name]
         yield ProfileOut(
             name=name, unit=found.unit, estimate=found.estimate, interval95=found.interval,
             values=found.values.tolist(), ratio=[to_finite(value) for value in found.ratio],
@@ -103,4 +103,4 @@ def _computed(
 
 def _estimate(problem: "Problem", stored: StoredRun) -> FloatArray:
     values = {one["name"]: one["value"] for one in stored.estimates}
-    return np.array([values[p.name] for p in problem.space])
+    return np.array([values[name] for name in problem.free_names])

@@ -3,8 +3,9 @@
 The field names are those of the job body; defaults are defined here once.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from sysid.core.errors import InvalidSettings
 
@@ -184,6 +185,51 @@ class Loss:
                 "/loss/noise_model",
                 f"{self.noise_model} is not available with {self.kind}; need the loss 'squares'",
             )
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """What a fit takes besides its model and its records.
+
+    Attributes
+    ----------
+    parameters : mapping of str to mapping
+        Changed bounds, scales or fixed values, or what a parameter is tied to.
+    prediction : {"simulation", "one-step"}
+        Free run or one step ahead.
+    loss : Loss
+        What is minimised.
+    weights : mapping of str to float or None
+        Weight of each output. None: 1 for one output, else 1 / its standard deviation.
+    skip : int
+        First samples of each output that are not scored.
+    scored_from : tuple of float or None
+        For each record the time (s) from which on samples are scored. None: all are.
+    """
+
+    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    prediction: Prediction = "simulation"
+    loss: Loss = field(default_factory=Loss)
+    weights: Mapping[str, float] | None = None
+    skip: int = 0
+    scored_from: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parameters", dict(self.parameters))
+        if self.weights is not None:
+            object.__setattr__(self, "weights", dict(self.weights))
+        if self.prediction not in ("simulation", "one-step"):
+            raise InvalidSettings(
+                "/prediction", f"{self.prediction!r} is not 'simulation' or 'one-step'"
+            )
+        if self.prediction == "one-step" and self.loss.noise_model == "ar1":
+            raise InvalidSettings(
+                "/loss/noise_model",
+                f"{self.loss.noise_model} is for free runs; predictions one step ahead contain the "
+                "noise",
+            )
+        if self.skip < 0:
+            raise InvalidSettings("/skip", f"{self.skip!r} is not a number of samples, 0 or more")
 
 
 def _require(holds: bool, pointer: str, found: object, right: str) -> None:

@@ -68,7 +68,7 @@ def _concluded(
     refined, ends, noise, analysis = _estimated(problem, algorithm, state, deadline)
     problem, theta = decided(problem, noise), noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
-        raise NothingIdentifiable(p.name for p in problem.space)
+        raise NothingIdentifiable(problem.free_names)
     simulated = problem.predictions(theta[None])[0]
     metrics = metrics_of(problem, simulated)
     times = noise.correlation_times
@@ -121,7 +121,7 @@ def _concluded(
 
 def _known_before(problem: Problem) -> tuple[float, ...]:
     """For how long (s) the inputs are known before what is scored of each experiment."""
-    since = problem.scored_from or tuple(one.start for one in problem.records)
+    since = problem.settings.scored_from or tuple(one.start for one in problem.records)
     return tuple(
         one.known_before + max(first - one.start, 0.0)
         for one, first in zip(problem.records, since, strict=True)
@@ -233,9 +233,9 @@ def _widened(problem: Problem, analysis: Analysis, found: Neighbourhood) -> Anal
     """The analysis with intervals that hold those of all minima found."""
     if analysis.linear is None:
         return analysis
-    names, share = tuple(p.name for p in problem.space), analysis.linear.share
+    share = analysis.linear.share
     found = replace(found, values=ordered(problem, found.values, analysis.exchanges))
-    estimates = widened(analysis.estimates, names, problem.n_scored, found, share)
+    estimates = widened(analysis.estimates, problem.free_names, problem.n_scored, found, share)
     return replace(analysis, estimates=estimates)
 
 
@@ -343,14 +343,12 @@ def _validated(
     are in the same measure. An initial state belongs to its record: where the last part of the
     same records is judged it is the estimated one, on other records it is found on them, alone.
     """
-    model, records, changes, prediction, loss, _, skip, since = validation.arguments
-    own = {p.name for p in (model.parameters if since is None else validation.all_parameters)}
+    model, changes = validation.untied_model, validation.settings.parameters
+    is_part = validation.settings.scored_from is not None
+    own = {p.name for p in (validation.all_parameters if is_part else model.parameters)}
     fixed = {e.name: _known(e) for e in estimates if e.name in own}
     kept = {name: fields for name, fields in changes.items() if name not in own}
-    known = Problem.build(
-        model, records, parameters={**kept, **fixed}, prediction=prediction, loss=loss,
-        weights=estimation.output_weights, skip=skip, scored_from=since,
-    )  # fmt: skip
+    known = validation.rebuild(parameters={**kept, **fixed}, weights=estimation.output_weights)
     theta = np.zeros(0)
     if known.space:
         middle = 0.5 * (known.evaluator.lower + known.evaluator.upper)
@@ -374,11 +372,12 @@ def _judged(
     known: Problem, simulated: tuple[tuple[FloatArray, ...], ...]
 ) -> tuple[tuple[FloatArray, ...], ...]:
     """The part from the time on at which the records are scored, at its measured times."""
-    if known.scored_from is None:
+    scored_from = known.settings.scored_from
+    if scored_from is None:
         return simulated
     names = [output.name for output in known.model.outputs]
     kept = []
-    for record, since, outputs in zip(known.records, known.scored_from, simulated, strict=True):
+    for record, since, outputs in zip(known.records, scored_from, simulated, strict=True):
         times = {channel.name: channel.times for channel in record.outputs}
         late = [times[name] >= since for name in names]
         kept.append(tuple(part[mask] for part, mask in zip(outputs, late, strict=True)))

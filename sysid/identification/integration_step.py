@@ -93,7 +93,7 @@ def _beside(
     held = {one.name for one in estimates if one.status == "at bound"}
     found = sensitivities(problem, theta)
     sloping = (found.plateau == 0.0) & ~found.one_sided
-    sloping &= [one.name not in held for one in problem.space]
+    sloping &= [name not in held for name in problem.free_names]
     columns = found.columns * sloping
     shift = -np.linalg.lstsq(columns, move, rcond=RANK)[0]
     left = error + move + columns @ shift
@@ -105,7 +105,7 @@ def _told(
     share: float,
 ) -> list[str]:  # fmt: skip
     """Estimates that move by much of their standard error, and by that share of themselves."""
-    by = dict(zip((one.name for one in problem.space), (end - theta).tolist(), strict=True))
+    by = dict(zip(problem.free_names, (end - theta).tolist(), strict=True))
     told = []
     for one in estimates:
         shift = by.get(one.name, 0.0)
@@ -119,12 +119,9 @@ def _told(
 
 def _finer(problem: Problem) -> Problem:
     """The problem with shorter steps of integration."""
-    model, records, parameters, prediction, loss, weights, skip, since = problem.arguments
+    model = problem.untied_model
     solver = replace(model.solver, substeps=_FINER * model.solver.substeps)
-    return Problem.build(
-        replace(model, solver=solver), records, parameters=parameters, prediction=prediction,
-        loss=loss, weights=weights, skip=skip, scored_from=since,
-    )  # fmt: skip
+    return problem.rebuild(model=replace(model, solver=solver))
 
 
 def _unit(estimate: Estimate) -> str:

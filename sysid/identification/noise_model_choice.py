@@ -30,6 +30,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sysid.core.settings import NoiseModel
 from sysid.core.types import FloatArray
 from sysid.identification.generalised_least_squares import Generalised, coloured_outputs
 from sysid.identification.integration_step import step_notes
@@ -162,9 +163,9 @@ def decided(problem: Problem, noise: Generalised) -> Problem:
     """The problem with the noise model that its estimates are of, in place of ``auto``."""
     if problem.loss.noise_model != "auto":
         return problem
-    model, records, parameters, prediction, loss, *others = problem.arguments
-    loss = replace(loss, noise_model="ar1" if any(noise.correlation_times.values()) else "white")
-    return replace(problem, arguments=(model, records, parameters, prediction, loss, *others))
+    noise_model: NoiseModel = "ar1" if any(noise.correlation_times.values()) else "white"
+    loss = replace(problem.loss, noise_model=noise_model)
+    return replace(problem, settings=replace(problem.settings, loss=loss))
 
 
 def choice_notes(problem: Problem, noise: Generalised) -> tuple[str, ...]:

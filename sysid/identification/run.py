@@ -47,7 +47,7 @@ def begin(
     """
     given = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
     given = tuple(one for one in given if one)
-    is_warm = any(all(p.name in one for p in problem.space) for one in given)
+    is_warm = any(all(name in one for name in problem.free_names) for one in given)
     starts = equation_error_starts(problem, algorithm)
     islands = found(problem, algorithm, seed, given, starts.values, starts.evaluations)
     for island in islands:

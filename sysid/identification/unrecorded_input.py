@@ -114,24 +114,23 @@ def _told_of(problem: Problem, analysis: Analysis) -> list[Estimate | None]:
     """The estimates in the order of the free parameters (D,); None of starts, and of vague ones."""
     own = {one.name for one in problem.model.parameters}
     by = {one.name: one for one in analysis.estimates if one.status == "identified"}
-    return [by.get(one.name) if one.name in own else None for one in problem.space]
+    return [by.get(name) if name in own else None for name in problem.free_names]
 
 
 def _theta(problem: Problem, analysis: Analysis) -> FloatArray:
     by = {one.name: one.value for one in analysis.estimates}
-    return np.array([by[one.name] for one in problem.space])
+    return np.array([by[name] for name in problem.free_names])
 
 
 def _without(problem: Problem, analysis: Analysis) -> FloatArray:
     """The estimate (D,) from the other samples, from where it is; itself if there is none."""
-    model, records, changes, prediction, loss, _, skip, since = problem.arguments
     theta = _theta(problem, analysis)
-    from_then = zip(_known_from(problem, analysis), since or [-np.inf] * len(records), strict=True)
+    since = problem.settings.scored_from or [-np.inf] * len(problem.records)
+    from_then = zip(_known_from(problem, analysis), since, strict=True)
     try:
-        others = Problem.build(
-            model, records, parameters=changes, prediction=prediction, loss=loss, skip=skip,
-            weights=problem.output_weights, scored_from=[max(pair) for pair in from_then],
-        )  # fmt: skip
+        others = problem.rebuild(
+            weights=problem.output_weights, scored_from=tuple(max(pair) for pair in from_then)
+        )
     except InvalidRecord:  # of one record nothing would be left
         return theta
     (end,) = refine(others, [theta], _STEPS * (theta.size + 1))

@@ -97,7 +97,7 @@ def _steps_read_as_ramps(problem: Problem) -> list[str]:
     """
     if is_difference(problem.model):
         return []  # a recursion reads inputs at the samples only
-    channels = [one for record in problem.arguments[1] for one in record.inputs]
+    channels = [one for record in problem.records for one in record.inputs]
     names = {
         one.name
         for one in channels
@@ -239,7 +239,7 @@ def lag_parameters(problem: Problem) -> set[str]:
     for one in past:
         if one.lag is not None:
             found |= names_in(one.lag)
-    return found & {p.name for p in problem.space}
+    return found & set(problem.free_names)
 
 
 def _correlated(

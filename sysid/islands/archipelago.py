@@ -21,7 +21,7 @@ from sysid.search.state import (
     SIMPLE,
     Plan,
 )
-from sysid.simulation.problem import Problem, loss_scale, record_progress
+from sysid.simulation.problem import Problem, record_progress
 from sysid.simulation.scaling import placed
 
 _WARM_SHARE = 4  # one individual in four of a warm start comes from the given values
@@ -31,7 +31,7 @@ _WARM_SPREAD = 0.1  # of the range
 def plans(problem: Problem, algorithm: GeneticAlgorithm, seed: int) -> tuple[Plan, ...]:
     """How each island searches."""
     progress = record_progress(problem)
-    alike = shared_plans(algorithm, len(problem.space), loss_scale(problem))
+    alike = shared_plans(algorithm, len(problem.space), problem.loss_scale)
     return tuple(plan._replace(seed=seed, progress=progress) for plan in alike)
 
 

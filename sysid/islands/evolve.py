@@ -21,7 +21,7 @@ from sysid.search.evolution import generations
 from sysid.search.island import NEVER, Island
 from sysid.search.state import EVALUATIONS, GENERATION, RMS, VALUES, Migrant, Plan
 from sysid.simulation.evaluator import Evaluator
-from sysid.simulation.problem import Problem, loss_scale, record_progress
+from sysid.simulation.problem import Problem, record_progress
 
 _OFTEN = 5  # generations between two looks at the target RMS, or at a warm start
 _BORDERS, _MIGRANTS = 100, 100_000
@@ -92,7 +92,7 @@ class Stand(NamedTuple):
 
 def course(problem: Problem, algorithm: GeneticAlgorithm, seed: int, *, is_warm: bool) -> Course:
     """The course of a run; `is_warm`: an earlier result stands behind it."""
-    way = _course(algorithm, len(problem.space), loss_scale(problem), is_warm)
+    way = _course(algorithm, len(problem.space), problem.loss_scale, is_warm)
     own = way.plans._replace(seed=seed, progress=record_progress(problem))
     return way._replace(plans=own)
 

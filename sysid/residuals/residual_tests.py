@@ -169,8 +169,6 @@ def series_of(
     problem: "Problem", simulated: FloatArray, correlation_times: Mapping[str, float] | None = None
 ) -> list[Series]:
     """The residuals of every output of every experiment, from simulated values (M,)."""
-    loss = problem.loss
-    scale = loss.scale if loss.kind == "soft-l1" else 0.0
     parts = zip(
         problem.records, problem.split(simulated), problem.split(problem.evaluator.measured),
         problem.split(problem.evaluator.weight), strict=True,
@@ -184,7 +182,7 @@ def series_of(
             factor = problem.output_weights[output]
             found.append(
                 series(number, output, times[output], factor * measured[output],
-                       factor * model[output], weight[output] > 0, inputs, scale,
+                       factor * model[output], weight[output] > 0, inputs, problem.loss_scale,
                        (correlation_times or {}).get(output, 0.0))
             )  # fmt: skip
     return found

@@ -9,7 +9,7 @@ from sysid.core.jit import compiled
 from sysid.core.types import FloatArray
 from sysid.search.least_squares import TRIED, Scored, solve
 from sysid.simulation.evaluator import Evaluator, population_fitness
-from sysid.simulation.problem import Problem, loss_scale
+from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import AT_BOUND, located, placed
 
 _SAME = 1e-3  # of the range: nearer champions lie in one valley
@@ -92,7 +92,7 @@ def _refined(
     steps = min(_STEPS, (left - _ENDS) // batch)
     at_once = max(1, _AT_ONCE // (batch * problem.n_steps))
     solved = solve(
-        Scored(evaluator, rows, evaluator.weight[rows] / unit), place, loss_scale(problem) / unit,
+        Scored(evaluator, rows, evaluator.weight[rows] / unit), place, problem.loss_scale / unit,
         steps=steps, at_once=at_once, is_late=is_late,
     )  # fmt: skip
     theta, reached = _end(evaluator, solved.place)

@@ -109,18 +109,14 @@ def _fitted(
         for one in candidates.parameters
         if one.name.startswith("a[") and one.name not in names
     }  # fmt: skip
-    _, records, _, prediction, loss, weights, skip, since = whole.arguments
-    part = Problem.build(
-        candidates, records, parameters={**changes, **absent}, prediction=prediction, loss=loss,
-        weights=weights, skip=skip, scored_from=since,
-    )  # fmt: skip
+    part = whole.rebuild(parameters={**changes, **absent})
     starts = equation_error_starts(part, GeneticAlgorithm()).values
     if not starts:
         return None
     begin = np.array([[starts[0].get(p.name, 0.5 * (p.lower + p.upper)) for p in part.space]])
     refined = refine(part, [begin[0]])[0]
     theta = begin[0] if refined is None else refined.theta
-    values = {one.name: float(v) for one, v in zip(part.space, theta, strict=True)}
+    values = dict(zip(part.free_names, theta.tolist(), strict=True))
     rms = float(part.fitness(theta[None])[0])
     fixed = {one.name: one.fixed for one in part.all_parameters if one.fixed is not None}
     return {**fixed, **values}, rms
@@ -129,8 +125,8 @@ def _fitted(
 def _triangle(whole: Problem, values: Mapping[str, float]) -> FloatArray:
     """R of the QR decomposition of [slopes, what they are to explain], (M + 1, M + 1)."""
     terms = whole.model.terms
-    theta = np.array([values[one.name] for one in whole.space])
-    columns = {one.name: d for d, one in enumerate(whole.space)}
+    theta = np.array([values[name] for name in whole.free_names])
+    columns = {name: d for d, name in enumerate(whole.free_names)}
     scored = whole.evaluator.weight > 0
     here = whole.predictions(theta[None])[0]
     slopes = np.zeros((int(np.count_nonzero(scored)), len(terms)))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sysid.core.errors import InvalidRecord, InvalidSettings
-from sysid.core.settings import Loss, Prediction
+from sysid.core.settings import FitSettings, Loss, Prediction
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Record
 from sysid.kernels.build import kernel_address
@@ -30,14 +30,17 @@ _Rebuild = tuple[Callable[..., "Problem"], tuple[Any, ...]]
 class Problem:
     """Fitness and predictions of candidates, J = √(Σ w²(y - ŷ)² / n) (Eq. 10).
 
-    Make one with `Problem.build`. Pickling sends what it was built from, since the address of
-    compiled code means nothing in another process.
+    Make one with `Problem.build` or `Problem.from_settings`. Pickling sends what it was built
+    from, since the address of compiled code means nothing in another process.
 
     Attributes
     ----------
     model : Model
         With tied parameters replaced by what they are tied to.
+    untied_model : Model
+        The model that the problem was built from.
     records : tuple of Record
+    settings : FitSettings
     all_parameters : tuple of Parameter
         K: the model's, then the estimated initial states, named ``x(0)`` in the first experiment
         and ``x(0)[2]`` in the second.
@@ -50,20 +53,21 @@ class Problem:
     experiments : tuple of Experiment
     output_weights : mapping of str to float
         Weight of each output, as given or found from the records.
-    scored_from : tuple of float or None
-        For each experiment the time (s) before which no sample is scored; None: all are.
+    simulates_only : bool
+        Whether every parameter is fixed, and nothing is compared with the records.
     """
 
     model: Model
+    untied_model: Model
     records: tuple[Record, ...]
+    settings: FitSettings
     all_parameters: tuple[Parameter, ...]
     space: tuple[Parameter, ...]
     evaluator: Evaluator
     experiments: tuple[Experiment, ...]
     output_weights: Mapping[str, float]
-    scored_from: tuple[float, ...] | None
-    arguments: tuple[Any, ...]
     ties: Ties
+    simulates_only: bool = False
 
     @classmethod
     def build(
@@ -78,67 +82,117 @@ class Problem:
         skip: int = 0,
         scored_from: Sequence[float] | None = None,
     ) -> "Problem":
-        """Lay the records out for the model and compile it.
+        """A problem from the fields of `FitSettings`; raises as `from_settings` does."""
+        since = None if scored_from is None else tuple(scored_from)
+        settings = FitSettings(parameters or {}, prediction, loss or Loss(), weights, skip, since)
+        return cls.from_settings(model, records, settings)
 
-        Parameters
-        ----------
-        parameters : mapping of str to mapping
-            Changed bounds, scales or fixed values, or what a parameter is tied to.
-        prediction : {"simulation", "one-step"}
-        loss : Loss
-            Squares if not given.
-        weights : mapping of str to float
-            Weight of each output; by default 1 for one output, else 1 / its standard deviation.
-        skip : int
-            First samples of each output that are not scored.
-        scored_from : sequence of float
-            For each record the time (s) from which on samples are scored: a part that is kept
-            for validation is simulated with all that went before it.
+    @classmethod
+    def from_settings(
+        cls, model: Model, records: Sequence[Record], settings: FitSettings
+    ) -> "Problem":
+        """Lay the records out for the model and compile it.
 
         Raises
         ------
         InvalidRecord, RecordTooShort
             If a record does not have what the model needs.
         InvalidSettings, InvalidBounds
-            If an option cannot be used.
+            If a setting cannot be used.
         """
-        arguments = (model, tuple(records), dict(parameters or {}), prediction, loss or Loss(),
-                     None if weights is None else dict(weights), skip,
-                     None if scored_from is None else tuple(scored_from))  # fmt: skip
-        return _built(*arguments)
+        records = tuple(records)
+        if model.rule is not None:
+            raise InvalidSettings("/model/terms", "the terms are not selected yet; see `selected`")
+        if not records:
+            raise InvalidRecord("there is no record to compare the model with; need one or more")
+        since = (-np.inf,) * len(records) if settings.scored_from is None else settings.scored_from
+        if len(since) != len(records):
+            raise InvalidSettings(
+                "/scored_from",
+                f"found {len(since)} times for {len(records)} records; need one each",
+            )
+        everything = override(
+            (*model.parameters, *initial_parameters(model, len(records))), settings.parameters
+        )
+        ties = ties_of(model, everything)
+        tied = tied_model(model, ties)
+        check_lags(tied, everything)
+        per_output = output_weights(tied, records, settings.weights, settings.skip)
+        experiments = tuple(
+            lay_out(tied, record, e, everything, per_output, settings.skip, scored_from=since[e])
+            for e, record in enumerate(records)
+        )
+        return cls(
+            model=tied,
+            untied_model=model,
+            records=records,
+            settings=settings,
+            all_parameters=everything,
+            space=tuple(parameter for parameter in everything if parameter.is_free),
+            evaluator=_evaluator(tied, experiments, everything, settings),
+            experiments=experiments,
+            output_weights=per_output,
+            ties=ties,
+        )
+
+    def rebuild(
+        self, *, model: Model | None = None, records: Sequence[Record] | None = None, **changes: Any
+    ) -> "Problem":
+        """The problem of another model, of other records, or with changed fields of its settings.
+
+        Raises as `from_settings` does.
+        """
+        return self.from_settings(
+            self.untied_model if model is None else model,
+            self.records if records is None else records,
+            replace(self.settings, **changes),
+        )
 
     @property
     def prediction(self) -> Prediction:
         """Free run or one step ahead."""
-        return "simulation" if len(self.arguments) < 4 else self.arguments[3]
+        return self.settings.prediction
 
     @property
     def loss(self) -> Loss:
         """What is minimised."""
-        return Loss() if len(self.arguments) < 5 else self.arguments[4]
+        return self.settings.loss
+
+    @property
+    def loss_scale(self) -> float:
+        """Scale of the soft-l1 loss, 0 for squares: the form that compiled code takes."""
+        return float(self.loss.scale) if self.loss.kind == "soft-l1" else 0.0
+
+    @cached_property
+    def free_names(self) -> tuple[str, ...]:
+        """Names of the free parameters, D."""
+        return tuple(parameter.name for parameter in self.space)
 
     def __reduce__(self) -> _Rebuild:
-        rebuild = _built if len(self.arguments) > 2 else simulation_problem
-        return rebuild, self.arguments
+        if self.simulates_only:
+            return simulation_problem, (self.untied_model, self.records[0])
+        return Problem.from_settings, (self.untied_model, self.records, self.settings)
 
     def measured_anew(self, records: Sequence[Record]) -> "Problem":
         """What `build` would make of records that differ in the values of their outputs only.
 
         Where their noise is all that runs have of their own, most of the work is done once.
         """
-        model, _, _, prediction, loss, weights, skip, since = self.arguments
-        per_output = output_weights(self.model, records, weights, skip)
+        skip, since = self.settings.skip, self.settings.scored_from
+        per_output = output_weights(self.model, records, self.settings.weights, skip)
         experiments = tuple(
             measured_anew(laid, self.model, record, e, self.all_parameters, per_output, skip,
                           -np.inf if since is None else since[e])
             for e, (laid, record) in enumerate(zip(self.experiments, records, strict=True))
         )  # fmt: skip
-        one_step = prediction == "one-step"
-        evaluator = _evaluator(self.model, experiments, self.all_parameters, one_step, loss)
+        evaluator = _evaluator(self.model, experiments, self.all_parameters, self.settings)
         return replace(
-            self, records=tuple(records), evaluator=evaluator, experiments=experiments,
-            output_weights=per_output, arguments=(model, tuple(records), *self.arguments[2:]),
-        )  # fmt: skip
+            self,
+            records=tuple(records),
+            evaluator=evaluator,
+            experiments=experiments,
+            output_weights=per_output,
+        )
 
     def fitness(self, theta: FloatArray) -> FloatArray:
         """J of individuals (P, D) → (P,), smaller is better; ``inf`` where one diverges."""
@@ -259,66 +313,37 @@ def _channel_metrics(problem: Problem, simulated: FloatArray) -> list[ChannelMet
     return found
 
 
-def _built(
-    model: Model, records: tuple[Record, ...], parameters: Mapping[str, Mapping[str, Any]],
-    prediction: Prediction, loss: Loss, weights: Mapping[str, float] | None, skip: int,
-    scored_from: tuple[float, ...] | None,
-) -> Problem:  # fmt: skip
-    if model.rule is not None:
-        raise InvalidSettings("/model/terms", "the terms are not selected yet; see `selected`")
-    if not records:
-        raise InvalidRecord("there is no record to compare the model with; need one or more")
-    if prediction not in ("simulation", "one-step"):
-        raise InvalidSettings("/prediction", f"{prediction!r} is not 'simulation' or 'one-step'")
-    if prediction == "one-step" and loss.noise_model == "ar1":
-        raise InvalidSettings(
-            "/loss/noise_model",
-            f"{loss.noise_model} is for free runs; predictions one step ahead contain the noise",
-        )
-    if skip < 0:
-        raise InvalidSettings("/skip", f"{skip!r} is not a number of samples, 0 or more")
-    since = (-np.inf,) * len(records) if scored_from is None else scored_from
-    if len(since) != len(records):
-        raise InvalidSettings(
-            "/scored_from", f"found {len(since)} times for {len(records)} records; need one each"
-        )
-    arguments = (model, records, parameters, prediction, loss, weights, skip, scored_from)
-    everything = override((*model.parameters, *initial_parameters(model, len(records))), parameters)
-    ties = ties_of(model, everything)
-    model = tied_model(model, ties)
-    check_lags(model, everything)
-    per_output = output_weights(model, records, weights, skip)
-    experiments = tuple(
-        lay_out(model, record, e, everything, per_output, skip, scored_from=since[e])
-        for e, record in enumerate(records)
-    )
-    free = tuple(parameter for parameter in everything if parameter.is_free)
-    evaluator = _evaluator(model, experiments, everything, prediction == "one-step", loss)
-    return Problem(
-        model, records, everything, free, evaluator, experiments, per_output, scored_from,
-        arguments, ties,
-    )  # fmt: skip
-
-
 def simulation_problem(model: Model, record: Record) -> Problem:
     """A problem that only simulates: every parameter is fixed, and nothing is compared."""
-    arguments = (model, record)
     weights = {output.name: 1.0 for output in model.outputs}
     experiment = lay_out(model, record, 0, model.parameters, weights, 0, simulates_only=True)
-    evaluator = _evaluator(model, (experiment,), model.parameters, False, Loss())
+    settings = FitSettings(weights=weights)
     return Problem(
-        model, (record,), model.parameters, (), evaluator, (experiment,), weights, None, arguments,
-        {},
-    )  # fmt: skip
+        model=model,
+        untied_model=model,
+        records=(record,),
+        settings=settings,
+        all_parameters=model.parameters,
+        space=(),
+        evaluator=_evaluator(model, (experiment,), model.parameters, settings),
+        experiments=(experiment,),
+        output_weights=weights,
+        ties={},
+        simulates_only=True,
+    )
 
 
 def _evaluator(
-    model: Model, experiments: Sequence[Experiment], parameters: Sequence[Parameter],
-    one_step: bool, loss: Loss,
-) -> Evaluator:  # fmt: skip
+    model: Model,
+    experiments: Sequence[Experiment],
+    parameters: Sequence[Parameter],
+    settings: FitSettings,
+) -> Evaluator:
     on_grid = all(fits_grid(experiment.outputs) for experiment in experiments)
     weighted = any(has_weights(e.outputs, e.grid, on_grid) for e in experiments)
-    variant = Variant(one_step, loss.kind == "soft-l1", on_grid, weighted)
+    loss = settings.loss
+    one_step, is_robust = settings.prediction == "one-step", loss.kind == "soft-l1"
+    variant = Variant(one_step, is_robust, on_grid, weighted)
     laid = [
         numbers(model, variant, e.grid, e.inputs, e.outputs, e.starts, e.lag, loss.scale)
         for e in experiments
@@ -364,12 +389,6 @@ def _population(theta: FloatArray, free: int) -> FloatArray:
             "parameter",
         )
     return values
-
-
-def loss_scale(problem: Problem) -> float:
-    """Scale of the soft-l1 loss, 0 for squares: what compiled code is told."""
-    loss = next(a for a in problem.arguments if isinstance(a, Loss))
-    return float(loss.scale) if loss.kind == "soft-l1" else 0.0
 
 
 def record_progress(problem: Problem) -> FloatArray:

@@ -36,7 +36,7 @@ from sysid.identifiability.translations import translations
 from sysid.residuals.coloured import Coloured
 from sysid.residuals.correlated_outputs import coloured_jointly
 from sysid.residuals.whitening import Whitening
-from sysid.simulation.problem import Problem, loss_scale
+from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import AT_BOUND, placed
 from sysid.uncertainty.estimates import (
     Criteria,
@@ -134,7 +134,7 @@ def _analysed(
     place = placed(problem.evaluator, theta[None])[0]
     # No step of least squares gains from a parameter on a plateau: there the loss is flat.
     sloping = np.where(plateau > 0, 0.0, columns)
-    influence = _influence(error, loss_scale(problem))
+    influence = _influence(error, problem.loss_scale)
     gain = _possible_gain(influence, sloping, place)
     pulled = is_pulled(influence, sloping, place)
     scale = physical_scale(problem, theta)
@@ -148,13 +148,13 @@ def _analysed(
     kept[d - known :] = False
     inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
     colour = coloured_jointly(problem, influence, columns)
-    covariance, noise = _covariance(error, columns, inverse, loss_scale(problem), colour)
+    covariance, noise = _covariance(error, columns, inverse, problem.loss_scale, colour)
     # A factor that is 0 is not moved by what scales it: the others are, without any effect.
     moved = _moved(powers * theta) | _moved(shifts)
     directions = weighed(singular, rows, ~kept, moved, covariance, noise)
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
     found = untold(directions)
-    names = tuple(p.name for p in problem.space)
+    names = problem.free_names
     uncertainty = Uncertainty(
         names=names,
         covariance=physical,
@@ -174,7 +174,7 @@ def _analysed(
     )  # fmt: skip
     estimates = _beside_jumps(problem, estimates_of(problem, told), one_sided, aside * scale)
     linear = None
-    if loss_scale(problem) == 0.0:
+    if problem.loss_scale == 0.0:
         stated = np.diag(covariance)
         root = singular[:, None] * rows
         linear = linear_model(error, columns, plateau > 0, place, stated, scale, inverse, root)
@@ -233,7 +233,7 @@ def _beside_jumps(
     problem: Problem, estimates: tuple[Estimate, ...], one_sided: BoolArray, aside: FloatArray
 ) -> tuple[Estimate, ...]:
     """Estimates of parameters whose output changes in jumps only."""
-    names = [p.name for p in problem.space]
+    names = problem.free_names
     blind = {name for name, one in zip(names, one_sided, strict=True) if one}
     moved = {name: float(by) for name, by in zip(names, aside, strict=True) if by}
     seen = (_on_one_side(one) if one.name in blind else one for one in estimates)

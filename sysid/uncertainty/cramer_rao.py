@@ -78,6 +78,6 @@ def floor(problem: Problem, theta: FloatArray) -> Floor:
     untold |= np.any(powers != 0.0, axis=0) | np.any(shifts != 0.0, axis=0) | (found.plateau > 0)
     stderr = np.where(untold, np.inf, np.sqrt(variance) * np.abs(scale))
     return Floor(
-        tuple(p.name for p in problem.space), stderr,
+        problem.free_names, stderr,
         float(np.sqrt(np.count_nonzero(kept) / n)), n,
     )  # fmt: skip

@@ -86,10 +86,9 @@ def _tied(
 ) -> tuple[float, FloatArray]:
     """Value of a tied parameter, and its slopes in the free ones by central differences."""
     given = {p.name: p.fixed for p in problem.all_parameters if p.fixed is not None}
-    names = [p.name for p in problem.space]
 
     def at(place: FloatArray) -> float:
-        return worth(tree, {**given, **dict(zip(names, place.tolist(), strict=True))})
+        return worth(tree, {**given, **dict(zip(problem.free_names, place.tolist(), strict=True))})
 
     steps = np.diag(_STEP * scale)
     slope = [(at(theta + one) - at(theta - one)) / (2.0 * one.sum()) for one in steps]

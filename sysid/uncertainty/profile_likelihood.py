@@ -29,7 +29,7 @@ from sysid.identifiability.exchange import Exchanges, exchanges, ordered
 from sysid.residuals.coloured import QUANTILE
 from sysid.residuals.correlated_outputs import coloured_jointly
 from sysid.search.refine import Refined, refine
-from sysid.simulation.problem import Problem, loss_scale
+from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import located, placed
 from sysid.uncertainty.sensitivities import sensitivities
 
@@ -102,7 +102,7 @@ def profile(
         If there are not more samples than parameters, if the simulation diverges, or if it equals
         the records but for rounding.
     """
-    names = [p.name for p in problem.space]
+    names = problem.free_names
     if name not in names:
         raise InvalidSettings("/parameters", f"no free parameter {name!r}{nearest(name, names)}")
     if problem.loss.noise_model == "ar1":
@@ -223,7 +223,7 @@ class _Walk:
         self, error: FloatArray, columns: FloatArray, direction: FloatArray, norm: float
     ) -> float:
         """What makes n ln(R/R₀) a ratio of χ², also where the residuals are coloured."""
-        scale = loss_scale(self._problem)
+        scale = self._problem.loss_scale
         seen = error if scale == 0.0 else error / np.sqrt(1.0 + (error / scale) ** 2)
         colour = coloured_jointly(self._problem, seen, columns)
         factor = _factor(error, scale)

@@ -8,6 +8,7 @@ from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
 from service.storage.garbage import collect
 from service.storage.tables import State
+from sysid.identification.fit_problems import FitRecords
 from tests.dispatching import Place, carry_out
 from workers.inline import InlineCrew
 from workers.tasks import advance
@@ -126,7 +127,9 @@ def test_a_run_that_failed_is_tried_again(place, monkeypatch):
         raise MemoryError(f"{len(done)} lost")
 
     with monkeypatch.context() as patched:
-        patched.setattr("service.dispatch.job_runs.prepared", lambda *_: ((), None))
+        patched.setattr(
+            "service.dispatch.job_runs.prepared", lambda *_: FitRecords((), None, None, None)
+        )
         patched.setattr("sysid.identification.run.conclude", broken)
         patched.setattr("workers.tasks.conclude", broken)
         _, (run,), _ = carried_out(place, **sweep(1))

@@ -114,7 +114,7 @@ def test_a_worker_builds_the_part_kept_on_the_whole_record_without_noise() -> No
         validation_fraction=FRACTION, noise=Noise(0.05, 1),
     )  # fmt: skip
     posed, judged = build(spec, {"r": (record,)})
-    estimation, kept = prepared(spec, {"r": (record,)})
+    estimation, kept, *_ = prepared(spec, {"r": (record,)})
     assert judged is not None
     assert kept is not None
     assert posed.records[0].outputs[0].values.tobytes() == estimation[0].outputs[0].values.tobytes()

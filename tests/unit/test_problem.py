@@ -10,11 +10,11 @@ import pytest
 
 from sysid.core.errors import InvalidBounds, InvalidRecord, InvalidSettings, RecordTooShort
 from sysid.core.jit import compiled
-from sysid.core.settings import Loss
+from sysid.core.settings import FitSettings, Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.simulation.evaluator import Evaluator, population_fitness
-from sysid.simulation.problem import Problem
+from sysid.simulation.problem import Problem, simulation_problem
 from tests.models import difference, differential, duffing, individuals, lag_element, record
 
 
@@ -36,6 +36,39 @@ def test_a_problem_is_rebuilt_from_a_pickle_and_gives_the_same_bits() -> None:
     theta = individuals(problem, 5)
     assert [p.name for p in again.space] == ["L", "b", "a"]
     np.testing.assert_array_equal(again.fitness(theta), problem.fitness(theta))
+
+
+def test_a_problem_that_only_simulates_is_rebuilt_from_a_pickle() -> None:
+    parameters = tuple(replace(p, fixed=p.upper, scale="linear") for p in duffing().parameters)
+    problem = simulation_problem(replace(duffing(), parameters=parameters), record())
+    again: Problem = pickle.loads(pickle.dumps(problem))
+    assert again.simulates_only
+    empty = np.empty((1, 0))
+    np.testing.assert_array_equal(again.predictions(empty), problem.predictions(empty))
+
+
+def test_a_problem_with_changed_settings_keeps_the_others_and_equals_one_built_so() -> None:
+    loss, changes = Loss("soft-l1", 0.5), {"c": {"tied": "b/20"}}
+    problem = Problem.build(duffing(), [record()], parameters=changes, loss=loss, skip=2)
+    changed = problem.rebuild(skip=4, scored_from=(0.3,))
+    alone = Problem.build(
+        duffing(), [record()], parameters=changes, loss=loss, skip=4, scored_from=[0.3]
+    )
+    theta = individuals(problem, 5)
+    assert changed.settings == alone.settings
+    assert changed.free_names == alone.free_names == ("L", "b", "a")
+    assert (changed.loss_scale, problem.rebuild(loss=Loss()).loss_scale) == (0.5, 0.0)
+    np.testing.assert_array_equal(changed.fitness(theta), alone.fitness(theta))
+    with pytest.raises(TypeError, match="skips"):
+        problem.rebuild(skips=1)
+
+
+def test_settings_do_not_change_with_what_they_were_made_of() -> None:
+    parameters, weights = {"c": {"fixed": 0.2}}, {"y": 2.0}
+    settings = FitSettings(parameters, weights=weights)
+    parameters.clear()
+    weights.clear()
+    assert settings == FitSettings({"c": {"fixed": 0.2}}, weights={"y": 2.0})
 
 
 def test_j_is_the_rms_error_over_the_scored_samples() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import workers.tasks
-from sysid.core.settings import GeneticAlgorithm, Loss
+from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss
 from sysid.data.noise import Noise
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import document
@@ -68,7 +68,7 @@ def test_a_run_whose_model_diverges_everywhere_fails_with_that_message() -> None
         "outputs": {"y": "x"},
         "initial": {"x": 1},
     }
-    problem = replace(whole.problem, model=wild, parameters={})
+    problem = replace(whole.problem, model=wild, settings=FitSettings())
     item = Advance("r1", replace(whole, problem=problem), None, 100.0)
     (done,) = workers.tasks.advance([item], ["short"], RECORDS["short"])
     assert isinstance(done.outcome, Failure)
@@ -78,7 +78,7 @@ def test_a_run_whose_model_diverges_everywhere_fails_with_that_message() -> None
 
 def test_a_run_that_selects_terms_gives_the_bits_of_the_library_call() -> None:
     asked = lagged(frols(4))
-    problem = ProblemSpec(model=asked, records="short", skip=3)
+    problem = ProblemSpec(model=asked, records="short", settings=FitSettings(skip=3))
     settings = GeneticAlgorithm(generations=10)
     (result,) = carry_out(InlineCrew(), {"r": RunSpec(problem, settings, 4)}).results["r"]
     alone = identify(parse_model(asked), RECORDS["short"], settings, seed=4, skip=3)
@@ -114,7 +114,7 @@ def test_runs_that_differ_in_noise_only_see_the_bits_they_would_see_alone(
     (short,) = RECORDS["short"]
     other = replace(short.outputs[0], name="w", values=2.0 * short.outputs[0].values)
     records = {"r": (replace(short, outputs=(*short.outputs, other)),)}
-    quiet = ProblemSpec(model, "r", validation_fraction=fraction, skip=2)
+    quiet = ProblemSpec(model, "r", validation_fraction=fraction, settings=FitSettings(skip=2))
     alike = workers.tasks.build(quiet, records)
     for seed in (1, 2):
         noisy = replace(quiet, noise=Noise(0.1, seed))
@@ -156,7 +156,7 @@ def result_of(run: RunSpec) -> tuple[object, ...]:
 
 
 def test_terms_are_selected_anew_for_other_noise() -> None:
-    quiet = ProblemSpec(model=lagged(frols(4)), records="short", skip=3)
+    quiet = ProblemSpec(model=lagged(frols(4)), records="short", settings=FitSettings(skip=3))
     noisy = replace(quiet, noise=Noise(2.0, 1))
     alone = workers.tasks.build(noisy, RECORDS)[0]
     beside = workers.tasks.build(noisy, RECORDS, workers.tasks.build(quiet, RECORDS))[0]
@@ -192,7 +192,8 @@ def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_l
     drifting = replace(short.outputs[0], values=short.outputs[0].values + slow)
     records = (replace(short, outputs=(drifting,)),)
     run = spec(generations=5, records="drifting")
-    problem = replace(run.problem, loss=Loss(noise_model="ar1"))
+    fit = replace(run.problem.settings, loss=Loss(noise_model="ar1"))
+    problem = replace(run.problem, settings=fit)
     pack = [Advance("r", replace(run, problem=problem), None, 100.0)]
     (whole,) = workers.tasks.advance(pack, ["drifting"], records)
 

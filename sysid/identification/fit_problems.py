@@ -1,0 +1,98 @@
+"""From the records of a fit to its problem, and to that of its validation data."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple, TypeAlias
+
+from sysid.core.errors import InvalidSettings
+from sysid.core.settings import FitSettings
+from sysid.data.noise import Noise, with_noise
+from sysid.data.records import Record
+from sysid.data.splitting import split_record, start_of_validation
+from sysid.models.model import Model
+from sysid.selection.select import selected
+from sysid.simulation.problem import Problem
+
+ProblemPair: TypeAlias = tuple[Problem, Problem | None]
+"""A problem, and that of its validation data if there are any."""
+
+
+class FitRecords(NamedTuple):
+    """The records of a fit, by what they are used for.
+
+    Attributes
+    ----------
+    estimation : tuple of Record
+        The model is fitted to them; with noise if some is added.
+    validation : tuple of Record or None
+        They are not used for the estimate.
+    validation_runs : tuple of Record or None
+        What is simulated to validate: whole records, where `validation` is their last part.
+    scored_from : tuple of float or None
+        For each of these runs the time (s) at which validation begins. None: they count as a whole.
+    """
+
+    estimation: tuple[Record, ...]
+    validation: tuple[Record, ...] | None
+    validation_runs: tuple[Record, ...] | None
+    scored_from: tuple[float, ...] | None
+
+
+def prepare_records(
+    records: Sequence[Record],
+    validation: Sequence[Record] | None = None,
+    fraction: float | None = None,
+    noise: Noise | None = None,
+) -> FitRecords:
+    """Split validation data off the records, and add noise to those for the estimate.
+
+    Parameters
+    ----------
+    validation : sequence of Record
+        Records that are not used for the estimate.
+    fraction : float
+        Instead of `validation`: the last part of each record.
+
+    Raises
+    ------
+    InvalidSettings
+        If there are both, or if the fraction leaves a part without samples.
+    """
+    whole = tuple(records)
+    noise = noise or Noise()
+    if fraction is None:
+        other = None if validation is None else tuple(validation)
+        return FitRecords(_add_noise(whole, noise), other, other, None)
+    if validation is not None:
+        raise InvalidSettings("/validation", "give either records or a fraction")
+    parts = [split_record(record, fraction) for record in whole]
+    starts = tuple(start_of_validation(record, fraction) for record in whole)
+    first, last = tuple(part[0] for part in parts), tuple(part[1] for part in parts)
+    return FitRecords(_add_noise(first, noise), last, whole, starts)
+
+
+def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> ProblemPair:
+    """The problem of a fit and that of its validation data, on the terms that are selected.
+
+    Both have the weights that the records for the estimate give.
+
+    Raises
+    ------
+    InvalidRecord, RecordTooShort, InvalidSettings, InvalidBounds
+        If model, records or settings cannot be used.
+    """
+    model, changes = selected(model, records.estimation, settings.parameters, settings.skip)
+    problem = Problem.from_settings(
+        model, records.estimation, replace(settings, parameters=changes)
+    )
+    if records.validation_runs is None:
+        return problem, None
+    return problem, problem.rebuild(
+        records=records.validation_runs,
+        weights=problem.output_weights,
+        scored_from=records.scored_from,
+    )
+
+
+def _add_noise(records: tuple[Record, ...], noise: Noise) -> tuple[Record, ...]:
+    return tuple(with_noise(record, noise, number) for number, record in enumerate(records))
