@@ -49,5 +49,5 @@ def bits(state: RunState | Island) -> tuple[object, ...]:
     if isinstance(state, RunState):
         islands = tuple(bits(island) for island in state.islands)
         return (state.generation, state.epoch, state.ended, state.migrations, islands)
-    arrays = (state.words, state.fitness, state.counters, state.memory)
+    arrays = (state.words, state.fitness, state.search, state.point)
     return (state.index, state.history, *(array.tobytes() for array in arrays))

@@ -18,7 +18,7 @@ from sysid.islands.migration import migrate
 from sysid.islands.state import RunState
 from sysid.islands.stopping import has_ended
 from sysid.search.island import Island, evolve, of_island
-from sysid.search.state import WARMED, Plan
+from sysid.search.state import Plan
 from sysid.selection.starts import equation_error_starts
 from sysid.simulation.problem import Problem
 
@@ -51,7 +51,7 @@ def begin(
     starts = equation_error_starts(problem, algorithm)
     islands = found(problem, algorithm, seed, given, starts.values, starts.evaluations)
     for island in islands:
-        island.counters[WARMED] = is_warm
+        island.search.is_warm_start = is_warm
     return RunState(seed, islands, is_warm=is_warm)
 
 
@@ -63,7 +63,7 @@ def border(algorithm: GeneticAlgorithm, state: RunState) -> int:
 
 def is_resting(plan: Plan, island: Island) -> bool:
     """Whether an island has used up its evaluations or reached the target RMS."""
-    return rests(plan, island.fitness, island.counters, island.champion_rms)
+    return rests(plan, island.arrays, island.champion_rms)
 
 
 def advance_island(

@@ -12,12 +12,10 @@ from sysid.search.evolution import initial_places
 from sysid.search.island import NEVER, Island, _island_budget, of_island, sizes
 from sysid.search.operators import WARM, coded, draws, unit
 from sysid.search.state import (
-    EVALUATIONS,
     IMPROVED,
     IMPROVED_PAPER_STEPS,
-    N_COUNTERS,
     PAPER,
-    POINT,
+    SEARCH_RECORD,
     SIMPLE,
     Plan,
 )
@@ -102,16 +100,16 @@ def found(
         given = (*warm, *mine)
         for p in range(max(1, size // _WARM_SHARE) if given else 0):
             _warm(problem, plan, given[p % len(given)], p, places, p >= len(given))
-        counters = np.zeros(N_COUNTERS, dtype=np.int64)
-        counters[EVALUATIONS] = spent if plan.island == 0 else 0
+        search = np.zeros((), SEARCH_RECORD).view(np.recarray)
+        search.evaluations = spent if plan.island == 0 else 0
         islands.append(
             Island(
                 plan.island,
                 seed,
                 coded(places, plan.bits),
                 np.full(size, np.nan),
-                counters,
-                np.zeros(POINT + n),
+                search,
+                np.zeros(n),
             )
         )
     return tuple(islands)

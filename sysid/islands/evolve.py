@@ -19,7 +19,7 @@ from sysid.islands.packed import Fleet, News, dealt, empty_news, gathered, migra
 from sysid.islands.stopping import Ends, has_ended
 from sysid.search.evolution import generations
 from sysid.search.island import NEVER, Island
-from sysid.search.state import EVALUATIONS, GENERATION, RMS, VALUES, Migrant, Plan
+from sysid.search.state import RMS, VALUES, IslandArrays, Migrant, Plan
 from sysid.simulation.evaluator import Evaluator
 from sysid.simulation.problem import Problem, record_progress
 
@@ -186,7 +186,7 @@ def _sail(
         if generation % way.every == 0 and fleet.rms.size > 1:
             send(way.routes, fleet, epoch, news)
             epoch += 1
-        if has_ended(way.ends, generation, fleet.rms, fleet.counters, False):
+        if has_ended(way.ends, generation, fleet.rms, fleet.search, False):
             break
     return generation, epoch, True
 
@@ -197,34 +197,33 @@ def _to_border(
 ) -> int:
     """Evolve every island up to a border; gives what is left of the budget, −1 if too little."""
     for i in range(fleet.rms.size):
-        plan, counters = plan_of(plans, i), fleet.counters[i]
-        fitness = fleet.fitness[fleet.first[i] : fleet.first[i + 1]]
-        if counters[GENERATION] >= target or rests(plan, fitness, counters, fleet.rms[i]):
+        begin, end = fleet.first[i], fleet.first[i + 1]
+        plan, search, written = plan_of(plans, i), fleet.search[i], news.written[0]
+        island = IslandArrays(
+            fleet.words[begin:end], fleet.fitness[begin:end], search, fleet.points[i]
+        )
+        if search.generation >= target or rests(plan, island, fleet.rms[i]):
             continue
         if budget == 0:
             return -1
-        before, written = counters[GENERATION], news.written[0]
-        made = generations(
-            evaluator, plan, min(target - before, budget),
-            fleet.words[fleet.first[i] : fleet.first[i + 1]], fitness, counters, fleet.memory[i],
-            news.improvements[written:],
-        )  # fmt: skip
+        before, rows = search.generation, news.improvements[written:]
+        made = generations(evaluator, plan, min(target - before, budget), island, rows)
         _take_note(fleet, i, made, news)
-        budget -= counters[GENERATION] - before
-        if counters[GENERATION] < target and not rests(plan, fitness, counters, fleet.rms[i]):
+        budget -= search.generation - before
+        if search.generation < target and not rests(plan, island, fleet.rms[i]):
             return -1
     return budget
 
 
 @compiled
-def rests(plan: Plan, fitness: FloatArray, counters: IntArray, rms: float) -> bool:
+def rests(plan: Plan, island: IslandArrays, rms: float) -> bool:
     """Whether an island has used up its evaluations or reached the target RMS.
 
     Not before its population is evaluated: finding the starts of a polynomial counts, too.
     """
-    if np.all(np.isnan(fitness)):
+    if np.all(np.isnan(island.fitness)):
         return False
-    return bool(counters[EVALUATIONS] >= plan.evaluations or rms <= plan.rms)
+    return bool(island.search.evaluations >= plan.evaluations or rms <= plan.rms)
 
 
 @compiled

@@ -15,19 +15,10 @@ from sysid.search.operators import coded, decoded, rank
 from sysid.search.state import (
     AT_EVALUATIONS,
     AT_GENERATION,
-    CLIFFS,
-    CONFIRMED,
-    EVALUATIONS,
-    GENERATION,
-    HOPS,
-    JUMPS,
     MIGRATION,
     PHASE,
-    RETURNED,
     RMS,
     SAME,
-    SETTLED,
-    STAGNATION,
     VALUES,
     Migrant,
 )
@@ -81,13 +72,14 @@ def migrate(
 def send(ways: Routes, fleet: Fleet, epoch: int, news: News) -> None:
     """One exchange in place: see `migrate`. An edge writes one improvement at most."""
     words, fitness = fleet.words.copy(), fleet.fitness.copy()
-    champions, jumps = fleet.champions.copy(), fleet.counters[:, JUMPS].copy()
+    champions = fleet.champions.copy()
+    discontinuities = fleet.search.fitness_discontinuities.copy()
     for e in range(ways.edges.shape[0]):
         source, destination = ways.edges[e, 0], ways.edges[e, 1]
         begin, end = fleet.first[source], fleet.first[source + 1]
         exact = ways.bits[source] == ways.bits[destination]
-        known = fleet.counters[destination]
-        known[JUMPS] = max(known[JUMPS], jumps[source])  # of the fitness, not of the place
+        known = fleet.search[destination]  # of the fitness, not of the place:
+        known.fitness_discontinuities = max(known.fitness_discontinuities, discontinuities[source])
         for p in range(begin, min(end, begin + ways.migrants)):
             word = words[p : p + 1]
             if not exact:
@@ -127,15 +119,15 @@ def _settle(fleet: Fleet, island: int, word: WordArray, fitness: float) -> None:
 @compiled
 def _lead(fleet: Fleet, island: int, fitness: float, values: FloatArray, news: News) -> None:
     """Note that an island's champion has come from another."""
-    counters, row = fleet.counters[island], news.improvements[news.written[0]]
+    search, row = fleet.search[island], news.improvements[news.written[0]]
     news.owners[news.written[0]] = island
     news.written[0] += 1
-    row[AT_GENERATION], row[AT_EVALUATIONS] = counters[GENERATION], counters[EVALUATIONS]
+    row[AT_GENERATION], row[AT_EVALUATIONS] = search.generation, search.evaluations
     row[RMS], row[PHASE] = fitness, MIGRATION
-    counters[STAGNATION], counters[SETTLED] = 0, 0
+    search.stagnation, search.champion_converged = 0, 0
     if fitness < fleet.rms[island] * (1.0 - SAME):
-        counters[CONFIRMED], counters[CLIFFS] = 0, 0
-        counters[HOPS], counters[RETURNED] = 0, 0
+        search.confirmed_starts, search.champion_discontinuities = 0, 0
+        search.hop_count, search.returned_hops = 0, 0
     fleet.rms[island] = fitness
     for d in range(values.size):
         fleet.champions[island, d] = row[VALUES + d] = values[d]

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.types import FloatArray, IntArray, WordArray
-from sysid.search.island import Island, improvement
-from sysid.search.state import VALUES, Improvement, Migrant
+from sysid.search.island import Island, improvement, stack_search
+from sysid.search.state import VALUES, Improvement, Migrant, SearchArray
 
 
 class Fleet(NamedTuple):
@@ -19,9 +19,9 @@ class Fleet(NamedTuple):
         Island i has the individuals ``first[i]`` to ``first[i + 1] - 1``.
     words : WordArray, shape (P, D)
     fitness : FloatArray, shape (P,)
-    counters : IntArray, shape (I, N)
-    memory : FloatArray, shape (I, M)
-        These four are those of `sysid.search.island.Island`.
+    search : SearchArray, shape (I,)
+    points : FloatArray, shape (I, D)
+        Up to here, those of `sysid.search.island.Island`.
     rms : FloatArray, shape (I,)
         Of each island's best individual so far; ``inf`` before the first evaluation.
     champions : FloatArray, shape (I, D)
@@ -31,8 +31,8 @@ class Fleet(NamedTuple):
     first: IntArray
     words: WordArray
     fitness: FloatArray
-    counters: IntArray
-    memory: FloatArray
+    search: SearchArray
+    points: FloatArray
     rms: FloatArray
     champions: FloatArray
 
@@ -67,8 +67,8 @@ def gathered(islands: Sequence[Island]) -> Fleet:
         np.cumsum([0, *(island.fitness.size for island in islands)]),
         np.concatenate([island.words for island in islands]),
         np.concatenate([island.fitness for island in islands]),
-        np.array([island.counters for island in islands]),
-        np.array([island.memory for island in islands]),
+        stack_search(islands),
+        np.array([island.point for island in islands]),
         np.array([island.champion_rms for island in islands]),
         champions,
     )
@@ -85,7 +85,7 @@ def dealt(fleet: Fleet, news: News, islands: Sequence[Island]) -> tuple[Island, 
     return tuple(
         Island(
             island.index, island.seed, fleet.words[begin:end], fleet.fitness[begin:end],
-            fleet.counters[i], fleet.memory[i], (*island.history, *better[i]),
+            fleet.search[i, ...], fleet.points[i], (*island.history, *better[i]),
         )
         for i, (island, begin, end) in enumerate(zip(islands, ends[:-1], ends[1:], strict=True))
     )  # fmt: skip

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.core.types import FloatArray, IntArray
-from sysid.search.island import Island
-from sysid.search.state import SAME, Improvement, Migrant
+from sysid.core.types import FloatArray
+from sysid.search.island import Island, stack_search
+from sysid.search.state import SAME, Improvement, Migrant, SearchArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,10 +51,10 @@ class RunState:
         return min(island.champion_rms for island in self.islands)
 
     @property
-    def tally(self) -> tuple[FloatArray, IntArray]:
-        """RMS of the champions (I,) and counters (I, N) of the islands."""
+    def tally(self) -> tuple[FloatArray, SearchArray]:
+        """RMS of the champions (I,) and search records (I,) of the islands."""
         rms = np.array([island.champion_rms for island in self.islands])
-        return rms, np.array([island.counters for island in self.islands])
+        return rms, stack_search(self.islands)
 
     def is_the_best_since(self, generation: int) -> bool:
         """Whether the best fitness was found by then, and nothing better after."""

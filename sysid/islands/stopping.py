@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.jit import compiled
-from sysid.core.types import FloatArray, IntArray
-from sysid.search.state import CLIFFS, CONFIRMED, GENERATION, HOPS, RETURNED, SAME, TRIED
+from sysid.core.types import FloatArray
+from sysid.search.state import SAME, SearchArray
 
 _OF_EACH, _MORE = 2, 2
 _SHARE = 1 / 3  # of all searches
@@ -57,23 +57,23 @@ class Searches(NamedTuple):
 
 
 @compiled
-def searches(rms: FloatArray, counters: IntArray) -> Searches:
-    """Count them over islands with these champions' RMS (I,) and counters (I, ·)."""
+def searches(rms: FloatArray, search: SearchArray) -> Searches:
+    """Count them over islands with these champions' RMS (I,) and records (I,)."""
     independent = confirmed = hops = returned = 0
     has_cliffs, most = False, np.min(rms) * (1.0 + SAME)
     for i in range(rms.size):
-        independent += counters[i, TRIED]
+        independent += search[i].random_starts
         if rms[i] <= most:
-            confirmed += counters[i, CONFIRMED]
-            hops += counters[i, HOPS]
-            returned += counters[i, RETURNED]
-            has_cliffs |= counters[i, CLIFFS] > 0
+            confirmed += search[i].confirmed_starts
+            hops += search[i].hop_count
+            returned += search[i].returned_hops
+            has_cliffs |= search[i].champion_discontinuities > 0
     return Searches(independent, confirmed, hops, returned, has_cliffs)
 
 
 @compiled
 def has_ended(
-    ends: Ends, generation: int, rms: FloatArray, counters: IntArray, is_old: bool
+    ends: Ends, generation: int, rms: FloatArray, search: SearchArray, is_old: bool
 ) -> bool:
     """Whether one of the conditions holds at the border `generation`.
 
@@ -82,12 +82,10 @@ def has_ended(
     """
     if generation >= ends.generations or np.min(rms) <= ends.rms:
         return True
-    if ends.settled > 0 and _is_settled(
-        ends.settled, ends.is_warm, searches(rms, counters), is_old
-    ):
+    if ends.settled > 0 and _is_settled(ends.settled, ends.is_warm, searches(rms, search), is_old):
         return True
     # Below the border only those islands stay that have used up their evaluations.
-    return bool(np.all(counters[:, GENERATION] < generation))
+    return bool(np.all(search.generation < generation))
 
 
 @compiled

@@ -12,7 +12,7 @@ from the best of fresh individuals, and take in the rest by and by.
 import numpy as np
 
 from sysid.core.jit import compiled
-from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.core.types import FloatArray, WordArray
 from sysid.search.basin_hopping import COUNTED, SINGLE, UNCOUNTED, hop, is_behind, is_coloured
 from sysid.search.levenberg_marquardt import damped_step, factored, spread
 from sysid.search.operators import (
@@ -27,34 +27,7 @@ from sysid.search.operators import (
     unit,
 )
 from sysid.search.slopes import normal_equations, partial_fitness, slope_distance
-from sysid.search.state import (
-    CONFIRMED,
-    DAMPING,
-    DEVELOPMENTS,
-    EVALUATIONS,
-    FAILED,
-    FRESH,
-    GENERATION,
-    GROWTH,
-    HOP,
-    HOPS,
-    HORIZON,
-    JUMPS,
-    OLD,
-    POINT,
-    PROBES,
-    REACHED,
-    RETURNED,
-    ROUGH,
-    SAME,
-    SEQUENCE,
-    SETTLED,
-    STAGNATION,
-    STEP,
-    TRIED,
-    WARMED,
-    Plan,
-)
+from sysid.search.state import SAME, IslandArrays, Plan
 from sysid.simulation.evaluator import Evaluator, partial_predictions, population_fitness
 from sysid.simulation.scaling import located
 
@@ -77,42 +50,43 @@ SHORT_GROWTH = 1.5  # doublings: beside the champion the later signs of velociti
 
 @compiled
 def _fresh(
-    evaluator: Evaluator, plan: Plan, shape: tuple[int, int], counters: IntArray, horizon: float
+    evaluator: Evaluator, plan: Plan, shape: tuple[int, int], search: np.record
 ) -> FloatArray:
-    """The best of a population of random places, judged by the record up to `horizon`."""
-    places = np.empty(shape)
+    """The best of a population of random places, judged by the record up to the horizon."""
+    places, horizon = np.empty(shape), search.horizon
     for p in range(shape[0]):
         for d in range(shape[1]):
             draw = 1 + p * shape[1] + d
-            word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
+            word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, draw)
             places[p, d] = unit(word[0])
-    counters[EVALUATIONS] += shape[0]
+    search.evaluations += shape[0]
     predicted = partial_predictions(evaluator, located(evaluator, places), horizon)
     reached = partial_fitness(evaluator, plan, predicted, horizon)
     return np.asarray(places[np.argmin(reached[: shape[0]])])
 
 
 @compiled
-def scatters(counters: IntArray) -> bool:
+def scatters(search: np.record) -> bool:
     """Whether the last development spread the population around the champion."""
-    return bool(counters[DEVELOPMENTS] % (TURNS // 2) == SCATTERS)
+    return bool(search.local_searches % (TURNS // 2) == SCATTERS)
 
 
 @compiled
-def _is_lost(evaluator: Evaluator, plan: Plan, words: WordArray, counters: IntArray) -> bool:
+def _is_lost(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> bool:
     """Whether this is a hop's turn that is better spent far away. Not where a budget ends."""
-    turn = counters[DEVELOPMENTS] % TURNS
-    if turn % 2 == 0 or turn == 1 or counters[SETTLED] == 0 or counters[JUMPS] == 0:
+    search = island.search
+    turn = search.local_searches % TURNS
+    if turn % 2 == 0 or turn == 1:
         return False
-    if counters[EVALUATIONS] + max(words.shape) + 2 > plan.evaluations:
+    if search.champion_converged == 0 or search.fitness_discontinuities == 0:
         return False
-    return is_coloured(evaluator, plan, words, counters)
+    if search.evaluations + max(island.chromosomes.shape) + 2 > plan.evaluations:
+        return False
+    return is_coloured(evaluator, plan, island)
 
 
 @compiled
-def _choose_beside(
-    size: int, word: Draws, is_lost: bool, counters: IntArray, memory: FloatArray
-) -> int:
+def _choose_beside(size: int, word: Draws, is_lost: bool, search: np.record) -> int:
     """The same where the fitness jumps: there most that is better lies beside the champion.
 
     Of eight developments four are hops, two of them of one parameter, two scatter, one grows from
@@ -120,184 +94,181 @@ def _choose_beside(
     fresh individuals. Both grow so fast that it costs little. Where the champion's errors are no
     noise, three of the hops give their turns to fresh individuals.
     """
-    turn = counters[DEVELOPMENTS] % TURNS
-    memory[ROUGH] = 1.0
-    if counters[SETTLED] == 0:  # the champion first, whole: what follows is drawn around it
+    turn = search.local_searches % TURNS
+    search.wide_differences = 1
+    if search.champion_converged == 0:  # the champion first, whole: what follows is drawn around it
         return 0
     if is_lost:
-        memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * (1.0 + unit(word[0])) / 2.0)
-        memory[GROWTH] = 2.0
+        search.horizon = 0.5 ** (LONGEST_GROWTH * (1.0 + unit(word[0])) / 2.0)
+        search.horizon_growth = 2.0
         return -1
     if turn % 2 == 1:
-        counters[HOP] = COUNTED + SINGLE if turn % 4 == 3 else COUNTED
+        search.hop_kind = COUNTED + SINGLE if turn % 4 == 3 else COUNTED
         return 0
-    if scatters(counters):
-        counters[PROBES] = size
+    if scatters(search):
+        search.probe_count = size
         return 0
-    memory[GROWTH] = 2.0
+    search.horizon_growth = 2.0
     if turn == GROWS_BESIDE:
-        counters[HOP] = UNCOUNTED + SINGLE
-        memory[HORIZON] = 0.5 ** (SHORT_GROWTH * unit(word[0]))
+        search.hop_kind = UNCOUNTED + SINGLE
+        search.horizon = 0.5 ** (SHORT_GROWTH * unit(word[0]))
         return 0
-    memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
+    search.horizon = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
     if below(word[1], 3) > 0:
         return -1
-    memory[GROWTH] = 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
-    counters[PROBES] = size // 3
+    search.horizon_growth = 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
+    search.probe_count = size // 3
     return below(word[2], size)
 
 
 @compiled
-def _choose(plan: Plan, size: int, is_lost: bool, counters: IntArray, memory: FloatArray) -> int:
+def _choose(plan: Plan, size: int, is_lost: bool, search: np.record) -> int:
     """What kind of development comes next; gives the individual it begins with, -1: a fresh one."""
-    number = counters[DEVELOPMENTS]
-    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
-    if counters[JUMPS] > 0 and number > EARLY:
-        return _choose_beside(size, word, is_lost, counters, memory)
+    number = search.local_searches
+    word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, 0)
+    if search.fitness_discontinuities > 0 and number > EARLY:
+        return _choose_beside(size, word, is_lost, search)
     grows = number == EARLY or (number > EARLY and number % 2 == 0)
-    last_early = EARLY - counters[WARMED]  # behind an earlier result, the last of them is a hop
-    settled = counters[SETTLED] == 1 and number > last_early
+    last_early = EARLY - search.is_warm_start  # behind an earlier result, the last of them is a hop
+    settled = search.champion_converged == 1 and number > last_early
     chosen = below(word[1], 3 * size) - size if grows else 0
-    memory[ROUGH] = counters[SETTLED] == 1 or grows
+    search.wide_differences = search.champion_converged == 1 or grows
     if settled and (chosen >= size or number % 4 == 1 or number == EARLY):
-        counters[HOP] = COUNTED
+        search.hop_kind = COUNTED
     elif grows:
-        memory[HORIZON] = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
-        memory[GROWTH] = 2.0 if number == EARLY else 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
-        counters[PROBES] = 0 if number == EARLY else size // 3  # in lanes that would idle
+        search.horizon = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
+        doublings = 1.0 if number == EARLY else 0.5 ** (1 + below(word[3], N_GROWTHS))
+        search.horizon_growth = 2.0**doublings
+        search.probe_count = 0 if number == EARLY else size // 3  # in lanes that would idle
     elif settled:
-        counters[PROBES] = size
-    if 1 < number <= EARLY and not counters[HOP]:
+        search.probe_count = size
+    if 1 < number <= EARLY and not search.hop_kind:
         chosen = -1
     return chosen if chosen < size else 0
 
 
 @compiled
-def start_development(
-    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray,
-    counters: IntArray, memory: FloatArray,
-) -> None:  # fmt: skip
+def start_development(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
     """Choose the point to begin with, and how much of the record counts at first."""
-    counters[DEVELOPMENTS] += 1
-    counters[SEQUENCE], counters[STEP], counters[FAILED] = 1, 0, 0
-    counters[PROBES], counters[FRESH], counters[HOP] = 0, 0, 0
-    early = counters[DEVELOPMENTS] <= EARLY
-    memory[DAMPING] = EARLY_DAMPING if early else FIRST_DAMPING
-    memory[HORIZON], memory[REACHED] = 1.0, np.inf
-    is_lost = _is_lost(evaluator, plan, words, counters)
-    chosen = _choose(plan, words.shape[0], is_lost, counters, memory)
+    chromosomes, search = island.chromosomes, island.search
+    search.local_searches += 1
+    search.in_sequence_search, search.step_count, search.failed_steps = 1, 0, 0
+    search.probe_count, search.from_random_start, search.hop_kind = 0, 0, 0
+    early = search.local_searches <= EARLY
+    search.damping = EARLY_DAMPING if early else FIRST_DAMPING
+    search.horizon, search.reached_fitness = 1.0, np.inf
+    is_lost = _is_lost(evaluator, plan, island)
+    chosen = _choose(plan, chromosomes.shape[0], is_lost, search)
     # The places of a fresh start, or the slopes of a hop, would pass the budget.
-    if counters[EVALUATIONS] + max(words.shape) + 1 > plan.evaluations:
-        chosen, counters[HOP] = max(chosen, 0), 0
+    if search.evaluations + max(chromosomes.shape) + 1 > plan.evaluations:
+        chosen, search.hop_kind = max(chosen, 0), 0
     if chosen >= 0:
-        memory[OLD] = np.inf if counters[HOP] else fitness[chosen]
-        begin = decoded(words[chosen : chosen + 1], plan.bits)[0]
+        search.replaced_fitness = np.inf if search.hop_kind else island.fitness[chosen]
+        begin = decoded(chromosomes[chosen : chosen + 1], plan.bits)[0]
     else:
-        memory[OLD], counters[FRESH] = np.inf, 1
-        drawn = min(EARLY_PLACES, words.shape[0]) if early else words.shape[0]
-        begin = _fresh(evaluator, plan, (drawn, words.shape[1]), counters, memory[HORIZON])
+        search.replaced_fitness, search.from_random_start = np.inf, 1
+        drawn = min(EARLY_PLACES, chromosomes.shape[0]) if early else chromosomes.shape[0]
+        begin = _fresh(evaluator, plan, (drawn, chromosomes.shape[1]), search)
     for d in range(begin.size):
-        memory[POINT + d] = begin[d]
-    if counters[HOP]:
-        hop(evaluator, plan, counters, memory)
+        island.point[d] = begin[d]
+    if search.hop_kind:
+        hop(evaluator, plan, island)
 
 
 @compiled
-def _keep(words: WordArray, fitness: FloatArray, memory: FloatArray, word: WordArray,
-          reached: float) -> None:  # fmt: skip
+def _keep(island: IslandArrays, chromosome: WordArray, reached: float) -> None:
     """Put a developed individual in the place of its former self, else of the worst."""
+    chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     place = fitness.size - 1
     for p in range(fitness.size - 1, -1, -1):
-        if fitness[p] == memory[OLD]:
+        if fitness[p] == search.replaced_fitness:
             place = p
     if reached < fitness[place]:
-        for d in range(word.size):
-            words[place, d] = word[d]
+        for d in range(chromosome.size):
+            chromosomes[place, d] = chromosome[d]
         fitness[place] = reached
-        rank(words, fitness)
-        memory[OLD] = reached
+        rank(chromosomes, fitness)
+        search.replaced_fitness = reached
 
 
 @compiled
-def _scatter(
-    words: WordArray, fitness: FloatArray, counters: IntArray, proposals: WordArray,
-    reached: FloatArray, best: int,
-) -> None:  # fmt: skip
+def _scatter(island: IslandArrays, proposals: WordArray, reached: FloatArray, best: int) -> None:
     """Let the probes take the places of all but the champion: the genetic search goes on there."""
-    if counters[PROBES] < fitness.size:  # those of a growing record go on with each step
+    chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
+    if search.probe_count < fitness.size:  # those of a growing record go on with each step
         return
-    counters[PROBES], counters[STAGNATION] = 0, 0
+    search.probe_count, search.stagnation = 0, 0
     for p in range(1, min(fitness.size, reached.size - TRIALS + 1)):
         t = TRIALS + p - 1
         if t != best:
             fitness[p] = reached[t]
-            for d in range(words.shape[1]):
-                words[p, d] = proposals[t, d]
-    rank(words, fitness)
+            for d in range(chromosomes.shape[1]):
+                chromosomes[p, d] = proposals[t, d]
+    rank(chromosomes, fitness)
 
 
 @compiled
-def _next_part(counters: IntArray, memory: FloatArray, fitness: FloatArray) -> None:
-    """Take in more of the record; at its end, the development ends."""
-    counters[FAILED] = 0
-    memory[DAMPING] = FIRST_DAMPING
-    if memory[HORIZON] < 1.0:
-        memory[HORIZON] = min(memory[HORIZON] * memory[GROWTH], 1.0)
+def _next_part(search: np.record, champion: float) -> None:
+    """Take in more of the record; at its end, the development ends.
+
+    `champion` is the champion's fitness.
+    """
+    search.failed_steps = 0
+    search.damping = FIRST_DAMPING
+    if search.horizon < 1.0:
+        search.horizon = min(search.horizon * search.horizon_growth, 1.0)
         return
-    counters[SEQUENCE], counters[STEP] = 0, 0
-    if memory[OLD] == fitness[0] and counters[DEVELOPMENTS] > 1:
-        counters[SETTLED] = 1
-    if counters[HOP] & COUNTED:
-        counters[HOPS] += 1
-        counters[RETURNED] += abs(memory[REACHED] - fitness[0]) <= fitness[0] * SAME
-    if counters[FRESH]:
-        counters[TRIED] += 1
-        counters[CONFIRMED] += memory[REACHED] <= fitness[0] * (1.0 + SAME)
+    search.in_sequence_search, search.step_count = 0, 0
+    if search.replaced_fitness == champion and search.local_searches > 1:
+        search.champion_converged = 1
+    if search.hop_kind & COUNTED:
+        search.hop_count += 1
+        search.returned_hops += abs(search.reached_fitness - champion) <= champion * SAME
+    if search.from_random_start:
+        search.random_starts += 1
+        search.confirmed_starts += search.reached_fitness <= champion * (1.0 + SAME)
 
 
 @compiled
-def _end_part(
-    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray, reached: float,
-    counters: IntArray, memory: FloatArray,
-) -> None:  # fmt: skip
+def _end_part(evaluator: Evaluator, plan: Plan, island: IslandArrays, reached: float) -> None:
     """Go on to the next part; a growth from far away, beside jumps, not if it is behind already."""
-    races = memory[HORIZON] < 1.0 and counters[JUMPS] > 0 and counters[HOP] == 0
-    if races and is_behind(evaluator, plan, words, counters, memory[HORIZON], reached):
-        memory[HORIZON] = 1.0
-    _next_part(counters, memory, fitness)
+    search = island.search
+    races = search.horizon < 1.0 and search.fitness_discontinuities > 0 and search.hop_kind == 0
+    if races and is_behind(evaluator, plan, island, search.horizon, reached):
+        search.horizon = 1.0
+    _next_part(search, island.fitness[0])
 
 
 @compiled
-def _trials(plan: Plan, counters: IntArray, memory: FloatArray, matrix: FloatArray,
-            gradient: FloatArray, base: float) -> FloatArray:  # fmt: skip
+def _trials(
+    plan: Plan, island: IslandArrays, matrix: FloatArray, gradient: FloatArray, base: float
+) -> FloatArray:
     """Places to try: steps of several dampings, and probes spread as the estimate's covariance."""
-    point = memory[POINT:]
-    places = np.empty((TRIALS + counters[PROBES], point.size))
+    point, search = island.point, island.search
+    places = np.empty((TRIALS + search.probe_count, point.size))
     for t in range(TRIALS):
-        damping = memory[DAMPING] * FACTOR ** (t - 1)
+        damping = search.damping * FACTOR ** (t - 1)
         damped_step(matrix, gradient, point, damping, places[t])
     deviation, factor = np.empty(point.size), factored(matrix, gradient, point, 0.0)
     for t in range(TRIALS, places.shape[0]):
         for d in range(point.size):
             draw = 1 + t * point.size + d
-            word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
+            word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, draw)
             deviation[d] = base * 10.0 ** (1.5 - 2.5 * unit(word[2])) * normal(word)
         spread(factor, point, deviation, places[t])
     return places
 
 
 @compiled
-def adaptive_sequence(
-    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray,
-    counters: IntArray, memory: FloatArray,
-) -> None:  # fmt: skip
+def adaptive_sequence(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
     """One generation of the adaptive search: sensitivities, then several steps at once."""
-    point, horizon = memory[POINT:], memory[HORIZON]
-    counters[STEP] += 1
-    counters[EVALUATIONS] += point.size + 1 + TRIALS + counters[PROBES]
-    difference = slope_distance(plan, counters, memory)
+    point, search = island.point, island.search
+    horizon = search.horizon
+    search.step_count += 1
+    search.evaluations += point.size + 1 + TRIALS + search.probe_count
+    difference = slope_distance(plan, search)
     matrix, gradient, base = normal_equations(evaluator, plan, point, horizon, difference)
-    proposals = coded(_trials(plan, counters, memory, matrix, gradient, base), plan.bits)
+    proposals = coded(_trials(plan, island, matrix, gradient, base), plan.bits)
     places = decoded(proposals, plan.bits)
     if horizon < 1.0:
         predicted = partial_predictions(evaluator, located(evaluator, places), horizon)
@@ -305,20 +276,21 @@ def adaptive_sequence(
     else:
         reached = population_fitness(evaluator, located(evaluator, places))
     best = np.argmin(reached)
-    _scatter(words, fitness, counters, proposals, reached, int(best))
-    strict = horizon == 1.0 and counters[DEVELOPMENTS] > 1 and reached[best] < FAR * fitness[0]
+    _scatter(island, proposals, reached, int(best))
+    is_near = reached[best] < FAR * island.fitness[0]
+    strict = is_near and horizon == 1.0 and search.local_searches > 1
     enough = ENOUGH if strict else ENOUGH_PART
     if reached[best] < base:
         for d in range(point.size):
             point[d] = places[best, d]
-        memory[DAMPING] *= FACTOR ** float(min(int(best), TRIALS) - 2)
+        search.damping *= FACTOR ** float(min(int(best), TRIALS) - 2)
         if horizon == 1.0:
-            memory[REACHED] = reached[best]
-            _keep(words, fitness, memory, proposals[best], reached[best])
-        if reached[best] > base * (1.0 - enough) or counters[STEP] >= MOST_STEPS:
-            _end_part(evaluator, plan, words, fitness, reached[best], counters, memory)
+            search.reached_fitness = reached[best]
+            _keep(island, proposals[best], reached[best])
+        if reached[best] > base * (1.0 - enough) or search.step_count >= MOST_STEPS:
+            _end_part(evaluator, plan, island, reached[best])
         return
-    memory[DAMPING] *= FACTOR**TRIALS
-    counters[FAILED] += 1
-    if counters[FAILED] == 2 or not np.isfinite(base):
-        _end_part(evaluator, plan, words, fitness, base, counters, memory)
+    search.damping *= FACTOR**TRIALS
+    search.failed_steps += 1
+    if search.failed_steps == 2 or not np.isfinite(base):
+        _end_part(evaluator, plan, island, base)

@@ -21,21 +21,11 @@ Both compare with nothing but the champion's own errors, so no scale enters.
 import numpy as np
 
 from sysid.core.jit import compiled
-from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.core.types import FloatArray
 from sysid.search.levenberg_marquardt import factored, spread
 from sysid.search.operators import DEVELOPMENT, below, decoded, draws, normal, unit
 from sysid.search.slopes import normal_equations, partial_fitness, slope_distance
-from sysid.search.state import (
-    CLIFFS,
-    EVALUATIONS,
-    GENERATION,
-    HOP,
-    HOPS,
-    JUMPS,
-    POINT,
-    WARMED,
-    Plan,
-)
+from sysid.search.state import IslandArrays, Plan
 from sysid.simulation.evaluator import Evaluator, partial_predictions, population_fitness
 from sysid.simulation.scaling import located
 
@@ -79,7 +69,7 @@ def _losses(
 @compiled
 def has_cliff(
     evaluator: Evaluator, factor: FloatArray, point: FloatArray, direction: FloatArray,
-    base: float, counters: IntArray,
+    base: float, search: np.record,
 ) -> bool:  # fmt: skip
     """Whether the loss jumps on a line through a point (D,), in at most `MOST` simulations.
 
@@ -89,13 +79,13 @@ def has_cliff(
         That of the sums of products of slopes (`sysid.search.levenberg_marquardt.factored`).
     direction : FloatArray, shape (D,)
         Standard normal numbers times the fitness `base` at the point: a standard error.
-    counters : IntArray
+    search : np.record
         The island's: simulations are counted.
     """
     first, width, before, above = -REACH, 2.0 * REACH, 0.0, 0.0
     variance, most = base**2 / evaluator.n_weight, _HIGH * base**2
     for level in range(_LEVELS):
-        counters[EVALUATIONS] += PLACES
+        search.evaluations += PLACES
         losses = _losses(evaluator, factor, point, direction, first, first + width, most)
         place, unlike = most_unlike(losses)
         if unlike <= variance or (level > 0 and unlike <= _LEFT * before):
@@ -114,32 +104,32 @@ LINES = 2  # on which each does
 
 
 @compiled
-def hop(evaluator: Evaluator, plan: Plan, counters: IntArray, memory: FloatArray) -> None:
+def hop(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
     """Move the point away: as the estimate's covariance spreads it, or one parameter alone."""
-    point = memory[POINT:]
-    counters[EVALUATIONS] += point.size + 1
-    difference = slope_distance(plan, counters, memory)
+    point, search = island.point, island.search
+    search.evaluations += point.size + 1
+    difference = slope_distance(plan, search)
     matrix, gradient, base = normal_equations(evaluator, plan, point, 1.0, difference)
-    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, 0)
     size = base * SHORTEST_HOP * (LONGEST_HOP / SHORTEST_HOP) ** unit(word[0])
     factor = factored(matrix, gradient, point, 0.0)
-    if counters[HOP] & COUNTED:
-        _look(evaluator, plan, factor, base, counters, memory)
-    if counters[HOP] & SINGLE:
-        _move_one(plan, counters, matrix, FARTHER * size, point)
+    if search.hop_kind & COUNTED:
+        _look(evaluator, plan, factor, base, island)
+    if search.hop_kind & SINGLE:
+        _move_one(plan, search, matrix, FARTHER * size, point)
     else:
-        spread(factor, point, _deviation(plan, counters, 0, size, point.size), point)
+        spread(factor, point, _deviation(plan, search, 0, size, point.size), point)
 
 
 @compiled
 def _move_one(
-    plan: Plan, counters: IntArray, matrix: FloatArray, size: float, point: FloatArray
+    plan: Plan, search: np.record, matrix: FloatArray, size: float, point: FloatArray
 ) -> None:
     """Move one parameter by so many of its standard errors with the others held: off the valley.
 
     One to which the output is insensitive stays.
     """
-    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 1)
+    word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, 1)
     d = below(word[2], point.size)
     if 0.0 < matrix[d, d] < np.inf:
         moved = point[d] + size * normal(word) / np.sqrt(matrix[d, d])
@@ -147,55 +137,51 @@ def _move_one(
 
 
 @compiled
-def _deviation(plan: Plan, counters: IntArray, line: int, size: float, n: int) -> FloatArray:
+def _deviation(plan: Plan, search: np.record, line: int, size: float, n: int) -> FloatArray:
     """Normal numbers (n,) of that standard deviation."""
     drawn = np.empty(n)
     for d in range(n):
         draw = 1 + line * n + d
-        word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], draw)
+        word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, draw)
         drawn[d] = size * normal(word)
     return drawn
 
 
 @compiled
 def _look(
-    evaluator: Evaluator, plan: Plan, factor: FloatArray, base: float, counters: IntArray,
-    memory: FloatArray,
-) -> None:  # fmt: skip
+    evaluator: Evaluator, plan: Plan, factor: FloatArray, base: float, island: IslandArrays
+) -> None:
     """Note whether the fitness jumps on lines through the point; not where a budget ends."""
-    point = memory[POINT:]
+    point, search = island.point, island.search
     for line in range(1, LINES + 1):
-        if counters[EVALUATIONS] + MOST + point.size + 1 > plan.evaluations or not np.isfinite(
-            base
-        ):
+        if search.evaluations + MOST + point.size + 1 > plan.evaluations or not np.isfinite(base):
             return
-        if counters[CLIFFS] == 0 and counters[HOPS] < LOOKS:
-            direction = _deviation(plan, counters, line, base, point.size)
-            counters[CLIFFS] += has_cliff(evaluator, factor, point, direction, base, counters)
+        if search.champion_discontinuities == 0 and search.hop_count < LOOKS:
+            direction = _deviation(plan, search, line, base, point.size)
+            jumps = has_cliff(evaluator, factor, point, direction, base, search)
+            search.champion_discontinuities += jumps
             # A warm start settles by fewer searches, chosen with those of a smooth fitness.
-            counters[JUMPS] += counters[CLIFFS] if counters[WARMED] == 0 else 0
+            search.fitness_discontinuities += jumps and search.is_warm_start == 0
 
 
 COLOURED = 0.5  # correlation of neighbouring errors: noise has none, a wrong response nearly 1
 
 
 @compiled
-def _champion(
-    evaluator: Evaluator, plan: Plan, words: WordArray, horizon: float, counters: IntArray
-) -> FloatArray:
+def _champion(evaluator: Evaluator, plan: Plan, island: IslandArrays, horizon: float) -> FloatArray:
     """Predictions (M, 1 or more) of the champion up to that part of the record."""
-    counters[EVALUATIONS] += 1
-    champion = located(evaluator, decoded(words[:1], plan.bits))
+    island.search.evaluations += 1
+    champion = located(evaluator, decoded(island.chromosomes[:1], plan.bits))
     return partial_predictions(evaluator, champion, horizon)
 
 
 @compiled
-def is_coloured(evaluator: Evaluator, plan: Plan, words: WordArray, counters: IntArray) -> bool:
+def is_coloured(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> bool:
     """Whether the champion's errors go together with their neighbours: a simulation.
 
     Then far more than noise is left to explain. Neighbours are so in the list of measured values.
     """
-    predicted = _champion(evaluator, plan, words, 1.0, counters)
+    predicted = _champion(evaluator, plan, island, 1.0)
     products, squares, last = 0.0, 0.0, 0.0
     for m in range(predicted.shape[0]):
         if evaluator.weight[m] != 0.0:
@@ -208,14 +194,13 @@ def is_coloured(evaluator: Evaluator, plan: Plan, words: WordArray, counters: In
 
 @compiled
 def is_behind(
-    evaluator: Evaluator, plan: Plan, words: WordArray, counters: IntArray, horizon: float,
-    reached: float,
-) -> bool:  # fmt: skip
+    evaluator: Evaluator, plan: Plan, island: IslandArrays, horizon: float, reached: float
+) -> bool:
     """Whether the champion fits a part better than what was fitted to it: a simulation.
 
     Not where the budget ends.
     """
-    if counters[EVALUATIONS] >= plan.evaluations:
+    if island.search.evaluations >= plan.evaluations:
         return False
-    predicted = _champion(evaluator, plan, words, horizon, counters)
+    predicted = _champion(evaluator, plan, island, horizon)
     return bool(partial_fitness(evaluator, plan, predicted, horizon)[0] < reached)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sysid.core.jit import compiled
-from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.core.types import FloatArray, WordArray
 from sysid.search.adaptive_search import (
     EARLY,
     TRIALS,
@@ -32,29 +32,17 @@ from sysid.search.sequence_search import fixed_sequence
 from sysid.search.state import (
     AT_EVALUATIONS,
     AT_GENERATION,
-    CLIFFS,
-    CONFIRMED,
-    DEVELOPMENTS,
-    EVALUATIONS,
-    GENERATION,
     GENETIC,
-    HOPS,
     IMPROVED,
-    JUMPS,
     LOCAL,
     MIGRATION,
     PHASE,
-    PROBES,
-    RETURNED,
     RMS,
     SAME,
-    SEQUENCE,
-    SETTLED,
     SIMPLE,
-    STAGNATION,
     START,
-    STEP,
     VALUES,
+    IslandArrays,
     Plan,
 )
 from sysid.simulation.evaluator import Evaluator, population_fitness
@@ -83,11 +71,10 @@ def initial_places(plan: Plan, individuals: int, n: int) -> FloatArray:
 
 
 @compiled
-def simple_generation(
-    plan: Plan, words: WordArray, fitness: FloatArray, counters: IntArray
-) -> None:
+def simple_generation(plan: Plan, island: IslandArrays) -> None:
     """Figure 4: the survivors stay unchanged, their children take the places of the others."""
-    generation, length = counters[GENERATION], words.shape[1] * plan.bits
+    words, fitness = island.chromosomes, island.fitness
+    generation, length = island.search.generation, words.shape[1] * plan.bits
     rate = scheduled(plan.starts, plan.rates, generation)
     for p in range(plan.survivors, fitness.size):
         word = draws(plan.seed, CHILDREN, plan.island, generation, 2 * p)
@@ -123,30 +110,31 @@ def _breed(plan: Plan, places: FloatArray, parents: WordArray, generation: int, 
 
 
 @compiled
-def improved_generation(plan: Plan, words: WordArray, counters: IntArray) -> WordArray:
+def improved_generation(plan: Plan, island: IslandArrays) -> WordArray:
     """As many children as there are individuals, to compete with their parents."""
-    children, places = np.empty_like(words), decoded(words, plan.bits)
-    for p in range(words.shape[0]):
-        _breed(plan, places, words, counters[GENERATION], p, children[p])
+    parents = island.chromosomes
+    children, places = np.empty_like(parents), decoded(parents, plan.bits)
+    for p in range(parents.shape[0]):
+        _breed(plan, places, parents, island.search.generation, p, children[p])
     return children
 
 
 @compiled
-def restart(plan: Plan, words: WordArray, fitness: FloatArray, counters: IntArray) -> None:
+def restart(plan: Plan, island: IslandArrays) -> None:
     """All but the champion are drawn anew."""
+    words, fitness = island.chromosomes, island.fitness
     largest, n = float((1 << plan.bits) - 1), words.shape[1]
     for p in range(1, fitness.size):
         fitness[p] = np.nan
         for d in range(n):
-            word = draws(plan.seed, RESTART, plan.island, counters[GENERATION], p * n + d)
+            word = draws(plan.seed, RESTART, plan.island, island.search.generation, p * n + d)
             words[p, d] = np.uint32(round(unit(word[0]) * largest))
 
 
 @compiled
-def compete(
-    words: WordArray, fitness: FloatArray, children: WordArray, reached: FloatArray
-) -> None:
+def compete(island: IslandArrays, children: WordArray, reached: FloatArray) -> None:
     """Of parents and children the fittest stay; on equal fitness the parent does."""
+    words, fitness = island.chromosomes, island.fitness
     size, n = words.shape
     everyone, values = np.empty((2 * size, n), np.uint32), np.empty(2 * size)
     for p in range(size):
@@ -161,114 +149,113 @@ def compete(
 
 
 @compiled
-def evaluate(
-    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray, counters: IntArray
-) -> None:
-    """Simulate the individuals that are not evaluated yet (``nan``), and rank all."""
+def evaluate(evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray) -> int:
+    """Simulate the individuals that are not evaluated yet (``nan``), and rank all.
+
+    Gives the number of simulations.
+    """
     waiting = np.flatnonzero(np.isnan(fitness))
     if waiting.size == 0:
-        return
+        return 0
     chosen = np.empty((waiting.size, words.shape[1]), np.uint32)
     for i in range(waiting.size):
         for d in range(words.shape[1]):
             chosen[i, d] = words[waiting[i], d]
     reached = population_fitness(evaluator, located(evaluator, decoded(chosen, plan.bits)))
-    counters[EVALUATIONS] += waiting.size
     for i in range(waiting.size):
         fitness[waiting[i]] = reached[i]
     rank(words, fitness)
+    return waiting.size
 
 
 @compiled
-def _generation(
-    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray,
-    counters: IntArray, memory: FloatArray,
-) -> None:  # fmt: skip
-    if counters[SEQUENCE] and plan.method == IMPROVED:
-        adaptive_sequence(evaluator, plan, words, fitness, counters, memory)
+def _generation(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
+    chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
+    if search.in_sequence_search and plan.method == IMPROVED:
+        adaptive_sequence(evaluator, plan, island)
         # Two steps of a hop simulate no more than one generation of another kind.
-        again = counters[JUMPS] > 0 and counters[SEQUENCE] and counters[PROBES] == 0
-        step = words.shape[1] + 1 + TRIALS
-        if again and counters[EVALUATIONS] + step <= plan.evaluations:
-            adaptive_sequence(evaluator, plan, words, fitness, counters, memory)
-    elif counters[SEQUENCE]:
-        fixed_sequence(evaluator, plan, words, fitness, counters)
+        goes_on = search.in_sequence_search and search.probe_count == 0
+        again = goes_on and search.fitness_discontinuities > 0
+        step = chromosomes.shape[1] + 1 + TRIALS
+        if again and search.evaluations + step <= plan.evaluations:
+            adaptive_sequence(evaluator, plan, island)
+    elif search.in_sequence_search:
+        fixed_sequence(evaluator, plan, island)
     elif plan.method < IMPROVED:
-        simple_generation(plan, words, fitness, counters)
-    elif counters[STAGNATION] >= plan.stagnation:
-        counters[STAGNATION] = 0
-        restart(plan, words, fitness, counters)
+        simple_generation(plan, island)
+    elif search.stagnation >= plan.stagnation:
+        search.stagnation = 0
+        restart(plan, island)
     else:
-        counters[STEP] += 1
-        children = improved_generation(plan, words, counters)
+        search.step_count += 1
+        children = improved_generation(plan, island)
         reached = np.full(fitness.size, np.nan)
-        evaluate(evaluator, plan, children, reached, counters)
-        compete(words, fitness, children, reached)
-    evaluate(evaluator, plan, words, fitness, counters)
+        search.evaluations += evaluate(evaluator, plan, children, reached)
+        compete(island, children, reached)
+    search.evaluations += evaluate(evaluator, plan, chromosomes, fitness)
 
 
 @compiled
-def _turn(
-    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray,
-    counters: IntArray, memory: FloatArray,
-) -> None:  # fmt: skip
+def _turn(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
     """GA ⇒ sequence: where the genetic search stands still, local search takes over."""
-    if counters[SEQUENCE] or plan.method == SIMPLE:
+    search = island.search
+    if search.in_sequence_search or plan.method == SIMPLE:
         return
     if plan.method == IMPROVED:
-        early = counters[DEVELOPMENTS] < EARLY
-        beside = counters[JUMPS] > 0 and not scatters(counters)
-        if early or beside or counters[STEP] >= max(1, plan.stagnation // 10):
-            start_development(evaluator, plan, words, fitness, counters, memory)
-    elif counters[STAGNATION] >= plan.stagnation:
-        counters[SEQUENCE], counters[STAGNATION] = 1, 0
+        early = search.local_searches < EARLY
+        beside = search.fitness_discontinuities > 0 and not scatters(search)
+        if early or beside or search.step_count >= max(1, plan.stagnation // 10):
+            start_development(evaluator, plan, island)
+    elif search.stagnation >= plan.stagnation:
+        search.in_sequence_search, search.stagnation = 1, 0
 
 
 @compiled
-def _note(evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray,
-          counters: IntArray, phase: int, row: FloatArray) -> None:  # fmt: skip
-    row[AT_GENERATION], row[AT_EVALUATIONS] = counters[GENERATION], counters[EVALUATIONS]
-    row[RMS], row[PHASE] = fitness[0], phase
-    values = located(evaluator, decoded(words[:1], plan.bits))
-    for d in range(words.shape[1]):
+def _note(
+    evaluator: Evaluator, plan: Plan, island: IslandArrays, phase: int, row: FloatArray
+) -> None:
+    search = island.search
+    row[AT_GENERATION], row[AT_EVALUATIONS] = search.generation, search.evaluations
+    row[RMS], row[PHASE] = island.fitness[0], phase
+    values = located(evaluator, decoded(island.chromosomes[:1], plan.bits))
+    for d in range(values.shape[1]):
         row[VALUES + d] = values[0, d]
 
 
 @compiled
 def generations(
-    evaluator: Evaluator, plan: Plan, count: int, words: WordArray, fitness: FloatArray,
-    counters: IntArray, memory: FloatArray, improvements: FloatArray,
-) -> int:  # fmt: skip
+    evaluator: Evaluator, plan: Plan, count: int, island: IslandArrays, improvements: FloatArray
+) -> int:
     """Evolve in place by `count` generations; gives the number of improvements written.
 
     An island that has used up its evaluations, or reached the target, rests. Before the first
     generation the initial population is evaluated.
     """
-    written = 0
+    fitness, search, written = island.fitness, island.search, 0
     if np.any(np.isnan(fitness)):  # the beginning, or migrants from an island of other bits
         # Not by the evaluations: finding the starts of a polynomial may have taken some.
         begins = np.all(np.isnan(fitness))
         best = np.inf if begins else np.nanmin(fitness)
         phase = START if begins else MIGRATION
-        evaluate(evaluator, plan, words, fitness, counters)
+        search.evaluations += evaluate(evaluator, plan, island.chromosomes, fitness)
         if fitness[0] < best:
-            _note(evaluator, plan, words, fitness, counters, phase, improvements[0])
+            _note(evaluator, plan, island, phase, improvements[0])
             written = 1
     for _ in range(count):
-        if counters[EVALUATIONS] >= plan.evaluations or fitness[0] <= plan.rms:
+        if search.evaluations >= plan.evaluations or fitness[0] <= plan.rms:
             break
-        _turn(evaluator, plan, words, fitness, counters, memory)
-        best, phase = fitness[0], LOCAL if counters[SEQUENCE] else GENETIC
-        _generation(evaluator, plan, words, fitness, counters, memory)
-        counters[GENERATION] += 1
-        counters[STAGNATION] += 1
+        _turn(evaluator, plan, island)
+        best, phase = fitness[0], LOCAL if search.in_sequence_search else GENETIC
+        _generation(evaluator, plan, island)
+        search.generation += 1
+        search.stagnation += 1
         if fitness[0] < best:
-            counters[STAGNATION] = 0
+            search.stagnation = 0
             if fitness[0] < best * (1.0 - SAME):
-                counters[CONFIRMED], counters[CLIFFS] = 0, 0
-                counters[HOPS], counters[RETURNED] = 0, 0
+                search.confirmed_starts, search.champion_discontinuities = 0, 0
+                search.hop_count, search.returned_hops = 0, 0
             if phase == GENETIC:
-                counters[SETTLED] = 0
-            _note(evaluator, plan, words, fitness, counters, phase, improvements[written])
+                search.champion_converged = 0
+            _note(evaluator, plan, island, phase, improvements[written])
             written += 1
     return written

@@ -6,21 +6,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.core.settings import GeneticAlgorithm
-from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.core.types import FloatArray, WordArray
 from sysid.kernels.abi import LANES
 from sysid.search.adaptive_search import TRIALS
 from sysid.search.evolution import generations
 from sysid.search.state import (
     AT_EVALUATIONS,
     AT_GENERATION,
-    EVALUATIONS,
-    GENERATION,
     PHASE,
     PHASES,
     RMS,
+    SEARCH_RECORD,
     VALUES,
     Improvement,
+    IslandArrays,
     Plan,
+    SearchArray,
 )
 from sysid.simulation.evaluator import Evaluator
 
@@ -39,10 +40,10 @@ class Island:
         Chromosomes, fittest first.
     fitness : FloatArray, shape (P,)
         J of Eq. 10, ascending; ``inf`` diverges, ``nan`` is not evaluated yet.
-    counters : IntArray
-        Generation, evaluations and the phase of the search (see `sysid.search.state`).
-    memory : FloatArray
-        What a sequence search carries from one generation to the next.
+    search : SearchArray, shape ()
+        How far the search has got (see `sysid.search.state.SEARCH_RECORD`).
+    point : FloatArray, shape (D,)
+        Where the local search stands.
     history : tuple of Improvement
         Every better champion since the start.
     """
@@ -51,24 +52,29 @@ class Island:
     seed: int
     words: WordArray
     fitness: FloatArray
-    counters: IntArray
-    memory: FloatArray
+    search: SearchArray
+    point: FloatArray
     history: tuple[Improvement, ...] = ()
 
     @property
     def generation(self) -> int:
         """Generations completed."""
-        return int(self.counters[GENERATION])
+        return int(self.search.generation)
 
     @property
     def evaluations(self) -> int:
         """Simulations run."""
-        return int(self.counters[EVALUATIONS])
+        return int(self.search.evaluations)
 
     @property
     def champion_rms(self) -> float:
         """Fitness of the best individual; ``inf`` before the first evaluation."""
         return self.history[-1].rms if self.history else float("inf")
+
+    @property
+    def arrays(self) -> IslandArrays:
+        """What compiled code reads and changes: not copies."""
+        return IslandArrays(self.words, self.fitness, self.search[()], self.point)
 
 
 def evolve(evaluator: Evaluator, plan: Plan, island: Island, count: int) -> Island:
@@ -76,13 +82,14 @@ def evolve(evaluator: Evaluator, plan: Plan, island: Island, count: int) -> Isla
 
     ``evolve(…, a + b)`` equals ``evolve(…, b)`` of ``evolve(…, a)``, bit for bit.
     """
-    words, fitness = island.words.copy(), island.fitness.copy()
-    counters, memory = island.counters.copy(), island.memory.copy()
-    rows = np.empty((count + 1, VALUES + words.shape[1]))
-    written = generations(evaluator, plan, count, words, fitness, counters, memory, rows)
+    after = replace(
+        island, words=island.words.copy(), fitness=island.fitness.copy(),
+        search=island.search.copy(), point=island.point.copy(),
+    )  # fmt: skip
+    rows = np.empty((count + 1, VALUES + island.point.size))
+    written = generations(evaluator, plan, count, after.arrays, rows)
     better = tuple(improvement(row) for row in rows[:written].tolist())
-    history = island.history + better
-    return Island(island.index, island.seed, words, fitness, counters, memory, history)
+    return replace(after, history=island.history + better)
 
 
 def improvement(row: Sequence[float]) -> Improvement:
@@ -94,6 +101,11 @@ def improvement(row: Sequence[float]) -> Improvement:
         PHASES[int(row[PHASE])],
         tuple(row[VALUES:]),
     )
+
+
+def stack_search(islands: Sequence[Island]) -> SearchArray:
+    """Copies of the islands' search records (I,)."""
+    return np.array([island.search for island in islands], SEARCH_RECORD).view(np.recarray)
 
 
 _UNLIMITED = 2**62

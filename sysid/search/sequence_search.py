@@ -7,9 +7,9 @@ proposals, keeps the best, and the search goes on while it gains.
 import numpy as np
 
 from sysid.core.jit import compiled
-from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.core.types import FloatArray, IntArray
 from sysid.search.operators import DEVELOPMENT, below, coded, decoded, draws, rank
-from sysid.search.state import EVALUATIONS, FAILED, GENERATION, SEQUENCE, Plan
+from sysid.search.state import IslandArrays, Plan
 from sysid.simulation.evaluator import Evaluator, population_fitness
 from sysid.simulation.scaling import located, placed
 
@@ -44,23 +44,22 @@ def _proposals(evaluator: Evaluator, plan: Plan, champion: FloatArray, n: int,
 
 
 @compiled
-def fixed_sequence(
-    evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray, counters: IntArray
-) -> None:
+def fixed_sequence(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
     """One generation of the fixed sequence search; two without a gain end the phase."""
-    champion = located(evaluator, decoded(words[:1], plan.bits))[0]
-    theta = _proposals(evaluator, plan, champion, fitness.size, counters[GENERATION])
+    chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
+    champion = located(evaluator, decoded(chromosomes[:1], plan.bits))[0]
+    theta = _proposals(evaluator, plan, champion, fitness.size, search.generation)
     proposals = coded(placed(evaluator, theta), plan.bits)
     reached = population_fitness(evaluator, located(evaluator, decoded(proposals, plan.bits)))
-    counters[EVALUATIONS] += fitness.size
+    search.evaluations += fitness.size
     best = np.argmin(reached)
     if reached[best] < fitness[0]:
         fitness[-1] = reached[best]
         for d in range(champion.size):
-            words[-1, d] = proposals[best, d]
-        rank(words, fitness)
-        counters[FAILED] = 0
+            chromosomes[-1, d] = proposals[best, d]
+        rank(chromosomes, fitness)
+        search.failed_steps = 0
         return
-    counters[FAILED] += 1
-    if counters[FAILED] == 2:
-        counters[SEQUENCE], counters[FAILED] = 0, 0
+    search.failed_steps += 1
+    if search.failed_steps == 2:
+        search.in_sequence_search, search.failed_steps = 0, 0

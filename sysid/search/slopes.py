@@ -7,10 +7,10 @@ soft-l1 loss the residuals are weighted by 1/√(1 + (we/s)²) (iteratively rewe
 import numpy as np
 
 from sysid.core.jit import compiled
-from sysid.core.types import FloatArray, IntArray
+from sysid.core.types import FloatArray
 from sysid.search.levenberg_marquardt import product
 from sysid.search.operators import DEVELOPMENT, draws, unit
-from sysid.search.state import GENERATION, ROUGH, Plan
+from sysid.search.state import Plan
 from sysid.simulation.evaluator import Evaluator, partial_predictions
 from sysid.simulation.scaling import located
 
@@ -57,16 +57,16 @@ def _sensed(
 
 
 @compiled
-def slope_distance(plan: Plan, counters: IntArray, memory: FloatArray) -> float:
+def slope_distance(plan: Plan, search: np.record) -> float:
     """Distance (of the range) over which the next slopes are taken.
 
     The first searches take derivatives, the others slopes over a distance that each step draws
     anew: where switches (dry friction) make the fitness rough, these tell what lies behind the
     next ripple, and no ripple stops them all.
     """
-    if memory[ROUGH] == 0.0:
+    if search.wide_differences == 0:
         return FINE
-    word = draws(plan.seed, DEVELOPMENT, plan.island, counters[GENERATION], 0)
+    word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, 0)
     return float(10.0 ** (-2.0 - 4.0 * unit(word[2])))
 
 

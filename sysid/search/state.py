@@ -1,9 +1,11 @@
-"""What compiled generations read and change: the plan of an island and its counters."""
+"""What compiled generations read and change: the plan of an island and its arrays."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
-from sysid.core.types import FloatArray, IntArray
+import numpy as np
+
+from sysid.core.types import FloatArray, IntArray, WordArray
 
 Phase = Literal["start", "genetic", "sequence", "migration", "refinement"]
 
@@ -46,15 +48,65 @@ class IslandSummary:
 SIMPLE, PAPER, IMPROVED, IMPROVED_PAPER_STEPS = 0, 1, 2, 3
 """Methods: simple GA; with the fixed sequence; improved with adaptive, with fixed sequence."""
 
-# Places in an island's counters.
-(
-    GENERATION, EVALUATIONS, STAGNATION, SEQUENCE, STEP, FAILED, DEVELOPMENTS, SETTLED, PROBES,
-    FRESH, TRIED, CONFIRMED, HOP, HOPS, RETURNED, CLIFFS, WARMED, JUMPS,
-) = range(18)  # fmt: skip
-N_COUNTERS = 18
+_COUNTS = (
+    "generation",
+    "evaluations",
+    "stagnation",  # generations since the last better champion
+    "in_sequence_search",
+    "step_count",  # of this sequence search, or of the generations since the last
+    "failed_steps",  # one after the other
+    "local_searches",  # begun so far
+    "champion_converged",  # a local search of the champion has come to its end
+    "probe_count",
+    "from_random_start",  # this local search
+    "random_starts",  # local searches from random places that have ended
+    "confirmed_starts",  # those of them that led to the champion
+    "hop_kind",  # 0: this local search is none
+    "hop_count",  # hops that have ended
+    "returned_hops",  # those of them that led back to the champion
+    "champion_discontinuities",  # lines beside this champion on which the fitness jumps
+    "is_warm_start",
+    "fitness_discontinuities",  # the same beside any champion, and what neighbours have met
+    "wide_differences",  # slopes are taken over distances that are drawn
+)
+_NUMBERS = (
+    "damping",
+    "horizon",  # part of the record that counts
+    "horizon_growth",  # factor from one part to the next
+    "replaced_fitness",  # of the individual whose place a local search takes
+    "reached_fitness",  # by this local search, over the whole record
+)
+SEARCH_RECORD = np.dtype(
+    (np.record, [(name, np.int64) for name in _COUNTS] + [(name, np.float64) for name in _NUMBERS])
+)
+"""How far the search of an island has got. What reads as a statement is 0 or 1."""
 
-# Places in an island's memory of the sequence search; the point's D places follow.
-DAMPING, HORIZON, GROWTH, ROUGH, OLD, REACHED, POINT = range(7)
+SearchArray: TypeAlias = np.recarray[Any, np.dtype[np.record]]
+"""Records of `SEARCH_RECORD`."""
+
+
+class IslandArrays(NamedTuple):
+    """One island as compiled code reads and changes it, in place.
+
+    Numba passes it as an argument but does not return it.
+
+    Attributes
+    ----------
+    chromosomes : WordArray, shape (P, D)
+        Fittest first.
+    fitness : FloatArray, shape (P,)
+        Ascending; ``nan`` is not evaluated yet.
+    search : np.record
+        A record of `SEARCH_RECORD`.
+    point : FloatArray, shape (D,)
+        Where the local search stands, in [0, 1].
+    """
+
+    chromosomes: WordArray
+    fitness: FloatArray
+    search: np.record
+    point: FloatArray
+
 
 # Columns of an improvement; the D physical values follow.
 AT_GENERATION, AT_EVALUATIONS, RMS, PHASE, VALUES = range(5)

@@ -7,7 +7,6 @@ from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.islands.archipelago import found, plans
 from sysid.search.basin_hopping import COUNTED, SINGLE, UNCOUNTED
 from sysid.search.island import Island, evolve
-from sysid.search.state import CLIFFS, DEVELOPMENTS, FRESH, HOP, HOPS, JUMPS, SEQUENCE, STEP
 from tests.searching import bits, example
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
@@ -25,13 +24,13 @@ def generations(model: str) -> tuple[Island, ...]:
     return tuple(states)
 
 
-def begun(model: str, place: int) -> list[int]:
-    """That counter in each development which was begun after jumps had been met, or any."""
+def begun(model: str, field: str) -> list[int]:
+    """That field in each development which was begun after jumps had been met, or in any."""
     return [
-        int(after.counters[place])
+        int(after.search[field])
         for before, after in pairwise(generations(model))
-        if after.counters[DEVELOPMENTS] > before.counters[DEVELOPMENTS] > 4
-        and (before.counters[JUMPS] > 0 or model == "duffing-eq16")
+        if after.search.local_searches > before.search.local_searches > 4
+        and (before.search.fitness_discontinuities > 0 or model == "duffing-eq16")
     ]
 
 
@@ -39,21 +38,22 @@ def test_jumps_once_met_stay_known_when_a_better_champion_comes() -> None:
     problem = example("coulomb-eq16")
     (plan,) = plans(problem, ALONE, 3)
     start = found(problem, ALONE, 3)[0]
-    start.counters[[JUMPS, CLIFFS]] = 1
+    start.search.fitness_discontinuities = start.search.champion_discontinuities = 1
     later = evolve(problem.evaluator, plan, start, 8)
     assert later.champion_rms < 0.9 * evolve(problem.evaluator, plan, start, 1).champion_rms
-    assert (later.counters[JUMPS], later.counters[CLIFFS]) == (1, 0)
-    assert generations("coulomb-eq16")[-1].counters[JUMPS] > 0
-    assert generations("duffing-eq16")[-1].counters[JUMPS] == 0
+    known = later.search
+    assert (known.fitness_discontinuities, known.champion_discontinuities) == (1, 0)
+    assert generations("coulomb-eq16")[-1].search.fitness_discontinuities > 0
+    assert generations("duffing-eq16")[-1].search.fitness_discontinuities == 0
 
 
 def test_there_most_developments_are_hops_and_some_still_begin_anywhere() -> None:
-    hops = begun("coulomb-eq16", HOP)
+    hops = begun("coulomb-eq16", "hop_kind")
     assert len(hops) > 30
     assert sum(hop > 0 for hop in hops) >= 0.4 * len(hops)
     assert {COUNTED, COUNTED + SINGLE, UNCOUNTED + SINGLE} <= set(hops)
-    assert sum(begun("coulomb-eq16", FRESH)) >= 2
-    smooth = begun("duffing-eq16", HOP)
+    assert sum(begun("coulomb-eq16", "from_random_start")) >= 2
+    smooth = begun("duffing-eq16", "hop_kind")
     assert set(smooth) == {0, COUNTED}
     assert sum(hop > 0 for hop in smooth) < 0.6 * len(smooth)
 
@@ -63,12 +63,12 @@ def test_growing_from_beside_the_champion_is_no_evidence_for_it() -> None:
     states = generations("coulomb-eq16")
     ends = {COUNTED: 0, COUNTED + SINGLE: 0, UNCOUNTED + SINGLE: 0}
     for before, after in pairwise(states):
-        hop = int(before.counters[HOP])
-        ended = before.counters[SEQUENCE] == 1 and after.counters[SEQUENCE] == 0
+        hop = int(before.search.hop_kind)
+        ended = before.search.in_sequence_search == 1 and after.search.in_sequence_search == 0
         if ended and hop and after.champion_rms == before.champion_rms:
             ends[hop] += 1
-            assert after.counters[HOPS] - before.counters[HOPS] == (hop & COUNTED > 0)
-            assert after.counters[STEP] == 0
+            assert after.search.hop_count - before.search.hop_count == (hop & COUNTED > 0)
+            assert after.search.step_count == 0
     assert min(ends.values()) > 0
 
 
@@ -76,5 +76,5 @@ def test_it_can_be_cut_anywhere_there_too() -> None:
     problem = example("coulomb-eq16")
     (plan,) = plans(problem, ALONE, 3)
     at_once = evolve(problem.evaluator, plan, found(problem, ALONE, 3)[0], GENERATIONS)
-    assert at_once.counters[JUMPS] > 0
+    assert at_once.search.fitness_discontinuities > 0
     assert bits(at_once) == bits(generations("coulomb-eq16")[-1])

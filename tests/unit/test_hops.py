@@ -8,7 +8,6 @@ from sysid.core.types import FloatArray
 from sysid.islands.archipelago import found, plans
 from sysid.search.basin_hopping import COUNTED, SINGLE, UNCOUNTED, hop
 from sysid.search.slopes import normal_equations
-from sysid.search.state import CLIFFS, EVALUATIONS, GENERATION, HOP, HOPS, POINT, ROUGH
 from sysid.simulation.evaluator import Evaluator
 from sysid.simulation.scaling import placed
 from tests.searching import COULOMB, example
@@ -23,14 +22,14 @@ DRAWN = 400
 def moved(kind: int, evaluator: Evaluator = PROBLEM.evaluator) -> FloatArray:
     """How far hops of that kind lead (DRAWN, D), each by its own draw."""
     island = found(PROBLEM, ALONE, 3)[0]
-    ends = np.empty((DRAWN, BEGIN.size))
+    search, ends = island.search, np.empty((DRAWN, BEGIN.size))
+    search.hop_kind, search.hop_count = kind, 4  # four hops have looked for jumps
     for k in range(DRAWN):
-        counters, memory = island.counters.copy(), island.memory.copy()
-        counters[[HOP, GENERATION, HOPS]] = kind, k, 4  # four hops have looked for jumps
-        memory[POINT:] = BEGIN
-        hop(evaluator, PLAN, counters, memory)
-        assert counters[EVALUATIONS] - island.counters[EVALUATIONS] == BEGIN.size + 1
-        ends[k] = memory[POINT:]
+        search.generation, before = k, island.evaluations
+        island.point[:] = BEGIN
+        hop(evaluator, PLAN, island.arrays)
+        assert island.evaluations - before == BEGIN.size + 1
+        ends[k] = island.point
     return ends - BEGIN
 
 
@@ -44,8 +43,8 @@ def test_a_hop_of_one_parameter_moves_each_of_them_in_its_turn_and_no_other(kind
 
 def test_it_leads_3_to_500_standard_errors_of_a_parameter_whose_fellows_are_held() -> None:
     moves = moved(COUNTED + SINGLE)
-    memory = found(PROBLEM, ALONE, 3)[0].memory
-    assert memory[ROUGH] == 0.0  # hops take the same derivatives
+    search = found(PROBLEM, ALONE, 3)[0].search
+    assert search.wide_differences == 0  # hops take the same derivatives
     matrix, _, base = normal_equations(PROBLEM.evaluator, PLAN, BEGIN, 1.0, 1e-6)
     inside = np.all((moves + BEGIN > 0.0) & (moves + BEGIN < 1.0), axis=1)
     assert np.mean(inside) > 0.8
@@ -69,9 +68,9 @@ def test_hops_that_are_evidence_look_for_jumps_whichever_way_they_lead(
     """Whether the fitness jumps decides what settles a search: all of the first hops have to."""
     for one in (0, SINGLE):
         island = found(PROBLEM, ALONE, 3)[0]
-        island.counters[HOP] = kind + one
-        island.memory[POINT:] = BEGIN
-        spent = island.counters[EVALUATIONS] + BEGIN.size + 1
-        hop(PROBLEM.evaluator, PLAN, island.counters, island.memory)
-        assert (island.counters[EVALUATIONS] > spent) == looks
-        assert island.counters[CLIFFS] == 0 or looks
+        island.search.hop_kind = kind + one
+        island.point[:] = BEGIN
+        spent = island.evaluations + BEGIN.size + 1
+        hop(PROBLEM.evaluator, PLAN, island.arrays)
+        assert (island.evaluations > spent) == looks
+        assert island.search.champion_discontinuities == 0 or looks

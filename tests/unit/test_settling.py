@@ -10,7 +10,6 @@ from sysid.identification.conclude import conclude
 from sysid.identification.run import advance, begin, exchange
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import load_model
-from sysid.search.state import CONFIRMED, GENERATION, HOPS, RETURNED, TRIED
 from sysid.simulation.problem import Problem
 from tests.searching import DUFFING, example, noisy, record
 
@@ -21,9 +20,10 @@ def found(again: int, tried: int, returned: int, hops: int, *, is_warm: bool = F
     """A run at its second border, its searches as told."""
     start = begin(example(), ALONE, 1)
     state = advance(example(), replace(ALONE, generations=1), start)
-    counters = state.islands[0].counters.copy()
-    counters[[GENERATION, CONFIRMED, TRIED, RETURNED, HOPS]] = 2, again, tried, returned, hops
-    island = replace(state.islands[0], counters=counters)
+    search = state.islands[0].search.copy()
+    search.generation, search.confirmed_starts, search.random_starts = 2, again, tried
+    search.returned_hops, search.hop_count = returned, hops
+    island = replace(state.islands[0], search=search)
     return exchange(ALONE, replace(state, ended=False, is_warm=is_warm), [island])
 
 

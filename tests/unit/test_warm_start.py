@@ -10,7 +10,6 @@ from sysid import Identification, identify, load_model
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.records import Record
 from sysid.identification.run import advance, begin, border, exchange
-from sysid.search.state import CONFIRMED, GENERATION, HOPS, RETURNED, TRIED
 from tests.runs import step_record
 from tests.searching import DUFFING, bits, example, noisy, record
 
@@ -92,9 +91,10 @@ def test_searches_from_beside_a_warm_start_alone_do_not_end_it(
     algorithm = GeneticAlgorithm(islands=1)
     state = advance(example(), replace(algorithm, generations=5), begin(example(), algorithm, 1))
     (island,) = state.islands
-    counters, first = island.counters.copy(), island.history[-1]._replace(generation=1)
-    counters[[TRIED, CONFIRMED, HOPS, RETURNED]] = random, 0, beside, beside
-    counters[GENERATION] = border(algorithm, state)
-    there = replace(island, counters=counters, history=(first,))
+    search, first = island.search.copy(), island.history[-1]._replace(generation=1)
+    search.random_starts, search.confirmed_starts = random, 0
+    search.hop_count = search.returned_hops = beside
+    search.generation = border(algorithm, state)
+    there = replace(island, search=search, history=(first,))
     state = replace(state, islands=(there,), is_warm=True, ended=False)
     assert exchange(algorithm, state, state.islands).ended is ends
