@@ -27,6 +27,7 @@ from service.cli.common import (
     usage,
 )
 from sysid.core.errors import nearest
+from sysid.core.settings import NOISE_MODELS
 
 if TYPE_CHECKING:
     from service.jobs.schemas import JobIn
@@ -80,8 +81,9 @@ def identify(
     noise_model: Annotated[
         str | None,
         typer.Option(
+            metavar=f"[{'|'.join(NOISE_MODELS)}]",
             help="white; ar1: least squares generalised to first-order noise; auto, the default: "
-            "ar1 where residuals are coloured and the model does not forget where it began."
+            "ar1 where residuals are coloured and the model does not forget where it began.",
         ),
     ] = None,
     segments: Segments = None,
@@ -132,10 +134,8 @@ def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
 
     from service.core.errors import FieldError, faults_of
     from service.core.validation import explained
-    from service.jobs.record_checks import setting_faults
     from service.jobs.schemas import JobIn
     from sysid.core.errors import SysidError
-    from sysid.models.model import initial_parameters
 
     try:
         job = JobIn.model_validate(body)
@@ -152,6 +152,9 @@ def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
                 for one in faults_of(error)
             )
         )
+    from service.jobs.record_checks import setting_faults
+    from sysid.models.model import initial_parameters
+
     parameters = (*model.parameters, *initial_parameters(model, pieces))
     faults = setting_faults(job.normal_form(), model, parameters)
     if faults:

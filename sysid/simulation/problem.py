@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from sysid.core.errors import InvalidRecord, InvalidSettings
-from sysid.core.settings import Loss, Prediction
+from sysid.core.settings import PREDICTION_KINDS, Loss, Prediction
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Record
 from sysid.kernels.build import kernel_address
@@ -268,8 +268,9 @@ def _built(
         raise InvalidSettings("/model/terms", "the terms are not selected yet; see `selected`")
     if not records:
         raise InvalidRecord("there is no record to compare the model with; need one or more")
-    if prediction not in ("simulation", "one-step"):
-        raise InvalidSettings("/prediction", f"{prediction!r} is not 'simulation' or 'one-step'")
+    if prediction not in PREDICTION_KINDS:
+        names = " or ".join(map(repr, PREDICTION_KINDS))
+        raise InvalidSettings("/prediction", f"{prediction!r} is not {names}")
     if prediction == "one-step" and loss.noise_model == "ar1":
         raise InvalidSettings(
             "/loss/noise_model",
