@@ -19,7 +19,8 @@ router = APIRouter(tags=["health"])
 PROBLEM_KINDS = {
     "conflict": "The state of the job does not allow what was asked.",
     "internal": "An unexpected error; the log of the server has it.",
-    "invalid": "The body or a query value cannot be used; `errors` lists every fault.",
+    "invalid": "The body or a query value cannot be used; `errors` lists every fault. "
+    "Faults of types come first; once all types are right, the answer lists all others.",
     "invalid-upload": "The file cannot be used; the message says where and why.",
     "method-not-allowed": "The path exists, but not for this method.",
     "not-found": "There is no such thing.",

@@ -1,24 +1,18 @@
-"""RFC 9457 problem documents: the one place where an error becomes an answer.
-
-What can be told of a body that its type refuses, so that one answer has every fault.
-"""
+"""RFC 9457 problem documents: the one place where an error becomes an answer."""
 
 import errno
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel
 from sqlalchemy.exc import TimeoutError as SqlTimeout
-from sqlalchemy.orm import Session
 from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse, Response
 
-from service.api.dependencies import Parts
 from service.api.html import error_page, is_for_people
 from service.core.errors import (
     Conflict,
@@ -30,36 +24,11 @@ from service.core.errors import (
     UnsupportedMediaType,
     faults_of,
 )
-from service.core.partial_bodies import beside
 from service.core.text_checks import HALF_A_PAIR
 from service.core.validation import body_type, detail_of, explained
-from service.jobs.schemas import JobIn
-from service.jobs.sweep_checks import faults_of_rest
 from service.storage.errors import StorageError
 from service.storage.retry import PASSING, is_passing
-from service.sweeps import noise, reidentify
-from service.sweeps.schemas import NoiseSweepIn, ReidentifyIn
 from sysid.core.errors import SysidError
-
-Meaning = Callable[[Session, Any, int, Set[str]], list[FieldError]]
-MEANINGS: Mapping[type[BaseModel], Meaning] = {
-    JobIn: faults_of_rest,
-    NoiseSweepIn: noise.faults_of_rest,
-    ReidentifyIn: reidentify.faults_of_rest,
-}
-
-
-def faults_beside(
-    parts: Parts, kind: Any, body: Any, faults: Sequence[FieldError]
-) -> list[FieldError]:
-    """Faults of what can be read of a body, besides those of its type."""
-    meant = MEANINGS.get(kind) if isinstance(kind, type) else None
-    if meant is None:
-        return []
-    most = parts.settings.max_runs_per_job
-    with parts.database.read() as session:
-        return beside(kind, body, faults, lambda whole, unread: meant(session, whole, most, unread))
-
 
 log = logging.getLogger(__name__)
 
@@ -218,10 +187,7 @@ def _validation_error(request: Request, error: Exception) -> Response:
         return _service_error(
             request, UnsupportedMediaType(f"found {kind!r}; need application/json")
         )
-    faults = list(_field_errors(request, error))
-    kind = body_type(request.scope.get("endpoint"))
-    more = faults_beside(request.app.state.parts, kind, error.body, faults)
-    return _service_error(request, InvalidRequest(dict.fromkeys([*faults, *more])))
+    return _service_error(request, InvalidRequest(_field_errors(request, error)))
 
 
 def _unexpected(request: Request, error: Exception) -> Response:

@@ -27,9 +27,9 @@ from service.cli.common import (
     usage,
 )
 from sysid.core.errors import nearest
+from sysid.core.settings import NOISE_MODELS
 
 if TYPE_CHECKING:
-    from service.core.errors import FieldError
     from service.jobs.schemas import JobIn
     from sysid.data.records import Record, Recording
     from sysid.identification.result import Identification
@@ -81,8 +81,9 @@ def identify(
     noise_model: Annotated[
         str | None,
         typer.Option(
+            metavar=f"[{'|'.join(NOISE_MODELS)}]",
             help="white; ar1: least squares generalised to first-order noise; auto, the default: "
-            "ar1 where residuals are coloured and the model does not forget where it began."
+            "ar1 where residuals are coloured and the model does not forget where it began.",
         ),
     ] = None,
     segments: Segments = None,
@@ -120,7 +121,9 @@ def _given(data: Path, model: str, changes: list[str], channels: dict[str, str])
 
 
 def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
-    """The body as its type, and the model; ends the command with every fault that is known now.
+    """The body as its type, and the model; ends the command with the faults of both.
+
+    A body of the wrong type is refused for that alone.
 
     Parameters
     ----------
@@ -130,41 +133,33 @@ def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
     from pydantic import ValidationError
 
     from service.core.errors import FieldError, faults_of
-    from service.core.partial_bodies import beside
     from service.core.validation import explained
     from service.jobs.schemas import JobIn
     from sysid.core.errors import SysidError
 
-    job, model = None, None
-    unread: list[FieldError] = []
-    found: list[FieldError] = []
     try:
         job = JobIn.model_validate(body)
     except ValidationError as error:
-        unread += explained(error.errors(), body, JobIn)
+        fail(PLACES.told(explained(error.errors(), body, JobIn)), 2)
+    if job.validation is not None and job.validation.datasets is not None:
+        usage(f"--set validation: {ELSEWHERE['validation.datasets']}")
     try:
         model = _model(body["model"])
     except SysidError as error:
-        found += [
-            FieldError("/model" + one.pointer.removeprefix("/model"), one.detail, one.column)
-            for one in faults_of(error)
-        ]
-    if job is not None and job.validation is not None and job.validation.datasets is not None:
-        usage(f"--set validation: {ELSEWHERE['validation.datasets']}")
-    if model is not None:
-        loaded = model
-        found += beside(JobIn, body, unread, lambda whole, _: _meant(whole, loaded, pieces))
-    if unread or found or job is None or model is None:
-        fail(PLACES.told((*unread, *found)), 2 if unread else 1)
-    return job, model
-
-
-def _meant(job: "JobIn", model: "Model", pieces: int) -> "list[FieldError]":
+        fail(
+            PLACES.told(
+                FieldError("/model" + one.pointer.removeprefix("/model"), one.detail, one.column)
+                for one in faults_of(error)
+            )
+        )
     from service.jobs.record_checks import setting_faults
     from sysid.models.model import initial_parameters
 
     parameters = (*model.parameters, *initial_parameters(model, pieces))
-    return setting_faults(job.normal_form(), model, parameters)
+    faults = setting_faults(job.normal_form(), model, parameters)
+    if faults:
+        fail(PLACES.told(faults))
+    return job, model
 
 
 @contextmanager

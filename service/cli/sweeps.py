@@ -25,6 +25,7 @@ from service.cli.common import (
 from service.cli.watch import follow
 from service.client.calls import DEFAULT_URL
 from service.core.documents import read_yaml
+from sysid.core.settings import METHODS
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -67,7 +68,7 @@ Relative = Annotated[
     bool, typer.Option("--relative", help="σ in standard deviations of the output.")
 ]
 Replicates = Annotated[int, typer.Option(help="Draws of noise and of the search for each σ.")]
-Methods = Annotated[str, typer.Option(help="Of simple, improved-paper, improved.")]
+Methods = Annotated[str, typer.Option(help=f"Of {', '.join(METHODS)}.")]
 Seed = Annotated[int, typer.Option(help="Of all draws; each replicate has its own from it.")]
 Channels = Annotated[str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")]
 Changes = Annotated[

@@ -1,11 +1,11 @@
 """What is sent and told when an identified model is simulated."""
 
-from typing import Literal
-
 from pydantic import Field
 
 from service.core.wire import Answer, Body
 from service.datasets.schemas import MAX_SIMULATED, DatasetOut, RunInputIn, SampleTime, Series
+from sysid.control.controllers import AntiWindup, DerivativeOn
+from sysid.control.tuning import Kind, Rule
 
 
 class TransportIn(Body):
@@ -23,8 +23,8 @@ class TuningIn(Body):
     given: longer is slower and more robust.
     """
 
-    rule: Literal["simc", "amigo"] = "simc"
-    controller: Literal["PI", "PID"] = "PI"
+    rule: Rule = "simc"
+    controller: Kind = "PI"
     closed_loop_time_constant: float | None = Field(default=None, gt=0, examples=[0.5])
 
 
@@ -47,12 +47,12 @@ class ControlIn(Body):
     integral_time: float | None = Field(default=None, gt=0, examples=[1.5])
     derivative_time: float = Field(default=0.0, ge=0)
     derivative_filter: float = Field(default=10.0, gt=0)
-    derivative_on: Literal["measurement", "error"] = "measurement"
+    derivative_on: DerivativeOn = "measurement"
     setpoint_weight: float = 1.0
     limit: float | None = Field(default=None, gt=0)
     lower: float | None = None
     upper: float | None = None
-    anti_windup: Literal["back-calculation", "none"] = "back-calculation"
+    anti_windup: AntiWindup = "back-calculation"
     tracking_time: float | None = Field(default=None, gt=0)
     tuning: TuningIn | None = None
     transport: TransportIn | None = None

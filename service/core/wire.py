@@ -1,4 +1,4 @@
-"""What every wire type shares. Wire types import no core type, so that clients stay light."""
+"""What every wire type shares. The client imports no wire type, so that it stays light."""
 
 from collections.abc import Iterable
 from typing import Annotated, Any, Generic, TypeVar

@@ -7,6 +7,7 @@ from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from service.core.wire import Answer, Body, NoiseIn, Seed
+from sysid.data.records import Hold
 
 MAX_SIMULATED_SAMPLES = 10_000_000
 
@@ -187,7 +188,7 @@ class SeriesInput(Body):
     kind: Literal["series"]
     times: list[float] = Field(min_length=1, max_length=MAX_SIMULATED)
     values: list[float] = Field(min_length=1, max_length=MAX_SIMULATED)
-    hold: Literal["zero", "first", "band-limited"] = "first"
+    hold: Hold = "first"
 
     @model_validator(mode="after")
     def _as_many(self) -> Self:

@@ -1,6 +1,6 @@
 """What can be known of a job before it runs: every fault is found here, and found now."""
 
-from collections.abc import Iterable, Iterator, Mapping, Set
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from pydantic import ValidationError
@@ -33,7 +33,6 @@ from sysid.models.polynomial import check_samples
 from sysid.models.ties import tied_model, ties_of
 
 Body = dict[str, Any]
-NOTHING: Set[str] = frozenset()
 MOST_NAMED = 1000  # experiments that are believed before they are known
 MOST_GENES = 10_000_000  # individuals times parameters: 80 MB for each copy of a population
 
@@ -51,12 +50,8 @@ class JobChecker:
         self._models: dict[str, tuple[Model, Any] | list[FieldError]] = {}
         self._datasets: dict[str, Dataset | str] = {one.id: one for one in unstored}
 
-    def errors(self, body: Body, unread: Set[str] = NOTHING) -> list[FieldError]:
-        """Every fault of a body in its normal form.
-
-        `unread` are fields that could not be read, for which their defaults stand: nothing is told
-        that depends on them.
-        """
+    def errors(self, body: Body) -> list[FieldError]:
+        """Every fault of a body in its normal form."""
         found = [*conversion_faults(body), *self._missing_datasets(body)]
         known = self.model(body["model"])
         if isinstance(known, list):
@@ -64,25 +59,16 @@ class JobChecker:
         model = known[0]
         parameters = overridden(found, self._all_parameters(body, model), body["parameters"])
         own = parameters[: len(model.parameters)]
-        tied = model
-        if "parameters" not in unread:
-            tied = tied_model(model, tried(ties_of, found, model, parameters) or {})
-            tried(check_lags, found, tied, own)
-        for read, check in (
-            (("parameters", "algorithm"),
-             lambda: _freedom_faults(parameters, body["algorithm"]["population"])),
-            (("datasets",), lambda: self._too_few_for_terms(body, model)),
-            (("parameters", "weights"), lambda: _unused_faults(tied, own, body["weights"])),
-            (("datasets", "validation"), lambda: self._repeated(body)),
-            (("datasets", "channels"), lambda: self._channels(body, model)),
-            (("datasets", "validation", "parameters", "skip"),
-             lambda: self._lengths(body, tied, own)),
-            (("datasets", "validation", "parameters", "skip"),
-             lambda: self._too_few_samples(body, model, parameters)),
-            (("datasets", "channels"), lambda: self._units(body, model)),
-        ):  # fmt: skip
-            if unread.isdisjoint(read):
-                found += check()
+        tied = tied_model(model, tried(ties_of, found, model, parameters) or {})
+        tried(check_lags, found, tied, own)
+        found += _freedom_faults(parameters, body["algorithm"]["population"])
+        found += self._too_few_for_terms(body, model)
+        found += _unused_faults(tied, own, body["weights"])
+        found += self._repeated(body)
+        found += self._channels(body, model)
+        found += self._lengths(body, tied, own)
+        found += self._too_few_samples(body, model, parameters)
+        found += self._units(body, model)
         found += warm_starts.faults(self._session, body["warm_start"], model)
         return found + list(signal_faults(body, model))
 
@@ -111,7 +97,7 @@ class JobChecker:
             try:
                 self._models[key] = models.resolve(self._session, reference, is_new=True)
             except SysidError as error:
-                self._models[key] = [_in_job(reference, fault) for fault in faults_of(error)]
+                self._models[key] = [fault_in_job(reference, fault) for fault in faults_of(error)]
         return self._models[key]
 
     def identifiers(self, references: list[str]) -> list[str]:
@@ -131,7 +117,7 @@ class JobChecker:
     def _all_parameters(self, body: Body, model: Model) -> tuple[Parameter, ...]:
         """The model's parameters, and the initial states to be estimated in each experiment.
 
-        Of datasets that are missing, or could not be read, as many experiments as are named.
+        Of datasets that are missing, as many experiments as are named.
         """
         found = [self.dataset(reference) for reference in body["datasets"]]
         pieces = sum(experiments_in(one) for one in found if isinstance(one, Dataset))
@@ -261,7 +247,7 @@ def _freedom_faults(parameters: tuple[Parameter, ...], population: int) -> Itera
         )
 
 
-def _in_job(reference: Any, fault: FieldError) -> FieldError:
+def fault_in_job(reference: Any, fault: FieldError) -> FieldError:
     """A fault of a model at its place in the job that names the model or holds it."""
     if isinstance(reference, Mapping):
         return FieldError("/model" + fault.pointer, fault.detail, fault.column)

@@ -1,7 +1,7 @@
 """The job body and what is told about a job.
 
-Defaults stand here a second time, beside those of `sysid.core.settings`, so that the OpenAPI
-document shows them and a client needs no NumPy; a test compares the two.
+Names to choose from, defaults and bounds are those of `sysid.core.settings`. Where a bound is
+narrower than there, it is what one request may ask of a server.
 
 What is told about accepted references.
 """
@@ -13,12 +13,32 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from service.core.wire import Answer, Body, NoiseIn, Pointer, Seed, not_too_deep
+from sysid.core.settings import (
+    MAX_BITS,
+    MIN_POPULATION,
+    MOST_EVALUATIONS,
+    MOST_GENERATIONS,
+    GeneticAlgorithm,
+    Loss,
+    LossKind,
+    NoiseModel,
+    Prediction,
+    SearchMethod,
+    SequenceKind,
+    TopologyName,
+)
+from sysid.data.records import Hold
+from sysid.models.parameters import Scale
+
+SEARCH, LOSS = GeneticAlgorithm(), Loss()
+"""The settings of the core, for their defaults."""
 
 Whole = Annotated[int, Field(gt=-(2**62), lt=2**62)]
-# The bounds are those of `sysid.core.settings`, which a client does not load.
-Count = Annotated[int, Field(ge=1, le=10**9)]
-Evaluations = Annotated[int, Field(ge=1, le=10**12)]
-Generation = Annotated[int, Field(ge=0, le=10**9)]
+Count = Annotated[int, Field(ge=1, le=MOST_GENERATIONS)]
+Evaluations = Annotated[int, Field(ge=1, le=MOST_EVALUATIONS)]
+Generation = Annotated[int, Field(ge=0, le=MOST_GENERATIONS)]
+Bits = Annotated[int, Field(ge=1, le=MAX_BITS)]
+MOST_INDIVIDUALS = 100_000
 Mutation = Annotated[list[tuple[Generation, float]], Field(min_length=1, max_length=1000)]
 
 
@@ -27,7 +47,7 @@ class ParameterIn(Body):
 
     lower: float | None = None
     upper: float | None = None
-    scale: Literal["linear", "log"] | None = None
+    scale: Scale | None = None
     fixed: float | None = None
     tied: str | None = Field(default=None, max_length=1000)
 
@@ -52,27 +72,25 @@ class LossIn(Body):
     is that where residuals are coloured and the model does not forget where it began, else white.
     """
 
-    kind: Literal["squares", "soft-l1"] = "squares"
-    scale: float = Field(default=1.0, gt=0)
-    noise_model: Literal["auto", "white", "ar1"] = "auto"
+    kind: LossKind = LOSS.kind
+    scale: float = Field(default=LOSS.scale, gt=0)
+    noise_model: NoiseModel = LOSS.noise_model
 
 
 class SequenceIn(Body):
     """The sequence search."""
 
-    kind: Literal["paper", "adaptive"] = "adaptive"
-    beta: float = Field(default=0.01, gt=0, lt=1)
-    relative: bool = True
+    kind: SequenceKind = SEARCH.sequence.kind
+    beta: float = Field(default=SEARCH.sequence.beta, gt=0, lt=1)
+    relative: bool = SEARCH.sequence.relative
 
 
 class MigrationIn(Body):
     """Exchange between islands."""
 
-    every: Count = 25
-    topology: Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"] = (
-        "one-way-ring"
-    )
-    migrants: int = Field(default=2, ge=0, le=100_000)
+    every: Count = SEARCH.migration.every
+    topology: TopologyName = SEARCH.migration.topology
+    migrants: int = Field(default=SEARCH.migration.migrants, ge=0, le=MOST_INDIVIDUALS)
 
 
 class StopIn(Body):
@@ -84,35 +102,35 @@ class StopIn(Body):
     all; null: never.
     """
 
-    evaluations: Evaluations | None = None
-    seconds: float | None = Field(default=None, gt=0)
-    rms: float | None = Field(default=None, gt=0)
-    settled: int | None = Field(default=6, ge=1, le=1_000_000)
+    evaluations: Evaluations | None = SEARCH.stop.evaluations
+    seconds: float | None = Field(default=SEARCH.stop.seconds, gt=0)
+    rms: float | None = Field(default=SEARCH.stop.rms, gt=0)
+    settled: int | None = Field(default=SEARCH.stop.settled, ge=1, le=1_000_000)
 
 
 class IslandIn(Body):
     """What one island does otherwise."""
 
-    method: Literal["simple", "improved-paper", "improved"] | None = None
-    bits: int | None = Field(default=None, ge=1, le=32)
+    method: SearchMethod | None = None
+    bits: Bits | None = None
     mutation: Mutation | None = None
 
 
 class AlgorithmIn(Body):
     """Settings of the search."""
 
-    method: Literal["simple", "improved-paper", "improved"] = "improved"
-    population: int = Field(default=50, ge=4, le=100_000)
-    generations: int = Field(default=400, ge=1, le=10_000_000)
-    bits: int = Field(default=24, ge=1, le=32)
-    selection_rate: float = Field(default=0.5, gt=0, lt=1)
-    mutation: Mutation = Field(default=[(0, 0.2), (50, 0.8)])
-    stagnation: Count = 30
+    method: SearchMethod = SEARCH.method
+    population: int = Field(default=SEARCH.population, ge=MIN_POPULATION, le=MOST_INDIVIDUALS)
+    generations: int = Field(default=SEARCH.generations, ge=1, le=10_000_000)
+    bits: Bits = SEARCH.bits
+    selection_rate: float = Field(default=SEARCH.selection_rate, gt=0, lt=1)
+    mutation: Mutation = Field(default=[*SEARCH.mutation])
+    stagnation: Count = SEARCH.stagnation
     sequence: SequenceIn = SequenceIn()
     islands: int | list[IslandIn] | None = None
     migration: MigrationIn = MigrationIn()
-    refine: bool = True
-    safe_limit: float | None = Field(default=None, gt=0)
+    refine: bool = SEARCH.refine
+    safe_limit: float | None = Field(default=SEARCH.safe_limit, gt=0)
     stop: StopIn = StopIn()
 
 
@@ -221,9 +239,9 @@ class IdentificationIn(Body):
     name: str | None = Field(default=None, max_length=200)
     model: Annotated[Any, AfterValidator(model_reference)]
     channels: dict[str, str] = Field(default={})
-    hold: dict[str, Literal["zero", "first", "band-limited"]] = Field(default={})
+    hold: dict[str, Hold] = Field(default={})
     parameters: dict[str, ParameterIn] = Field(default={})
-    prediction: Literal["simulation", "one-step"] = "simulation"
+    prediction: Prediction = "simulation"
     loss: LossIn = LossIn()
     weights: dict[str, float] | None = None
     skip: int = Field(default=0, ge=0)

@@ -14,7 +14,7 @@ from service.core.json_pointer import body_of, value_at
 from service.core.wire import Seed, Sigma
 from service.jobs import warm_starts
 from service.jobs.axes import Cell, Step, axis_faults, count, grouped, steps_of
-from service.jobs.checks import NOTHING, JobChecker, value_faults
+from service.jobs.checks import JobChecker, value_faults
 from service.jobs.schemas import LEAST_PLACE, MOST_PLACE, PREVIOUS, JobIn, is_place
 from sysid.core.errors import nearest
 from sysid.models.model import Model
@@ -75,23 +75,19 @@ ALONE: Mapping[str, TypeAdapter[Any]] = {
 }
 MOST_TOLD = 200
 """Values that cannot be used, after which no more are looked at: of some that takes 2 ms each."""
-SINGLE = ("/trend/parameters", "/trend/reference")
-"""Fields of a trend that do not depend on the axes."""
 
 
 def faults_of_job(
-    session: Session, checker: JobChecker, body: JobIn, most_runs: int, unread: Set[str] = NOTHING
+    session: Session, checker: JobChecker, body: JobIn, most_runs: int
 ) -> list[FieldError]:
     """Every fault that can be known before the job runs.
 
     Values of axes are looked at where the axes are sound, and no more than `most_runs` of them.
-    `unread` are fields that could not be read, for which their defaults stand: nothing is told
-    that depends on them.
     """
     document = body.normal_form()
     found = list(axis_faults(body))
-    known = checker.errors(body_of(document, {}), unread)
-    if not found and "sweep" not in unread:
+    known = checker.errors(body_of(document, {}))
+    if not found:
         groups = grouped(body.sweep.axes)
         n_runs = count(body, groups)
         if n_runs > most_runs:
@@ -100,22 +96,13 @@ def faults_of_job(
             ))  # fmt: skip
         else:
             steps = steps_of(body.sweep.axes, groups)
-            wrong = list(_sweep_faults(checker, document, steps, frozenset(known), unread))
+            wrong = list(_sweep_faults(checker, document, steps, frozenset(known)))
             found += wrong
             if len(wrong) < MOST_TOLD:
                 found += _repeated_recordings(checker, body)
     model = checker.model(body.model)
-    trend = trend_faults(session, body, None if isinstance(model, list) else model[0])
-    are_axes_known = unread.isdisjoint({"sweep", "trend"})
-    found += [one for one in trend if are_axes_known or one.pointer.startswith(SINGLE)]
+    found += trend_faults(session, body, None if isinstance(model, list) else model[0])
     return list(dict.fromkeys([*known, *found]))
-
-
-def faults_of_rest(
-    session: Session, body: JobIn, most_runs: int, unread: Set[str]
-) -> list[FieldError]:
-    """Faults of a body of which fields are `unread`: those that stand whatever these say."""
-    return faults_of_job(session, JobChecker(session), body, most_runs, unread)
 
 
 def _repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldError]:
@@ -146,12 +133,10 @@ def _sweep_faults(
     document: dict[str, Any],
     groups: Sequence[Sequence[Step]],
     known: Set[FieldError],
-    unread: Set[str],
 ) -> Iterator[FieldError]:
     """Faults of the values; of a range or a logarithmic axis, those of its first bad value.
 
-    What the job has without its axes is `known`, and not told of every value again; nor is what a
-    value makes of a field of which a part is `unread`.
+    What the job has without its axes is `known`, and not told of every value again.
     """
     told: set[str] = set()
     n_wrong = 0
@@ -161,7 +146,7 @@ def _sweep_faults(
         if n_wrong == MOST_TOLD:
             yield FieldError("", f"{MOST_TOLD} values of axes are told; the rest is not looked at")
             return
-        found = list(_step_faults(checker, document, step, known, unread))
+        found = list(_step_faults(checker, document, step, known))
         if found:
             told.add(step.pointer)
             n_wrong += 1
@@ -195,7 +180,6 @@ def _step_faults(
     document: dict[str, Any],
     step: Step,
     known: Set[FieldError],
-    unread: Set[str],
 ) -> Iterator[FieldError]:
     body = body_of(document, step.cell.values)
     wrong = value_faults(step.pointer, body)
@@ -204,6 +188,6 @@ def _step_faults(
         return
     whole = JobIn.model_validate(body).normal_form()
     yield from _of_another_type(step, whole)
-    for fault in checker.errors(whole, unread):
-        if fault not in known and fault.pointer.split("/")[1:2] not in ([one] for one in unread):
+    for fault in checker.errors(whole):
+        if fault not in known:
             yield FieldError(step.pointer, str(fault), fault.column)

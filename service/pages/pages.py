@@ -6,7 +6,7 @@ The pages on which a noise sweep and a batch re-identification are submitted.
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pprint import pformat
-from typing import Any, get_args
+from typing import Any
 from urllib.parse import urlencode
 
 import yaml
@@ -23,6 +23,7 @@ from service.models import models
 from service.models.schemas import ModelOut
 from service.pages.api_reference import operations
 from service.pages.cell_grid import grid_of
+from service.pages.choices import DEFAULTS, list_choices
 from service.pages.dataset_links import dataset_links, unnamed
 from service.pages.diagnostics import findings_of
 from service.pages.figure_data import sought_parameters
@@ -38,7 +39,8 @@ from service.repositories.runs import RunRepository
 from service.runs.comparison import compare
 from service.runs.runs import wanted
 from service.storage.tables import Dataset, Job, Run, State
-from service.sweeps.schemas import Method, NoiseSweepIn
+from service.sweeps.schemas import NoiseSweepIn
+from sysid.core.settings import METHODS
 
 JOBS_PER_PAGE = 50
 RUNS_PER_PAGE = 100
@@ -67,6 +69,7 @@ def jobs_page(session: Session, state: State | None, cursor: str | None) -> str:
         states=[one.value for one in State], any_open=any(job.is_open for job in jobs),
         cursor=cursor, filter_query=_query(chosen),
         next=_query({**chosen, "cursor": page.next}) if page.next else "",
+        choices=list_choices(), defaults=DEFAULTS,
     )  # fmt: skip
 
 
@@ -261,7 +264,7 @@ LISTED = 200
 def noise_sweep_page(session: Session) -> str:
     """The form of a noise sweep."""
     chosen = NoiseSweepIn.model_fields["methods"].default
-    methods = [(one, one in chosen) for one in get_args(Method)]
+    methods = [(one, one in chosen) for one in METHODS]
     return render(
         "noise_sweep.html", models=_models(session), datasets=_datasets(session), methods=methods
     )

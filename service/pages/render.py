@@ -19,6 +19,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from service.figures import formats
+from sysid.core.settings import GeneticAlgorithm
 
 STATIC = Path(__file__).parent / "static"
 MEDIA_TYPES = {
@@ -74,6 +75,7 @@ def environment() -> Environment:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     made.filters.update(formats.FILTERS)
+    made.globals["default_algorithm"] = GeneticAlgorithm()
     made.globals.update(static=lambda name: f"/static/{name}", plotly=f"/static/{plotly_name()}")
     return made
 

@@ -23,6 +23,7 @@ from service.figures.theme import MAX_POINTS
 from service.jobs.stored_run import StoredRun, load_run
 from service.pages.render import render
 from service.pages.simulate_form import (
+    CHOICES,
     KINDS,
     TUNINGS,
     Asked,
@@ -130,7 +131,7 @@ def simulate_page(
         faults = [at_home(one) for one in _faults(error)]
         status = error.status if isinstance(error, Unavailable) else 422
     page = render(
-        "simulate.html", known=known, kind=kind, kinds=KINDS, tunings=TUNINGS,
+        "simulate.html", known=known, kind=kind, kinds=KINDS, tunings=TUNINGS, choices=CHOICES,
         values={**known.defaults, **(_late(known.defaults) if kind == "loop" else {}),
                 **(TAKEN if is_asked(query) else {}), **query,
                 **_numbers(context.get("result"))},

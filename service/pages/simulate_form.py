@@ -4,11 +4,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from math import isfinite
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from service.core.errors import FieldError, InvalidRequest
 from service.datasets.schemas import MAX_SIMULATED
 from service.jobs.record_checks import signals_of
+from sysid.control.controllers import AntiWindup, DerivativeOn
+from sysid.control.tuning import CONTROLLERS, RULES
 from sysid.core.errors import nearest
 from sysid.models.model import Model
 
@@ -33,13 +35,18 @@ LABELS = {
 }  # fmt: skip
 BY_HAND = "by hand"
 TUNINGS = {
-    BY_HAND: "by hand", "simc PI": "SIMC, PI", "simc PID": "SIMC, PID",
-    "amigo PI": "AMIGO, PI", "amigo PID": "AMIGO, PID",
-}  # fmt: skip
+    BY_HAND: "by hand",
+    **{f"{rule} {kind}": f"{rule.upper()}, {kind}" for rule in RULES for kind in CONTROLLERS},
+}
 """Rule and controller: a rule chooses gain and times itself."""
+CHOICES = {
+    "derivative_on": [(one, one) for one in get_args(DerivativeOn)],
+    "anti_windup": [(one, one) for one in get_args(AntiWindup)],
+}
+"""Values and texts of the fields of a controller that take one of some names."""
 _NUMBERS = ("derivative_filter", "setpoint_weight", "limit", "lower", "upper", "tracking_time")
 _TUNED = ("gain", "integral_time", "derivative_time")
-_CHOSEN = ("derivative_on", "anti_windup")
+_CHOSEN = tuple(CHOICES)
 _PLACES = {
     "/control/tuning/closed_loop_time_constant": "closed_loop_time_constant",
     **{f"/control/{name}": name for name in ("tuning", *_TUNED, *_NUMBERS, *_CHOSEN)},

@@ -4,7 +4,7 @@ Draws depend on the sweep's seed and the replicate alone. So a run keeps its spe
 grid of σ or the number of replicates grows, and is taken over then (`service.queue.reuse`).
 """
 
-from collections.abc import Iterator, Set
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from sqlalchemy.orm import Session
@@ -14,28 +14,35 @@ from service.core.settings import Settings
 from service.datasets.schemas import SimulateIn
 from service.datasets.simulated import Simulated, simulated
 from service.jobs import submit as jobs
-from service.jobs import sweep_checks
-from service.jobs.checks import JobChecker
+from service.jobs.checks import JobChecker, fault_in_job
 from service.jobs.schemas import JobIn, JobOut
 from service.repositories.jobs import JobRepository
 from service.storage.errors import KeyReused
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
-from service.sweeps.output_spread import check_relative, spread
+from service.sweeps.output_spread import relative_faults, spread
 from service.sweeps.schemas import MOST_REPLICATES, NoiseSweepIn
 from service.sweeps.true_parameters import truth_of
-from sysid.core.errors import SysidError
+from sysid.core.errors import InvalidModel, SysidError, UnknownModel
 
 UNSTORED = "the simulated record"
 """Stands for its identifier until it has one."""
 
 
 class _Source(NamedTuple):
-    """Where the record comes from: stored datasets, or a simulation that is not stored yet."""
+    """Where the record comes from: stored datasets, or a simulation that is not stored yet.
+
+    `faults`: why there is no record, if it could not be simulated.
+    """
 
     datasets: list[str]
     made: Simulated | None = None
+    faults: tuple[FieldError, ...] = ()
+
+    @property
+    def is_missing(self) -> bool:
+        return self.made is None and self.datasets == [UNSTORED]
 
     @property
     def unstored(self) -> list[Dataset]:
@@ -66,16 +73,10 @@ def submit(
     KeyReused
         If the idempotency key was used with another body.
     """
-    own = list(_own_faults(body, settings.max_runs_per_job))
-    if own:
-        most, unread = settings.max_runs_per_job, {one.pointer.split("/")[1] for one in own}
-        with database.read() as session:
-            more = faults_of_rest(session, body, most, unread)
-        raise InvalidRequest(dict.fromkeys([*own, *more]))
     source = _source(database, store, body)
     try:
         with database.read() as session:
-            plain = _plain(session, body, source)
+            plain = _plain(session, body, source, settings.max_runs_per_job)
         job = _job(store, body, plain, source)
         if source.made is not None:
             with database.read() as session:
@@ -89,16 +90,7 @@ def submit(
         raise InvalidRequest(_at_home(one, body) for one in error.errors) from None
 
 
-def faults_of_rest(
-    session: Session, body: NoiseSweepIn, most_runs: int, unread: Set[str]
-) -> list[FieldError]:
-    """Faults of a body of which fields are `unread`: those that stand whatever these say."""
-    job = JobIn.model_validate({**body.shared, "datasets": body.datasets or [UNSTORED]})
-    found = sweep_checks.faults_of_rest(session, job, most_runs, unread)
-    return [one for one in found if body.datasets or not one.pointer.startswith("/datasets")]
-
-
-def _own_faults(body: NoiseSweepIn, most_runs: int) -> Iterator[FieldError]:
+def _grid_faults(body: NoiseSweepIn, most_runs: int) -> Iterator[FieldError]:
     if "method" in body.algorithm.model_fields_set:
         yield FieldError("/algorithm/method", "the sweep takes its methods from 'methods'")
     count = len(body.sigma) * body.replicates * len(body.methods)
@@ -116,22 +108,20 @@ def _source(database: Database, store: ObjectStore, body: NoiseSweepIn) -> _Sour
     document = {"model": body.model, **body.truth.model_dump()}
     try:
         found = simulated(database, store, SimulateIn.model_validate(document))
+    except (InvalidModel, UnknownModel) as error:
+        of_model = (fault_in_job(body.model, one) for one in faults_of(error))
+        return _Source([UNSTORED], faults=tuple(of_model))
     except (InvalidRequest, SysidError) as error:
         faults = error.errors if isinstance(error, InvalidRequest) else faults_of(error)
-        raise InvalidRequest(
-            FieldError(
-                one.pointer if one.pointer.startswith("/model") else f"/truth{one.pointer}",
-                one.detail, one.column,
-            )
-            for one in faults
-        ) from None  # fmt: skip
+        at_home = (FieldError(f"/truth{one.pointer}", one.detail, one.column) for one in faults)
+        return _Source([UNSTORED], faults=tuple(at_home))
     if isinstance(found, Simulated):
         return _Source([UNSTORED], found)
     return _Source([found.dataset.id])
 
 
-def _plain(session: Session, body: NoiseSweepIn, source: _Source) -> _Plain:
-    """What is known without the samples.
+def _plain(session: Session, body: NoiseSweepIn, source: _Source, most_runs: int) -> _Plain:
+    """What is known without the samples, of a body without faults.
 
     Where the truth is not known σ = 0 is among the values: its best run is what errors are told
     against.
@@ -139,18 +129,22 @@ def _plain(session: Session, body: NoiseSweepIn, source: _Source) -> _Plain:
     fields = {"name": "noise sweep", **body.shared, "datasets": source.datasets}
     job = JobIn.model_validate(fields)
     checker = JobChecker(session, source.unstored)
-    faults = checker.errors(job.normal_form())
-    if faults:
-        raise InvalidRequest(faults)
+    faults = [*_grid_faults(body, most_runs), *source.faults]
+    faults += (
+        one
+        for one in checker.errors(job.normal_form())
+        if not (source.is_missing and one.pointer.startswith("/datasets"))
+    )
     rows = [one for name in job.datasets if isinstance(one := checker.dataset(name), Dataset)]
+    model = checker.model(job.model)
+    if body.relative and not isinstance(model, list):
+        faults += relative_faults(model[0], rows)
+    if faults or isinstance(model, list):
+        raise InvalidRequest(dict.fromkeys(faults))
     values = list(body.sigma)
     if 0 not in values and truth_of(session, job.model, rows) is None:
         values.insert(0, 0.0)
-    found = checker.model(job.model)
-    assert isinstance(found, tuple)  # it has no faults
-    if body.relative:
-        check_relative(found[0], rows)
-    output = found[0].outputs[0].name
+    output = model[0].outputs[0].name
     return _Plain(fields, values, rows, job.channels.get(output, output))
 
 

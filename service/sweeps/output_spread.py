@@ -1,10 +1,10 @@
 """How far an output varies: the unit of a relative σ."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from service.core.errors import InvalidRequest
+from service.core.errors import FieldError, InvalidRequest
 from service.datasets.recordings import recording_of
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
@@ -15,24 +15,18 @@ MOST_VALUES = 10_000_000
 """Values that are read for it, over all channels: a request must not take minutes."""
 
 
-def check_relative(model: Model, rows: Sequence[Dataset]) -> None:
-    """Refuse a relative σ for several outputs at once, or of more values than are read.
-
-    Raises
-    ------
-    InvalidRequest
-        At ``/relative``.
-    """
+def relative_faults(model: Model, rows: Sequence[Dataset]) -> Iterator[FieldError]:
+    """Faults of a relative σ: several outputs, or more values than are read."""
     names = [one.name for one in model.outputs]
     if len(names) > 1:
-        raise InvalidRequest.at(
+        yield FieldError(
             "/relative",
             f"the model has the outputs {', '.join(names)}, and σ is one number for all; "
             "give σ in their unit, with relative: false",
         )
     count = sum(row.n_samples * row.n_channels for row in rows)
     if count > MOST_VALUES:
-        raise InvalidRequest.at(
+        yield FieldError(
             "/relative",
             f"the datasets have {count} values in all, and at most {MOST_VALUES} are read to find "
             "what σ is relative to; give σ in the output's unit, with relative: false",

@@ -1,16 +1,12 @@
 """Batch re-identification: one run for each value of a label, warm-started, with a trend."""
 
 import re
-from collections.abc import Iterator, Set
 from typing import Any
-
-from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
 from service.core.settings import Settings
 from service.core.text_checks import fault_of
 from service.jobs import submit as jobs
-from service.jobs import sweep_checks
 from service.jobs.schemas import PREVIOUS, REFERENCE, RUN, JobIn, JobOut
 from service.storage.sessions import Database
 from service.sweeps.schemas import ReidentifyIn
@@ -18,9 +14,6 @@ from service.sweeps.schemas import ReidentifyIn
 FIRST_AXIS = "/sweep/axes/0"
 IN_DATASETS = re.compile(r"/datasets(?P<place>/\d+): ")
 """How the fault of a value of the axis begins that is one of its recordings'."""
-MADE_OF = {"batch": ("datasets", "sweep"), "label": ("sweep", "trend"), "look_at": ("trend",),
-           "predict": ("trend",), "reference": ("trend", "warm_start")}  # fmt: skip
-"""Fields of the job that each field of this body makes; the others have the same name."""
 
 
 def submit(
@@ -37,36 +30,22 @@ def submit(
     """
     order = order_of(body)
     job = job_of(body, order)
-    own = list(_own_faults(body))
+    faults = []
+    if body.warm_start == "reference" and body.reference is None:
+        faults.append(FieldError("/warm_start", "'reference' needs one: name the reference too"))
     try:
-        if own:
-            with database.read() as session:
-                jobs.check(session, job, settings)
-        else:
+        if not faults:
             return jobs.submit_to(database, job, settings, key)
+        with database.read() as session:
+            jobs.check(session, job, settings)
     except InvalidRequest as error:
-        own += [_at_home(one, order) for one in error.errors]
-    raise InvalidRequest(dict.fromkeys(own))
-
-
-def faults_of_rest(
-    session: Session, body: ReidentifyIn, most_runs: int, unread: Set[str]
-) -> list[FieldError]:
-    """Faults of a body of which fields are `unread`: those that stand whatever these say."""
-    order = order_of(body)
-    theirs = {name for ours in unread for name in MADE_OF.get(ours, (ours,))}
-    found = sweep_checks.faults_of_rest(session, job_of(body, order), most_runs, theirs)
-    return [*_own_faults(body), *(_at_home(one, order) for one in found)]
+        faults += [_at_home(one, order) for one in error.errors]
+    raise InvalidRequest(dict.fromkeys(faults))
 
 
 def order_of(body: ReidentifyIn) -> list[int]:
     """Places in the batch, in the order of x."""
     return sorted(range(len(body.batch)), key=lambda number: body.batch[number].x)
-
-
-def _own_faults(body: ReidentifyIn) -> Iterator[FieldError]:
-    if body.warm_start == "reference" and body.reference is None:
-        yield FieldError("/warm_start", "'reference' needs one: name the reference too")
 
 
 def job_of(body: ReidentifyIn, order: list[int]) -> JobIn:

@@ -13,11 +13,10 @@ from pydantic_core import PydanticCustomError
 from service.core.wire import Answer, Body, Seed, Sigma
 from service.datasets.schemas import MAX_SIMULATED_SAMPLES, InputIn, SampleTime
 from service.jobs.schemas import IdentificationIn, PlaceIn, ValidationIn
+from sysid.core.settings import SearchMethod
 
 MOST_REPLICATES = 1_000_000
 """Seeds of replicate r are `seed` times this plus r, so that no two sweeps share one by chance."""
-
-Method = Literal["simple", "improved-paper", "improved"]
 
 
 def _distinct(found: list[Any]) -> list[Any]:
@@ -55,7 +54,7 @@ class NoiseSweepIn(IdentificationIn):
     ]
     relative: bool = False
     replicates: int = Field(default=20, ge=1, lt=MOST_REPLICATES)
-    methods: Annotated[list[Method], AfterValidator(_distinct)] = Field(
+    methods: Annotated[list[SearchMethod], AfterValidator(_distinct)] = Field(
         default=["simple", "improved"], min_length=1
     )
     seed: int = Field(default=1, ge=0, lt=2**32)

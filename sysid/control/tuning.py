@@ -8,7 +8,7 @@ k' e^(-θs)/(s (T2 s + 1)), is the limit of an infinite T1 with k/T1 = k'.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import inf, isfinite
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from sysid.kernels.reads import is_difference
 
 Rule = Literal["simc", "amigo"]
 Kind = Literal["PI", "PID"]
+RULES: tuple[Rule, ...] = get_args(Rule)
+CONTROLLERS: tuple[Kind, ...] = get_args(Kind)
 
 REFERENCES: Mapping[Rule, str] = {
     "simc": "S. Skogestad, Simple analytic rules for model reduction and PID controller tuning, "

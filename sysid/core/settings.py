@@ -1,27 +1,35 @@
 """Settings of a search and of the problem it solves, as frozen values.
 
-The field names are those of the job body; defaults are defined here once.
+The field names are those of the job body. Names to choose from, defaults and bounds are defined
+here once: the wire schemas, the forms and the command line take them from here.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from sysid.core.errors import InvalidSettings
 
 SearchMethod = Literal["simple", "improved-paper", "improved"]
 TopologyName = Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"]
+SequenceKind = Literal["paper", "adaptive"]
 Prediction = Literal["simulation", "one-step"]
+LossKind = Literal["squares", "soft-l1"]
 NoiseModel = Literal["auto", "white", "ar1"]
-NOISE_MODELS: tuple[NoiseModel, ...] = ("auto", "white", "ar1")
-METHODS: tuple[SearchMethod, ...] = ("simple", "improved-paper", "improved")
+METHODS: tuple[SearchMethod, ...] = get_args(SearchMethod)
+TOPOLOGIES: tuple[TopologyName, ...] = get_args(TopologyName)
+SEQUENCE_KINDS: tuple[SequenceKind, ...] = get_args(SequenceKind)
+PREDICTION_KINDS: tuple[Prediction, ...] = get_args(Prediction)
+LOSS_KINDS: tuple[LossKind, ...] = get_args(LossKind)
+NOISE_MODELS: tuple[NoiseModel, ...] = get_args(NoiseModel)
+MIN_POPULATION = 4
+"""Individuals of an island at least: a child needs two parents, and they others to replace."""
+MAX_BITS = 32
+"""Bits of a coded parameter at most."""
 # What the compiled search counts in 64 bits, with room to add; no run of years comes near them.
 MOST_GENERATIONS = 10**9
 MOST_EVALUATIONS = 10**12
 Schedule = tuple[tuple[int, float], ...]
-TOPOLOGIES: tuple[TopologyName, ...] = (
-    "one-way-ring", "ring", "fully-connected", "star", "unconnected",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,12 +40,13 @@ class SequenceSearch:
     directions. `beta` is the step, relative to the value (`relative`, Eq. 12) or to the range.
     """
 
-    kind: Literal["paper", "adaptive"] = "adaptive"
+    kind: SequenceKind = "adaptive"
     beta: float = 0.01
     relative: bool = True
 
     def __post_init__(self) -> None:
-        _require(self.kind in ("paper", "adaptive"), "sequence/kind", self.kind, "paper, adaptive")
+        right = ", ".join(SEQUENCE_KINDS)
+        _require(self.kind in SEQUENCE_KINDS, "sequence/kind", self.kind, right)
         _require(0 < self.beta < 1, "sequence/beta", self.beta, "between 0 and 1")
 
 
@@ -130,9 +139,10 @@ class GeneticAlgorithm:
 
     def __post_init__(self) -> None:
         _require(self.method in METHODS, "method", self.method, ", ".join(METHODS))
-        _require(self.population >= 4, "population", self.population, "4 or more")
+        _require(self.population >= MIN_POPULATION, "population", self.population,
+                 f"{MIN_POPULATION} or more")  # fmt: skip
         _require_count(self.generations, "generations")
-        _require(1 <= self.bits <= 32, "bits", self.bits, "1 to 32")
+        _require(1 <= self.bits <= MAX_BITS, "bits", self.bits, f"1 to {MAX_BITS}")
         _require(0 < self.selection_rate < 1, "selection_rate", self.selection_rate,
                  "between 0 and 1")  # fmt: skip
         _require_count(self.stagnation, "stagnation")
@@ -144,8 +154,8 @@ class GeneticAlgorithm:
         _require(budget is None or budget >= self.population, "stop/evaluations", budget,
                  f"{self.population} or more, the simulations of one population of "
                  f"{self.population} individuals")  # fmt: skip
-        _require(self.population >= 4 * self.n_islands, "population", self.population,
-                 f"4 or more for each of the {self.n_islands} islands")  # fmt: skip
+        _require(self.population >= MIN_POPULATION * self.n_islands, "population", self.population,
+                 f"{MIN_POPULATION} or more for each of the {self.n_islands} islands")  # fmt: skip
 
     @property
     def n_islands(self) -> int:
@@ -166,20 +176,18 @@ class Loss:
     (`sysid.identification.noise_model_choice`), else ``white``.
     """
 
-    kind: Literal["squares", "soft-l1"] = "squares"
+    kind: LossKind = "squares"
     scale: float = 1.0
     noise_model: NoiseModel = "auto"
 
     def __post_init__(self) -> None:
-        if self.kind not in ("squares", "soft-l1"):
-            raise InvalidSettings("/loss/kind", f"{self.kind!r} is not 'squares' or 'soft-l1'")
+        if self.kind not in LOSS_KINDS:
+            raise InvalidSettings("/loss/kind", f"{self.kind!r} is not {_join(LOSS_KINDS)}")
         if not self.scale > 0:
             raise InvalidSettings("/loss/scale", f"{self.scale!r} is not a positive number")
         if self.noise_model not in NOISE_MODELS:
-            raise InvalidSettings(
-                "/loss/noise_model",
-                f"{self.noise_model!r} is not {', '.join(NOISE_MODELS[:-1])} or {NOISE_MODELS[-1]}",
-            )
+            detail = f"{self.noise_model!r} is not {_join(NOISE_MODELS)}"
+            raise InvalidSettings("/loss/noise_model", detail)
         if self.noise_model == "ar1" and self.kind != "squares":
             raise InvalidSettings(
                 "/loss/noise_model",
@@ -218,9 +226,10 @@ class FitSettings:
         object.__setattr__(self, "parameters", dict(self.parameters))
         if self.weights is not None:
             object.__setattr__(self, "weights", dict(self.weights))
-        if self.prediction not in ("simulation", "one-step"):
+        if self.prediction not in PREDICTION_KINDS:
             raise InvalidSettings(
-                "/prediction", f"{self.prediction!r} is not 'simulation' or 'one-step'"
+                "/prediction",
+                f"{self.prediction!r} is not {_join(list(map(repr, PREDICTION_KINDS)))}",
             )
         if self.prediction == "one-step" and self.loss.noise_model == "ar1":
             raise InvalidSettings(
@@ -230,6 +239,50 @@ class FitSettings:
             )
         if self.skip < 0:
             raise InvalidSettings("/skip", f"{self.skip!r} is not a number of samples, 0 or more")
+
+
+def _require(holds: bool, pointer: str, found: object, right: str) -> None:
+    if not holds:
+        raise InvalidSettings(f"/algorithm/{pointer}", f"found {found!r}; need {right}")
+
+
+def _require_count(found: int, pointer: str) -> None:
+    _require(1 <= found <= MOST_GENERATIONS, pointer, found, f"1 to {MOST_GENERATIONS}")
+
+
+def _require_schedule(found: Schedule, pointer: str) -> None:
+    generations = [generation for generation, _ in found]
+    holds = (
+        bool(generations) and generations[0] == 0 and generations[-1] <= MOST_GENERATIONS
+        and generations == sorted(set(generations))
+        and all(0 <= rate <= 1 for _, rate in found)
+    )  # fmt: skip
+    right = f"[generation, rate] pairs from generation 0 up to {MOST_GENERATIONS}, rates 0 to 1"
+    _require(holds, pointer, found, right)
+
+
+def _join(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} or {names[-1]}"
+
+
+def _require(holds: bool, pointer: str, found: object, right: str) -> None:
+    if not holds:
+        raise InvalidSettings(f"/algorithm/{pointer}", f"found {found!r}; need {right}")
+
+
+def _require_count(found: int, pointer: str) -> None:
+    _require(1 <= found <= MOST_GENERATIONS, pointer, found, f"1 to {MOST_GENERATIONS}")
+
+
+def _require_schedule(found: Schedule, pointer: str) -> None:
+    generations = [generation for generation, _ in found]
+    holds = (
+        bool(generations) and generations[0] == 0 and generations[-1] <= MOST_GENERATIONS
+        and generations == sorted(set(generations))
+        and all(0 <= rate <= 1 for _, rate in found)
+    )  # fmt: skip
+    right = f"[generation, rate] pairs from generation 0 up to {MOST_GENERATIONS}, rates 0 to 1"
+    _require(holds, pointer, found, right)
 
 
 def _require(holds: bool, pointer: str, found: object, right: str) -> None:

@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping
 from math import isfinite
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from sysid.core.errors import InvalidSettings, nearest
+
+Word = TypeVar("Word", bound=str)
 
 
 class Arguments:
@@ -94,12 +96,13 @@ class Arguments:
                 self.fail(name, f"found {one!r} in the list; need names")
         return list(value)
 
-    def choice(self, name: str, choices: tuple[str, ...], default: str | None = None) -> str:
+    def choice(self, name: str, choices: tuple[Word, ...], default: Word | None = None) -> Word:
         """Return one of some words."""
         value = self.text(name, default)
-        if value not in choices:
-            self.fail(name, f"found {value!r}; need one of {', '.join(choices)}")
-        return value
+        for one in choices:
+            if value == one:
+                return one
+        self.fail(name, f"found {value!r}; need one of {', '.join(choices)}")
 
     def pair(self, name: str) -> tuple[int, int]:
         """Return two whole numbers, the second the larger."""

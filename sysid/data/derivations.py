@@ -14,14 +14,12 @@ from sysid.core.errors import InvalidRecord, InvalidSettings, nearest
 from sysid.core.units import difference, factor, is_blank, is_read, suggestion
 from sysid.data.arguments import Arguments
 from sysid.data.history import changed, with_history, without_history
-from sysid.data.noise import Noise, noise_samples
+from sysid.data.noise import NOISE_KINDS, Noise, noise_samples
 from sysid.data.pooling import pool, select
-from sysid.data.records import HOLDS, Channel, Hold, Recording, Segment
+from sysid.data.records import HOLDS, Channel, Recording, Segment
 from sysid.data.resampling import resample
 from sysid.data.splitting import time_of_cut
 
-KINDS = ("gaussian", "uniform-sum")
-_HOLDS: Mapping[str, Hold] = {hold: hold for hold in HOLDS}
 Step = Callable[[Recording, Arguments], Recording]
 
 
@@ -63,7 +61,7 @@ def add_noise(recording: Recording, given: Arguments) -> Recording:
         noise = Noise(
             given.number("sigma"),
             given.whole("seed", 0),
-            "uniform-sum" if given.choice("kind", KINDS, "gaussian") == KINDS[1] else "gaussian",
+            given.choice("kind", NOISE_KINDS, "gaussian"),
             given.whole("terms", 12, most=1000),
             given.number("mean", 0.0),
         )
@@ -184,7 +182,7 @@ def subtract_offset(recording: Recording, given: Arguments) -> Recording:
 
 def set_hold(recording: Recording, given: Arguments) -> Recording:
     """Say what named channels do between their samples, when they are inputs."""
-    return recording.held({name: _HOLDS[given.choice(name, HOLDS)] for name, _ in given.items()})
+    return recording.held({name: given.choice(name, HOLDS) for name, _ in given.items()})
 
 
 def set_unit(recording: Recording, given: Arguments) -> Recording:

@@ -5,7 +5,7 @@ in (0, 1), so that ξ = (Σψ − N/2)/√(N/12) has mean 0, variance 1 and exce
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Record
 
 NoiseKind = Literal["gaussian", "uniform-sum"]
+NOISE_KINDS: tuple[NoiseKind, ...] = get_args(NoiseKind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +45,9 @@ class Noise:
             raise InvalidSettings("/noise/sigma", f"found {self.sigma!r}; need 0 or more")
         if self.seed < 0:
             raise InvalidSettings("/noise/seed", f"found {self.seed!r}; need 0 or more")
-        if self.kind not in ("gaussian", "uniform-sum"):
-            raise InvalidSettings(
-                "/noise/kind", f"{self.kind!r} is not 'gaussian' or 'uniform-sum'"
-            )
+        if self.kind not in NOISE_KINDS:
+            names = " or ".join(map(repr, NOISE_KINDS))
+            raise InvalidSettings("/noise/kind", f"{self.kind!r} is not {names}")
         if self.terms < 3:
             raise InvalidSettings("/noise/terms", f"found {self.terms!r}; need 3 or more")
 

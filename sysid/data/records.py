@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from sysid.core.errors import InvalidRecord, nearest
 from sysid.core.types import FloatArray
 
 Hold = Literal["zero", "first", "band-limited"]
-HOLDS: tuple[Hold, ...] = ("zero", "first", "band-limited")
+HOLDS: tuple[Hold, ...] = get_args(Hold)
 
 REGULAR_WITHIN = 1e-2
 """Times are regular when none is further than this part of a period from its place.

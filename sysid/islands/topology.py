@@ -1,5 +1,6 @@
 """Topologies: which island sends its migrants to which."""
 
+from collections.abc import Callable, Mapping
 from typing import TypeAlias
 
 from sysid.core.settings import TopologyName
@@ -9,20 +10,40 @@ Edge: TypeAlias = tuple[int, int]
 
 
 def edges(name: TopologyName, n: int) -> tuple[Edge, ...]:
-    """All connections of an archipelago of `n` islands, by source and destination.
+    """All connections of an archipelago of `n` islands, by source and destination."""
+    return tuple(sorted(edge for edge in CONNECTIONS[name](n) if edge[0] != edge[1]))
 
-    ``one-way-ring``: each to the next. ``ring``: to both neighbours. ``star``: island 0 is the
-    centre. ``fully-connected``: each to all others. ``unconnected``: none.
-    """
-    match name:
-        case "one-way-ring":
-            found = {(i, (i + 1) % n) for i in range(n)}
-        case "ring":
-            found = {(i, (i + step) % n) for i in range(n) for step in (1, -1)}
-        case "star":
-            found = {edge for i in range(1, n) for edge in ((0, i), (i, 0))}
-        case "fully-connected":
-            found = {(i, j) for i in range(n) for j in range(n)}
-        case "unconnected":
-            found = set()
-    return tuple(sorted(edge for edge in found if edge[0] != edge[1]))
+
+def _connect_next(n: int) -> set[Edge]:
+    """Each to the next."""
+    return {(i, (i + 1) % n) for i in range(n)}
+
+
+def _connect_neighbours(n: int) -> set[Edge]:
+    """Each to both neighbours."""
+    return {(i, (i + step) % n) for i in range(n) for step in (1, -1)}
+
+
+def _connect_all(n: int) -> set[Edge]:
+    """Each to all others."""
+    return {(i, j) for i in range(n) for j in range(n)}
+
+
+def _connect_centre(n: int) -> set[Edge]:
+    """Island 0 to all others, and they to it."""
+    return {edge for i in range(1, n) for edge in ((0, i), (i, 0))}
+
+
+def _connect_none(n: int) -> set[Edge]:
+    """None: every island searches alone."""
+    return set()
+
+
+CONNECTIONS: Mapping[TopologyName, Callable[[int], set[Edge]]] = {
+    "one-way-ring": _connect_next,
+    "ring": _connect_neighbours,
+    "fully-connected": _connect_all,
+    "star": _connect_centre,
+    "unconnected": _connect_none,
+}
+"""The connections of `n` islands by the name of their topology."""

@@ -106,7 +106,7 @@ class Selection:
 
 
 Form = Literal["difference", "differential", "polynomial"]
-Method = Literal["euler", "semi-implicit", "rk4"]
+Method = Literal["rk4", "euler", "semi-implicit"]
 History = Literal["constant", "zero"]
 Interpolation = Literal["linear", "cubic", "nearest"]
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from functools import reduce
 from itertools import combinations_with_replacement
 from math import comb
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, cast, get_args
 
 from sysid.core.errors import InvalidBounds, InvalidSettings, nearest
 from sysid.language.checker import check
@@ -29,8 +29,6 @@ MAX_CANDIDATES = 512
 
 _MAX_DEGREE = 9
 _SELECTORS = ("frols",)
-_CRITERIA = ("none", "bic")
-_ERRORS = ("one-step", "simulation")
 _RULE_FIELDS = ("select", "keep", "err", "criterion", "exchange", "error", "candidates")
 
 
@@ -83,13 +81,15 @@ def _rule(reader: Reader, written: Mapping[str, Any], candidates: int) -> TermRu
     fields = reader.section(written, "/terms", _RULE_FIELDS)
     if reader.required(fields, "select", "/terms", "name the selector: frols") is not None:
         reader.choice(fields["select"], _SELECTORS, "/terms/select")
-    criterion = reader.choice(fields.get("criterion", "none"), _CRITERIA, "/terms/criterion")
+    criterion = reader.choice(
+        fields.get("criterion", "none"), get_args(Criterion), "/terms/criterion"
+    )
     exchange = _truth(reader, fields.get("exchange", True), "/terms/exchange")
     err = None if fields.get("err") is None else _share(reader, fields["err"])
     most, keep = min(candidates, MAX_PARAMETERS), fields.get("keep")
     if keep is None and err is None and fields.get("criterion", "none") == "none":
         reader.fault("/terms/keep", "is missing; say how many terms to keep, such as 8")
-    error = reader.choice(fields.get("error", "one-step"), _ERRORS, "/terms/error")
+    error = reader.choice(fields.get("error", "one-step"), get_args(ErrorKind), "/terms/error")
     # Without candidates, that is the fault to tell.
     all_of_them = keep is None or most == 0
     number = max(most, 1) if all_of_them else _kept(reader, keep, candidates, most)

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 from sysid.core.errors import InvalidBounds, nearest
 from sysid.language.scope import Timing, reserved
@@ -11,8 +11,11 @@ from sysid.models.model import (
     EstimatedInitial,
     FixedInitial,
     Form,
+    History,
     Initial,
+    Interpolation,
     MeasuredInitial,
+    Method,
     Quantity,
     Solver,
 )
@@ -75,7 +78,7 @@ def _parameter(reader: Reader, name: str, entry: object) -> Parameter | None:
         if fields.get(key) is not None
     }
     unit = reader.unit(fields.get("unit"), place + "/unit")
-    scale = reader.choice(fields.get("scale", "linear"), ("linear", "log"), place + "/scale")
+    scale = reader.choice(fields.get("scale", "linear"), get_args(Scale), place + "/scale")
     reader.text(fields.get("description"), place + "/description")
     tied = reader.text(fields.get("tied"), place + "/tied") or None
     if tied is not None and "fixed" in numbers:
@@ -144,9 +147,9 @@ def solver(reader: Reader, value: object, form: Form) -> Solver:
     choices: dict[str, Any] = {
         name: reader.choice(fields.get(name, getattr(plain, name)), options, "/solver/" + name)
         for name, options in (
-            ("method", ("rk4", "euler", "semi-implicit")),
-            ("history", ("constant", "zero")),
-            ("interpolation", ("linear", "cubic", "nearest")),
+            ("method", get_args(Method)),
+            ("history", get_args(History)),
+            ("interpolation", get_args(Interpolation)),
         )
     }
     substeps = reader.whole(fields.get("substeps", 1), "/solver/substeps", 1, 1000)

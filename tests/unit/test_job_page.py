@@ -12,8 +12,10 @@ import yaml
 
 from service.datasets.schemas import DeriveIn
 from service.jobs.schemas import JobIn
+from sysid.core.settings import METHODS, TOPOLOGIES
 from sysid.data.derivations import STEPS, derive
-from sysid.data.records import Channel, Recording, Segment
+from sysid.data.noise import NOISE_KINDS
+from sysid.data.records import HOLDS, Channel, Recording, Segment
 
 PAGE = (Path(__file__).parents[2] / "docs/job.md").read_text(encoding="utf-8")
 EXAMPLES = [yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)]
@@ -68,6 +70,37 @@ def test_every_field_of_a_job_is_told_with_its_default(path: str) -> None:
         assert default == f"`{json.dumps(field['default'])}`"
     if "default" not in field and path != "model":
         assert default == "needed"
+
+
+def choices(field: Any) -> set[str]:
+    """Names that a field, its entries or its values take, where these are listed."""
+    if not isinstance(field, dict):
+        return set()
+    inner = [field.get("items"), field.get("additionalProperties"), *field.get("anyOf", [])]
+    return set(field.get("enum", ())).union(*(choices(one) for one in inner))
+
+
+CHOICES = {path: choices(field) for path, field in FIELDS.items() if choices(field)}
+
+
+@pytest.mark.parametrize("path", CHOICES)
+def test_every_name_that_a_field_of_a_job_takes_is_told_and_no_other(path: str) -> None:
+    kind = ROWS[path][0]
+    if kind.startswith("as "):
+        kind = ROWS[kind.removeprefix("as ").strip("`")][0]
+    assert set(re.findall(r"`([^`]+)`", kind)) == CHOICES[path]
+
+
+def test_the_fields_that_take_names_are_found() -> None:
+    assert set(TOPOLOGIES) == CHOICES["algorithm.migration.topology"]
+    assert set(METHODS) == CHOICES["algorithm.method"] == CHOICES["algorithm.islands.method"]
+    assert set(HOLDS) == CHOICES["hold"]
+
+
+@pytest.mark.parametrize(("step", "names"), [("hold", HOLDS), ("noise", NOISE_KINDS)])
+def test_every_name_that_a_step_takes_is_told(step: str, names: tuple[str, ...]) -> None:
+    told = " ".join(STEP_ROWS[step])
+    assert [name for name in names if not re.search(rf"(?<![\w-]){name}(?![\w-])", told)] == []
 
 
 @pytest.mark.parametrize("step", STEPS)

@@ -6,7 +6,7 @@ import pytest
 from sysid.core.settings import TOPOLOGIES, GeneticAlgorithm, Migration, TopologyName
 from sysid.identification.run import advance, begin
 from sysid.islands.migration import migrate
-from sysid.islands.topology import edges
+from sysid.islands.topology import CONNECTIONS, edges
 from sysid.search.island import sizes
 from tests.searching import bits, example
 
@@ -26,6 +26,10 @@ def test_topologies_connect_as_named() -> None:
     assert edges("star", 3) == ((0, 1), (0, 2), (1, 0), (2, 0))
     assert len(edges("fully-connected", 5)) == 20
     assert edges("unconnected", 5) == ()
+
+
+def test_every_topology_has_its_connections() -> None:
+    assert set(CONNECTIONS) == set(TOPOLOGIES)
 
 
 @pytest.mark.parametrize("name", TOPOLOGIES)

@@ -1,4 +1,4 @@
-"""Settings, defaults that stand in two places, and what a client loads."""
+"""Settings, defaults and names that wire types take from the core, and what a client loads."""
 
 import subprocess
 import sys
@@ -6,13 +6,30 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from service.core.errors import Misconfigured
 from service.core.settings import Settings, is_loopback
 from service.jobs.schemas import JobIn
 from service.jobs.to_core import algorithm_of, loss_of
+from service.pages.choices import DEFAULTS, NAMES, TEXTS, list_choices
 from sysid.core.errors import InvalidSettings
-from sysid.core.settings import GeneticAlgorithm, IslandChange, Loss, Migration, Stop
+from sysid.core.settings import (
+    LOSS_KINDS,
+    MAX_BITS,
+    METHODS,
+    MIN_POPULATION,
+    NOISE_MODELS,
+    PREDICTION_KINDS,
+    SEQUENCE_KINDS,
+    TOPOLOGIES,
+    GeneticAlgorithm,
+    IslandChange,
+    Loss,
+    Migration,
+    Stop,
+)
+from sysid.data.records import HOLDS
 
 
 @pytest.mark.parametrize(
@@ -39,6 +56,33 @@ def test_the_defaults_of_the_job_body_are_those_of_the_core() -> None:
     document = JobIn.model_validate({"model": "m", "datasets": ["d"]}).normal_form()
     assert algorithm_of(document["algorithm"]) == GeneticAlgorithm()
     assert loss_of(document["loss"]) == Loss()
+
+
+def test_the_wire_types_take_every_name_of_the_core_and_its_bounds() -> None:
+    every = [{"algorithm": {"migration": {"topology": name}}} for name in TOPOLOGIES] + [
+        {"algorithm": {"method": name}} for name in METHODS
+    ]
+    every += [{"algorithm": {"sequence": {"kind": name}}} for name in SEQUENCE_KINDS]
+    every += [{"loss": {"kind": name}} for name in LOSS_KINDS]
+    every += [{"loss": {"noise_model": name}} for name in NOISE_MODELS]
+    every += [{"prediction": name} for name in PREDICTION_KINDS]
+    every += [{"hold": {"u": name}} for name in HOLDS]
+    every += [{"algorithm": {"population": MIN_POPULATION}}, {"algorithm": {"bits": MAX_BITS}}]
+    for body in every:
+        document = JobIn.model_validate({"model": "m", "datasets": ["d"], **body}).normal_form()
+        assert algorithm_of(document["algorithm"])
+        assert loss_of(document["loss"])
+    for field, value in (("population", MIN_POPULATION - 1), ("bits", MAX_BITS + 1)):
+        body = {"model": "m", "datasets": ["d"], "algorithm": {field: value}}
+        with pytest.raises(ValidationError, match=field):
+            JobIn.model_validate(body)
+
+
+def test_the_form_has_a_choice_for_every_name_and_no_text_without_a_name() -> None:
+    assert {name for names in NAMES.values() for name in names} >= set(TEXTS)
+    for field, pairs in list_choices().items():
+        assert [value for value, _ in pairs] == list(NAMES[field])
+        assert DEFAULTS[field] in ("", *NAMES[field])
 
 
 def test_changes_of_single_islands_reach_the_core() -> None:

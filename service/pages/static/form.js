@@ -9,7 +9,6 @@ const form = document.getElementById('job-form');
 const field = (name) => form.elements.namedItem(name);
 const state = { dataset: null, model: null, cloned: null, extra: {}, started: false };
 const query = new URLSearchParams(location.search);
-const HOLDS = [['', 'as the recording says'], ['zero', 'held (zero)'], ['first', 'straight line (first)'], ['band-limited', 'band-limited']];
 
 async function start() {
   if (state.started) return;
@@ -192,7 +191,7 @@ function betweenSamples(signal, hold) {
   const select = document.createElement('select');
   select.dataset.hold = signal;
   select.dataset.pointer = `/hold/${signal}`;
-  for (const [value, text] of HOLDS) select.append(new Option(text, value));
+  select.append(document.getElementById('holds').content.cloneNode(true));
   select.value = hold ?? '';
   label.append(select);
   return label;

@@ -1,0 +1,52 @@
+"""Choices of the form of a new identification: the names of the core, with texts for people."""
+
+from collections.abc import Mapping, Sequence
+
+from sysid.core.settings import (
+    LOSS_KINDS,
+    METHODS,
+    NOISE_MODELS,
+    PREDICTION_KINDS,
+    GeneticAlgorithm,
+    Loss,
+)
+from sysid.data.records import HOLDS
+
+NAMES: Mapping[str, Sequence[str]] = {
+    "method": METHODS,
+    "loss": LOSS_KINDS,
+    "noise_model": NOISE_MODELS,
+    "prediction": PREDICTION_KINDS,
+    "hold": HOLDS,
+}
+"""Names to choose from, by the field of the form."""
+
+DEFAULTS: Mapping[str, str] = {
+    "method": GeneticAlgorithm().method,
+    "loss": Loss().kind,
+    "noise_model": Loss().noise_model,
+    "prediction": "simulation",
+    "hold": "",
+}
+"""What is chosen at first; of a hold nothing, since the recording has one."""
+
+TEXTS: Mapping[str, str] = {
+    "improved": "improved (islands, sequence search)",
+    "improved-paper": "improved, as in the paper",
+    "simple": "simple genetic algorithm",
+    "soft-l1": "soft-l1 (outliers)",
+    "auto": "by the residuals (auto)",
+    "ar1": "slow, first order (ar1)",
+    "simulation": "simulation (free run)",
+    "one-step": "one step ahead",
+    "zero": "held (zero)",
+    "first": "straight line (first)",
+}
+"""What a name means; a name without a text stands for itself."""
+
+
+def list_choices() -> dict[str, list[tuple[str, str]]]:
+    """Values and texts of every field with names to choose from."""
+    return {
+        field: [(name, TEXTS.get(name, name)) for name in names] for field, names in NAMES.items()
+    }
