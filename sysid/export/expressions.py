@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Protocol
 
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary, walk
 
 _LEVEL = {
     "or": 1, "and": 2, "<": 4, "<=": 4, ">": 4, ">=": 4, "==": 4, "!=": 4,
@@ -120,17 +120,7 @@ def _infix(tree: Binary, language: Language, scope: Scope) -> str:
 
 def is_number(expression: Expression) -> bool:
     """Whether an expression has no names in it."""
-    match expression:
-        case Number():
-            return True
-        case Unary(_, operand):
-            return is_number(operand)
-        case Binary(_, left, right):
-            return is_number(left) and is_number(right)
-        case Call(_, arguments):
-            return all(is_number(one) for one in arguments)
-        case _:
-            return False
+    return not any(isinstance(node, Symbol | Past) for node in walk(expression))
 
 
 def _whole(base: Expression, exponent: Expression) -> int | None:

@@ -4,11 +4,10 @@ Places are counted in half integration steps from the last finished step: the st
 Runge-Kutta step lie at 0, 1 and 2; the sample that a difference equation computes at 2.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
-from sysid.language.delays import mentions_time
-from sysid.language.tree import Binary, Call, Expression, Past, Unary
+from sysid.language.delays import mentions_time, past_values
+from sysid.language.tree import Past
 from sysid.models.model import Model
 
 NEAR = 8
@@ -49,21 +48,6 @@ def state_place(model: Model, stage: int, equation: int, state: int) -> int:
     return 2 if semi_implicit and state < equation else stage
 
 
-def pasts(expression: Expression) -> Iterator[Past]:
-    """All signals of an expression, from left to right."""
-    match expression:
-        case Past():
-            yield expression
-        case Unary(_, operand):
-            yield from pasts(operand)
-        case Binary(_, left, right):
-            yield from pasts(left)
-            yield from pasts(right)
-        case Call(_, arguments):
-            for argument in arguments:
-                yield from pasts(argument)
-
-
 def reads(model: Model) -> tuple[Read, ...]:
     """Every past value that the equations and the outputs read; kept, since every run asks."""
     known = _reads.get(id(model))
@@ -79,12 +63,12 @@ def _found(model: Model) -> list[Read]:
     found: list[Read] = []
     for i, equation in enumerate(model.equations):
         for stage in stages(model):
-            for past in pasts(equation):
+            for past in past_values(equation):
                 state = past.kind == "state"
                 at = state_place(model, stage, i, numbers[past.name]) if state else stage
                 found.append(Read(past, at - 2 * past.offset))
     for output in model.outputs:
-        found += [Read(past, -2 * past.offset) for past in pasts(output.expression)]
+        found += [Read(past, -2 * past.offset) for past in past_values(output.expression)]
     return found
 
 

@@ -4,6 +4,7 @@ After checking, every name is resolved and every past value is a `Past` with its
 its unknown lag apart, so that code generation never looks at text.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -79,3 +80,34 @@ class Call:
 
 
 Expression: TypeAlias = Number | Symbol | Past | Unary | Binary | Call
+
+
+def children(tree: Expression) -> tuple[Expression, ...]:
+    """The nodes right below the root of a tree, in the order of the text; of `Past`, its lag."""
+    match tree:
+        case Past(lag=lag):
+            return () if lag is None else (lag,)
+        case Unary(_, operand):
+            return (operand,)
+        case Binary(_, left, right):
+            return (left, right)
+        case Call(_, arguments):
+            return arguments
+        case _:
+            return ()
+
+
+def walk(tree: Expression) -> Iterator[Expression]:
+    """Every node of a tree, the root first, then its children in the order of the text."""
+    yield tree
+    for child in children(tree):
+        yield from walk(child)
+
+
+def match_plain_state(tree: Expression) -> str | None:
+    """Name of the state that an expression is; None where it is anything else."""
+    match tree:
+        case Past(name, "state", 0, None):
+            return name
+        case _:
+            return None

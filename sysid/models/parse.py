@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from sysid.core.errors import Fault, InvalidModel, InvalidSettings
 from sysid.language.scope import Scope, Timing
-from sysid.language.tree import Expression, Past
+from sysid.language.tree import Expression, Past, match_plain_state
 from sysid.models import equations as eq
 from sysid.models.documents import Reader, pointer, shown
 from sysid.models.model import FixedInitial, Form, Initial, MeasuredInitial, Model, Output, Quantity
@@ -175,10 +175,10 @@ def _check_measured(
     scope: Scope,
 ) -> None:
     """A measured start needs an output that is that state, or whose rate the state is."""
-    seen = {name for o in outputs if (name := _plain_state(o.expression))}
+    seen = {name for o in outputs if (name := match_plain_state(o.expression))}
     if scope.form == "differential":
         rates = (trees[scope.states.index(name)] for name in tuple(seen))
-        seen |= {name for tree in rates if (name := _plain_state(tree))}
+        seen |= {name for tree in rates if (name := match_plain_state(tree))}
     for name, start in zip(scope.states, starts, strict=True):
         if isinstance(start, MeasuredInitial) and name not in seen:
             detail = (
@@ -186,15 +186,6 @@ def _check_measured(
                 "measured; give a number, or {lower, upper} to estimate it"
             )
             reader.fault(pointer("initial", name), detail)
-
-
-def _plain_state(tree: Expression) -> str | None:
-    """The state that an expression is, if it is nothing else."""
-    match tree:
-        case Past(name, "state", 0, None):
-            return name
-        case _:
-            return None
 
 
 def _polynomial(reader: Reader, fields: Mapping[str, Any]) -> Model:
