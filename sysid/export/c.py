@@ -9,14 +9,15 @@ from sysid.export.description import facts, unit_text, value_lines, wrapped
 from sysid.export.expressions import number, source
 from sysid.export.identifiers import Identifiers, in_c_comment
 from sysid.export.program import Kind, Place, Program, lag_steps
+from sysid.language.functions import FUNCTIONS
 from sysid.models.model import MeasuredInitial
 
 _WORDS = (
     "auto break case char const continue default do double else enum extern float for goto if "
     "inline int long register restrict return short signed sizeof static struct switch typedef "
     "union unsigned void volatile while _Bool _Complex _Imaginary asm main errno "
-    "sin cos tan exp log sqrt fabs pow tanh atan floor ceil fmin fmax isnan isfinite NAN INFINITY "
-    "HUGE_VAL NULL size_t malloc free sign least greatest between held sample past lately n t p "
+    "pow floor ceil fmin fmax isnan isfinite NAN INFINITY HUGE_VAL NULL size_t malloc free "
+    "between held sample past lately n t p "
     "step steps i part stage slope work points grid ratio ramp half averaged sample_time "
     "dt h k now y0 y1 yn j0 j1 jn gamma signgam unix linux i386 EOF stdin stdout stderr assert "
     "BUFSIZ RAND_MAX"
@@ -37,7 +38,7 @@ def c_source(identified: Identified) -> str:
         If a value is missing.
     """
     language = CLanguage()
-    names = Identifiers(_WORDS.split())
+    names = Identifiers([*_WORDS.split(), *(one.c for one in FUNCTIONS.values())])
     stem = names.of(identified.model.name)
     for suffix in ("parameters", "identified", "simulate"):
         names.of(f"{stem}_{suffix}")

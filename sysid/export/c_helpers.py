@@ -4,13 +4,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from sysid.control.linear_form import Identified, variants_of
-from sysid.export.expressions import ATOM, WIDTHS, Language
-
-_FUNCTIONS = {
-    "sin": "sin", "cos": "cos", "tan": "tan", "exp": "exp", "log": "log", "sqrt": "sqrt",
-    "abs": "fabs", "sign": "sign", "min": "least", "max": "greatest", "tanh": "tanh",
-    "atan": "atan",
-}  # fmt: skip
+from sysid.export.expressions import WIDTHS, Language
+from sysid.language.functions import FUNCTIONS, Level
 
 
 @dataclass(slots=True)
@@ -26,12 +21,13 @@ class CLanguage(Language):
 
     def function(self, name: str, arguments: list[str]) -> str:
         """A call of a function of the model language."""
-        self.called.add(_FUNCTIONS[name])
-        return f"{_FUNCTIONS[name]}({', '.join(arguments)})"
+        function = FUNCTIONS[name].c
+        self.called.add(function)
+        return f"{function}({', '.join(arguments)})"
 
     def power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
         """A power and its level."""
-        return f"pow({base}, {exponent})", ATOM
+        return f"pow({base}, {exponent})", Level.ATOM
 
     def choice(self, condition: str, first: str, second: str) -> str:
         """``where``, to stand anywhere."""

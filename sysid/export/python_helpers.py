@@ -3,13 +3,8 @@
 from collections.abc import Iterable, Mapping
 
 from sysid.control.linear_form import Identified, variants_of
-from sysid.export.expressions import ATOM, WIDTHS, Language
-
-_FUNCTIONS = {
-    "sin": "np.sin", "cos": "np.cos", "tan": "np.tan", "exp": "np.exp", "log": "np.log",
-    "sqrt": "np.sqrt", "abs": "np.abs", "sign": "np.sign", "min": "np.minimum",
-    "max": "np.maximum", "tanh": "np.tanh", "atan": "np.arctan",
-}  # fmt: skip
+from sysid.export.expressions import WIDTHS, Language
+from sysid.language.functions import FUNCTIONS, Level
 
 
 class PythonLanguage(Language):
@@ -23,13 +18,13 @@ class PythonLanguage(Language):
 
     def function(self, name: str, arguments: list[str]) -> str:
         """A call of a function of the model language."""
-        return f"{_FUNCTIONS[name]}({', '.join(arguments)})"
+        return f"np.{FUNCTIONS[name].numpy}({', '.join(arguments)})"
 
     def power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
         """A power and its level."""
         if whole is not None:
-            return f"{base}**{whole}", ATOM - 1
-        return f"np.power({base}, {exponent})", ATOM
+            return f"{base}**{whole}", Level.ATOM - 1
+        return f"np.power({base}, {exponent})", Level.ATOM
 
     def choice(self, condition: str, first: str, second: str) -> str:
         """``where``, to stand anywhere."""

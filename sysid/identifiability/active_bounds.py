@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.types import BoolArray, FloatArray
-from sysid.language.intervals import Interval
+from sysid.core.types import BoolArray, FloatArray, Interval
 from sysid.models.parameters import Parameter
 from sysid.simulation.scaling import AT_BOUND
 

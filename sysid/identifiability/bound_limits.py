@@ -8,7 +8,8 @@ constant does.
 from collections.abc import Callable, Iterator, Mapping
 from math import inf
 
-from sysid.language.intervals import Interval, bounds
+from sysid.core.types import Interval
+from sysid.language.intervals import bounds
 from sysid.language.tree import Binary, Call, Expression, Number, Past, walk
 from sysid.models.delays import longest_lag, past_signals
 from sysid.models.parameters import Parameter

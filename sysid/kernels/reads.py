@@ -6,6 +6,7 @@ Runge-Kutta step lie at 0, 1 and 2; the sample that a difference equation comput
 
 from typing import NamedTuple
 
+from sysid.core.memo import cache_by_identity
 from sysid.language.delays import mentions_time, past_values
 from sysid.language.tree import Past
 from sysid.models.model import Model
@@ -21,10 +22,6 @@ class Read(NamedTuple):
 
     past: Past
     halves: int
-
-
-_KEPT = 64
-_reads: dict[int, tuple[Model, tuple[Read, ...]]] = {}  # by identity: a model's hash is a long walk
 
 
 def is_difference(model: Model) -> bool:
@@ -48,17 +45,9 @@ def state_place(model: Model, stage: int, equation: int, state: int) -> int:
     return 2 if semi_implicit and state < equation else stage
 
 
+@cache_by_identity  # every run asks
 def reads(model: Model) -> tuple[Read, ...]:
-    """Every past value that the equations and the outputs read; kept, since every run asks."""
-    known = _reads.get(id(model))
-    if known is None or known[0] is not model:
-        if len(_reads) >= _KEPT:
-            _reads.clear()
-        known = _reads[id(model)] = (model, tuple(_found(model)))
-    return known[1]
-
-
-def _found(model: Model) -> list[Read]:
+    """Every past value that the equations and the outputs read."""
     numbers = {state.name: i for i, state in enumerate(model.states)}
     found: list[Read] = []
     for i, equation in enumerate(model.equations):
@@ -69,7 +58,7 @@ def _found(model: Model) -> list[Read]:
                 found.append(Read(past, at - 2 * past.offset))
     for output in model.outputs:
         found += [Read(past, -2 * past.offset) for past in past_values(output.expression)]
-    return found
+    return tuple(found)
 
 
 def lags(model: Model, kind: str) -> list[Past]:

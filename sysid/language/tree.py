@@ -61,21 +61,21 @@ class Unary:
 
 @dataclass(frozen=True, slots=True)
 class Binary:
-    """Arithmetic, comparison or logic of two operands; logic and comparisons only in `where`."""
+    """An operator of the table (`sysid.language.functions`) between two operands.
 
-    operator: Literal["+", "-", "*", "/", "**", "<", "<=", ">", ">=", "==", "!=", "and", "or"]
+    Comparison and logic stand only in the condition of `where`.
+    """
+
+    operator: str
     left: "Expression"
     right: "Expression"
 
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A function of the grammar; ``where(condition, a, b)`` has three arguments."""
+    """A function of the table (`sysid.language.functions`) of its arguments."""
 
-    function: Literal[
-        "sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "min", "max",
-        "where", "tanh", "atan",
-    ]  # fmt: skip
+    function: str
     arguments: "tuple[Expression, ...]"
 
 

@@ -6,8 +6,9 @@ What a request gives without any effect: refused, since it is a mistake more oft
 from collections.abc import Mapping, Sequence
 
 from sysid.core.errors import Fault, InvalidSettings, RecordTooShort
+from sysid.core.types import Interval
 from sysid.language.delays import past_values
-from sysid.language.intervals import Interval, bounds
+from sysid.language.intervals import bounds
 from sysid.language.printer import text
 from sysid.language.tree import Past
 from sysid.models.model import Model, initial_parameters
