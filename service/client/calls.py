@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeAlias, TypedDict
 from uuid import uuid4
 
+from sysid.core.errors import join_pointer
+
 if TYPE_CHECKING:
     import httpx
 
@@ -125,8 +127,7 @@ def _check_finite(pointer: str, value: Any) -> None:
         raise NotFinite(pointer, value)
     if isinstance(value, Mapping):
         for name, one in value.items():
-            part = str(name).replace("~", "~0").replace("/", "~1")
-            _check_finite(f"{pointer}/{part}", one)
+            _check_finite(pointer + join_pointer(str(name)), one)
     elif isinstance(value, list | tuple):
         for index, one in enumerate(value):
             _check_finite(f"{pointer}/{index}", one)

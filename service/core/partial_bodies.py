@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from service.core.errors import FieldError
+from sysid.core.errors import split_pointer
 
 Whole = TypeVar("Whole", bound=BaseModel)
 
@@ -68,7 +69,7 @@ def _without(body: dict[str, Any], pointers: Iterable[str]) -> dict[str, Any]:
     for pointer in pointers:
         here: Any = rest
         last: tuple[dict[str, Any], str] | None = None
-        for part in (one.replace("~1", "/").replace("~0", "~") for one in pointer.split("/")[1:]):
+        for part in split_pointer(pointer):
             if not isinstance(here, dict):
                 break
             if part not in here:  # a field that is missing: what should hold it goes

@@ -15,6 +15,7 @@ from service.repositories.runs import RunRepository
 from service.runs.schemas import ComparedParameter, ComparedRun, ComparedValue, ComparisonOut
 from service.storage.errors import NotFound
 from service.storage.tables import Job, Run
+from sysid.core.units import format_unit
 from sysid.models.model import Model
 
 Document = Mapping[str, Any]
@@ -202,7 +203,7 @@ def _has_ends(interval: Sequence[float | None] | None) -> bool:
 def _note(
     name: str, unit: str, pair: Sequence[tuple[str, Document]], *, same_model: bool
 ) -> str:  # fmt: skip
-    symbol = "" if unit == "1" else f" {unit}"
+    symbol = format_unit(unit)
     told = ", ".join(f"{_plus_minus(estimate)}{symbol} with {title}" for title, estimate in pair)
     return f"{name} depends on the {'run' if same_model else 'model'}: {told}"
 
