@@ -79,15 +79,6 @@ class Identified:
         return self.holds.get(signal, "first")
 
 
-def variants_of(identified: Identified) -> Mapping[str, str]:
-    """Which helpers of a program are written in another way, by the solver of its model."""
-    solver = identified.model.solver
-    found = {"past": "past cubic"} if solver.interpolation == "cubic" else {}
-    if identified.model.form == "differential" and solver.step is not None:
-        found["held"] = "held on grid"  # its points need not meet the jumps
-    return found
-
-
 class NotLinear(SysidError, ValueError):
     """A model has no transfer function; the message says which term is in the way."""
 

@@ -43,6 +43,18 @@ class Language(Protocol):
     def real(self, index: str) -> str:
         """A whole number as floating-point number."""
 
+    def lag(self, text: str, *, is_whole: bool) -> str:
+        """A lag that is not negative; `is_whole`: of the nearest whole number of steps."""
+
+    def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
+        """First line of a loop over the steps from `first` on, the last one too if asked for."""
+
+    def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:
+        """An assignment, on as many lines as it needs; `is_new`: of a name that it declares."""
+
+    def close_loop(self) -> list[str]:
+        """What ends a loop."""
+
 
 class Scope(Protocol):
     """What names stand for at one place of the program; the texts are to stand anywhere."""
