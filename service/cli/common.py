@@ -18,6 +18,7 @@ from rich.table import Table
 
 from service.client.calls import DEFAULT_URL, NotFinite, ProblemError
 from service.core.errors import FieldError
+from sysid.core.errors import join_pointer, split_pointer
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -205,7 +206,7 @@ class Places:
 
     def _typed(self, found: re.Match[str]) -> str:
         part, name, value = found.groups()
-        place = self.of(f"/{part}/{name.replace('~', '~0').replace('/', '~1')}")
+        place = self.of(join_pointer(part, name))
         return f"{place}{'=' if place.startswith('--set ') else ' '}{value}"
 
     def _one(self, fault: FieldError) -> str:
@@ -247,7 +248,7 @@ def _upwards(pointer: str) -> Iterator[str]:
 
 
 def _written(option: str, below: str, *, is_whole: bool = False) -> str:
-    parts = [one.replace("~1", "/").replace("~0", "~") for one in below.split("/")[1:]]
+    parts = split_pointer(below)
     if option.endswith("…"):
         return option.replace(" …", f": {below}" if below else "")
     name = ".".join(parts) if is_whole else "".join(parts[:1])

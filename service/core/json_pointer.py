@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from copy import copy
 from typing import Any
 
+from sysid.core.errors import split_pointer
+
 
 def body_of(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Body of one run: the job's normal form with the cell's values put in.
@@ -12,7 +14,7 @@ def body_of(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str,
     """
     body = {name: value for name, value in document.items() if name != "sweep"}
     for path, value in values.items():
-        *parents, last = _parts(path)
+        *parents, last = split_pointer(path)
         here: Any = body
         for part in parents:
             place: Any = int(part) if isinstance(here, list) else part
@@ -29,10 +31,6 @@ def body_of(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str,
 def value_at(document: Mapping[str, Any], path: str) -> Any:
     """The value of a field that is there."""
     here: Any = document
-    for part in _parts(path):
+    for part in split_pointer(path):
         here = here[int(part)] if isinstance(here, list) else here[part]
     return here
-
-
-def _parts(path: str) -> list[str]:
-    return [part.replace("~1", "/").replace("~0", "~") for part in path.split("/")[1:]]

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pydantic_core.core_schema import ErrorType
 
 from service.core.errors import FieldError
-from sysid.core.errors import nearest
+from sysid.core.errors import join_pointer, nearest
 
 SHOWN = 80
 NOT_AN_OBJECT = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
@@ -159,15 +159,15 @@ def pointer_into(body: Any, loc: Location, *, is_missing: bool = False) -> str:
 
     `is_missing`: the last part is not in the body, and should be.
     """
-    parts: list[str] = []
+    parts: list[str | int] = []
     here = body
     for position, part in enumerate(loc):
         if _is_in(here, part):
             here = here[part]
-            parts.append(escaped(part))
+            parts.append(part)
         elif is_missing and position == len(loc) - 1:
-            parts.append(escaped(part))
-    return "".join(f"/{part}" for part in parts)
+            parts.append(part)
+    return join_pointer(*parts)
 
 
 def body_type(endpoint: Callable[..., Any] | None) -> Any:
@@ -196,11 +196,6 @@ def places_of(kind: Any, name: str | int, above: str = "") -> list[str]:
             if get_origin(field.annotation) not in (dict, list):
                 found += places_of(field.annotation, name, f"{above}/{own}")
     return sorted(dict.fromkeys(found), key=lambda place: place.count("/"))
-
-
-def escaped(part: str | int) -> str:
-    """One part of a JSON pointer (RFC 6901)."""
-    return str(part).replace("~", "~0").replace("/", "~1")
 
 
 def _is_in(value: Any, part: str | int) -> bool:

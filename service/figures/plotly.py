@@ -14,6 +14,7 @@ import numpy as np
 from service.figures import formats, theme
 from service.figures.data import Floats, Improvement, RunEvidence, SoughtParameter
 from service.figures.theme import strided
+from sysid.core.units import format_unit
 
 Figure = dict[str, Any]
 Abscissa = Literal["generations", "evaluations"]
@@ -329,7 +330,7 @@ def _level(y: float, axis: str) -> dict[str, Any]:
 
 
 def _caption(parameter: SoughtParameter) -> str:
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    unit = format_unit(parameter.unit)
     if parameter.value is None:
         return f"<b>{parameter.name}</b>{f' [{parameter.unit}]' if unit else ''}"
     value, error = formats.estimate(parameter.value, parameter.stderr)

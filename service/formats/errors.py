@@ -6,6 +6,7 @@
 """
 
 from service.core.errors import FieldError, InvalidRequest
+from sysid.core.errors import join_pointer
 
 
 class InvalidUpload(InvalidRequest, ValueError):
@@ -52,5 +53,5 @@ def _pointer(row: int | None, column: str | None, byte: int | None) -> str:
     if byte is not None:
         return f"/bytes/{byte}"
     parts = [] if row is None else ["rows", str(row)]
-    parts += [] if column is None else [column.replace("~", "~0").replace("/", "~1")]
-    return "".join(f"/{part}" for part in parts)
+    parts += [] if column is None else [column]
+    return join_pointer(*parts)

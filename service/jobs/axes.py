@@ -6,9 +6,8 @@ from math import exp, log, prod
 from typing import Any
 
 from service.core.errors import FieldError, InvalidRequest
-from service.core.json_pointer import _parts
 from service.jobs.schemas import Axis, JobIn
-from sysid.core.errors import nearest
+from sysid.core.errors import nearest, split_pointer
 
 # Fields that decide on the job as a whole; a cell of it cannot have its own.
 FIXED_FIELDS = ("name", "priority", "reuse", "sweep", "trend")
@@ -203,7 +202,7 @@ def _bad_spacing(axis: Axis) -> str | None:
 
 def _unknown_path(document: Mapping[str, Any], path: str) -> str | None:
     """Why a path is not a field of the body, or None."""
-    parts = _parts(path)
+    parts = split_pointer(path)
     if parts[0] in FIXED_FIELDS:
         return f"{path!r} cannot be swept"
     if parts[0] in ("channels", "weights") and len(parts) == 2:

@@ -11,6 +11,7 @@ from service.jobs.results import is_free, read_noise_model
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import ComparedParameter, ComparedRun, ComparedValue, ComparisonOut
 from service.storage.errors import NotFound
+from sysid.core.units import format_unit
 
 Document = Mapping[str, Any]
 
@@ -174,7 +175,7 @@ def _has_ends(interval: Sequence[float | None] | None) -> bool:
 def _note(
     name: str, unit: str, pair: Sequence[tuple[str, Document]], *, same_model: bool
 ) -> str:  # fmt: skip
-    symbol = "" if unit == "1" else f" {unit}"
+    symbol = format_unit(unit)
     told = ", ".join(f"{_plus_minus(estimate)}{symbol} with {title}" for title, estimate in pair)
     return f"{name} depends on the {'run' if same_model else 'model'}: {told}"
 

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from service.jobs.results import read_noise_model
 from service.repositories.trends import TrendRow
 from service.trends.points import Quantity
+from sysid.core.units import format_unit
 from sysid.trends.trend import Place, Trend
 
 REAL_SCATTER = 1.5  # Birge ratios below that happen by chance in small batches
@@ -93,7 +94,7 @@ def _used(one: Quantity) -> list[float]:
 def _against_bounds(one: Quantity, at: Place) -> Iterator[str]:
     """Predictions that no run could have given, or that lack part of their interval."""
     lower, upper = one.bounds
-    unit = "" if one.unit in ("", "1") else f" {one.unit}"
+    unit = format_unit(one.unit)
     limits = f"{lower:g} to {upper:g}{unit}" if upper < float("inf") else f"{lower:g}{unit} or more"
     if not lower <= at.value <= upper and at.value == at.value:
         yield (

@@ -14,7 +14,7 @@ from sysid.kernels.reads import is_difference
 from sysid.language.evaluation import value as number_of
 from sysid.language.printer import text
 from sysid.language.transform import substitute
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary, walk
 from sysid.models.model import Model
 
 
@@ -77,15 +77,6 @@ class Identified:
     def hold(self, signal: str) -> Hold:
         """How an input was held between its samples."""
         return self.holds.get(signal, "first")
-
-
-def variants_of(identified: Identified) -> Mapping[str, str]:
-    """Which helpers of a program are written in another way, by the solver of its model."""
-    solver = identified.model.solver
-    found = {"past": "past cubic"} if solver.interpolation == "cubic" else {}
-    if identified.model.form == "differential" and solver.step is not None:
-        found["held"] = "held on grid"  # its points need not meet the jumps
-    return found
 
 
 class NotLinear(SysidError, ValueError):
@@ -217,17 +208,14 @@ class _Reader:
         return self.affine(left).times(1.0 / divisor)
 
     def _has_signals(self, tree: Expression) -> bool:
-        match tree:
-            case Past():
-                return True
-            case Symbol(name, "time" | "index"):
-                raise NotLinear(f"{self.where} changes with {name}, so it has no transfer function")
-            case Unary(_, operand):
-                return self._has_signals(operand)
-            case Binary(_, left, right):
-                return self._has_signals(left) or self._has_signals(right)
-            case Call(_, arguments):
-                return any(self._has_signals(one) for one in arguments)
+        for node in walk(tree):
+            match node:
+                case Past():
+                    return True
+                case Symbol(name, "time" | "index"):
+                    raise NotLinear(
+                        f"{self.where} changes with {name}, so it has no transfer function"
+                    )
         return False
 
     def _refusal(self, tree: Expression) -> NotLinear:

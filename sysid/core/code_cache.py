@@ -10,6 +10,7 @@ import logging
 import os
 import re
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -24,6 +25,21 @@ _OURS = re.compile(r"[0-9a-f]{64}\.(o|loop)")
 _ADVICE = "set LAGID_CACHE_DIR to a folder that this user alone can write to"
 _log = logging.getLogger(__name__)
 _told: list[str] = []
+
+
+def digest_files(paths: Iterable[Path], root: Path) -> str:
+    """SHA-256 of some files below `root`: of their places there and of what they hold.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(paths):
+        digest.update(str(path.relative_to(root)).encode())
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def cache_folder() -> Path:

@@ -130,3 +130,13 @@ def nearest(name: str, known: Iterable[str]) -> str:
     left = len(names) - _MOST_NAMES
     more = f", and {left} more" if left > 0 else ""
     return f"; known are {', '.join(names[:_MOST_NAMES])}{more}" if names else ""
+
+
+def join_pointer(*parts: str | int) -> str:
+    """JSON pointer (RFC 6901) of nested fields and entries of lists."""
+    return "".join("/" + str(part).replace("~", "~0").replace("/", "~1") for part in parts)
+
+
+def split_pointer(pointer: str) -> list[str]:
+    """The parts that `join_pointer` joined, as text."""
+    return [part.replace("~1", "/").replace("~0", "~") for part in pointer.split("/")[1:]]

@@ -21,7 +21,7 @@ import llvmlite
 import numba
 import numpy as np
 
-from sysid.core.code_cache import store, stored, tell
+from sysid.core.code_cache import digest_files, store, stored, tell
 
 _SOURCES = (
     "search/*.py", "islands/*.py", "kernels/*.py", "plants/*.py", "simulation/*.py",
@@ -38,12 +38,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 def _digest_of_sources() -> str:
     package = Path(__file__).parents[1]
-    digest = sha256()
-    for pattern in _SOURCES:
-        for source in sorted(package.glob(pattern)):
-            digest.update(source.name.encode())
-            digest.update(source.read_bytes())
-    return digest.hexdigest()
+    return digest_files((f for pattern in _SOURCES for f in package.glob(pattern)), package)
 
 
 # Read before any module with a compiled function is loaded, all of which load this one first.
@@ -59,7 +54,7 @@ def fingerprint() -> str:
 def _digest_of(source: str) -> str | None:
     """Digest of a file, None if there is none."""
     try:
-        return sha256(Path(source).read_bytes()).hexdigest()
+        return digest_files([Path(source)], Path(source).parent)
     except OSError:
         return None
 

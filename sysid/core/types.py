@@ -16,4 +16,7 @@ IntArray: TypeAlias = NDArray[np.int64]
 WordArray: TypeAlias = NDArray[np.uint32]
 """Chromosomes: one unsigned word per free parameter, of which `bits` bits are used."""
 
+Interval: TypeAlias = tuple[float, float]
+"""Lower and upper end."""
+
 RANK = 1e-7  # of the largest singular value: below, the differences are rounding

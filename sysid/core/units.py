@@ -149,6 +149,11 @@ def is_blank(unit: str | None) -> bool:
     return unit is None or unit.strip() in _BLANK
 
 
+def format_unit(unit: str) -> str:
+    """A unit as it stands behind a number; nothing where there is none."""
+    return "" if unit in ("", "1") else f" {unit}"
+
+
 def is_read(unit: str) -> bool:
     """Whether it is known what a unit means."""
     return _read(unit) is not None

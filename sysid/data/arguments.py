@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from math import isfinite
 from typing import Any, NoReturn, TypeVar
 
-from sysid.core.errors import InvalidSettings, nearest
+from sysid.core.errors import InvalidSettings, join_pointer, nearest
 
 Word = TypeVar("Word", bound=str)
 
@@ -26,8 +26,8 @@ class Arguments:
 
     def fail(self, name: str, detail: str) -> NoReturn:
         """Raise the error of one argument (of the step itself if the name is empty)."""
-        escaped = name.replace("~", "~0").replace("/", "~1")
-        raise InvalidSettings(f"{self.pointer}/{escaped}" if name else self.pointer, detail)
+        place = self.pointer + (join_pointer(name) if name else "")
+        raise InvalidSettings(place, detail)
 
     def only(self, *names: str) -> None:
         """Refuse every argument but these."""

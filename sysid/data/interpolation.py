@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.core.errors import InvalidRecord
 from sysid.core.types import FloatArray
-from sysid.data.records import Channel, History, known_history
+from sysid.data.records import Channel, History, known_history, sampling_of
 
 DENSE = 8
 """Fine points in a sampling period where the signal between samples is not a straight line."""
@@ -173,8 +173,8 @@ def _band_limited(channel: Channel, times: FloatArray) -> FloatArray:
     from scipy.interpolate import CubicSpline
     from scipy.signal import upfirdn
 
-    period = (channel.times[-1] - channel.times[0]) / (channel.times.size - 1)
-    if not _is_regular(channel.times, period):
+    sampling = sampling_of(channel.times, within=_OFF_PERIOD)
+    if not sampling.is_regular:
         raise InvalidRecord(
             f"input {channel.name!r} is to be band-limited between its samples, but they are not "
             "regular; use hold 'first' or resample it"
@@ -186,16 +186,9 @@ def _band_limited(channel: Channel, times: FloatArray) -> FloatArray:
     dense = upfirdn(kernel, extended, up=DENSE)[_HALF_WIDTH * DENSE :]
     first = (margin - 1) * DENSE
     dense = dense[first : first + (values.size + 1) * DENSE + 1]
-    places = (np.arange(dense.size) / DENSE - 1.0) * period + channel.times[0]
+    places = (np.arange(dense.size) / DENSE - 1.0) * sampling.period + channel.times[0]
     inside = np.clip(times, channel.times[0], channel.times[-1])
     if dense.size == 0:
         return np.interp(times, channel.times, values)
     found: FloatArray = CubicSpline(places, dense)(inside)
     return found
-
-
-def _is_regular(times: FloatArray, period: float) -> bool:
-    return bool(
-        period > 0
-        and np.max(np.abs(times - times[0] - period * np.arange(times.size))) < _OFF_PERIOD * period
-    )

@@ -13,7 +13,7 @@ Hold = Literal["zero", "first", "band-limited"]
 HOLDS: tuple[Hold, ...] = get_args(Hold)
 
 REGULAR_WITHIN = 1e-2
-"""Times are regular when none is further than this part of a period from its place.
+"""Part of a period by which times may be off their places and still be regular.
 
 Files print times with few digits: 610.35 Hz to 10 µs is off by 0.3 % of a period.
 """
@@ -36,13 +36,13 @@ class Sampling(NamedTuple):
         return f"{self.samples} samples, {kind} {self.period:.6g} s"
 
 
-def sampling_of(times: FloatArray) -> Sampling:
-    """How times (s) are spaced."""
+def sampling_of(times: FloatArray, within: float = REGULAR_WITHIN) -> Sampling:
+    """How times (s) are spaced; regular: each within that part of a period from its place."""
     if times.size < 2:
         return Sampling(times.size, float("nan"), is_regular=False)
     period = float(times[-1] - times[0]) / (times.size - 1)
     grid = times[0] + period * np.arange(times.size)
-    if period > 0 and float(np.max(np.abs(times - grid))) <= REGULAR_WITHIN * period:
+    if period > 0 and float(np.max(np.abs(times - grid))) <= within * period:
         return Sampling(times.size, period, is_regular=True)
     return Sampling(times.size, float(np.median(np.diff(times))), is_regular=False)
 

@@ -1,27 +1,103 @@
 """Export as self-contained C99: parameters in a struct, one function that simulates."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from sysid.control.linear_form import Identified
-from sysid.export.c_helpers import HELPERS, CLanguage, with_needed
 from sysid.export.description import facts, unit_text, value_lines, wrapped
-from sysid.export.expressions import number, source
+from sysid.export.expressions import WIDTHS, Language, number, source
 from sysid.export.identifiers import Identifiers, in_c_comment
-from sysid.export.program import Kind, Place, Program, lag_steps
+from sysid.export.program import (
+    Place,
+    Program,
+    equation,
+    indented,
+    lag_steps,
+    needed_helpers,
+    time_loop,
+)
+from sysid.language.functions import FUNCTIONS, Level
 from sysid.models.model import MeasuredInitial
 
 _WORDS = (
     "auto break case char const continue default do double else enum extern float for goto if "
     "inline int long register restrict return short signed sizeof static struct switch typedef "
     "union unsigned void volatile while _Bool _Complex _Imaginary asm main errno "
-    "sin cos tan exp log sqrt fabs pow tanh atan floor ceil fmin fmax isnan isfinite NAN INFINITY "
-    "HUGE_VAL NULL size_t malloc free sign least greatest between held sample past lately n t p "
+    "pow floor ceil fmin fmax isnan isfinite NAN INFINITY HUGE_VAL NULL size_t malloc free "
+    "between held sample past lately n t p "
     "step steps i part stage slope work points grid ratio ramp half averaged sample_time "
     "dt h k now y0 y1 yn j0 j1 jn gamma signgam unix linux i386 EOF stdin stdout stderr assert "
     "BUFSIZ RAND_MAX"
 )
 _WIDTH = 92
+
+
+@dataclass(slots=True)
+class CLanguage(Language):
+    """C99 with the functions of math.h; `called` gathers what math.h does not have."""
+
+    called: set[str] = field(default_factory=set)
+    words: Mapping[str, str] = field(default_factory=lambda: {"and": "&&", "or": "||"})
+
+    def negation(self, condition: str) -> str:
+        """``not (…)``, to stand anywhere."""
+        return f"!({condition})"
+
+    def function(self, name: str, arguments: list[str]) -> str:
+        """A call of a function of the model language."""
+        function = FUNCTIONS[name].c
+        self.called.add(function)
+        return f"{function}({', '.join(arguments)})"
+
+    def power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
+        """A power and its level."""
+        return f"pow({base}, {exponent})", Level.ATOM
+
+    def choice(self, condition: str, first: str, second: str) -> str:
+        """``where``, to stand anywhere."""
+        return f"({condition} ? {first} : {second})"
+
+    def quotient(self, above: str) -> str:
+        """A dividend of numbers only: it needs nothing here."""
+        return above
+
+    def element(self, array: str, index: str, divisor: int) -> str:
+        """Array at the whole part of index / divisor."""
+        if divisor == 1:
+            return f"{array}[{index}]"
+        return f"{array}[{f'({index})' if '-' in index else index}/{divisor}]"
+
+    def read(self, helper: str, signal: str, place: str) -> str:
+        """A call of ``between``, ``held`` or ``averaged``."""
+        return f"{helper}({signal}, n, {place}{WIDTHS[helper]})"
+
+    def limited(self, value: str, least: int, most: int) -> str:
+        """A number held between two others."""
+        return f"fmin(fmax({value}, {least}.0), {most}.0)"
+
+    def real(self, index: str) -> str:
+        """A whole number as floating-point number."""
+        return f"(double){index}"
+
+    def lag(self, text: str, *, is_whole: bool) -> str:
+        """A lag that is not negative."""
+        least = f"fmax({text}, 0.0)"
+        return f"floor({least} + 0.5)" if is_whole else least
+
+    def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
+        """First line of a loop over the steps."""
+        return (
+            f"for (long {index} = {first}; {index} {'<=' if to_last else '<'} steps; ++{index}) {{"
+        )
+
+    def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:
+        """An assignment."""
+        return _statement(f"const double {name} = " if is_new else f"{name} = ", text)
+
+    def close_loop(self) -> list[str]:
+        """The brace that ends a loop."""
+        return ["}"]
 
 
 def c_source(identified: Identified) -> str:
@@ -37,19 +113,19 @@ def c_source(identified: Identified) -> str:
         If a value is missing.
     """
     language = CLanguage()
-    names = Identifiers(_WORDS.split())
+    names = Identifiers([*_WORDS.split(), *(one.c for one in FUNCTIONS.values())])
     stem = names.of(identified.model.name)
     for suffix in ("parameters", "identified", "simulate"):
         names.of(f"{stem}_{suffix}")
     program = Program(identified, language, names, prefix="p->")
-    loop = [*_loop(program), *_outputs(program)]
+    loop = [*time_loop(program, _runge_kutta), *_outputs(program)]
     body = [*_checks(program), *_steps(program), *_lags(program), *_states(program), *loop,
             "free(work);", "return 0;"]  # fmt: skip
-    helpers = with_needed(program.helpers | language.called, identified)
+    helpers = needed_helpers(HELPERS, program.helpers | language.called, identified)
     parts = [
         _header(identified, stem), "#include <math.h>\n#include <stdlib.h>\n",
-        _struct(program, stem), _defaults(program, stem), *(HELPERS[name] for name in helpers),
-        _about_simulate(program), _signature(program, stem), "{", *_indented(body), "}",
+        _struct(program, stem), _defaults(program, stem), *helpers,
+        _about_simulate(program), _signature(program, stem), "{", *indented(body), "}",
     ]  # fmt: skip
     return "\n".join(parts) + "\n"
 
@@ -158,10 +234,7 @@ def _steps(program: Program) -> list[str]:
 def _lags(program: Program) -> list[str]:
     lines = []
     for lag, name in program.lags.items():
-        text = f"fmax({lag_steps(program, lag)}, 0.0)"
-        if program.identified.model.solver.interpolation == "nearest":
-            text = f"floor({text} + 0.5)"
-        lines += [f"const double {name} = {text}; /* integration steps */",
+        lines += [f"const double {name} = {lag_steps(program, lag)}; /* integration steps */",
                   f"if (!({name} < 1e9))", "    return 1;"]  # fmt: skip
     return lines
 
@@ -182,43 +255,6 @@ def _states(program: Program) -> list[str]:
 
 
 # ---- the time loop --------------------------------------------------------------------------
-def _loop(program: Program) -> list[str]:
-    if program.is_recursion:
-        return _recursion(program)
-    if program.identified.model.solver.method == "rk4":
-        return _runge_kutta(program)
-    return _euler(program)
-
-
-def _equation(program: Program, kind: Kind, number_: int, floor: int = 0) -> str:
-    tree = program.identified.model.equations[number_]
-    return source(tree, program.language, Place(program, kind, number_), floor)
-
-
-def _recursion(program: Program) -> list[str]:
-    model = program.identified.model
-    lines = [f"for (long k = {program.memory}; k <= steps; ++k) {{"]
-    for i in model.order:
-        name = model.states[i].name
-        now = program.now[name]
-        lines += _indented(_statement(f"const double {now} = ", _equation(program, "recursion", i)))
-        lines.append(f"    {program.every[name]}[k] = {now};")
-    return [*lines, "}"]
-
-
-def _euler(program: Program) -> list[str]:
-    model = program.identified.model
-    lines = ["for (long step = 0; step < steps; ++step) {"]
-    for i, state in enumerate(model.states):
-        text = f"{program.every[state.name]}[step] + dt*{_equation(program, 'update', i, 6)}"
-        lines += _indented(_statement(f"const double {program.following[state.name]} = ", text))
-    lines += [
-        f"    {program.every[s.name]}[step + 1] = {program.following[s.name]};"
-        for s in model.states
-    ]
-    return [*lines, "}"]
-
-
 def _runge_kutta(program: Program) -> list[str]:
     """The four stages as a loop: each begins where the slope of the one before it leads."""
     states = program.identified.model.states
@@ -234,12 +270,12 @@ def _runge_kutta(program: Program) -> list[str]:
         lines.append(f"        const double {now} = {moved};")
     lines += [f"        (void){program.now[state.name]};" for state in states]
     for i in range(len(states)):
-        lines += _indented(_statement(f"slope[stage][{i}] = ", _equation(program, "slope", i)), 2)
+        lines += indented(_statement(f"slope[stage][{i}] = ", equation(program, "slope", i)), 2)
     lines.append("    }")
     for i, state in enumerate(states):
         every = program.every[state.name]
         mean = f"slope[0][{i}] + 2.0*slope[1][{i}] + 2.0*slope[2][{i}] + slope[3][{i}]"
-        lines += _indented(_statement(f"{every}[step + 1] = ", f"{every}[step] + dt/6.0*({mean})"))
+        lines += indented(_statement(f"{every}[step + 1] = ", f"{every}[step] + dt/6.0*({mean})"))
     return [*lines, "}"]
 
 
@@ -252,7 +288,7 @@ def _outputs(program: Program) -> list[str]:
              f"    (void){program.index};"]  # fmt: skip
     for output in model.outputs:
         text = source(output.expression, program.language, Place(program, "output"))
-        lines += _indented(_statement(f"{program.outputs[output.name]}[i] = ", text))
+        lines += indented(_statement(f"{program.outputs[output.name]}[i] = ", text))
     return [*lines, "}"]
 
 
@@ -270,7 +306,7 @@ def _outputs_between(program: Program) -> list[str]:
             "    if (grid == NULL) {", "        free(work);", "        return 2;", "    }",
             "    for (long i = 0; i <= points; ++i) {",
             f"        const long step = i*{program.substeps};", "        (void)step;",
-            *_indented(_statement("grid[i] = ", text), 2), "    }",
+            *indented(_statement("grid[i] = ", text), 2), "    }",
             "    for (long i = 0; i < n; ++i)",
             f"        {name}[i] = between(grid, points + 1, (t[i] - t[0])/{own});",
             "    free(grid);", "}",
@@ -287,5 +323,122 @@ def _statement(before: str, text: str) -> list[str]:
     return [before.rstrip(), *(f"    {line}" for line in lines[:-1]), f"    {lines[-1]};"]
 
 
-def _indented(lines: Sequence[str], levels: int = 1) -> list[str]:
-    return [textwrap.indent(line, "    " * levels) for line in lines]
+# ---- functions that a program calls -----------------------------------------------------------
+_BETWEEN = """\
+/* Signal at a place in samples, on a line between them; its end values outside. */
+static double between(const double *signal, long n, double place)
+{
+    const double inside = fmin(fmax(place, 0.0), (double)(n - 1));
+    const long i = (long)inside < n - 2 ? (long)inside : n - 2;
+    return signal[i] + (inside - (double)i)*(signal[i + 1] - signal[i]);
+}
+"""
+_HELD = """\
+/* Signal at a place in samples, held after each; a jump takes `ramp` to either side. */
+static double held(const double *signal, long n, double place, double ramp)
+{
+    const double inside = fmin(fmax(place, -1.0), (double)n);
+    const double nearest = floor(inside + 0.5);
+    const double part = fmin(fmax((inside - nearest + ramp)/(2*ramp), 0.0), 1.0);
+    const long i = (long)nearest;
+    const double after = signal[i < 0 ? 0 : i < n ? i : n - 1];
+    const double before = signal[i < 1 ? 0 : i <= n ? i - 1 : n - 1];
+    return before + part*(after - before);
+}
+"""
+_HELD_ON_GRID = """\
+/* Signal at a place in samples, held after each; on lines between points `ramp` apart. */
+static double held(const double *signal, long n, double place, double ramp)
+{
+    const double inside = fmin(fmax(place, -1.0), (double)n);
+    const double first = floor(inside/ramp), part = inside/ramp - first;
+    double value = 0.0;
+    for (int j = 0; j < 2; ++j)
+        for (int side = -1; side < 2; side += 2) { /* at a jump the mean of both sides */
+            const long k = (long)floor((first + j)*ramp + 1e-6*side);
+            value += 0.5*(j == 0 ? 1.0 - part : part)*signal[k < 0 ? 0 : k < n ? k : n - 1];
+        }
+    return value;
+}
+"""
+_AVERAGED = """\
+/* Mean of a held signal from `half` before a place, in samples, to `half` after it. */
+static double averaged(const double *signal, long n, double place, double half)
+{
+    const double inside = fmin(fmax(place, -1.0 - half), (double)n + half);
+    const double first = inside - half, last = inside + half;
+    double total = 0.0;
+    for (long k = (long)floor(first); (double)k < last; ++k) {
+        const double width = fmin((double)(k + 1), last) - fmax((double)k, first);
+        total += width*signal[k < 0 ? 0 : k < n ? k : n - 1];
+    }
+    return total/(2*half);
+}
+"""
+_SAMPLE = """\
+/* Value at a step that may lie before the start. */
+static double sample(const double *array, double before, long step)
+{
+    return step >= 0 ? array[step] : before;
+}
+"""
+_PAST = """\
+/* Value `lag` >= 0 steps before a finished step, on a line between two; `before` the start. */
+static double past(const double *array, double before, long step, double lag)
+{
+    const double whole = floor(-lag);
+    const double older = sample(array, before, step + (long)whole);
+    const double newer = sample(array, before, step + (long)fmin(whole + 1.0, 0.0));
+    return older + (-lag - whole)*(newer - older);
+}
+"""
+_PAST_CUBIC = """\
+/* Value `lag` >= 0 steps before a finished step, on a cubic through four (the last: three). */
+static double past(const double *array, double before, long step, double lag)
+{
+    const double whole = floor(-lag), part = -lag - whole;
+    const int last = whole <= -2.0 ? 2 : 1;
+    double value = 0.0;
+    for (int a = -1; a <= last; ++a) {
+        double weight = 1.0;
+        for (int b = -1; b <= last; ++b)
+            if (b != a)
+                weight *= (part - b)/(a - b);
+        value += weight*sample(array, before, step + (long)fmin(whole + a, 0.0));
+    }
+    return value;
+}
+"""
+_LATELY = """\
+/* Value `lag` steps before the place `part` of a step after it began, where it is `there`. */
+static double lately(const double *array, double before, long step, double part, double there,
+                     double lag)
+{
+    if (lag < part)
+        return array[step] + (part - lag)/part*(there - array[step]);
+    return past(array, before, step, lag - part);
+}
+"""
+_SIGN = """\
+static double sign(double x)
+{
+    return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : x;
+}
+"""
+_LEAST = """\
+static double least(double a, double b)
+{
+    return isnan(a) || a < b ? a : b;
+}
+"""
+_GREATEST = """\
+static double greatest(double a, double b)
+{
+    return isnan(a) || a > b ? a : b;
+}
+"""
+HELPERS: Mapping[str, str] = {
+    "sign": _SIGN, "least": _LEAST, "greatest": _GREATEST, "between": _BETWEEN, "held": _HELD,
+    "held on grid": _HELD_ON_GRID, "averaged": _AVERAGED,
+    "sample": _SAMPLE, "past": _PAST, "past cubic": _PAST_CUBIC, "lately": _LATELY,
+}  # fmt: skip

@@ -3,14 +3,8 @@
 from collections.abc import Mapping
 from typing import Protocol
 
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
-
-_LEVEL = {
-    "or": 1, "and": 2, "<": 4, "<=": 4, ">": 4, ">=": 4, "==": 4, "!=": 4,
-    "+": 5, "-": 5, "*": 6, "/": 6,
-}  # fmt: skip
-_SIGN = 7
-ATOM = 9
+from sysid.language.functions import OPERATORS, Level
+from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary, walk
 
 WIDTHS = {"between": "", "held": ", ramp", "averaged": ", half"}
 """What the functions that read inputs are told besides the place."""
@@ -49,6 +43,18 @@ class Language(Protocol):
     def real(self, index: str) -> str:
         """A whole number as floating-point number."""
 
+    def lag(self, text: str, *, is_whole: bool) -> str:
+        """A lag that is not negative; `is_whole`: of the nearest whole number of steps."""
+
+    def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
+        """First line of a loop over the steps from `first` on, the last one too if asked for."""
+
+    def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:
+        """An assignment, on as many lines as it needs; `is_new`: of a name that it declares."""
+
+    def close_loop(self) -> list[str]:
+        """What ends a loop."""
+
 
 class Scope(Protocol):
     """What names stand for at one place of the program; the texts are to stand anywhere."""
@@ -74,28 +80,28 @@ def number(value: float) -> str:
 def _written(expression: Expression, language: Language, scope: Scope) -> tuple[str, int]:
     match expression:
         case Number(value):
-            return number(value), ATOM if value >= 0 else _SIGN
+            return number(value), Level.ATOM if value >= 0 else Level.SIGN
         case Symbol():
-            return scope.symbol(expression), ATOM
+            return scope.symbol(expression), Level.ATOM
         case Past():
-            return scope.past(expression), ATOM
+            return scope.past(expression), Level.ATOM
         case Unary():
             return _prefix(expression, language, scope)
         case Binary("**", base, exponent):
             return language.power(
-                source(base, language, scope, ATOM), source(exponent, language, scope),
+                source(base, language, scope, Level.ATOM), source(exponent, language, scope),
                 _whole(base, exponent),
             )  # fmt: skip
         case Binary():
-            return _infix(expression, language, scope), _LEVEL[expression.operator]
+            return _infix(expression, language, scope), OPERATORS[expression.operator].level
         case Call():
-            return _call(expression, language, scope), ATOM
+            return _call(expression, language, scope), Level.ATOM
 
 
 def _prefix(tree: Unary, language: Language, scope: Scope) -> tuple[str, int]:
     if tree.operator == "-":
-        return f"-{source(tree.operand, language, scope, _SIGN + 1)}", _SIGN
-    return language.negation(source(tree.operand, language, scope)), ATOM
+        return f"-{source(tree.operand, language, scope, Level.SIGN + 1)}", Level.SIGN
+    return language.negation(source(tree.operand, language, scope)), Level.ATOM
 
 
 def _call(tree: Call, language: Language, scope: Scope) -> str:
@@ -107,30 +113,21 @@ def _call(tree: Call, language: Language, scope: Scope) -> str:
 
 
 def _infix(tree: Binary, language: Language, scope: Scope) -> str:
-    level = _LEVEL[tree.operator]
-    logical = level <= _LEVEL["<"]
-    before = source(tree.left, language, scope, 4 + (level == 4) if logical else level)
-    after = source(tree.right, language, scope, 4 + (level == 4) if logical else level + 1)
+    level = OPERATORS[tree.operator].level
+    logical = level <= Level.COMPARISON
+    beside = Level.COMPARISON + (level == Level.COMPARISON)
+    before = source(tree.left, language, scope, beside if logical else level)
+    after = source(tree.right, language, scope, beside if logical else level + 1)
     if tree.operator == "/" and is_number(tree):
         before = language.quotient(before)
     operator = language.words.get(tree.operator, tree.operator)
-    space = " " if level <= _LEVEL["+"] else ""
+    space = " " if level <= Level.SUM else ""
     return f"{before}{space}{operator}{space}{after}"
 
 
 def is_number(expression: Expression) -> bool:
     """Whether an expression has no names in it."""
-    match expression:
-        case Number():
-            return True
-        case Unary(_, operand):
-            return is_number(operand)
-        case Binary(_, left, right):
-            return is_number(left) and is_number(right)
-        case Call(_, arguments):
-            return all(is_number(one) for one in arguments)
-        case _:
-            return False
+    return not any(isinstance(node, Symbol | Past) for node in walk(expression))
 
 
 def _whole(base: Expression, exponent: Expression) -> int | None:

@@ -5,6 +5,8 @@ all its steps, so that the past is there to be read; what lies between two steps
 by a few small functions, which are written out only where they are called.
 """
 
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import ceil
 from typing import Literal
@@ -15,6 +17,7 @@ from sysid.data.interpolation import DENSE, MOST_POINTS
 from sysid.export.expressions import Language, Scope, number, source
 from sysid.export.identifiers import Identifiers
 from sysid.kernels.reads import averaged_inputs, is_difference
+from sysid.language.functions import Level
 from sysid.language.tree import Expression, Past, Symbol
 from sysid.models.model import FixedInitial, MeasuredInitial, initial_name
 
@@ -280,7 +283,79 @@ class Lag(Scope):
 
 
 def lag_steps(program: Program, lag: Expression) -> str:
-    """Text of a lag in integration steps, before it is limited to what is not negative."""
+    """Text of a lag in integration steps."""
     if program.is_recursion:
-        return source(lag, program.language, Lag(program))
-    return f"{source(lag, program.language, Lag(program), 7)}/{program.period}"
+        text = source(lag, program.language, Lag(program))
+    else:
+        text = f"{source(lag, program.language, Lag(program), Level.SIGN)}/{program.period}"
+    is_whole = program.identified.model.solver.interpolation == "nearest"
+    return program.language.lag(text, is_whole=is_whole)
+
+
+# ---- what both languages write alike --------------------------------------------------------
+def time_loop(program: Program, runge_kutta: Callable[[Program], list[str]]) -> list[str]:
+    """The loop that computes the states; of a Runge-Kutta method each language has its own."""
+    if program.is_recursion:
+        return _recursion(program)
+    if program.identified.model.solver.method == "rk4":
+        return runge_kutta(program)
+    return _euler(program)
+
+
+def _recursion(program: Program) -> list[str]:
+    model, language = program.identified.model, program.language
+    body: list[str] = []
+    for i in model.order:
+        name = model.states[i].name
+        now = program.now[name]
+        body += language.assign(now, equation(program, "recursion", i), is_new=True)
+        body += language.assign(f"{program.every[name]}[k]", now)
+    head = language.open_loop("k", program.memory, to_last=True)
+    return [head, *indented(body), *language.close_loop()]
+
+
+def _euler(program: Program) -> list[str]:
+    model, language = program.identified.model, program.language
+    body: list[str] = []
+    for i, state in enumerate(model.states):
+        slope = equation(program, "update", i, Level.PRODUCT)
+        text = f"{program.every[state.name]}[step] + dt*{slope}"
+        body += language.assign(program.following[state.name], text, is_new=True)
+    for state in model.states:
+        target = f"{program.every[state.name]}[step + 1]"
+        body += language.assign(target, program.following[state.name])
+    head = language.open_loop("step", 0, to_last=False)
+    return [head, *indented(body), *language.close_loop()]
+
+
+def equation(program: Program, kind: Kind, number_: int, floor: int = 0) -> str:
+    """Text of an equation's right-hand side; in parentheses if it binds less than `floor`."""
+    tree = program.identified.model.equations[number_]
+    return source(tree, program.language, Place(program, kind, number_), floor)
+
+
+def indented(lines: Sequence[str], levels: int = 1) -> list[str]:
+    """Lines (or several joined) moved to the right."""
+    return [textwrap.indent(line, "    " * levels) for line in lines]
+
+
+def needed_helpers(
+    helpers: Mapping[str, str], used: Iterable[str], identified: Identified
+) -> list[str]:
+    """Texts of the helpers that are used or that those call, each before who calls it."""
+    wanted = set(used)
+    if "lately" in wanted:
+        wanted.add("past")
+    if "past" in wanted:
+        wanted.add("sample")
+    variants = _variants_of(identified)
+    return [helpers[variants.get(name, name)] for name in helpers if name in wanted]
+
+
+def _variants_of(identified: Identified) -> Mapping[str, str]:
+    """Which helpers of a program are written in another way, by the solver of its model."""
+    solver = identified.model.solver
+    found = {"past": "past cubic"} if solver.interpolation == "cubic" else {}
+    if identified.model.form == "differential" and solver.step is not None:
+        found["held"] = "held on grid"  # its points need not meet the jumps
+    return found

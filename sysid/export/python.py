@@ -1,14 +1,22 @@
 """Export as a Python module of one function that needs nothing but NumPy."""
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 from sysid.control.linear_form import Identified
 from sysid.export.description import facts, unit_text, value_lines, wrapped
-from sysid.export.expressions import number, source
+from sysid.export.expressions import WIDTHS, Language, number, source
 from sysid.export.identifiers import Identifiers, in_docstring
-from sysid.export.program import Kind, Place, Program, lag_steps
-from sysid.export.python_helpers import HELPERS, PythonLanguage, with_needed
+from sysid.export.program import (
+    Place,
+    Program,
+    equation,
+    indented,
+    lag_steps,
+    needed_helpers,
+    time_loop,
+)
+from sysid.language.functions import FUNCTIONS, Level
 from sysid.models.model import Output, Quantity
 
 _WORDS = (
@@ -19,6 +27,70 @@ _WORDS = (
     "abs len y before between held past lately sign signal array grid print math ValueError"
 )
 _WIDTH = 96
+
+
+class PythonLanguage(Language):
+    """Python, with NumPy's functions on single numbers: overflow gives ``inf``, not an error."""
+
+    words: Mapping[str, str] = {}
+
+    def negation(self, condition: str) -> str:
+        """``not (…)``, to stand anywhere."""
+        return f"(not ({condition}))"
+
+    def function(self, name: str, arguments: list[str]) -> str:
+        """A call of a function of the model language."""
+        return f"np.{FUNCTIONS[name].numpy}({', '.join(arguments)})"
+
+    def power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
+        """A power and its level."""
+        if whole is not None:
+            return f"{base}**{whole}", Level.ATOM - 1
+        return f"np.power({base}, {exponent})", Level.ATOM
+
+    def choice(self, condition: str, first: str, second: str) -> str:
+        """``where``, to stand anywhere."""
+        return f"({first} if {condition} else {second})"
+
+    def quotient(self, above: str) -> str:
+        """A dividend of numbers only."""
+        return f"np.float64({above})"
+
+    def element(self, array: str, index: str, divisor: int) -> str:
+        """Array at the whole part of index / divisor."""
+        if divisor == 1:
+            return f"{array}[{index}]"
+        return f"{array}[{f'({index})' if '-' in index else index}//{divisor}]"
+
+    def read(self, helper: str, signal: str, place: str) -> str:
+        """A call of ``between``, ``held`` or ``averaged``."""
+        return f"{helper}({signal}, {place}{WIDTHS[helper]})"
+
+    def limited(self, value: str, least: int, most: int) -> str:
+        """A number held between two others."""
+        return f"min(max({value.replace('ceil', 'np.ceil')}, {least}), {most})"
+
+    def real(self, index: str) -> str:
+        """A whole number as floating-point number."""
+        return f"np.float64({index})"
+
+    def lag(self, text: str, *, is_whole: bool) -> str:
+        """A lag that is not negative."""
+        least = f"max({text}, 0.0)"
+        return f"np.floor({least} + 0.5)" if is_whole else least
+
+    def open_loop(self, index: str, first: int, *, to_last: bool) -> str:
+        """First line of a loop over the steps."""
+        ends = f"{first}, " if first else ""
+        return f"for {index} in range({ends}steps{' + 1' if to_last else ''}):"
+
+    def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:
+        """An assignment; a new name is not declared."""
+        return _statement(f"{name} = ", text)
+
+    def close_loop(self) -> list[str]:
+        """Nothing: what is no longer indented is behind the loop."""
+        return []
 
 
 def python_source(identified: Identified) -> str:
@@ -36,11 +108,11 @@ def python_source(identified: Identified) -> str:
     names = [output.name for output in identified.model.outputs]
     taken = [word for word in _WORDS.split() if word not in names]
     program = Program(identified, PythonLanguage(), Identifiers(taken))
-    loop = [*_loop(program), *_outputs(program)]
+    loop = [*time_loop(program, _runge_kutta), *_outputs(program)]
     head = [*_arrays(program), *_steps(program), *_lags(program), *_starts(program)]
-    helpers = [HELPERS[name] for name in with_needed(program.helpers, identified)]
+    helpers = needed_helpers(HELPERS, program.helpers, identified)
     body = [*head, 'with np.errstate(all="ignore"):  # what diverges becomes inf or nan']
-    body += _indented(loop)
+    body += indented(loop)
     parts = [_docstring(identified), "import numpy as np\n", *(f"\n{one}" for one in helpers)]
     parts.append("\n" + _signature(program))
     parts += [textwrap.indent("\n".join(_inner_docstring(program)), "    ")]
@@ -136,13 +208,8 @@ def _steps(program: Program) -> list[str]:
 
 
 def _lags(program: Program) -> list[str]:
-    lines = []
-    for lag, name in program.lags.items():
-        text = f"max({lag_steps(program, lag)}, 0.0)"
-        if program.identified.model.solver.interpolation == "nearest":
-            text = f"np.floor({text} + 0.5)"
-        lines.append(f"{name} = {text}  # integration steps")
-    return lines
+    lags = program.lags.items()
+    return [f"{name} = {lag_steps(program, lag)}  # integration steps" for lag, name in lags]
 
 
 def _starts(program: Program) -> list[str]:
@@ -154,48 +221,12 @@ def _starts(program: Program) -> list[str]:
 
 
 # ---- the time loop --------------------------------------------------------------------------
-def _loop(program: Program) -> list[str]:
-    if program.is_recursion:
-        return _recursion(program)
-    if program.identified.model.solver.method == "rk4":
-        return _runge_kutta(program)
-    return _euler(program)
-
-
-def _equation(program: Program, kind: Kind, number_: int) -> str:
-    tree = program.identified.model.equations[number_]
-    return source(tree, program.language, Place(program, kind, number_))
-
-
-def _recursion(program: Program) -> list[str]:
-    model = program.identified.model
-    lines = [f"for k in range({program.memory}, steps + 1):"]
-    for i in model.order:
-        name = model.states[i].name
-        text = _equation(program, "recursion", i)
-        lines += _indented(_statement(f"{program.now[name]} = ", text))
-        lines.append(f"    {program.every[name]}[k] = {program.now[name]}")
-    return lines
-
-
-def _euler(program: Program) -> list[str]:
-    model = program.identified.model
-    lines = ["for step in range(steps):"]
-    for i, state in enumerate(model.states):
-        slope = source(model.equations[i], program.language, Place(program, "update", i), 6)
-        text = f"{program.every[state.name]}[step] + dt*{slope}"
-        lines += _indented(_statement(f"{program.following[state.name]} = ", text))
-    return lines + [
-        f"    {program.every[s.name]}[step + 1] = {program.following[s.name]}" for s in model.states
-    ]
-
-
 def _runge_kutta(program: Program) -> list[str]:
     model = program.identified.model
     states = [program.now[state.name] for state in model.states]
     slopes: list[str] = []
     for i in range(len(model.states)):
-        slopes += _indented(_statement("", _equation(program, "slope", i), ","), 2)
+        slopes += indented(_statement("", equation(program, "slope", i), ","), 2)
     every = [program.every[state.name] for state in model.states]
     now = ", ".join(f"{name}[step]" for name in every)
     following = [f"{name}[step + 1]" for name in every]
@@ -209,7 +240,7 @@ def _runge_kutta(program: Program) -> list[str]:
         "    slope_2 = rates(step, 0.5, *(now + dt/2*slope_1))",
         "    slope_3 = rates(step, 0.5, *(now + dt/2*slope_2))",
         "    slope_4 = rates(step, 1.0, *(now + dt*slope_3))",
-        *_indented(_statement(
+        *indented(_statement(
             f"{target} = ", "now + dt/6*(slope_1 + 2*slope_2 + 2*slope_3 + slope_4)"
         )),
     ]  # fmt: skip
@@ -223,7 +254,7 @@ def _outputs(program: Program) -> list[str]:
         text = source(output.expression, program.language, Place(program, "output"))
         loop = f"for {program.index} in range({by})"
         target = program.outputs[output.name]
-        lines += [f"{target} = np.array([", *_indented(_statement("", text)), f"    {loop}",
+        lines += [f"{target} = np.array([", *indented(_statement("", text)), f"    {loop}",
                   "], dtype=np.float64)"]  # fmt: skip
         if program.own_step is not None:
             grid = f"t[0] + {number(program.own_step)}*np.arange(points + 1)"
@@ -243,5 +274,70 @@ def _wrapped(text: str, indent: str) -> str:
     return textwrap.indent("\n".join(wrapped(text, _WIDTH - 16)), indent)
 
 
-def _indented(lines: Sequence[str], levels: int = 1) -> list[str]:
-    return [textwrap.indent(line, "    " * levels) for line in lines]
+# ---- functions that a program calls -----------------------------------------------------------
+_BETWEEN = '''def between(signal, place):
+    """Signal at a place in samples, on a line between them; its end values outside."""
+    place = min(max(place, 0.0), signal.size - 1.0)
+    i = min(int(place), signal.size - 2)
+    return signal[i] + (place - i)*(signal[i + 1] - signal[i])
+'''
+_HELD = '''def held(signal, place, ramp):
+    """Signal at a place in samples, held after each; a jump takes `ramp` to either side."""
+    i = int(np.floor(place + 0.5))
+    part = min(max((place - i + ramp)/(2*ramp), 0.0), 1.0)
+    before = signal[min(max(i - 1, 0), signal.size - 1)]
+    return before + part*(signal[min(max(i, 0), signal.size - 1)] - before)
+'''
+_HELD_ON_GRID = '''def held(signal, place, ramp):
+    """Signal at a place in samples, held after each; on lines between points `ramp` apart."""
+    i = int(np.floor(place/ramp))
+    part = place/ramp - i
+    value = 0.0
+    for j, weight in ((i, 1.0 - part), (i + 1, part)):
+        for side in (-1e-6, 1e-6):  # at a jump the mean of both sides
+            k = int(np.floor(j*ramp + side))
+            value += 0.5*weight*signal[min(max(k, 0), signal.size - 1)]
+    return value
+'''
+_AVERAGED = '''def averaged(signal, place, half):
+    """Mean of a held signal from `half` before a place, in samples, to `half` after it."""
+    first, last = place - half, place + half
+    total = 0.0
+    for k in range(int(np.floor(first)), int(np.ceil(last))):
+        width = min(k + 1.0, last) - max(float(k), first)
+        total += width*signal[min(max(k, 0), signal.size - 1)]
+    return total/(2*half)
+'''
+_PAST = '''def past(array, before, step, lag):
+    """Value `lag` >= 0 steps before a finished step, on a line between two; `before` the start."""
+    i = int(np.floor(-lag))
+    part = -lag - i
+    older, newer = (
+        array[step + j] if step + j >= 0 else before for j in (i, min(i + 1, 0))
+    )
+    return older + part*(newer - older)
+'''
+_PAST_CUBIC = '''def past(array, before, step, lag):
+    """Value `lag` >= 0 steps before a finished step, on a cubic through four (the last: three)."""
+    i = int(np.floor(-lag))
+    part = -lag - i
+    nodes = (-1, 0, 1, 2) if i <= -2 else (-1, 0, 1)
+    value = 0.0
+    for a in nodes:
+        j = step + min(i + a, 0)
+        weight = np.prod([(part - b)/(a - b) for b in nodes if b != a])
+        value += weight*(array[j] if j >= 0 else before)
+    return value
+'''
+_LATELY = '''def lately(array, before, step, part, there, lag):
+    """Value `lag` steps before the place `part` of a step after it began, where it is `there`."""
+    if lag < part:
+        return array[step] + (part - lag)/part*(there - array[step])
+    return past(array, before, step, lag - part)
+'''
+HELPERS: Mapping[str, str] = {
+    "between": _BETWEEN, "held": _HELD, "held on grid": _HELD_ON_GRID,
+    "averaged": _AVERAGED,
+    "past": _PAST, "past cubic": _PAST_CUBIC,
+    "lately": _LATELY,
+}  # fmt: skip

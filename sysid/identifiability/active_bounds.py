@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.types import BoolArray, FloatArray
-from sysid.language.intervals import Interval
+from sysid.core.types import BoolArray, FloatArray, Interval
+from sysid.core.units import format_unit
 from sysid.models.parameters import Parameter
-from sysid.simulation.scaling import AT_BOUND
+from sysid.simulation.scaling import is_at_bounds
 
 _SHARE = 0.05  # of the squared error that the release of this bound would remove
 _SURE = 16.0  # times what a parameter without effect would seem to remove: four standard errors
@@ -37,7 +37,7 @@ class Pull(NamedTuple):
     limit: float | None = None
 
     def __str__(self) -> str:
-        return f"{self.name} beyond its {self.side} bound {self.bound:g}{self._unit}"
+        return f"{self.name} beyond its {self.side} bound {self.bound:g}{format_unit(self.unit)}"
 
     @property
     def cure(self) -> str:
@@ -47,11 +47,7 @@ class Pull(NamedTuple):
         if self.limit is None:
             return text
         most = "least" if lower else "most"
-        return f"{text}, to {self.limit:.4g}{self._unit} at the {most}"
-
-    @property
-    def _unit(self) -> str:
-        return "" if self.unit == "1" else f" {self.unit}"
+        return f"{text}, to {self.limit:.4g}{format_unit(self.unit)} at the {most}"
 
 
 def is_pulled(influence: FloatArray, columns: FloatArray, place: FloatArray) -> BoolArray:
@@ -72,7 +68,7 @@ def is_pulled(influence: FloatArray, columns: FloatArray, place: FloatArray) -> 
     downhill = -(columns.T @ influence)
     size = np.einsum("nd,nd->d", columns, columns)
     share = downhill**2 / np.where(size > 0, size * total, np.inf)
-    low, high = _at_ends(place)
+    low, high = is_at_bounds(place)
     out = (low & (downhill < 0)) | (high & (downhill > 0))
     return np.asarray(out & (share > _SHARE) & (share * influence.size > _SURE))
 
@@ -91,7 +87,7 @@ def pulls(
         For each the lowest and the highest value that its bounds may be given.
     """
     step = _Step.of(space, reaches, influence, columns, place)
-    low, high = _at_ends(place)
+    low, high = is_at_bounds(place)
     room = np.where(low, -step.outer[0] - place, step.outer[1] - (1.0 - place))
     candidates = [int(d) for d in np.flatnonzero((low | high) & (room > _ROOM))]
     shares: dict[int, float] = {}
@@ -118,10 +114,6 @@ def _pull(one: Parameter, reach: Interval, is_low: bool, share: float) -> Pull:
     known = limit if np.isfinite(limit) else None
     bound, side = (one.lower, "lower") if is_low else (one.upper, "upper")
     return Pull(one.name, side, bound, one.unit, share, known)
-
-
-def _at_ends(place: FloatArray) -> tuple[BoolArray, BoolArray]:
-    return np.asarray(place < AT_BOUND), np.asarray(place > 1.0 - AT_BOUND)
 
 
 class _Step(NamedTuple):

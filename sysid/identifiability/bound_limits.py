@@ -8,8 +8,9 @@ constant does.
 from collections.abc import Callable, Iterator, Mapping
 from math import inf
 
-from sysid.language.intervals import Interval, bounds
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Unary
+from sysid.core.types import Interval
+from sysid.language.intervals import bounds
+from sysid.language.tree import Binary, Call, Expression, Number, Past, walk
 from sysid.models.delays import longest_lag, past_signals
 from sysid.models.parameters import Parameter
 from sysid.models.sections import interval
@@ -72,33 +73,18 @@ def _signed(problem: Problem) -> Iterator[Expression]:
 
 
 def _divisors(tree: Expression) -> Iterator[Expression]:
-    match tree:
-        case Binary("/", _, divisor):
-            yield divisor
-            if isinstance(divisor, Binary) and divisor.operator == "**":
-                yield divisor.left  # whose square would pass 0 without a change of its sign
-        case Binary("**", base, exponent) if not _is_whole(exponent):
-            yield base
-        case Call("sqrt" | "log", (argument,)):
-            yield argument
-    for one in _parts(tree):
-        yield from _divisors(one)
+    for node in walk(tree):
+        match node:
+            case Binary("/", _, divisor):
+                yield divisor
+                if isinstance(divisor, Binary) and divisor.operator == "**":
+                    yield divisor.left  # whose square would pass 0 without a change of its sign
+            case Binary("**", base, exponent) if not _is_whole(exponent):
+                yield base
+            case Call("sqrt" | "log", (argument,)):
+                yield argument
 
 
 def _is_whole(exponent: Expression) -> bool:
     """Whether any base, of either sign and 0, has such a power."""
     return isinstance(exponent, Number) and exponent.value >= 0 and exponent.value % 1 == 0
-
-
-def _parts(tree: Expression) -> tuple[Expression, ...]:
-    match tree:
-        case Unary(_, operand):
-            return (operand,)
-        case Binary(_, left, right):
-            return (left, right)
-        case Call(_, arguments):
-            return arguments
-        case Past(_, _, _, lag):
-            return () if lag is None else (lag,)
-        case _:
-            return ()

@@ -5,6 +5,7 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
+from sysid.core.code_cache import digest_files
 from sysid.kernels.machine_code import machine_name
 
 _LIBRARIES = ("numpy", "scipy", "numba")
@@ -18,9 +19,7 @@ def program(*packages: Path) -> str:
     what kernels depend on in the machine.
     """
     parts = [machine_name(), *(f"{name} {version(name)}" for name in _LIBRARIES)]
-    digest = hashlib.blake2b("\n".join(parts).encode(), digest_size=16)
     for folder in (Path(__file__).parents[1], *packages):
-        for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.yaml")]):
-            digest.update(str(path.relative_to(folder.parent)).encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
+        sources = (*folder.rglob("*.py"), *folder.rglob("*.yaml"))
+        parts.append(digest_files(sources, folder.parent))
+    return hashlib.blake2b("\n".join(parts).encode(), digest_size=16).hexdigest()

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.fft import irfft, rfft
 
+from sysid.core.linear_algebra import truncated_svd
 from sysid.core.types import FloatArray
 from sysid.residuals.autocorrelation import laid_out
 from sysid.residuals.coloured import Part, is_coloured, parts
@@ -180,8 +181,7 @@ def _are_alike(found: Mapping[str, float], known: Mapping[str, float]) -> bool:
 def _spread(columns: FloatArray, error: FloatArray, white: Whitening) -> FloatArray:
     """L (n, D) of the covariance LLᵀ of fitted outputs with slopes (n, D)."""
     seen, left = white.of(columns.T).T, white.of(error)
-    singular, rows = np.linalg.svd(seen, full_matrices=False)[1:]
-    kept = singular > 1e-7 * max(float(singular[0]), np.finfo(float).tiny)
+    _, singular, rows, kept = truncated_svd(seen)
     deviation = np.sqrt(float(left @ left) / max(error.size - columns.shape[1], 1))
     return np.asarray(deviation * columns @ (rows[kept].T / singular[kept]))
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.types import RANK, FloatArray
+from sysid.core.units import format_unit
 from sysid.kernels.reads import is_difference
 from sysid.search.refine import refine
 from sysid.simulation.problem import Problem
@@ -111,7 +112,10 @@ def _told(
         shift = by.get(one.name, 0.0)
         if one.stderr and abs(shift) > max(one.stderr, share * abs(one.value)):
             digits = max(4, 2 + ceil(log10(abs(one.value / shift)))) if one.value else 4
-            values = (f"{value:.{digits}g}{_unit(one)}" for value in (one.value + shift, one.value))
+            values = (
+                f"{value:.{digits}g}{format_unit(one.unit)}"
+                for value in (one.value + shift, one.value)
+            )
             often = f"{abs(shift) / one.stderr:.2g} of its standard errors away"
             told.append(f"{one.name} = {' instead of '.join(values)}, {often}")
     return told
@@ -122,7 +126,3 @@ def _finer(problem: Problem) -> Problem:
     model = problem.untied_model
     solver = replace(model.solver, substeps=_FINER * model.solver.substeps)
     return problem.rebuild(model=replace(model, solver=solver))
-
-
-def _unit(estimate: Estimate) -> str:
-    return "" if estimate.unit == "1" else f" {estimate.unit}"

@@ -32,6 +32,7 @@ import numpy as np
 
 from sysid.core.settings import NoiseModel
 from sysid.core.types import FloatArray
+from sysid.core.units import format_unit
 from sysid.identification.generalised_least_squares import Generalised, coloured_outputs
 from sysid.identification.integration_step import step_notes
 from sysid.kernels.layout import Layout
@@ -180,11 +181,11 @@ def choice_notes(problem: Problem, noise: Generalised) -> tuple[str, ...]:
     if noise.instead_of is None:
         return ()
     squares = ", ".join(
-        f"{one.name} = {value:.4g}{'' if one.unit == '1' else f' {one.unit}'}"
+        f"{one.name} = {value:.4g}{format_unit(one.unit)}"
         for one, value in zip(problem.space, noise.instead_of.tolist(), strict=True)
     )
     metrics = problem.metrics(np.asarray(noise.instead_of))
-    unit = "" if metrics.unit == "1" else f" {metrics.unit}"
+    unit = format_unit(metrics.unit)
     return (
         "noise_model auto chose ar1: the residuals of squares are not white, and the model does "
         "not forget where it began, as a drive or a tank (it integrates), so that errors of a "

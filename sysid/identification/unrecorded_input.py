@@ -12,6 +12,7 @@ these samples do not fit the others. Only then the estimate is found anew withou
 import numpy as np
 
 from sysid.core.errors import InvalidRecord
+from sysid.core.linear_algebra import truncated_svd
 from sysid.core.types import RANK, BoolArray, FloatArray
 from sysid.data.records import Channel, Record
 from sysid.kernels.reads import lags
@@ -154,9 +155,8 @@ def _told(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:
 
 def _variances(columns: FloatArray) -> FloatArray:
     """Diagonal of (SᵀS)⁻¹, (D,); inf of what these rows leave open."""
-    triangle = np.linalg.qr(columns, mode="r")  # of a long record in half the time
-    singular, rows = np.linalg.svd(triangle)[1:]
-    kept = singular > RANK * max(float(singular[0]), np.finfo(float).tiny)
+    triangle = np.asarray(np.linalg.qr(columns, mode="r"))  # of a long record in half the time
+    _, singular, rows, kept = truncated_svd(triangle)
     found: FloatArray = np.sum((rows[kept].T / singular[kept]) ** 2, axis=1)
     is_open = np.max(np.abs(rows[~kept]), axis=0, initial=0.0) > RANK
     return np.where(is_open, np.inf, found)

@@ -6,6 +6,7 @@ import numpy as np
 
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
+from sysid.core.units import format_unit
 from sysid.identifiability.combinations import Group
 from sysid.identification.unrecorded_input import past_notes
 from sysid.kernels.reads import is_difference, lags
@@ -149,7 +150,7 @@ def _constant_outputs(problem: Problem) -> list[str]:
             [y[output.name][w[output.name] > 0] for y, w in zip(measured, weights, strict=True)]
         )
         if np.ptp(values) == 0.0:
-            unit = "" if output.unit == "1" else f" {output.unit}"
+            unit = format_unit(output.unit)
             found.append(
                 f"output {output.name!r} is constant ({values[0]:.4g}{unit}): it tells nothing of "
                 "the dynamics, and no fit % can be given"
@@ -173,7 +174,7 @@ def _worse_than_a_line(problem: Problem, simulated: FloatArray) -> list[str]:
             rms = _rms(y - model)
             if rms > line:
                 where = f" of experiment {e + 1}" if len(problem.experiments) > 1 else ""
-                unit = "" if output.unit == "1" else f" {output.unit}"
+                unit = format_unit(output.unit)
                 found.append(
                     f"the model fits {output.name}{where} worse than a straight line "
                     f"(RMS {rms:.4g} against {line:.4g}{unit})"
@@ -196,7 +197,7 @@ def _rms(values: FloatArray) -> float:
 def _of_estimate(estimate: Estimate) -> str:
     low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
     side, bound = ("lower", estimate.lower) if low else ("upper", estimate.upper)
-    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    unit = format_unit(estimate.unit)
     place = f"lies at its {side} bound {bound:g}{unit}"
     match estimate.status:
         case "at bound":
@@ -216,7 +217,7 @@ def _vague(estimate: Estimate) -> str:
         return ""
     if estimate.stderr < estimate.value:
         return ""
-    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    unit = format_unit(estimate.unit)
     return (
         f"the standard error of {estimate.name}, {estimate.stderr:.3g}{unit}, is as large as its "
         f"value, {estimate.value:.3g}{unit}"

@@ -5,20 +5,19 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from sysid.core.code_cache import store, stored
+from sysid.core.code_cache import digest_files, store, stored
+from sysid.core.memo import cache_by_identity
 from sysid.kernels.kernel import KERNEL, kernel_code
 from sysid.kernels.layout import Variant
 from sysid.kernels.machine_code import loaded, machine_name, object_code_bounded
 from sysid.models.model import EstimatedInitial, Model
 
-_KEPT = 64
 _addresses: dict[str, int] = {}
-_keys: dict[tuple[int, Variant], tuple[Model, str]] = {}  # by identity: its name is a long walk
 
 
 def kernel_address(model: Model, variant: Variant) -> int:
     """Address of the model's kernel in this process, for `sysid.kernels.abi.call_kernel`."""
-    key = _key(model, variant)
+    key = kernel_key(model, variant)
     if key not in _addresses:
         code = stored(key)
         if code is None:
@@ -28,16 +27,7 @@ def kernel_address(model: Model, variant: Variant) -> int:
     return _addresses[key]
 
 
-def _key(model: Model, variant: Variant) -> str:
-    """`kernel_key`, kept for the many runs of one model."""
-    known = _keys.get((id(model), variant))
-    if known is None or known[0] is not model:
-        if len(_keys) >= _KEPT:
-            _keys.clear()
-        known = _keys[id(model), variant] = (model, kernel_key(model, variant))
-    return known[1]
-
-
+@cache_by_identity  # it is a long walk, and many runs have one model
 def kernel_key(model: Model, variant: Variant) -> str:
     """Name of a kernel: what its code depends on, and nothing else.
 
@@ -62,8 +52,7 @@ def kernel_key(model: Model, variant: Variant) -> str:
 
 @cache
 def _writers() -> str:
-    """Digest of the modules that write kernels: a new version of them makes new kernels."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()
+    """Digest of what writes kernels: a new version of it makes new kernels."""
+    package = Path(__file__).parents[1]
+    sources = (*package.glob("kernels/*.py"), package / "language" / "functions.py")
+    return digest_files(sources, package)

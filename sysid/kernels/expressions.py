@@ -3,17 +3,13 @@
 from typing import Protocol
 
 from sysid.kernels.vectors import Lanes, Value
+from sysid.language.functions import FUNCTIONS, OPERATORS, Level
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
 
 LARGEST_POWER = 64
 """Whole exponents up to this one are written as multiplications."""
 
 _ARITHMETIC = {"+": "add", "-": "sub", "*": "mul", "/": "div"}
-_COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
-_LIBRARY = {"abs": "fabs", "sqrt": "sqrt", "sin": "sin", "cos": "cos", "tan": "tan", "exp": "exp",
-            "log": "log", "tanh": "tanh", "atan": "atan",
-            # unlike a comparison, these pass nan on, so that divergence is not hidden
-            "min": "minimum", "max": "maximum"}  # fmt: skip
 
 
 class Scope(Protocol):
@@ -69,7 +65,7 @@ def _binary(lanes: Lanes, expression: Binary, scope: Scope) -> Value:
     right = emit(lanes, expression.right, scope)
     if operator in _ARITHMETIC:
         return getattr(lanes, _ARITHMETIC[operator])(left, right)
-    if operator in _COMPARISONS:
+    if OPERATORS[operator].level == Level.COMPARISON:
         return lanes.compare(operator, left, right)
     left, right = lanes.same_shape(left, right)
     return lanes.builder.and_(left, right) if operator == "and" else lanes.builder.or_(left, right)
@@ -102,7 +98,7 @@ def _call(lanes: Lanes, function: str, arguments: list[Value]) -> Value:
         return lanes.select(*arguments)
     if function == "sign":
         return _sign(lanes, arguments[0])
-    return lanes.intrinsic(_LIBRARY[function], *arguments)
+    return lanes.intrinsic(FUNCTIONS[function].llvm, *arguments)
 
 
 def _sign(lanes: Lanes, value: Value) -> Value:

@@ -6,17 +6,8 @@ from sysid.kernels.integrators import Placing
 from sysid.kernels.layout import Variant
 from sysid.kernels.signals import Experiment, States
 from sysid.kernels.vectors import INT, Lanes, Loop, Value
-from sysid.language.tree import Past
-from sysid.models.model import Model, Output
-
-
-def measured_state(output: Output) -> str | None:
-    """The state that an output measures directly; None for any other output."""
-    match output.expression:
-        case Past(name, "state", 0, None):
-            return name
-        case _:
-            return None
+from sysid.language.tree import match_plain_state
+from sysid.models.model import Model
 
 
 class Comparison:
@@ -150,7 +141,7 @@ class Comparison:
     def _replace(self, grid: Value, states: States) -> None:
         """One-step prediction goes on from the measurement."""
         for i, output in enumerate(self._model.outputs):
-            name = measured_state(output)
+            name = match_plain_state(output.expression)
             if name is not None:
                 place = self._lanes.builder.add(self._experiment.output(i, "grid"), grid)
                 value = self._lanes.load(self._experiment.floats, place)

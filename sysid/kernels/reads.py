@@ -4,11 +4,11 @@ Places are counted in half integration steps from the last finished step: the st
 Runge-Kutta step lie at 0, 1 and 2; the sample that a difference equation computes at 2.
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
-from sysid.language.delays import mentions_time
-from sysid.language.tree import Binary, Call, Expression, Past, Unary
+from sysid.core.memo import cache_by_identity
+from sysid.language.delays import mentions_time, past_values
+from sysid.language.tree import Past
 from sysid.models.model import Model
 
 NEAR = 8
@@ -22,10 +22,6 @@ class Read(NamedTuple):
 
     past: Past
     halves: int
-
-
-_KEPT = 64
-_reads: dict[int, tuple[Model, tuple[Read, ...]]] = {}  # by identity: a model's hash is a long walk
 
 
 def is_difference(model: Model) -> bool:
@@ -49,43 +45,20 @@ def state_place(model: Model, stage: int, equation: int, state: int) -> int:
     return 2 if semi_implicit and state < equation else stage
 
 
-def pasts(expression: Expression) -> Iterator[Past]:
-    """All signals of an expression, from left to right."""
-    match expression:
-        case Past():
-            yield expression
-        case Unary(_, operand):
-            yield from pasts(operand)
-        case Binary(_, left, right):
-            yield from pasts(left)
-            yield from pasts(right)
-        case Call(_, arguments):
-            for argument in arguments:
-                yield from pasts(argument)
-
-
+@cache_by_identity  # every run asks
 def reads(model: Model) -> tuple[Read, ...]:
-    """Every past value that the equations and the outputs read; kept, since every run asks."""
-    known = _reads.get(id(model))
-    if known is None or known[0] is not model:
-        if len(_reads) >= _KEPT:
-            _reads.clear()
-        known = _reads[id(model)] = (model, tuple(_found(model)))
-    return known[1]
-
-
-def _found(model: Model) -> list[Read]:
+    """Every past value that the equations and the outputs read."""
     numbers = {state.name: i for i, state in enumerate(model.states)}
     found: list[Read] = []
     for i, equation in enumerate(model.equations):
         for stage in stages(model):
-            for past in pasts(equation):
+            for past in past_values(equation):
                 state = past.kind == "state"
                 at = state_place(model, stage, i, numbers[past.name]) if state else stage
                 found.append(Read(past, at - 2 * past.offset))
     for output in model.outputs:
-        found += [Read(past, -2 * past.offset) for past in pasts(output.expression)]
-    return found
+        found += [Read(past, -2 * past.offset) for past in past_values(output.expression)]
+    return tuple(found)
 
 
 def lags(model: Model, kind: str) -> list[Past]:

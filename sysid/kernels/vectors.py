@@ -22,8 +22,9 @@ from typing import Any, NamedTuple, TypeAlias
 import llvmlite.binding as llvm
 from llvmlite import ir
 
+from sysid.language.functions import FUNCTIONS
+
 _LIBRARY = "libmvec.so.1"
-_ARGUMENTS = {"exp": 1, "log": 1, "sin": 1, "cos": 1, "tan": 1, "tanh": 1, "atan": 1, "pow": 2}
 
 
 class VectorFunctions(NamedTuple):
@@ -47,9 +48,8 @@ def vector_functions() -> VectorFunctions:
     features = llvm.get_host_cpu_features()
     wide = (("avx512f", "e", 8), ("avx2", "d", 4), ("sse2", "b", 2))
     letter, lanes = next((isa, n) for feature, isa, n in wide if features.get(feature))
-    names = {
-        name: f"_ZGV{letter}N{lanes}{'v' * count}_{name}" for name, count in _ARGUMENTS.items()
-    }
+    counts = {one.llvm: one.fewest for one in FUNCTIONS.values()} | {"pow": 2}
+    names = {name: f"_ZGV{letter}N{lanes}{'v' * count}_{name}" for name, count in counts.items()}
     return VectorFunctions(lanes, {n: s for n, s in names.items() if hasattr(library, s)})
 
 

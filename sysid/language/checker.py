@@ -1,9 +1,10 @@
 """Syntax to a checked tree: names resolved, past values taken apart, every fault named."""
 
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 from sysid.core.errors import nearest
 from sysid.language.delays import delay
+from sysid.language.functions import FUNCTIONS, OPERATORS, Level
 from sysid.language.parser import (
     MAX_DEPTH,
     Apply,
@@ -16,10 +17,9 @@ from sysid.language.parser import (
     TextFault,
     parse,
 )
-from sysid.language.scope import FUNCTIONS, Scope
+from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
 
-_COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 _PI = 3.141592653589793
 _NOTHING = Number(0.0)
 
@@ -83,7 +83,7 @@ class _Checker:
                 return self._apply(node, depth)
             case Prefix("-", operand):
                 return Unary("-", self.value(operand, depth + 1))
-            case Infix(operator, left, right) if operator in ("+", "-", "*", "/", "**"):
+            case Infix(operator, left, right) if OPERATORS[operator].level >= Level.SUM:
                 return self._binary(operator, left, right, depth)
             case _:
                 detail = f"{node.operator!r} is only for the condition of where(condition, a, b)"
@@ -99,7 +99,7 @@ class _Checker:
             case Infix(("and" | "or") as operator, left, right):
                 first = self._condition(left, depth + 1)
                 return Binary(operator, first, self._condition(right, depth + 1))
-            case Infix(operator, left, right) if operator in _COMPARISONS:
+            case Infix(operator, left, right) if OPERATORS[operator].level == Level.COMPARISON:
                 return self._binary(operator, left, right, depth)
             case _:
                 detail = "a condition compares two values, such as x > 0"
@@ -107,7 +107,7 @@ class _Checker:
 
     def _binary(self, operator: str, left: Syntax, right: Syntax, depth: int) -> Expression:
         first = self.value(left, depth + 1)
-        return Binary(cast(Any, operator), first, self.value(right, depth + 1))
+        return Binary(operator, first, self.value(right, depth + 1))
 
     def _name(self, node: Name) -> Expression:
         name, scope = node.name, self._scope
@@ -152,7 +152,7 @@ class _Checker:
         return self._fault(node.column, f"there is no function or signal {node.name!r}{hint}")
 
     def _call(self, node: Apply, depth: int) -> Expression:
-        fewest, most = FUNCTIONS[node.name]
+        fewest, most = FUNCTIONS[node.name].fewest, FUNCTIONS[node.name].most
         count = len(node.arguments)
         if count < fewest or (most is not None and count > most):
             need = f"{fewest}" if most == fewest else f"{fewest} or more"
@@ -163,11 +163,10 @@ class _Checker:
             branches = [self.value(one, depth + 1) for one in node.arguments[1:]]
             return Call("where", (condition, *branches))
         first, *others = (self.value(one, depth + 1) for one in node.arguments)
-        function = cast(Any, node.name)
         if not others:
-            return Call(function, (first,))
+            return Call(node.name, (first,))
         for other in others:  # min and max of several, two by two
-            first = Call(function, (first, other))
+            first = Call(node.name, (first, other))
         return first
 
     def _past(self, node: Apply, depth: int) -> Expression:

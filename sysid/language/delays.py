@@ -7,7 +7,7 @@ from sysid.language.intervals import bounds
 from sysid.language.monomials import CONSTANT, Polynomial, add, collect, rebuild, scale, times
 from sysid.language.printer import number, text
 from sysid.language.scope import Scope
-from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary
+from sysid.language.tree import Expression, Past, Symbol, walk
 
 _PERIOD = Symbol("h", "period")
 _LONGEST = 1e6
@@ -51,32 +51,13 @@ def delay(index: Expression, scope: Scope) -> Delay | str:
 
 def mentions_time(expression: Expression, *kinds: str) -> bool:
     """Whether an expression depends on t or k; or on one of the given kinds of symbol."""
-    match expression:
-        case Symbol(_, kind):
-            return kind in (kinds or ("time", "index"))
-        case Unary(_, operand):
-            return mentions_time(operand, *kinds)
-        case Binary(_, left, right):
-            return mentions_time(left, *kinds) or mentions_time(right, *kinds)
-        case Call(_, arguments):
-            return any(mentions_time(one, *kinds) for one in arguments)
-        case _:
-            return False
+    wanted = kinds or ("time", "index")
+    return any(isinstance(node, Symbol) and node.kind in wanted for node in walk(expression))
 
 
 def past_values(expression: Expression) -> tuple[Past, ...]:
     """Every signal value in an expression, in the order of the text."""
-    match expression:
-        case Past():
-            return (expression,)
-        case Unary(_, operand):
-            return past_values(operand)
-        case Binary(_, left, right):
-            return past_values(left) + past_values(right)
-        case Call(_, arguments):
-            return tuple(value for one in arguments for value in past_values(one))
-        case _:
-            return ()
+    return tuple(node for node in walk(expression) if isinstance(node, Past))
 
 
 def _split(back: Polynomial, low: float, scope: Scope) -> Delay:

@@ -3,25 +3,15 @@
 By NumPy as it stands: what is worth a number or a few samples is not worth a kernel.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from math import nan
 from typing import Any
 
 import numpy as np
 
 from sysid.core.types import FloatArray
+from sysid.language.functions import FUNCTIONS, OPERATORS
 from sysid.language.tree import Binary, Call, Expression, Number, Symbol, Unary
-
-_OPERATORS: Mapping[str, Callable[..., Any]] = {
-    "+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide, "**": np.power,
-    "<": np.less, "<=": np.less_equal, ">": np.greater, ">=": np.greater_equal,
-    "==": np.equal, "!=": np.not_equal, "and": np.logical_and, "or": np.logical_or,
-}  # fmt: skip
-_FUNCTIONS: Mapping[str, Callable[..., Any]] = {
-    "sin": np.sin, "cos": np.cos, "tan": np.tan, "exp": np.exp, "log": np.log, "sqrt": np.sqrt,
-    "abs": np.abs, "sign": np.sign, "min": np.minimum, "max": np.maximum, "tanh": np.tanh,
-    "atan": np.arctan, "where": np.where,
-}  # fmt: skip
 
 
 def value(expression: Expression, parameters: Mapping[str, float]) -> float:
@@ -54,8 +44,11 @@ def _value(expression: Expression, named: Mapping[str, Any]) -> Any:
             inside = _value(operand, named)
             return -inside if operator == "-" else np.logical_not(inside)
         case Binary(operator, left, right):
-            return _OPERATORS[operator](_value(left, named), _value(right, named))
+            operands = (_value(left, named), _value(right, named))
+            return getattr(np, OPERATORS[operator].numpy)(*operands)
         case Call(function, arguments):
-            return _FUNCTIONS[function](*(_value(one, named) for one in arguments))
+            return getattr(np, FUNCTIONS[function].numpy)(
+                *(_value(one, named) for one in arguments)
+            )
         case _:
             return np.float64(nan)

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from math import isinf
 from typing import Literal, NamedTuple, TypeAlias
 
+from sysid.language.functions import OPERATORS, Level
+
 MAX_LENGTH = 4000
 """Characters of one equation."""
 
@@ -156,13 +158,6 @@ def _foreign(kind: str | None, word: str) -> str:
     return f"{word!r} is not part of the language{hint}"
 
 
-_OR, _AND, _NOT, _COMPARE, _SUM, _PRODUCT, _SIGN, _POWER = range(1, 9)
-
-_LEVEL = {
-    "or": _OR, "and": _AND, "+": _SUM, "-": _SUM, "*": _PRODUCT, "/": _PRODUCT, "**": _POWER,
-    **dict.fromkeys(("<", "<=", ">", ">=", "==", "!="), _COMPARE),
-}  # fmt: skip
-
 _OPPOSITE = {"+": "-", "-": "+", "*": "/", "/": "*"}
 
 _FOLD = 8
@@ -194,7 +189,7 @@ class _Parser:
         """The syntax of the whole text."""
         if self._peek().kind == "end":
             raise SyntaxFault(1, "the expression is empty")
-        found = self._expression(_OR)
+        found = self._expression(Level.OR)
         word = self._peek()
         if word.kind != "end":
             raise SyntaxFault(word.column, _unexpected(word))
@@ -207,7 +202,7 @@ class _Parser:
             detail = f"the expression is nested deeper than {MAX_DEPTH} levels"
             raise SyntaxFault(self._peek().column, detail)
         left = self._operand()
-        while (level := _LEVEL.get(self._peek().text, 0)) >= floor:
+        while (level := self._next_level()) >= floor:
             left = self._chain(left, level)
         self._depth -= 1
         return left
@@ -215,13 +210,13 @@ class _Parser:
     def _chain(self, first: Syntax, level: int) -> Syntax:
         """What follows `first` at one level of precedence: ``a - b + c``."""
         links: list[tuple[Token, Syntax]] = []
-        while _LEVEL.get(self._peek().text, 0) == level:
+        while self._next_level() == level:
             operator = self._advance()
-            if level == _COMPARE and links:
+            if level == Level.COMPARISON and links:
                 detail = "comparisons do not chain; write a < b and b < c"
                 raise SyntaxFault(operator.column, detail)
             # ** groups to the right: a**b**c is a**(b**c).
-            links.append((operator, self._expression(level if level == _POWER else level + 1)))
+            links.append((operator, self._expression(level if level == Level.POWER else level + 1)))
         return _folded(first, links)
 
     def _operand(self) -> Syntax:
@@ -229,14 +224,14 @@ class _Parser:
         if word.kind == "number":
             return NumberSyntax(float(word.text), word.column)
         if word.text == "-":
-            return Prefix("-", self._expression(_SIGN), word.column)
+            return Prefix("-", self._expression(Level.SIGN), word.column)
         if word.text == "not":
-            return Prefix("not", self._expression(_COMPARE), word.column)
+            return Prefix("not", self._expression(Level.COMPARISON), word.column)
         if word.text == "(":
-            inner = self._expression(_OR)
+            inner = self._expression(Level.OR)
             self._close(word)
             return inner
-        if word.kind == "name" and word.text not in _LEVEL:
+        if word.kind == "name" and word.text not in OPERATORS:
             return self._named(word)
         raise SyntaxFault(word.column, _missing_operand(word))
 
@@ -246,10 +241,10 @@ class _Parser:
         opening = self._advance()
         arguments: list[Syntax] = []
         if self._peek().text != ")":
-            arguments.append(self._expression(_OR))
+            arguments.append(self._expression(Level.OR))
             while self._peek().text == ",":
                 self._advance()
-                arguments.append(self._expression(_OR))
+                arguments.append(self._expression(Level.OR))
         self._close(opening)
         return Apply(word.text, tuple(arguments), word.column)
 
@@ -265,6 +260,11 @@ class _Parser:
 
     def _peek(self) -> Token:
         return self._words[self._next]
+
+    def _next_level(self) -> int:
+        """How tightly the next token binds; 0 where it is no operator."""
+        word = self._peek().text
+        return OPERATORS[word].level if word in OPERATORS else 0
 
     def _advance(self) -> Token:
         word = self._peek()

@@ -1,14 +1,8 @@
 """Checked trees back to text, with no more parentheses than needed."""
 
+from sysid.language.functions import OPERATORS, Level
 from sysid.language.monomials import CONSTANT, add, collect, rebuild
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
-
-_LEVEL = {
-    "or": 1, "and": 2, "not": 3, "<": 4, "<=": 4, ">": 4, ">=": 4, "==": 4, "!=": 4,
-    "+": 5, "-": 5, "*": 6, "/": 6, "**": 8,
-}  # fmt: skip
-_SIGN = 7
-_ATOM = 9
 
 
 def text(expression: Expression, clock: str = "k") -> str:
@@ -31,28 +25,28 @@ def _text(expression: Expression, clock: str, floor: int) -> str:
 def _written(expression: Expression, clock: str) -> tuple[str, int]:
     match expression:
         case Number(value):
-            return number(value), _ATOM if value >= 0 else _SIGN
+            return number(value), Level.ATOM if value >= 0 else Level.SIGN
         case Symbol(name):
-            return name, _ATOM
+            return name, Level.ATOM
         case Past():
-            return _past(expression, clock), _ATOM
+            return _past(expression, clock), Level.ATOM
         case Unary("-", operand):
-            return f"-{_text(operand, clock, _SIGN)}", _SIGN
+            return f"-{_text(operand, clock, Level.SIGN)}", Level.SIGN
         case Unary(_, operand):
-            return f"not {_text(operand, clock, _LEVEL['<'])}", _LEVEL["not"]
+            return f"not {_text(operand, clock, Level.COMPARISON)}", Level.NOT
         case Binary(operator, left, right):
-            return _infix(operator, left, right, clock), _LEVEL[operator]
+            return _infix(operator, left, right, clock), OPERATORS[operator].level
         case Call(function, arguments):
             inside = ", ".join(_text(one, clock, 0) for one in arguments)
-            return f"{function}({inside})", _ATOM
+            return f"{function}({inside})", Level.ATOM
 
 
 def _infix(operator: str, left: Expression, right: Expression, clock: str) -> str:
-    level = _LEVEL[operator]
+    level = OPERATORS[operator].level
     grows_right = operator == "**"
-    before = _text(left, clock, level + 1 if grows_right or level == _LEVEL["<"] else level)
-    after = _text(right, clock, _SIGN if grows_right else level + 1)
-    space = " " if level <= _LEVEL["+"] else ""
+    before = _text(left, clock, level + 1 if grows_right or level == Level.COMPARISON else level)
+    after = _text(right, clock, Level.SIGN if grows_right else level + 1)
+    space = " " if level <= Level.SUM else ""
     return f"{before}{space}{operator}{space}{after}"
 
 
@@ -62,7 +56,7 @@ def _past(value: Past, clock: str) -> str:
         back = add(back, collect(value.lag))
     constant = back.pop(CONSTANT, 0.0)
     whole = f"-{number(constant)}" if constant else ""
-    lag = _text(rebuild(back), clock, _LEVEL["*"])
+    lag = _text(rebuild(back), clock, Level.PRODUCT)
     index = f"{clock}{whole} - {lag}" if back else f"{clock}{whole}"
     return value.name if index == clock else f"{value.name}({index})"
 

@@ -4,12 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-FUNCTIONS: Mapping[str, tuple[int, int | None]] = {
-    "sin": (1, 1), "cos": (1, 1), "tan": (1, 1), "exp": (1, 1), "log": (1, 1), "sqrt": (1, 1),
-    "abs": (1, 1), "sign": (1, 1), "tanh": (1, 1), "atan": (1, 1),
-    "min": (2, None), "max": (2, None), "where": (3, 3),
-}  # fmt: skip
-"""Functions of the grammar, with the fewest and the most arguments."""
+from sysid.language.functions import FUNCTIONS
 
 WORDS = ("and", "or", "not")
 

@@ -4,6 +4,7 @@ After checking, every name is resolved and every past value is a `Past` with its
 its unknown lag apart, so that code generation never looks at text.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -60,22 +61,53 @@ class Unary:
 
 @dataclass(frozen=True, slots=True)
 class Binary:
-    """Arithmetic, comparison or logic of two operands; logic and comparisons only in `where`."""
+    """An operator of the table (`sysid.language.functions`) between two operands.
 
-    operator: Literal["+", "-", "*", "/", "**", "<", "<=", ">", ">=", "==", "!=", "and", "or"]
+    Comparison and logic stand only in the condition of `where`.
+    """
+
+    operator: str
     left: "Expression"
     right: "Expression"
 
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A function of the grammar; ``where(condition, a, b)`` has three arguments."""
+    """A function of the table (`sysid.language.functions`) of its arguments."""
 
-    function: Literal[
-        "sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "min", "max",
-        "where", "tanh", "atan",
-    ]  # fmt: skip
+    function: str
     arguments: "tuple[Expression, ...]"
 
 
 Expression: TypeAlias = Number | Symbol | Past | Unary | Binary | Call
+
+
+def children(tree: Expression) -> tuple[Expression, ...]:
+    """The nodes right below the root of a tree, in the order of the text; of `Past`, its lag."""
+    match tree:
+        case Past(lag=lag):
+            return () if lag is None else (lag,)
+        case Unary(_, operand):
+            return (operand,)
+        case Binary(_, left, right):
+            return (left, right)
+        case Call(_, arguments):
+            return arguments
+        case _:
+            return ()
+
+
+def walk(tree: Expression) -> Iterator[Expression]:
+    """Every node of a tree, the root first, then its children in the order of the text."""
+    yield tree
+    for child in children(tree):
+        yield from walk(child)
+
+
+def match_plain_state(tree: Expression) -> str | None:
+    """Name of the state that an expression is; None where it is anything else."""
+    match tree:
+        case Past(name, "state", 0, None):
+            return name
+        case _:
+            return None

@@ -6,8 +6,10 @@ What a request gives without any effect: refused, since it is a mistake more oft
 from collections.abc import Mapping, Sequence
 
 from sysid.core.errors import Fault, InvalidSettings, RecordTooShort
+from sysid.core.types import Interval
+from sysid.core.units import format_unit
 from sysid.language.delays import past_values
-from sysid.language.intervals import Interval, bounds
+from sysid.language.intervals import bounds
 from sysid.language.printer import text
 from sysid.language.tree import Past
 from sysid.models.model import Model, initial_parameters
@@ -89,7 +91,7 @@ def check_length(
     cure = "a longer record"
     if len(names) == 1:
         most = _largest(model, past, spans, step, duration)
-        unit = _unit(units.get(names[0], "1"))
+        unit = format_unit(units.get(names[0], "1"))
         end = names[0] if _is_known(spans[names[0]]) else f"upper bound of {names[0]}"
         cure += "" if most is None else f", or a smaller {end}: below {most:.4g}{unit}"
     elif names:
@@ -99,16 +101,12 @@ def check_length(
 
 
 def _told(name: str, span: Interval, unit: str) -> str:
-    value = f"{span[1]:.6g}{_unit(unit)}"
+    value = f"{span[1]:.6g}{format_unit(unit)}"
     return f"{name} is {value}" if _is_known(span) else f"the upper bound of {name} is {value}"
 
 
 def _is_known(span: Interval) -> bool:
     return span[0] == span[1]
-
-
-def _unit(unit: str) -> str:
-    return "" if unit == "1" else f" {unit}"
 
 
 def _largest(

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 import yaml
 
-from sysid.core.errors import Fault, InvalidModel, nearest
+from sysid.core.errors import Fault, InvalidModel, join_pointer, nearest
 
 MAX_CHARACTERS = 262_144
 _MAX_DEPTH = 20
@@ -113,11 +113,6 @@ def shown(value: object) -> str:
     return _SHORT.repr(value)
 
 
-def pointer(*parts: str) -> str:
-    """JSON pointer (RFC 6901) of nested fields."""
-    return "".join("/" + part.replace("~", "~0").replace("/", "~1") for part in parts)
-
-
 def _printable(text: str) -> str:
     """The text in one line: a name that was sent may hold anything."""
     return "".join(one if one.isprintable() else "�" for one in text)
@@ -180,7 +175,7 @@ class Reader:
                 meant = f", or write 0.{key} where 0,{key} was meant" if comma else ""
                 self.fault(place, f"the key {shown(key)} is not a text; put it in quotes{meant}")
             elif names is not None and key not in names:
-                self.fault(place + pointer(key[:80]), f"unknown field{nearest(key, names)}")
+                self.fault(place + join_pointer(key[:80]), f"unknown field{nearest(key, names)}")
             else:
                 fields[key] = item
         return fields
@@ -188,7 +183,7 @@ class Reader:
     def required(self, fields: Mapping[str, Any], name: str, place: str, what: str) -> Any:
         """A field that must be there; None if it is not."""
         if fields.get(name) is None:
-            self.fault(place + pointer(name), f"is missing; {what}")
+            self.fault(place + join_pointer(name), f"is missing; {what}")
         return fields.get(name)
 
     def number(self, value: object, place: str, default: float = 0.0) -> float:

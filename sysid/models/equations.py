@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from sysid.core.errors import nearest
+from sysid.core.errors import join_pointer, nearest
 from sysid.language.checker import Checked, check
 from sysid.language.delays import past_values
 from sysid.language.intervals import bounds
 from sysid.language.scope import Scope
 from sysid.language.tree import Expression, Number, Past
-from sysid.models.documents import Reader, pointer
+from sysid.models.documents import Reader
 from sysid.models.model import Output, Quantity
 from sysid.models.sections import MAX_EQUATIONS
 
@@ -31,10 +31,10 @@ def equations(
     for name in fields:
         if name not in scope.states:
             detail = f"there is no such state{nearest(name, scope.states)}"
-            reader.fault(pointer("equations", name), detail)
+            reader.fault(join_pointer("equations", name), detail)
     texts, trees = {}, []
     for state in scope.states:
-        place = pointer("equations", state)
+        place = join_pointer("equations", state)
         if fields.get(state) is None:
             reader.fault(place, f"is missing; every state needs its equation, {_form(scope)}")
             continue
@@ -62,7 +62,7 @@ def outputs(
     units = {state.name: state.unit for state in states}
     texts, found = [], []
     for name, entry in fields.items():
-        place = pointer("outputs", name)
+        place = join_pointer("outputs", name)
         written = _output_text(reader, entry, place)
         at = place + "/expression" if isinstance(entry, Mapping) else place
         checked = check(written.expression, scope)
@@ -120,7 +120,7 @@ def _fault_own_present(reader: Reader, found: Checked, state: str, scope: Scope)
                 f"this {what} the present {state}(k), which the equation is to give; "
                 f"write {state}(k-1…), or bounds that keep the lag at one sample or more"
             )
-            reader.fault(pointer("equations", state), detail, column)
+            reader.fault(join_pointer("equations", state), detail, column)
 
 
 def _output_text(reader: Reader, entry: object, place: str) -> OutputText:

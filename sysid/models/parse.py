@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
-from sysid.core.errors import Fault, InvalidModel, InvalidSettings
+from sysid.core.errors import Fault, InvalidModel, InvalidSettings, join_pointer
 from sysid.language.scope import Scope, Timing
-from sysid.language.tree import Expression, Past
+from sysid.language.tree import Expression, Past, match_plain_state
 from sysid.models import equations as eq
-from sysid.models.documents import Reader, pointer, shown
+from sysid.models.documents import Reader, shown
 from sysid.models.model import FixedInitial, Form, Initial, MeasuredInitial, Model, Output, Quantity
 from sysid.models.normal_form import normal_form
 from sysid.models.parameters import Parameter
@@ -95,7 +95,7 @@ def _head(reader: Reader, fields: Mapping[str, Any]) -> None:
         need = "need up to 64 of A-Z a-z 0-9 . _ -, starting with a letter or a digit"
         reader.fault("/name", f"{shown(name)} cannot be a model's name; {need}")
     for field in ("title", "description", "source"):
-        reader.text(fields.get(field), pointer(field))
+        reader.text(fields.get(field), join_pointer(field))
 
 
 def _equations(reader: Reader, fields: Mapping[str, Any]) -> Model:
@@ -162,7 +162,7 @@ def _check_outputs(reader: Reader, outputs: tuple[Output, ...], scope: Scope) ->
     for output in outputs:
         if output.name in scope.inputs:
             reader.fault(
-                pointer("outputs", output.name),
+                join_pointer("outputs", output.name),
                 f"{output.name!r} is an input, too; a channel is one or the other",
             )
 
@@ -175,26 +175,17 @@ def _check_measured(
     scope: Scope,
 ) -> None:
     """A measured start needs an output that is that state, or whose rate the state is."""
-    seen = {name for o in outputs if (name := _plain_state(o.expression))}
+    seen = {name for o in outputs if (name := match_plain_state(o.expression))}
     if scope.form == "differential":
         rates = (trees[scope.states.index(name)] for name in tuple(seen))
-        seen |= {name for tree in rates if (name := _plain_state(tree))}
+        seen |= {name for tree in rates if (name := match_plain_state(tree))}
     for name, start in zip(scope.states, starts, strict=True):
         if isinstance(start, MeasuredInitial) and name not in seen:
             detail = (
                 f"no output is just {name}, nor has {name} as its rate, so its start is not "
                 "measured; give a number, or {lower, upper} to estimate it"
             )
-            reader.fault(pointer("initial", name), detail)
-
-
-def _plain_state(tree: Expression) -> str | None:
-    """The state that an expression is, if it is nothing else."""
-    match tree:
-        case Past(name, "state", 0, None):
-            return name
-        case _:
-            return None
+            reader.fault(join_pointer("initial", name), detail)
 
 
 def _polynomial(reader: Reader, fields: Mapping[str, Any]) -> Model:

@@ -10,13 +10,13 @@ from itertools import combinations_with_replacement
 from math import comb
 from typing import Any, NamedTuple, cast, get_args
 
-from sysid.core.errors import InvalidBounds, InvalidSettings, nearest
+from sysid.core.errors import InvalidBounds, InvalidSettings, join_pointer, nearest
 from sysid.language.checker import check
 from sysid.language.delays import delay
 from sysid.language.printer import text
 from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Expression, Number, Past, Symbol
-from sysid.models.documents import Reader, pointer, shown
+from sysid.models.documents import Reader, shown
 from sysid.models.equations import note
 from sysid.models.model import Criterion, ErrorKind, Term, TermRule
 from sysid.models.parameters import Parameter, Scale
@@ -173,7 +173,7 @@ def _regressors(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> tupl
     lags = reader.required(fields, "lags", "", "name the past values, such as {y: [1], u: [1]}")
     found: list[Past] = []
     for name, entries in reader.section(lags, "/lags").items():
-        place = pointer("lags", name)
+        place = join_pointer("lags", name)
         if name not in scope.signals:
             reader.fault(place, f"there is no such signal{nearest(name, scope.signals)}")
         elif not isinstance(entries, list | tuple) or not entries:
@@ -186,7 +186,7 @@ def _regressors(reader: Reader, fields: Mapping[str, Any], scope: Scope) -> tupl
             ]
     for number, value in enumerate(found):
         if value in found[:number]:
-            reader.fault(pointer("lags", value.name), f"{text(value)} is listed twice")
+            reader.fault(join_pointer("lags", value.name), f"{text(value)} is listed twice")
     return tuple(found)
 
 

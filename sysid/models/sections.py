@@ -4,9 +4,9 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, cast, get_args
 
-from sysid.core.errors import InvalidBounds, nearest
+from sysid.core.errors import InvalidBounds, join_pointer, nearest
 from sysid.language.scope import Timing, reserved
-from sysid.models.documents import Reader, pointer, shown
+from sysid.models.documents import Reader, shown
 from sysid.models.model import (
     EstimatedInitial,
     FixedInitial,
@@ -36,7 +36,7 @@ def check_names(reader: Reader, form: Timing, sections: Mapping[str, Sequence[st
     words = reserved(form)
     for section, names in sections.items():
         for name in names:
-            place = pointer(section, name)
+            place = join_pointer(section, name)
             if not _NAME.fullmatch(name):
                 need = "need letters, digits and _, not starting with a digit, at most 64 of them"
                 reader.fault(place, f"{shown(name)} cannot be a name; {need}")
@@ -50,13 +50,13 @@ def check_names(reader: Reader, form: Timing, sections: Mapping[str, Sequence[st
 def signals(reader: Reader, value: object, place: str) -> tuple[Quantity, ...]:
     """Signals with their units: ``{q: N}``."""
     fields = reader.section(value, place, most=MAX_EQUATIONS)
-    return tuple(Quantity(k, reader.unit(v, place + pointer(k))) for k, v in fields.items())
+    return tuple(Quantity(k, reader.unit(v, place + join_pointer(k))) for k, v in fields.items())
 
 
 def constants(reader: Reader, value: object) -> dict[str, float]:
     """Known numbers: ``{m: 1.0}``."""
     fields = reader.section(value, "/constants")
-    return {k: reader.number(v, pointer("constants", k)) for k, v in fields.items()}
+    return {k: reader.number(v, join_pointer("constants", k)) for k, v in fields.items()}
 
 
 def parameters(reader: Reader, value: object) -> tuple[Parameter, ...]:
@@ -67,13 +67,13 @@ def parameters(reader: Reader, value: object) -> tuple[Parameter, ...]:
 
 
 def _parameter(reader: Reader, name: str, entry: object) -> Parameter | None:
-    place, known = pointer("parameters", name), reader.count()
+    place, known = join_pointer("parameters", name), reader.count()
     fields = reader.section(entry, place, _PARAMETER_FIELDS)
     if isinstance(entry, Mapping) or entry is None:
         for bound in ("lower", "upper"):
             reader.required(fields, bound, place, "give the interval in which to search")
     numbers = {
-        key: reader.number(fields[key], place + pointer(key))
+        key: reader.number(fields[key], place + join_pointer(key))
         for key in ("lower", "upper", "fixed")
         if fields.get(key) is not None
     }
@@ -106,9 +106,11 @@ def initial(
     fields = reader.section(value, "/initial")
     for name in fields:
         if name not in states:
-            reader.fault(pointer("initial", name), f"there is no such state{nearest(name, states)}")
+            reader.fault(
+                join_pointer("initial", name), f"there is no such state{nearest(name, states)}"
+            )
     return tuple(
-        _initial(reader, fields[name], pointer("initial", name)) if name in fields else default
+        _initial(reader, fields[name], join_pointer("initial", name)) if name in fields else default
         for name in states
     )
 
@@ -142,7 +144,7 @@ def solver(reader: Reader, value: object, form: Form) -> Solver:
         detail = "belongs to the differential form; a difference equation steps by samples"
         if name == "substeps":
             detail = "is of no use to a polynomial, whose terms are samples"
-        reader.fault(pointer("solver", name), detail)
+        reader.fault(join_pointer("solver", name), detail)
     plain = Solver()
     choices: dict[str, Any] = {
         name: reader.choice(fields.get(name, getattr(plain, name)), options, "/solver/" + name)

@@ -13,7 +13,7 @@ from sysid.language.checker import check
 from sysid.language.delays import mentions_time
 from sysid.language.scope import Scope
 from sysid.language.transform import substitute
-from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary
+from sysid.language.tree import Expression, Symbol, walk
 from sysid.models.model import Model
 from sysid.models.parameters import Parameter
 
@@ -108,16 +108,6 @@ def _resolve(
 
 def names_in(tree: Expression) -> set[str]:
     """Names of the parameters in an expression, and in the lags of its past values."""
-    match tree:
-        case Symbol(name, "parameter"):
-            return {name}
-        case Unary(_, operand):
-            return names_in(operand)
-        case Binary(_, left, right):
-            return names_in(left) | names_in(right)
-        case Call(_, arguments):
-            return set().union(*(names_in(one) for one in arguments))
-        case Past(lag=lag) if lag is not None:
-            return names_in(lag)
-        case _:
-            return set()
+    return {
+        node.name for node in walk(tree) if isinstance(node, Symbol) and node.kind == "parameter"
+    }

@@ -19,14 +19,14 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations
 from math import isclose, prod
 
-from sysid.core.errors import InvalidRecord
+from sysid.core.errors import InvalidRecord, join_pointer
 from sysid.core.units import difference, factor, is_blank, is_known, is_read, suggestion
 from sysid.data.records import Channel, Record
 from sysid.language.delays import past_values
 from sysid.language.monomials import Monomial, collect
 from sysid.language.scope import Timing
-from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary
-from sysid.models.documents import Reader, pointer
+from sysid.language.tree import Binary, Expression, Past, Symbol, children
+from sysid.models.documents import Reader
 from sysid.models.model import Model
 
 _PERIOD = (Symbol("h", "period"), -1)
@@ -47,7 +47,7 @@ def check_lag_units(reader: Reader, model: Model) -> None:
                     continue
                 told.add(name)
                 detail = _detail(name, units[name], size, form, in_periods=in_periods)
-                reader.fault(pointer("parameters", name, "unit"), detail)
+                reader.fault(join_pointer("parameters", name, "unit"), detail)
 
 
 def _bare(past: Past) -> Iterator[tuple[str, bool]]:
@@ -118,14 +118,12 @@ def _names(monomial: Monomial, sizes: Mapping[str, float]) -> list[str]:
 def _inside(node: Expression) -> tuple[Expression, ...]:
     """Of what stands in a product as a whole, the terms inside."""
     match node:
-        case Call(_, arguments):
-            return arguments
-        case Unary(_, operand):
-            return (operand,)
-        case Binary(_, left, right):  # a denominator has its own sum, with its factor in it
-            return (left, right) if collect(node) == {((node, 1),): 1.0} else (node,)
-        case _:
+        case Past():
             return ()
+        case Binary() if collect(node) != {((node, 1),): 1.0}:
+            return (node,)  # a denominator has its own sum, with its factor in it
+        case _:
+            return children(node)
 
 
 _SHOWN = 40  # characters of a unit in a message

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from sysid.language.delays import past_values
-from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary
+from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary, match_plain_state
 from sysid.models.model import Model
 from sysid.models.parameters import Parameter
 from sysid.models.ties import tied_model, ties_of
@@ -25,10 +25,7 @@ class _Seen(NamedTuple):
 
 def reads_outputs(model: Model) -> bool:
     """Whether a prediction one step ahead is other than the free run: some output is a state."""
-    return any(
-        isinstance(one, Past) and one.kind == "state" and one.offset == 0 and one.lag is None
-        for one in (output.expression for output in model.outputs)
-    )
+    return any(match_plain_state(output.expression) for output in model.outputs)
 
 
 def coefficients_on_past_outputs(model: Model, parameters: Sequence[Parameter]) -> dict[str, int]:

@@ -19,7 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc, expit
 
-from sysid.core.types import RANK, FloatArray, IntArray
+from sysid.core.linear_algebra import truncated_svd
+from sysid.core.types import FloatArray, IntArray
 from sysid.residuals.autocorrelation import Laid, whiteness
 
 STEEPEST = 0.97
@@ -82,8 +83,8 @@ def modelled(laid: Laid, columns: FloatArray) -> Modelled | None:
     from scipy.optimize import minimize  # late, as below: few runs need what takes long to load
 
     values = laid.values[laid.present]
-    left, size, _ = np.linalg.svd(columns, full_matrices=False)
-    basis = left[:, size > RANK * max(float(size[0]), np.finfo(float).tiny)]
+    left, _, _, kept = truncated_svd(columns)
+    basis = left[:, kept]
     series = _Series(values, basis, np.diff(np.flatnonzero(laid.present)))
     if values.size <= basis.shape[1] + 2:
         return None

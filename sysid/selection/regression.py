@@ -16,10 +16,11 @@ from sysid.core.types import FloatArray, IntArray
 from sysid.data.interpolation import FineInput
 from sysid.data.records import Record
 from sysid.language.intervals import bounds
-from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary
+from sysid.language.tree import Past
 from sysid.models.model import Model, Term, initial_parameters
 from sysid.models.parameters import Parameter
 from sysid.models.sections import interval
+from sysid.models.ties import names_in
 from sysid.simulation.experiments import Experiment, lay_out
 
 BLOCK = 4096
@@ -164,21 +165,7 @@ def past_of(piece: Piece, lags: Mapping[str, float], rows: IntArray, output: Flo
 def lag_parameters(model: Model) -> set[str]:
     """Names of the parameters in a polynomial's lags."""
     lags = {factor.lag for term in model.terms for factor in term.factors}
-    return {name for lag in lags if lag is not None for name in _names(lag)}
-
-
-def _names(expression: Expression) -> set[str]:
-    match expression:
-        case Symbol(name, "parameter"):
-            return {name}
-        case Unary(_, operand):
-            return _names(operand)
-        case Binary(_, left, right):
-            return _names(left) | _names(right)
-        case Call(_, arguments):
-            return {name for one in arguments for name in _names(one)}
-        case _:
-            return set()
+    return {name for lag in lags if lag is not None for name in names_in(lag)}
 
 
 def lag_of(past: Past, lags: Mapping[str, float], period: float) -> float:

@@ -9,9 +9,8 @@ from sysid.core.errors import InvalidRecord, InvalidSettings, RecordTooShort, ne
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.interpolation import FineInput
 from sysid.data.records import Channel, Record
-from sysid.kernels.loss import measured_state
 from sysid.kernels.reads import is_difference
-from sysid.language.tree import Past
+from sysid.language.tree import Past, match_plain_state
 from sysid.models.model import EstimatedInitial, FixedInitial, MeasuredInitial, Model, initial_name
 from sysid.models.parameters import Parameter
 from sysid.simulation.grid import Grid, grid_of, sample_places
@@ -191,7 +190,7 @@ def _scored_since(model: Model, grid: Grid, scored_from: float) -> dict[str, flo
     computed = grid.start + (max(model.memory, 1) - 0.5) * grid.integration_step
     return {
         output.name: max(scored_from, computed)
-        if isinstance(initial.get(measured_state(output) or ""), MeasuredInitial)
+        if isinstance(initial.get(match_plain_state(output.expression) or ""), MeasuredInitial)
         else scored_from
         for output in model.outputs
     }
@@ -248,7 +247,9 @@ def _measured_start(model: Model, state: int, grid: Grid, outputs: Sequence[Chan
     InvalidRecord
         If no output measures the state or what it is the rate of.
     """
-    measured = {measured_state(o): c for o, c in zip(model.outputs, outputs, strict=True)}
+    measured = {
+        match_plain_state(o.expression): c for o, c in zip(model.outputs, outputs, strict=True)
+    }
     name = model.states[state].name
     count = max(model.memory, 1) if is_difference(model) else 1
     if name in measured:

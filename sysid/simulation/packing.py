@@ -7,13 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from sysid.core.types import FloatArray, IntArray
+from sysid.core.types import FloatArray, IntArray, Interval
 from sysid.data.interpolation import FineInput, fine_input
 from sysid.data.records import Channel
 from sysid.kernels.abi import LANES
 from sysid.kernels.layout import Layout, Variant
 from sysid.kernels.reads import averaged_inputs, furthest, is_difference, lags, with_history
-from sysid.language.intervals import Interval, bounds
+from sysid.language.intervals import bounds
 from sysid.models.delays import check_length
 from sysid.models.model import Model
 from sysid.simulation.grid import Grid, is_on_grid

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sysid.core.jit import compiled
-from sysid.core.types import FloatArray
+from sysid.core.types import BoolArray, FloatArray
 from sysid.simulation.evaluator import Evaluator
 
 
@@ -39,3 +39,8 @@ def placed(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
 
 AT_BOUND = 1e-6
 """Of the interval: an estimate nearer to its end than that lies at its bound."""
+
+
+def is_at_bounds(places: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """Whether each place in [0, 1] lies at the lower end, and whether at the upper one."""
+    return np.asarray(places < AT_BOUND), np.asarray(places > 1.0 - AT_BOUND)

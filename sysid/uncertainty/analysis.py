@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
+from sysid.core.linear_algebra import truncated_svd
 from sysid.core.types import RANK, BoolArray, FloatArray
 from sysid.identifiability.active_bounds import Pull, is_pulled, pulls
 from sysid.identifiability.bound_limits import reach
@@ -37,7 +38,7 @@ from sysid.residuals.coloured import Coloured
 from sysid.residuals.correlated_outputs import coloured_jointly
 from sysid.residuals.whitening import Whitening
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import AT_BOUND, placed
+from sysid.simulation.scaling import is_at_bounds, placed
 from sysid.uncertainty.estimates import (
     Criteria,
     Estimate,
@@ -143,8 +144,7 @@ def _analysed(
     shifts, more = translations(problem, theta, columns, scale, left)
     count += more
     columns, known = without_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
-    singular, rows = np.linalg.svd(columns, full_matrices=False)[1:]
-    kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
+    _, singular, rows, kept = truncated_svd(columns)
     kept[d - known :] = False
     inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
     colour = coloured_jointly(problem, influence, columns)
@@ -190,7 +190,7 @@ def _moved(directions: FloatArray) -> BoolArray:
 def _held_back(
     problem: Problem, influence: FloatArray, columns: FloatArray, place: FloatArray
 ) -> tuple[Pull, ...]:
-    at_end = (place < AT_BOUND) | (place > 1.0 - AT_BOUND)
+    at_end = np.logical_or(*is_at_bounds(place))
     reaches = tuple(
         reach(problem, one) if asked else (one.lower, one.upper)
         for one, asked in zip(problem.space, at_end, strict=True)
@@ -270,12 +270,12 @@ def _possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray
     """
     total = float(influence @ influence)
     downhill = -(columns.T @ influence)
-    held = ((place < AT_BOUND) & (downhill < 0)) | ((place > 1.0 - AT_BOUND) & (downhill > 0))
+    at_lower, at_upper = is_at_bounds(place)
+    held = (at_lower & (downhill < 0)) | (at_upper & (downhill > 0))
     if total == 0.0 or held.all():
         return 0.0
-    left, singular, _ = np.linalg.svd(columns[:, ~held], full_matrices=False)
-    span = left[:, singular > RANK * max(singular[0], np.finfo(float).tiny)]
-    return float(np.sum((span.T @ influence) ** 2)) / total
+    left, _, _, kept = truncated_svd(columns[:, ~held])
+    return float(np.sum((left[:, kept].T @ influence) ** 2)) / total
 
 
 def _covariance(
@@ -328,7 +328,7 @@ def _statuses(
     bound leaves and standard errors with it.
     """
     statuses: list[EstimateStatus] = ["identified"] * place.size
-    for d in np.flatnonzero((place < AT_BOUND) | (place > 1.0 - AT_BOUND)):
+    for d in np.flatnonzero(np.logical_or(*is_at_bounds(place))):
         statuses[d] = "at bound"
     for block in found:
         for d in block.members:

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.types import RANK, FloatArray
+from sysid.core.linear_algebra import truncated_svd
+from sysid.core.types import FloatArray
 from sysid.identifiability.combinations import NULL_MEMBER
 from sysid.identifiability.scaling import scalings
 from sysid.identifiability.translations import translations
@@ -70,8 +71,7 @@ def floor(problem: Problem, theta: FloatArray) -> Floor:
     n, d = columns.shape
     # Rows of zeros make the directions complete where there are fewer samples than parameters.
     square = np.vstack([columns, np.zeros((max(d - n, 0), d))])
-    singular, rows = np.linalg.svd(square, full_matrices=False)[1:]
-    kept = singular > RANK * max(float(singular[0]), np.finfo(float).tiny)
+    _, singular, rows, kept = truncated_svd(square)
     kept[d - known :] = False
     variance = np.sum((rows[kept] / singular[kept, None]) ** 2, axis=0)
     untold = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | found.one_sided

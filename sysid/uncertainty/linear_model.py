@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sysid.core.types import RANK, BoolArray, FloatArray
-from sysid.simulation.scaling import AT_BOUND
+from sysid.core.linear_algebra import truncated_svd
+from sysid.core.types import BoolArray, FloatArray
+from sysid.simulation.scaling import is_at_bounds
 
 _STREAM = 2**63
 
@@ -96,7 +97,8 @@ def linear_model(
     slope = np.where(held, 0.0, columns.T @ error)
     if held.any():
         inverse, root = _without(root, held)
-    leads_out = ((place < AT_BOUND) & (slope > 0)) | ((place > 1.0 - AT_BOUND) & (slope < 0))
+    at_lower, at_upper = is_at_bounds(place)
+    leads_out = (at_lower & (slope > 0)) | (at_upper & (slope < 0))
     unit = np.where(scale > 0, scale, 1.0)
     return Linear(
         covariance=variance * inverse * np.outer(scale, scale),
@@ -110,6 +112,5 @@ def linear_model(
 def _without(root: FloatArray, held: BoolArray) -> tuple[FloatArray, FloatArray]:
     """The same without the parameters held."""
     root = np.where(held, 0.0, root)
-    singular, rows = np.linalg.svd(root, full_matrices=False)[1:]
-    kept = singular > RANK * max(singular[0], np.finfo(float).tiny)
+    _, singular, rows, kept = truncated_svd(root)
     return (rows[kept].T / singular[kept] ** 2) @ rows[kept], root

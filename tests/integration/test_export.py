@@ -207,7 +207,7 @@ def test_an_identification_is_exported_with_its_uncertainty() -> None:
         (sysid.Channel("u", times, u, hold="zero"),), (sysid.Channel("y", times, y),)
     )
     small = sysid.GeneticAlgorithm(population=16, generations=20, islands=1)
-    found = sysid.identification.identify(model, [record], small, parameters={"L": {"upper": 1.0}})
+    found = sysid.identify(model, [record], small, parameters={"L": {"upper": 1.0}})
     document = json.loads(sysid.export_model(model, found, "json", provenance={"made": "here"}))
     stderr = {one["name"]: one["stderr"] for one in document["values"]}
     covariance = document["covariance"]

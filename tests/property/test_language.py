@@ -7,10 +7,11 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from sysid.language.checker import check
+from sysid.language.functions import FUNCTIONS
 from sysid.language.intervals import bounds
 from sysid.language.monomials import collect, rebuild
 from sysid.language.printer import text
-from sysid.language.scope import FUNCTIONS, Scope
+from sysid.language.scope import Scope
 from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
 from tests.meaning import meaning
 
@@ -40,7 +41,7 @@ def _grown(inner: st.SearchStrategy[Expression]) -> st.SearchStrategy[Expression
         comparison.map(lambda one: Unary("not", one)),
         st.builds(Binary, st.sampled_from(["and", "or"]), comparison, comparison),
     )
-    single = [name for name, (fewest, most) in FUNCTIONS.items() if fewest == most == 1]
+    single = [name for name, function in FUNCTIONS.items() if function.most == 1]
     return st.one_of(
         st.builds(Binary, st.sampled_from(["+", "-", "*", "/", "**"]), inner, inner),
         inner.map(lambda one: Unary("-", one)),

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sysid.language.scope import FUNCTIONS
+from sysid.language.functions import FUNCTIONS
 from sysid.models.documents import read_yaml
 from sysid.models.parse import parse_model
 

@@ -5,8 +5,9 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.core.validation import escaped, explained
+from service.core.validation import explained
 from service.jobs.schemas import JobIn
+from sysid.core.errors import join_pointer, split_pointer
 
 
 def faults(**changes: Any) -> dict[str, str]:
@@ -38,4 +39,5 @@ def test_what_was_found_is_shown_but_not_at_length() -> None:
 
 
 def test_slashes_and_tildes_are_escaped() -> None:
-    assert escaped("a/b~c") == "a~1b~0c"
+    assert join_pointer("a/b~c", 1) == "/a~1b~0c/1"
+    assert split_pointer("/a~1b~0c/1") == ["a/b~c", "1"]

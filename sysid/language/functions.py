@@ -1,0 +1,206 @@
+"""Operators and functions of the language: one table, from which every layer takes its part.
+
+To add a function, add its entry here; where LLVM has no intrinsic for it, write its instructions
+in `sysid.kernels.expressions`; where C99 has no function for it, write one in `sysid.export.c`.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from math import atan, exp, inf, log, pi, sqrt, tan, tanh
+
+from sysid.core.types import Interval
+
+EVERYTHING: Interval = (-inf, inf)
+
+
+class Level(IntEnum):
+    """How tightly an operator binds, from loose to tight; a name binds as an atom."""
+
+    OR = 1
+    AND = 2
+    NOT = 3
+    COMPARISON = 4
+    SUM = 5
+    PRODUCT = 6
+    SIGN = 7
+    POWER = 8
+    ATOM = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Operator:
+    """An operator between two operands.
+
+    Attributes
+    ----------
+    level : Level
+    numpy : str
+        Its name in NumPy.
+    interval : function or None
+        The interval of its values, given those of its operands; None: false or true, 0 or 1.
+    """
+
+    level: Level
+    numpy: str
+    interval: Callable[[Interval, Interval], Interval] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Function:
+    """A function of the language.
+
+    Attributes
+    ----------
+    name : str
+        In the language.
+    interval : function
+        The interval of its values, given those of its arguments.
+    fewest, most : int
+        Number of arguments; most None: any number, taken two by two.
+    numpy, llvm, c : str
+        Its names in NumPy, as intrinsic of LLVM and in math.h, where they are not `name`.
+    """
+
+    name: str
+    interval: Callable[..., Interval]
+    fewest: int = 1
+    most: int | None = 1
+    numpy: str = ""
+    llvm: str = ""
+    c: str = ""
+
+    def __post_init__(self) -> None:
+        for language in ("numpy", "llvm", "c"):
+            if not getattr(self, language):
+                object.__setattr__(self, language, self.name)
+
+
+def _sum(a: Interval, b: Interval) -> Interval:
+    return (a[0] + b[0], a[1] + b[1])
+
+
+def _difference(a: Interval, b: Interval) -> Interval:
+    return (a[0] - b[1], a[1] - b[0])
+
+
+def _times(a: float, b: float) -> float:
+    return 0.0 if a == 0.0 or b == 0.0 else a * b  # an unbounded end is never reached, so 0·∞ = 0
+
+
+def _product(a: Interval, b: Interval) -> Interval:
+    corners = [_times(x, y) for x in a for y in b]
+    return (min(corners), max(corners))
+
+
+def _quotient(a: Interval, b: Interval) -> Interval:
+    if b[0] > 0 or b[1] < 0:
+        return _product(a, (1 / b[1], 1 / b[0]))
+    if b[0] == 0 and b[1] > 0:
+        return _product(a, (1 / b[1], inf))
+    if b[1] == 0 and b[0] < 0:
+        return _product(a, (-inf, 1 / b[0]))
+    return EVERYTHING
+
+
+def _power(a: Interval, b: Interval) -> Interval:
+    if b[0] == b[1] and b[0] >= 0 and b[0].is_integer():
+        ends = [_raise(x, b[0]) for x in a]
+        if b[0] % 2 == 0 and a[0] < 0 < a[1]:
+            ends.append(0.0 if b[0] else 1.0)
+        return (min(ends), max(ends))
+    if a[0] >= 0:  # monotone in either argument, so the ends lie at the corners
+        corners = [_raise(x, y) for x in a for y in b]
+        return (min(corners), max(corners))
+    return EVERYTHING
+
+
+def _raise(base: float, exponent: float) -> float:
+    try:
+        return float(base**exponent)
+    except OverflowError:
+        return -inf if base < 0 and exponent % 2 == 1 else inf
+    except ZeroDivisionError:
+        return inf
+
+
+def _rising(function: Callable[[float], float]) -> Callable[[Interval], Interval]:
+    return lambda a: (function(a[0]), function(a[1]))
+
+
+def _exp(x: float) -> float:
+    return inf if x > 709.0 else exp(x)
+
+
+def _log(x: float) -> float:
+    return -inf if x <= 0 else log(x)
+
+
+def _sqrt(x: float) -> float:
+    return sqrt(max(x, 0.0))
+
+
+def _sign(x: float) -> float:
+    return float((x > 0) - (x < 0))
+
+
+def _absolute(a: Interval) -> Interval:
+    low = 0.0 if a[0] <= 0 <= a[1] else min(abs(a[0]), abs(a[1]))
+    return (low, max(abs(a[0]), abs(a[1])))
+
+
+def _wave(_: Interval) -> Interval:
+    return (-1.0, 1.0)
+
+
+def _tangent(a: Interval) -> Interval:
+    return (tan(a[0]), tan(a[1])) if -pi / 2 < a[0] and a[1] < pi / 2 else EVERYTHING
+
+
+def _least(a: Interval, b: Interval) -> Interval:
+    return (min(a[0], b[0]), min(a[1], b[1]))
+
+
+def _either(_: Interval, a: Interval, b: Interval) -> Interval:
+    return (min(a[0], b[0]), max(a[1], b[1]))
+
+
+def _greatest(a: Interval, b: Interval) -> Interval:
+    return (max(a[0], b[0]), max(a[1], b[1]))
+
+
+OPERATORS: Mapping[str, Operator] = {
+    "or": Operator(Level.OR, "logical_or"),
+    "and": Operator(Level.AND, "logical_and"),
+    "<": Operator(Level.COMPARISON, "less"),
+    "<=": Operator(Level.COMPARISON, "less_equal"),
+    ">": Operator(Level.COMPARISON, "greater"),
+    ">=": Operator(Level.COMPARISON, "greater_equal"),
+    "==": Operator(Level.COMPARISON, "equal"),
+    "!=": Operator(Level.COMPARISON, "not_equal"),
+    "+": Operator(Level.SUM, "add", _sum),
+    "-": Operator(Level.SUM, "subtract", _difference),
+    "*": Operator(Level.PRODUCT, "multiply", _product),
+    "/": Operator(Level.PRODUCT, "divide", _quotient),
+    "**": Operator(Level.POWER, "power", _power),
+}
+
+FUNCTIONS: Mapping[str, Function] = {
+    function.name: function
+    for function in (
+        Function("sin", _wave),
+        Function("cos", _wave),
+        Function("tan", _tangent),
+        Function("exp", _rising(_exp)),
+        Function("log", _rising(_log)),
+        Function("sqrt", _rising(_sqrt)),
+        Function("abs", _absolute, llvm="fabs", c="fabs"),
+        Function("sign", _rising(_sign)),
+        Function("tanh", _rising(tanh)),
+        Function("atan", _rising(atan), numpy="arctan"),
+        # Unlike a comparison, minimum and maximum pass nan on, so that divergence is not hidden.
+        Function("min", _least, 2, None, numpy="minimum", llvm="minimum", c="least"),
+        Function("max", _greatest, 2, None, numpy="maximum", llvm="maximum", c="greatest"),
+        Function("where", _either, 3, 3),
+    )
+}
