@@ -15,8 +15,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import quote
 from uuid import uuid4
 
-from sysid.core.errors import join_pointer
-
 if TYPE_CHECKING:
     import httpx
 
@@ -124,7 +122,8 @@ def _check_finite(pointer: str, value: Any) -> None:
         raise NotFinite(pointer, value)
     if isinstance(value, Mapping):
         for name, one in value.items():
-            _check_finite(pointer + join_pointer(str(name)), one)
+            part = str(name).replace("~", "~0").replace("/", "~1")
+            _check_finite(f"{pointer}/{part}", one)
     elif isinstance(value, list | tuple):
         for index, one in enumerate(value):
             _check_finite(f"{pointer}/{index}", one)
