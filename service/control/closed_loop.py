@@ -16,6 +16,7 @@ from service.control.schemas import (
     TuningOut,
 )
 from service.core.errors import FieldError, InvalidRequest
+from service.core.text import plain_unit
 from service.datasets.schemas import StepInput
 from service.datasets.simulated import check_finite
 from sysid.core.errors import InvalidSettings, nearest
@@ -290,7 +291,7 @@ def _start_notes(
     start = float(output.values[0])
     if abs(start - step.offset) <= band:
         return
-    unit = "" if output.unit == "1" else f" {output.unit}"
+    unit = plain_unit(output.unit)
     yield (
         f"{output.name} starts at {start:.4g}{unit} with a reference of {step.offset:.4g}{unit} "
         f"before the step: unless the loop rests there, {_MORE}"
@@ -302,7 +303,7 @@ def _stability_notes(
 ) -> Iterator[str]:
     """That a loop is unstable or keeps swinging, said plainly."""
     if metrics is not None and metrics.swing is not None:
-        unit = "" if metrics.unit == "1" else f" {metrics.unit}"
+        unit = plain_unit(metrics.unit)
         decays = margins is not None and margins.is_stable and not controller.saturated_percent
         yield (
             f"{metrics.output} keeps swinging and does not settle: {metrics.swing:.4g}{unit} from "

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from service.core.text import bracket_unit, format_value
 from service.figures import theme
-from service.figures.formats import bracketed
 from service.figures.plotly import MARGIN, Figure, finite, layout
 from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
 
@@ -92,7 +92,7 @@ def noise_height(n_panels: int, columns: int = 2) -> int:
 
 
 def _panels(summary: SummaryOut, unit: str) -> list[_Panel]:
-    suffix = bracketed(unit)
+    suffix = bracket_unit(unit)
     response = _Panel("<b>RMS error</b> of the response", f"RMS error{suffix}", is_signed=False)
     panels = {"": response}
     for group in summary.groups:
@@ -116,7 +116,7 @@ def _add_error(panel: _Panel, name: str, sigma: float, one: ParameterSummaryOut)
 
 
 def _panel_of(one: ParameterSummaryOut) -> _Panel:
-    suffix = bracketed(one.unit)
+    suffix = bracket_unit(one.unit)
     known = "" if one.reference is None else f" − {one.reference:.6g}".replace("−-", "+")
     return _Panel(f"<b>{one.name}</b>{known}", f"error of {one.name}{suffix}", is_signed=True)
 
@@ -134,10 +134,7 @@ def _series(group: GroupOut) -> str:
     rest = {key: value for key, value in group.key.items() if key != SIGMA}
     if list(rest) == [METHOD]:
         return str(rest[METHOD])
-    words = (
-        value.get("name", "…") if isinstance(value, dict) else value for value in rest.values()
-    )
-    return ", ".join(map(str, words)) or "all runs"
+    return ", ".join(map(format_value, rest.values())) or "all runs"
 
 
 def _look(name: str, number: int) -> dict[str, Any]:
@@ -164,7 +161,7 @@ def _add(
     figure["data"] += _floors(panel, at, told)
     figure["layout"][f"xaxis{axis}"] = {
         "domain": across, "anchor": f"y{axis}", "rangemode": "tozero", "nticks": 7,
-        "title": {"text": "σ" + bracketed(unit), "font": {"size": 11},
+        "title": {"text": "σ" + bracket_unit(unit), "font": {"size": 11},
                   "standoff": 4},
         **({} if number == 0 else {"matches": "x"}),
     }  # fmt: skip

@@ -11,7 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from service.figures import formats, theme
+from service.core.text import append_unit, bracket_unit, join_estimate, plain_unit
+from service.figures import theme
 from service.figures.data import Floats, Improvement, RunEvidence, SoughtParameter
 from service.figures.theme import strided
 
@@ -246,7 +247,7 @@ def _some(epochs: Sequence[int]) -> list[int]:
 
 def _fitness_axis(run: RunEvidence, data: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The axis of the fitness; `data` are the traces upon it."""
-    title = {"text": run.fitness + formats.bracketed(run.unit)}
+    title = {"text": run.fitness + bracket_unit(run.unit)}
     # Over less than a decade the digits between its powers would stand alone, without any power.
     axis = {"title": title, "type": "log", "exponentformat": "e", "minorloglabels": "complete"}
     positive = [y for trace in data for y in trace["y"] if y is not None and y > 0]
@@ -329,8 +330,7 @@ def _level(y: float, axis: str) -> dict[str, Any]:
 
 
 def _caption(parameter: SoughtParameter) -> str:
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
     if parameter.value is None:
-        return f"<b>{parameter.name}</b>{f' [{parameter.unit}]' if unit else ''}"
-    value, error = formats.estimate(parameter.value, parameter.stderr)
-    return f"<b>{parameter.name}</b> = {value}{f' ± {error}' if error else ''}{unit}"
+        return append_unit(f"<b>{parameter.name}</b>", parameter.unit)
+    estimate = join_estimate(parameter.value, parameter.stderr)
+    return f"<b>{parameter.name}</b> = {estimate}{plain_unit(parameter.unit)}"

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+from service.core.text import bracket_unit
 from service.figures import theme
-from service.figures.formats import bracketed
 from service.figures.plotly import MARGIN, Figure, layout
 from service.runs.schemas import ProfileOut
 
@@ -27,7 +27,7 @@ def profile(profiles: Sequence[ProfileOut], threshold: float, columns: int = 2) 
         axis = "" if number == 0 else str(number + 1)
         figure["data"].append(_line(one, axis))
         figure["layout"]["shapes"] += _marks(one, axis, threshold)
-        title = one.name + bracketed(one.unit)
+        title = one.name + bracket_unit(one.unit)
         figure["layout"][f"xaxis{axis}"] = {
             "domain": [left, left + wide], "anchor": f"y{axis}", "title": {"text": title},
             "nticks": 6,

@@ -2,8 +2,8 @@
 
 from typing import Any
 
+from service.core.text import bracket_unit
 from service.figures import theme
-from service.figures.formats import bracketed
 from service.figures.plotly import MARGIN, Figure, finite, layout
 from service.trends.schemas import LawOut, PlaceOut, PointOut, QuantityOut, TrendOut
 
@@ -61,7 +61,7 @@ def _axes(
 ) -> Axes:  # fmt: skip
     axis = "" if number == 0 else str(number + 1)
     across, upward = place
-    unit = bracketed(one.unit)
+    unit = bracket_unit(one.unit)
     figure["layout"][f"xaxis{axis}"] = {
         "domain": across, "anchor": f"y{axis}", "nticks": 7, "rangemode": "tozero",
         "title": {"text": x, "font": {"size": 11}, "standoff": 4},

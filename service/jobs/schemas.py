@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from service.core.states import StateName
 from service.core.wire import Answer, Body, NoiseIn, Pointer, Seed, not_too_deep
 
 Whole = Annotated[int, Field(gt=-(2**62), lt=2**62)]
@@ -283,7 +284,7 @@ class JobOut(Answer):
 
     id: str
     name: str
-    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
+    state: StateName
     cancel_requested: bool = False
     created_at: datetime
     started_at: datetime | None = None

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from service.figures import formats
+from service.core.text import format_count, format_estimate, format_interval, format_value
 from service.pages.diagnostics import Findings, findings_of
 from service.storage.tables import Event, Job, Run, State
 
@@ -144,12 +144,12 @@ def run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
 def estimate_view(one: Document) -> EstimateView:
     """A line of the table, from an entry of the result's ``parameters``."""
     stderr = one.get("stderr")
-    value, error = formats.estimate(one["value"], stderr)
+    value, error = format_estimate(one["value"], stderr)
     bounds = [one[name] for name in ("lower", "upper") if one.get(name) is not None]
     status = one.get("status", "")
     return EstimateView(
         name=one["name"], unit=one.get("unit", "1"), value_text=value, stderr_text=error,
-        interval_text=formats.interval(one.get("interval95"), stderr),
+        interval_text=format_interval(one.get("interval95"), stderr),
         bounds_text=" … ".join(f"{bound:.6g}".replace("-", "−") for bound in bounds),
         status=status, reason=one.get("reason") or "",
     )  # fmt: skip
@@ -165,7 +165,9 @@ def event_view(event: Event) -> EventView:
     text = data.get("message") or data.get("text")
     if text is None:
         known = ((name.replace("_", " "), value) for name, value in data.items())
-        text = ", ".join(f"{name} {_plain(value)}" for name, value in known if value is not None)
+        text = ", ".join(
+            f"{name} {format_value(value)}" for name, value in known if value is not None
+        )
     return EventView(event.created_at, event.kind, str(text))
 
 
@@ -198,7 +200,7 @@ def cell_text(cell: Document, labels: Document) -> str:
     """What distinguishes a run from the others of its job; labels tell data better than ids."""
     told = {path: value for path, value in cell.items() if not (labels and path == DATASETS)}
     pairs = [(_field_name(path, told), value) for path, value in told.items()]
-    return ", ".join(f"{name} {_plain(value)}" for name, value in [*labels.items(), *pairs])
+    return ", ".join(f"{name} {format_value(value)}" for name, value in [*labels.items(), *pairs])
 
 
 def _field_name(path: str, others: Iterable[str]) -> str:
@@ -214,18 +216,9 @@ def _run_title(run: Run) -> str:
 
 def _progress_text(job: Job, share: float) -> str:
     if job.n_runs > 1:
-        return f"{formats.count(job.n_done)} of {formats.count(job.n_runs)} runs"
+        return f"{format_count(job.n_done)} of {format_count(job.n_runs)} runs"
     if job.state is State.QUEUED:
         return "waiting"
     if job.state is not State.SUCCEEDED:
-        return f"generation {formats.count(job.generation)}" if job.generation else ""
+        return f"generation {format_count(job.generation)}" if job.generation else ""
     return f"{100 * share:.0f}\u202f%"
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, float):
-        return formats.number(value)
-    if isinstance(value, dict | list):
-        text = json.dumps(value, ensure_ascii=False)
-        return text if len(text) <= 60 else f"{text[:57]}…"
-    return str(value)

@@ -8,6 +8,7 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
 from service.core.json_pointer import body_of
+from service.core.text import plain_estimate, plain_unit
 from service.jobs.to_core import noise_model_of
 from service.models.models import model_of_run
 from service.repositories.jobs import JobRepository
@@ -202,20 +203,11 @@ def _has_ends(interval: Sequence[float | None] | None) -> bool:
 def _note(
     name: str, unit: str, pair: Sequence[tuple[str, Document]], *, same_model: bool
 ) -> str:  # fmt: skip
-    symbol = "" if unit == "1" else f" {unit}"
-    told = ", ".join(f"{_plus_minus(estimate)}{symbol} with {title}" for title, estimate in pair)
+    told = ", ".join(
+        f"{plain_estimate(estimate['value'], estimate['stderr'])}{plain_unit(unit)} with {title}"
+        for title, estimate in pair
+    )
     return f"{name} depends on the {'run' if same_model else 'model'}: {told}"
-
-
-def _plus_minus(estimate: Document) -> str:
-    """A value and its standard error, both to the error's second digit."""
-    value, stderr = float(estimate["value"]), estimate["stderr"]
-    if not stderr or stderr <= 0:
-        return f"{value:.6g}"
-    decimals = 1 - int(f"{stderr:.1e}".partition("e")[2])
-    if not 0 <= decimals <= 9:
-        return f"{value:.6g} ± {stderr:.2g}"
-    return f"{value:.{decimals}f} ± {stderr:.{decimals}f}"
 
 
 def _unit(ordered: Sequence[_Candidate]) -> str:

@@ -12,10 +12,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field
 
+from service.core.states import StateName
 from service.core.wire import Answer, Body
 from service.datasets.schemas import Series
-
-RunState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
 
 class RunOut(Answer):
@@ -32,7 +31,7 @@ class RunOut(Answer):
     number: int
     cell: dict[str, Any]
     labels: dict[str, Any]
-    state: RunState
+    state: StateName
     valid: bool | None = None
     rms: float | None = None
     rms_unit: str | None = Field(
