@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -172,14 +171,13 @@ def _tuned(
         closed_loop_time_constant=tuning.closed_loop_time_constant, transport=transport,
     )  # fmt: skip
     process = found.process
-    told = TuningOut(
-        rule=found.rule, controller=found.controller,
-        closed_loop_time_constant=found.closed_loop_time_constant,
-        process_gain=process.gain, process_delay=process.delay,
-        process_time_constant=_known(process.time_constant),
+    told = TuningOut.from_source(
+        found,
+        process_gain=process.gain,
+        process_delay=process.delay,
+        process_time_constant=process.time_constant,
         process_second_time_constant=process.second_time_constant,
-        formulas=list(found.formulas), reference=found.reference,
-    )  # fmt: skip
+    )
     return found.gain, found.integral_time, found.derivative_time, told
 
 
@@ -189,15 +187,9 @@ def _margins(identified: "Identified", control: "PidControl") -> MarginsOut | No
     from sysid.control.margins import margins
 
     try:
-        found = margins(identified, control)
+        return MarginsOut.from_source(margins(identified, control))
     except NotLinear:
         return None
-    return MarginsOut(
-        is_stable=found.is_stable, gain_margin=_known(found.gain_margin),
-        phase_margin=_known(found.phase_margin), delay_margin=_known(found.delay_margin),
-        crossover_frequency=_known(found.crossover_frequency),
-        sensitivity_peak=_known(found.sensitivity_peak),
-    )  # fmt: skip
 
 
 def _controller_told(used: "PidControl", command: FloatArray) -> ControllerOut:
@@ -206,14 +198,16 @@ def _controller_told(used: "PidControl", command: FloatArray) -> ControllerOut:
     for limit, sign in ((low, -1.0), (high, 1.0)):
         if limit is not None:
             at_limit |= sign * command >= sign * limit - _AT_LIMIT * abs(limit)
-    return ControllerOut(
-        gain=used.gain, integral_time=used.integral_time if used.integrates else None,
-        derivative_time=used.derivative_time, derivative_filter=used.derivative_filter,
-        derivative_on=used.derivative_on, setpoint_weight=used.setpoint_weight,
-        lower=low, upper=high, tracking_time=used.tracking,
-        command_min=float(np.min(command)), command_max=float(np.max(command)),
+    return ControllerOut.from_source(
+        used,
+        integral_time=used.integral_time if used.integrates else None,
+        lower=low,
+        upper=high,
+        tracking_time=used.tracking,
+        command_min=float(np.min(command)),
+        command_max=float(np.max(command)),
         saturated_percent=100.0 * float(np.mean(at_limit)),
-    )  # fmt: skip
+    )
 
 
 def _check_finite(
@@ -254,20 +248,7 @@ def _metrics(
     found = step_metrics(
         times, output.values, at=step.time, before=step.offset, after=step.offset + step.amplitude
     )
-    return StepMetricsOut(
-        output=output.name, unit=output.unit, rise_time=_known(found.rise_time),
-        overshoot_percent=_known(found.overshoot_percent),
-        overshoot_of_final_percent=_known(found.overshoot_of_final_percent),
-        settling_time=_known(found.settling_time), band=found.band,
-        steady_error=_known(found.steady_error), final_value=_known(found.final_value),
-        runs_away=found.runs_away, is_settled=found.is_settled,
-        iae=_known(found.iae), itae=_known(found.itae),
-        swing=_known(found.swing), swing_period=_known(found.swing_period),
-    )  # fmt: skip
-
-
-def _known(value: float) -> float | None:
-    return value if isfinite(value) else None
+    return StepMetricsOut.from_source(found, output=output.name, unit=output.unit)
 
 
 def _tuning_notes(tuning: TuningOut) -> Iterator[str]:

@@ -18,12 +18,12 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import ServiceError
 from service.core.json_pointer import body_of
+from service.core.wire import to_finite
 from service.dispatch.background import Make
 from service.dispatch.job_runs import JobRuns
 from service.queue.leases import Claim
 from service.repositories.datasets import DatasetRepository
 from service.repositories.summaries import Group, GroupKey, groups, quietest_run
-from service.runs.result import finite
 from service.storage.columns import Document
 from service.storage.errors import StorageError
 from service.storage.retry import patiently
@@ -160,11 +160,12 @@ class _Floors:
 
 def _told(found: Floor) -> Document:
     stderr = {
-        name: finite(value) for name, value in zip(found.names, found.stderr.tolist(), strict=True)
+        name: to_finite(value)
+        for name, value in zip(found.names, found.stderr.tolist(), strict=True)
     }
     untold = [name for name, value in stderr.items() if value is None]
     note = f"the data tell nothing of {', '.join(untold)} alone: no floor" if untold else ""
-    return {"stderr": stderr, "rms": finite(found.response), "note": note}
+    return {"stderr": stderr, "rms": to_finite(found.response), "note": note}
 
 
 def _without_noise(spec: ProblemSpec) -> ProblemSpec:

@@ -3,9 +3,10 @@
 import math
 from collections.abc import Iterator, Mapping
 
+from service.core.wire import to_finite
 from service.queue.run_writes import RunOutcome
 from service.repositories.history import HistoryPoint, MigrantPoint
-from service.runs.result import finite, result_document
+from service.runs.result import result_document
 from service.storage.tables import State
 from sysid.search.state import Improvement, Migrant
 from workers.ports import Concluded
@@ -13,16 +14,16 @@ from workers.ports import Concluded
 
 def outcome_of(run: str, concluded: Concluded, seconds: float) -> RunOutcome:
     """The row of a run that succeeded, its signals left out."""
-    found, without = concluded.identification, finite(concluded.rms_noise_free)
+    found, without = concluded.identification, to_finite(concluded.rms_noise_free)
     return RunOutcome(
         run_id=run,
         state=State.SUCCEEDED,
         result={**result_document(found, seconds), "rms_noise_free": without},
         valid=found.valid,
-        best_rms=finite(found.rms),
+        best_rms=to_finite(found.rms),
         rms_noise_free=without,
-        fit_estimation=finite(found.fit_percent),
-        fit_validation=finite(found.fit_percent_validation),
+        fit_estimation=to_finite(found.fit_percent),
+        fit_validation=to_finite(found.fit_percent_validation),
         evaluations=found.evaluations,
         generations=found.generations,
         seconds=seconds,

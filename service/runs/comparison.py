@@ -176,11 +176,7 @@ def _parameters(
         known = sum(_has_ends(estimate["interval95"]) for _, estimate in found)
         yield ComparedParameter(
             name=name, unit=unit, differs=None if known < 2 else pair is not None, note=note,
-            values=[
-                ComparedValue(run=one.run.id, value=e["value"], stderr=e["stderr"],
-                              interval95=e["interval95"], status=e["status"])
-                for one, e in found
-            ],
+            values=[ComparedValue.model_validate({**e, "run": one.run.id}) for one, e in found],
         )  # fmt: skip
 
 

@@ -75,18 +75,17 @@ def free_run(
         If the recording does not have what the model needs, or the simulation diverges.
     """
     found = judged(database, store, run_id, body)
-    return FreeRunOut(
-        id=found.run, dataset=found.dataset, unit=found.metrics.unit, rms=found.metrics.rms,
-        fit_percent=_finite(found.metrics.fit_percent), starts=found.starts,
+    return FreeRunOut.from_source(
+        found.metrics,
+        id=found.run,
+        dataset=found.dataset,
+        starts=found.starts,
         agreement=[
-            AgreementOut(
-                experiment=one.experiment + 1, output=one.output, unit=one.unit,
-                samples=one.samples, rms=one.rms, fit_percent=_finite(one.fit_percent),
-            )
+            AgreementOut.from_source(one, experiment=one.experiment + 1)
             for one in found.metrics.channels
         ],
         experiments=list(_experiments(found, max_points)),
-    )  # fmt: skip
+    )
 
 
 @simulating.one()
@@ -302,7 +301,3 @@ def _experiments(found: FreeRun, max_points: int) -> Iterator[ExperimentOut]:
             measured=[series(one, max_points) for one in record.outputs],
             simulated=[series(one, max_points) for one in simulated],
         )
-
-
-def _finite(value: float) -> float | None:
-    return value if isfinite(value) else None

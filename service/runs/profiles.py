@@ -5,7 +5,6 @@ before it begins, what does take long is stopped, and there is one at a time.
 """
 
 from collections.abc import Iterator, Mapping
-from math import isfinite
 from threading import Lock
 from time import monotonic
 from typing import TYPE_CHECKING, Any
@@ -101,16 +100,13 @@ def _computed(
                 "fewer parameters or points, or use sysid.uncertainty.profile_likelihood.profile",
             )
         others = [p.name for p in problem.space if p.name != name]
-        yield ProfileOut(
-            name=name, unit=found.unit, estimate=found.estimate, interval95=found.interval,
-            values=found.values.tolist(), ratio=_finite(found.ratio), rms=_finite(found.rms),
+        yield ProfileOut.from_source(
+            found,
+            name=name,
+            interval95=found.interval,
             others=dict(zip(others, found.others.T.tolist(), strict=True)),
-            evaluations=found.evaluations,
-        )  # fmt: skip
-
-
-def _finite(values: Any) -> list[float | None]:
-    return [float(value) if isfinite(value) else None for value in values]
+            **{key: getattr(found, key).tolist() for key in ("values", "ratio", "rms")},
+        )
 
 
 def _problem(session: Session, store: ObjectStore, run_id: str) -> "tuple[Problem, Any]":

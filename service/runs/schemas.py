@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field
 
 from service.core.states import StateName
-from service.core.wire import Answer, Body
+from service.core.wire import Answer, Body, Finite
 from service.datasets.schemas import Series
 
 
@@ -164,8 +164,8 @@ class ProfileOut(Answer):
     estimate: float
     interval95: tuple[float | None, float | None]
     values: list[float]
-    ratio: list[float | None]
-    rms: list[float | None]
+    ratio: list[Finite]
+    rms: list[Finite]
     others: dict[str, list[float]]
     evaluations: int
 
@@ -267,7 +267,7 @@ class AgreementOut(Answer):
     unit: str
     samples: int
     rms: float
-    fit_percent: float | None
+    fit_percent: Finite
 
 
 class FreeRunOut(Answer):
@@ -282,7 +282,7 @@ class FreeRunOut(Answer):
     dataset: str
     unit: str
     rms: float
-    fit_percent: float | None
+    fit_percent: Finite
     agreement: list[AgreementOut]
     starts: dict[str, float]
     experiments: list[ExperimentOut]
