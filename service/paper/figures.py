@@ -138,7 +138,7 @@ def _numbers(values: Sequence[float | None]) -> Floats:
 
 def band(x: Sequence[float], lower: Sequence[float], upper: Sequence[float], method: str) -> Line:
     """The area between two lines, in the method's colour."""
-    colour = theme.SHADE if method == "" else _faint(style(method)["color"])
+    colour = theme.SHADE if method == "" else theme.fade(style(method)["color"], 0.16)
     around = [*x, *reversed(x)], [*upper, *reversed(lower)]
     return line("", *around, fill="toself", fillcolor=colour, line={"width": 0},
                 hoverinfo="skip", showlegend=False)  # fmt: skip
@@ -148,11 +148,6 @@ def points(name: str, x: Sequence[float], y: Sequence[float], method: str) -> Li
     """Single runs of a method."""
     marker = {"color": style(method)["color"], "size": 4, "opacity": 0.45}
     return line(name, x, y, mode="markers", marker=marker, showlegend=False)
-
-
-def _faint(colour: str) -> str:
-    red, green, blue = (int(colour[n : n + 2], 16) for n in (1, 3, 5))
-    return f"rgba({red},{green},{blue},0.16)"
 
 
 def _end(found: Mapping[str, Found]) -> float:
