@@ -301,7 +301,7 @@ def _small_plot(
             figure["data"].append({
                 "type": "scatter", "mode": "lines",
                 "name": f"{parameter.name}, island {island + 1}",
-                "x": x, "y": finite(y), **at,
+                "x": x, "y": finite(y), "xaxis": at["xaxis"], "yaxis": at["yaxis"],
                 "line": {**theme.series_style(island), "shape": "hv"},
                 "hovertemplate": f"island {island + 1}<br>%{{x}}: %{{y:.6g}}<extra></extra>",
             })  # fmt: skip
