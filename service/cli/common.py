@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -17,13 +18,17 @@ from rich.console import Console
 from rich.table import Table
 
 from service.client.calls import DEFAULT_URL, NotFinite, ProblemError
-from service.core.errors import FieldError
+from service.core.documents import read_yaml
+from service.core.errors import FieldError, InvalidRequest
+from service.core.text import DASH, format_value, plain_estimate
 from sysid.core.errors import join_pointer, split_pointer
 
 if TYPE_CHECKING:
     from service.client.client import Client
 
 
+MODEL_SUFFIXES = (".yaml", ".yml", ".json")
+DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
 WIDE = 200  # where nobody looks, a line is not folded at 80 columns
 out = Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -55,8 +60,20 @@ def connected(url: str, key: str | None = None) -> "Iterator[Client]":
 
 def fail(message: str, code: int = 1) -> NoReturn:
     """End the command with one readable line on stderr."""
-    err.print(f"lagid: {' '.join(message.split())}", markup=False)
+    print_error(message)
     raise typer.Exit(code)
+
+
+def print_error(message: str) -> None:
+    """Print what went wrong as one line on stderr."""
+    err.print(f"lagid: {' '.join(message.split())}", markup=False)
+
+
+def check_succeeded(job: dict[str, Any]) -> None:
+    """End the command with the reason if a job that is over did not succeed."""
+    if job["state"] != "succeeded":
+        reason = f": {job['error']}" if job["error"] else ""
+        fail(f"{job['id']} {job['state']}{reason}")
 
 
 def usage(message: str) -> NoReturn:
@@ -74,8 +91,6 @@ def parts_of(change: str) -> list[str]:
 
 def put(body: dict[str, Any], change: str) -> None:
     """Put the value of a ``--set path=value`` into a body; the value is read as YAML."""
-    from service.core.documents import read_yaml
-
     parts, here = parts_of(change), body
     for part in parts[:-1]:
         here = here.setdefault(part, {})
@@ -87,6 +102,18 @@ def put(body: dict[str, Any], change: str) -> None:
 def print_json(value: Any) -> None:
     """Print a value as JSON, unstyled and unwrapped."""
     out.print(json.dumps(value, indent=2, ensure_ascii=False), markup=False, soft_wrap=True)
+
+
+def print_line(text: str) -> None:
+    """Print a line as it is: neither styled nor folded."""
+    out.print(text, markup=False, soft_wrap=True)
+
+
+def print_job(job: dict[str, Any]) -> None:
+    """Print a job that was just submitted."""
+    n_runs = job["progress"]["runs"]
+    runs = f"{n_runs} runs, " if n_runs > 1 else ""
+    print_line(f"{job['id']}  {job['name']}: {runs}{job['state']}")
 
 
 def print_table(
@@ -122,35 +149,18 @@ def print_listing(
 def shown(value: object) -> str:
     """A value in a cell: a dash for None, six digits for a number."""
     if value is None:
-        return "–"
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    return str(value).replace("[", "\\[")
-
-
-def with_unit(name: str, unit: str | None) -> str:
-    """A heading with its unit, ``T [s]``; σ as a unit is that of several outputs together."""
-    return name if unit in (None, "", "1") else f"{name} [{unit}]"
+        return DASH
+    return format_value(value).replace("[", "\\[")
 
 
 def estimate(one: dict[str, Any]) -> str:
-    """``0.1193 ± 0.0004``, cut at the standard error's second digit."""
-    value, stderr = one["value"], one["stderr"]
-    if stderr is None or not stderr > 0:
-        return f"{value:.6g}"
-    digits = max(0, 1 - _exponent(stderr))
-    if _exponent(stderr) > 5 or digits > 9:
-        return f"{value:.6g} ± {stderr:.2g}"
-    return f"{value:.{digits}f} ± {stderr:.{digits}f}"
+    """``0.1193 ± 0.0004``, from an entry of a run's parameters."""
+    return plain_estimate(one["value"], one["stderr"])
 
 
 def status_of(one: dict[str, Any]) -> str:
     """The status of an estimate, with its reason where there is one."""
     return f"{one['status']} ({one['reason']})" if one["reason"] else str(one["status"])
-
-
-def _exponent(number: float) -> int:
-    return int(f"{number:e}".partition("e")[2])
 
 
 def read_file(path: Path) -> bytes:
@@ -159,6 +169,77 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         fail(f"{path} cannot be read: {error.strerror}")
+
+
+def read_document(path: Path) -> Any:
+    """What a YAML or JSON file says; ends the command if it cannot be read."""
+    try:
+        return read_yaml(read_file(path))
+    except InvalidRequest as error:
+        fail(f"{path}: {error}")
+
+
+def read_object(path: Path, form: str = "an object (name: value)") -> dict[str, Any]:
+    """The object in a YAML or JSON file; ends the command if it holds something else."""
+    document = read_document(path)
+    if not isinstance(document, dict):
+        fail(f"{path} does not hold {form}")
+    return document
+
+
+def read_model(name: str) -> Any:
+    """A model as a body gives it: the document if the name is that of a file."""
+    return read_document(Path(name)) if name.endswith(MODEL_SUFFIXES) else name
+
+
+def write_file(path: Path, text: str) -> None:
+    """Write a file that the user names; ends the command if it cannot be written."""
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        fail(f"{path} cannot be written: {error.strerror}")
+
+
+def split_names(text: str | None) -> list[str]:
+    """Names that are joined by commas."""
+    return [name.strip() for name in (text or "").split(",") if name.strip()]
+
+
+def parse_pairs(option: str, texts: Iterable[str], form: str = "NAME=VALUE") -> dict[str, str]:
+    """Texts of the form ``name=value`` by their names; ends the command if one is not."""
+    pairs = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition("="))
+        if not (equals and name and value):
+            usage(f"{option} {text}: need {form}")
+        pairs[name] = value
+    return pairs
+
+
+def parse_channels(text: str | None) -> dict[str, str]:
+    """The channel of each signal out of ``u=P1,y=P2``."""
+    return parse_pairs("--channels", split_names(text), "signal=channel, such as u=P1")
+
+
+def parse_number(place: str, text: str) -> float:
+    """A finite number; ends the command if the text at this place of the command is none."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not isfinite(value):
+        usage(f"{place}: found {text!r}; need a number")
+    return value
+
+
+def format_moment(text: str) -> str:
+    """A time of an answer to the second, ``2026-01-31 12:00:00``."""
+    return text[:19].replace("T", " ")
+
+
+def format_decimals(value: float | None) -> str | None:
+    """A number with two decimals; None where there is none."""
+    return None if value is None else f"{value:.2f}"
 
 
 INVALID = 422

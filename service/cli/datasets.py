@@ -14,14 +14,17 @@ from service.cli.common import (
     Url,
     connected,
     fail,
-    out,
+    parse_number,
+    parse_pairs,
     print_json,
+    print_line,
     print_listing,
-    read_file,
+    read_document,
+    read_object,
     told_at,
 )
 from service.client.calls import DEFAULT_URL
-from service.core.documents import read_yaml
+from service.core.text import append_unit
 
 app = typer.Typer(help="Add, simulate and derive recordings.", no_args_is_help=True)
 
@@ -83,13 +86,16 @@ def simulate(
     """
     if file is None and plant is None:
         fail("give a file with the request, or --plant actuator or --plant tube")
-    body = {} if file is None else _object(read_yaml(read_file(file)), file)
+    body = {} if file is None else read_object(file)
     if plant is not None:
         body["plant"] = plant
     if name is not None:
         body["name"] = name
     if sets:
-        given = dict(_parameter(one) for one in sets)
+        given = {
+            name: parse_number(f"--set {name}={value}", value)
+            for name, value in parse_pairs("--set", sets).items()
+        }
         body["parameters"] = {**(body.get("parameters") or {}), **given}
     with connected(url, key) as client, told_at(_places(file, sets)):
         stored = client.simulate_dataset(body)
@@ -106,7 +112,7 @@ def derive(
     as_json: AsJson = False,
 ) -> None:
     """Make a recording from another: noise, resample, trim, select, pool and so on."""
-    steps = read_yaml(read_file(file))
+    steps = read_document(file)
     if isinstance(steps, dict):
         steps = steps.get("steps")
     if not isinstance(steps, list):
@@ -132,28 +138,13 @@ def _tell(stored: dict[str, Any], as_json: bool) -> None:
     sampling = "irregular sampling" if period is None else f"sampling period {period:.6g} s"
     before = stored["details"].get("known_before")
     known = f"known for {before:.6g} s before, " if before else ""
-    out.print(f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, {known}"
-              f"channels {_channels(stored)}", markup=False, soft_wrap=True)  # fmt: skip
+    print_line(
+        f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, {known}"
+        f"channels {_channels(stored)}"
+    )
     for warning in stored["warnings"]:
-        out.print(f"note: {warning}", markup=False, soft_wrap=True)
+        print_line(f"note: {warning}")
 
 
 def _channels(dataset: dict[str, Any]) -> str:
-    return ", ".join(
-        one["name"] if one["unit"] == "1" else f"{one['name']} [{one['unit']}]"
-        for one in dataset["channels"]
-    )
-
-
-def _parameter(text: str) -> tuple[str, float]:
-    name, _, value = text.partition("=")
-    try:
-        return name.strip(), float(value)
-    except ValueError:
-        fail(f"--set {text}: need NAME=VALUE with a number, such as length_m=30")
-
-
-def _object(body: Any, file: Path) -> dict[str, Any]:
-    if not isinstance(body, dict):
-        fail(f"{file} does not hold an object (name: value)")
-    return body
+    return ", ".join(append_unit(one["name"], one["unit"]) for one in dataset["channels"])

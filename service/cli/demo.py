@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from service.cli.common import estimate
 from service.client.client import Client
 from service.client.embedded import embedded_service
 
@@ -109,10 +110,7 @@ def _table(console: Console, runs: dict[str, dict[str, Any]]) -> None:
 
 
 def _estimate(run: dict[str, Any], name: str) -> str:
-    found = next(p for p in run["parameters"] if p["name"] == name)
-    if found["stderr"] is None:
-        return f"{found['value']:.4f}"
-    return f"{found['value']:.4f} ± {found['stderr']:.4f}"
+    return estimate(next(p for p in run["parameters"] if p["name"] == name))
 
 
 def _say_where(console: Console, data_dir: Path, report: Path) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import (
+    MODEL_SUFFIXES,
     Places,
     SampleTime,
     Segments,
@@ -18,14 +19,18 @@ from service.cli.common import (
     estimate,
     fail,
     out,
+    parse_channels,
     parts_of,
     print_json,
     print_table,
     put,
     read_file,
+    split_names,
     status_of,
     usage,
+    write_file,
 )
+from service.core.text import plain_unit
 from sysid.core.errors import nearest
 from sysid.core.settings import NOISE_MODELS
 
@@ -50,7 +55,6 @@ PLACES = Places({
     "/model": "--model …", "/datasets": "DATA", "/channels": "--channels {}",
     "/loss/noise_model": "--noise-model",
 })  # fmt: skip
-MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +100,9 @@ def identify(
     changes = list(changes or ())
     if noise_model is not None:
         changes.append(f"loss.noise_model={noise_model}")
-    given = _given(data, model, changes, _pairs(channels))
+    given = _given(data, model, changes, parse_channels(channels))
     _refuse_same(data, validation)
-    reading = Reading(sample_time, _names(segments))
+    reading = Reading(sample_time, tuple(split_names(segments)))
     recording = read(data, reading)
     body, loaded = checked(given, max(1, len(recording.segments)))
     records = _records(recording, data, loaded, body)
@@ -220,10 +224,7 @@ def tell(model: "Model", found: "Identification", seconds: float, json_file: str
     if json_file is not None:
         import json
 
-        try:
-            Path(json_file).write_text(json.dumps(document, indent=2), encoding="utf-8")
-        except OSError as error:
-            fail(f"{json_file} cannot be written: {error.strerror}")
+        write_file(Path(json_file), json.dumps(document, indent=2))
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "status"),
         (
@@ -233,8 +234,11 @@ def tell(model: "Model", found: "Identification", seconds: float, json_file: str
         empty="no parameters",
     )
     unit = model.outputs[0].unit if len(model.outputs) == 1 else "standard deviations"
-    fit = f"RMS {found.rms:.6g} {'' if unit == '1' else unit}".rstrip()
-    out.print(f"{fit}, fit {_percent(found.fit_percent)}", markup=False, end="")
+    out.print(
+        f"RMS {found.rms:.6g}{plain_unit(unit)}, fit {_percent(found.fit_percent)}",
+        markup=False,
+        end="",
+    )
     if found.fit_percent_validation is not None:
         out.print(f", validation {_percent(found.fit_percent_validation)}", markup=False, end="")
     out.print(f"; {found.evaluations} simulations in {seconds:.2f} s", markup=False)
@@ -318,17 +322,3 @@ def _records(recording: "Recording", path: Path, model: "Model", body: "JobIn") 
             fail(f"{given}: {path} has no channel {channel!r} for signal {signal!r} of the model"
                  f"{nearest(channel, recording.names)}")  # fmt: skip
     return list(channels.cut_records(recording, path.stem))
-
-
-def _pairs(text: str | None) -> dict[str, str]:
-    pairs = {}
-    for one in _names(text):
-        signal, equals, channel = one.partition("=")
-        if not equals or not signal or not channel:
-            usage(f"--channels {text}: need signal=channel,…, as u=P1,y=P2")
-        pairs[signal.strip()] = channel.strip()
-    return pairs
-
-
-def _names(text: str | None) -> tuple[str, ...]:
-    return tuple(one.strip() for one in (text or "").split(",") if one.strip())

@@ -1,51 +1,45 @@
 """`lagid submit`, `watch`, `jobs`, `runs`, `cancel`, `resume`, `report`."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from service.cli.common import (
+    DATA_SUFFIXES,
+    MODEL_SUFFIXES,
     AsJson,
     Key,
     Url,
+    check_succeeded,
     connected,
-    err,
     estimate,
     fail,
+    format_decimals,
+    format_moment,
     in_file,
     out,
+    print_job,
     print_json,
+    print_line,
     print_listing,
     print_table,
-    read_file,
+    read_document,
+    read_object,
     told_at,
-    with_unit,
+    write_file,
 )
 from service.cli.tables import MOST, place_of, print_many, show_run, tell_reused
 from service.cli.watch import follow
 from service.client.calls import DEFAULT_URL
-from service.core.documents import read_yaml
-from service.core.errors import InvalidRequest
+from service.core.states import State
+from service.core.text import append_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client
 
 
-class State(StrEnum):
-    """States of a job."""
-
-    queued = "queued"
-    running = "running"
-    succeeded = "succeeded"
-    failed = "failed"
-    cancelled = "cancelled"
-
-
 JobName = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.")]
-FILE_SUFFIXES = (".yaml", ".yml", ".json")
-DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
 
 
 def submit(
@@ -67,7 +61,7 @@ def submit(
             if as_json:
                 print_json(job)
             else:
-                out.print(f"{job['id']}  {job['name']}: {job['state']}", markup=False)
+                print_job(job)
             return
         _finish(client, follow(client, job["id"], quiet=as_json), as_json)
 
@@ -94,7 +88,7 @@ def listing(
         as_json,
         ("id", "name", "state", "model", "runs", ">RMS", "unit", "submitted"),
         lambda one: (one["id"], one["name"], one["state"], one["model"], _counts(one),
-                     *_rms(one), one["created_at"][:19].replace("T", " ")),
+                     *_rms(one), format_moment(one["created_at"])),
         empty=f"no jobs are {' or '.join(state)}" if state
         else "no jobs; submit one: lagid submit job.yaml",
     )  # fmt: skip
@@ -150,33 +144,21 @@ def report(
     """Write the report of a job as one HTML file."""
     with connected(url, key) as client:
         text = client.report(job)
-    try:
-        file.write_text(text, encoding="utf-8")
-    except OSError as error:
-        fail(f"{file} cannot be written: {error.strerror}")
+    write_file(file, text)
     out.print(str(file), markup=False)
 
 
 def job_of(file: Path) -> dict[str, Any]:
     """The body of a job file; a model named as a file is read, beside the job file."""
-    body = _yaml_of(file)
-    if not isinstance(body, dict):
-        fail(f"{file} does not hold a job (model: …, datasets: […])")
+    body = read_object(file, "a job (model: …, datasets: […])")
     model = body.get("model")
-    if isinstance(model, str) and model.endswith(FILE_SUFFIXES):
-        body["model"] = _yaml_of(file.parent / model)
+    if isinstance(model, str) and model.endswith(MODEL_SUFFIXES):
+        body["model"] = read_document(file.parent / model)
     for one in body.get("datasets") or []:
         if isinstance(one, str) and one.endswith(DATA_SUFFIXES):
             fail(f"{file}: datasets are ids or names on the server, and {one!r} is a file; "
                  f"add it first: lagid dataset add {one}")  # fmt: skip
     return body
-
-
-def _yaml_of(file: Path) -> Any:
-    try:
-        return read_yaml(read_file(file))
-    except InvalidRequest as error:
-        fail(f"{file}: {error}")
 
 
 def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
@@ -188,13 +170,19 @@ def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
     for run, place in zip(runs, places, strict=True):
         found = {one["name"]: estimate(one) for one in run["parameters"]}
         fit = run.get("fit_percent") or {}
-        rows.append([
-            run["id"], run["state"], *(place.get(path) for path in paths),
-            run["rms"], _percent(fit.get("estimation")), _percent(fit.get("validation")),
-            *(found.get(name) for name in units),
-        ])  # fmt: skip
-    headings = ("run", "state", *paths, f">{with_unit('RMS', rms_unit)}", ">fit %",
-                ">validation %", *(f">{with_unit(*one)}" for one in units.items()))  # fmt: skip
+        rows.append(
+            [
+                run["id"],
+                run["state"],
+                *(place.get(path) for path in paths),
+                run["rms"],
+                format_decimals(fit.get("estimation")),
+                format_decimals(fit.get("validation")),
+                *(found.get(name) for name in units),
+            ]
+        )
+    headings = ("run", "state", *paths, f">{append_unit('RMS', rms_unit)}", ">fit %",
+                ">validation %", *(f">{append_unit(*one)}" for one in units.items()))  # fmt: skip
     print_table(headings, rows, empty="no runs")
 
 
@@ -207,13 +195,10 @@ def _finish(client: "Client", job: dict[str, Any], as_json: bool) -> None:
     else:
         print_runs(found, job["rms_unit"])
         for warning in dict.fromkeys(w for run in found for w in run.get("warnings", [])):
-            out.print(f"note: {warning}", markup=False, soft_wrap=True)
+            print_line(f"note: {warning}")
     if not as_json:
         tell_reused(job, found, "reuse: false in the job")
-    if job["state"] != "succeeded":
-        reason = f": {job['error']}" if job["error"] else ""
-        err.print(f"lagid: {job['id']} {job['state']}{reason}", markup=False)
-        raise typer.Exit(1)
+    check_succeeded(job)
 
 
 def _latest(client: "Client") -> str:
@@ -239,7 +224,3 @@ def _rms(job: dict[str, Any]) -> tuple[float | None, str | None]:
     if job["progress"]["runs"] != 1 or best is None:
         return None, None
     return best, job["rms_unit"]
-
-
-def _percent(value: float | None) -> str | None:
-    return None if value is None else f"{value:.2f}"

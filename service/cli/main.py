@@ -13,7 +13,7 @@ from service.cli import reidentify as references
 from service.cli import runs as exporting
 from service.cli import server as serving
 from service.cli import server as upkeep
-from service.cli.common import err, out
+from service.cli.common import out, print_error
 from service.cli.identify import identify
 from service.cli.paper import paper
 from service.cli.reidentify import reidentify
@@ -108,7 +108,7 @@ def _usage(error: TyperException) -> str:
 
 def _end(message: str, code: int = 1) -> None:
     if message:
-        err.print(f"lagid: {' '.join(message.split())}", markup=False)
+        print_error(message)
     sys.exit(code)
 
 

@@ -11,12 +11,12 @@ from service.cli.common import (
     Url,
     connected,
     err,
-    fail,
     in_file,
     out,
     print_json,
     print_listing,
     read_file,
+    read_object,
     told_at,
 )
 from service.client.calls import DEFAULT_URL
@@ -116,9 +116,7 @@ def add(
     key: Key = None,
 ) -> None:
     """Store an own model on a server."""
-    document = read_yaml(read_file(file))
-    if not isinstance(document, dict):
-        fail(f"{file} does not hold a model (name, equations, …)")
+    document = read_object(file, "a model (name, equations, …)")
     with connected(url, key) as client, told_at(in_file(file)):
         stored = client.add_model(document)
     out.print(f"{stored['name']}@{stored['version']}", markup=False)

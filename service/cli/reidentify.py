@@ -10,34 +10,37 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from service.cli.common import (
+    DATA_SUFFIXES,
     AsJson,
     Key,
     Places,
     Url,
+    check_succeeded,
     connected,
-    err,
     estimate,
     fail,
+    format_moment,
     out,
+    parse_channels,
+    parse_number,
+    print_job,
     print_json,
     print_listing,
     print_table,
     put,
-    read_file,
+    read_model,
+    split_names,
     told_at,
     usage,
+    write_file,
 )
 from service.cli.tables import print_trend, tell_reused
 from service.cli.watch import follow
 from service.client.calls import DEFAULT_URL
-from service.core.documents import read_yaml
+from service.core.text import format_labels
 
 if TYPE_CHECKING:
     from service.client.client import Client
-
-
-MODEL_SUFFIXES = (".yaml", ".yml", ".json")
-DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
 
 
 Experiments = Annotated[
@@ -104,9 +107,9 @@ def reidentify(
     batch = [_experiments(text) for text in experiments]
     chosen = _chosen([x for x, _ in batch], label, accept, accept_run)
     body: dict[str, Any] = {
-        "model": _model(model), "label": label, "look_at": _names(parameters),
-        "predict": [_number("--predict", one) for one in _names(predict)],
-        "channels": dict(_pair(one) for one in _names(channels)),
+        "model": read_model(model), "label": label, "look_at": split_names(parameters),
+        "predict": [parse_number("--predict", one) for one in split_names(predict)],
+        "channels": parse_channels(channels),
         **_given(reference=reference, warm_start=warm_start, name=name),
     }  # fmt: skip
     for change in changes or []:
@@ -116,8 +119,7 @@ def reidentify(
         with told_at(_places(experiments)):
             job = client.reidentify(body)
         if not (wait or accept or json_file):
-            runs = job["progress"]["runs"]
-            out.print(f"{job['id']}  {job['name']}: {runs} runs, {job['state']}", markup=False)
+            print_job(job)
             return
         ended = follow(client, job["id"], quiet=json_file == "-")
         _tell(client, ended, json_file)
@@ -143,14 +145,8 @@ def _tell(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
         print_trend(trend, Places())
         tell_reused(job, (), "--set reuse=false")
     if json_file not in (None, "-"):
-        try:
-            Path(str(json_file)).write_text(json.dumps(trend, indent=2, ensure_ascii=False))
-        except OSError as error:
-            fail(f"{json_file} cannot be written: {error.strerror}")
-    if job["state"] != "succeeded":
-        reason = f": {job['error']}" if job["error"] else ""
-        err.print(f"lagid: {job['id']} {job['state']}{reason}", markup=False)
-        raise typer.Exit(1)
+        write_file(Path(str(json_file)), json.dumps(trend, indent=2, ensure_ascii=False))
+    check_succeeded(job)
 
 
 def _chosen(given: list[float], label: str, accept: str | None, accept_run: str | None) -> float:
@@ -167,7 +163,7 @@ def _chosen(given: list[float], label: str, accept: str | None, accept_run: str 
             f"--accept-run {accept_run}: need a value of {label}, since only a run of this batch "
             f"can be meant; {there}. Another run: lagid references accept {accept} {accept_run}"
         )
-    x = given[0] if accept_run is None else _number("--accept-run", accept_run)
+    x = given[0] if accept_run is None else parse_number("--accept-run", accept_run)
     if given.count(x) != 1:
         found = f"{given.count(x)} experiments have {label} = {x:g}; {there}"
         several = f". Accept one of their runs at the end: lagid references accept {accept} RUN"
@@ -178,9 +174,7 @@ def _chosen(given: list[float], label: str, accept: str | None, accept_run: str 
 def _accept(client: "Client", job: dict[str, Any], name: str, label: str, x: float) -> None:
     """Make a run of the batch the reference of a name."""
     (run,) = client.runs(job["id"], label=f"{label}={json.dumps(x)}")
-    told = client.accept_reference(name, run["id"])
-    before = f" (before: {told['history'][0]['run']})" if told["history"] else ""
-    out.print(f"{told['name']}: {told['run']}{before}", markup=False)
+    _print_accepted(client.accept_reference(name, run["id"]))
 
 
 def _uploaded(client: "Client", batch: list[tuple[float, list[str]]]) -> list[dict[str, Any]]:
@@ -198,40 +192,14 @@ def _uploaded(client: "Client", batch: list[tuple[float, list[str]]]) -> list[di
 
 def _experiments(text: str) -> tuple[float, list[str]]:
     x, equals, sources = text.partition("=")
-    names = _names(sources)
+    names = split_names(sources)
     if not (equals and names):
         usage(f"{text}: need X=DATA, the value of the label and a recording, such as 5=a.csv")
-    return _number(text, x), names
-
-
-def _number(where: str, text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not abs(value) < float("inf"):
-        usage(f"{where}: found {text!r}; need a number")
-    return value
-
-
-def _pair(text: str) -> tuple[str, str]:
-    name, equals, value = (part.strip() for part in text.partition("="))
-    if not (equals and name and value):
-        usage(f"--channels {text}: need signal=channel, such as u=P1")
-    return name, value
+    return parse_number(text, x), names
 
 
 def _given(**options: str | None) -> dict[str, str]:
     return {name: value for name, value in options.items() if value is not None}
-
-
-def _model(name: str) -> Any:
-    path = Path(name)
-    return read_yaml(read_file(path)) if path.suffix in MODEL_SUFFIXES else name
-
-
-def _names(text: str) -> list[str]:
-    return [one.strip() for one in text.split(",") if one.strip()]
 
 
 app = typer.Typer(help="List, show and accept references.", no_args_is_help=True)
@@ -247,11 +215,19 @@ def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) ->
     with connected(url, key) as client:
         found = client.references()
     print_listing(
-        found, as_json, ("name", "run", "accepted", "by", "labels", "estimates"),
-        lambda one: (one["name"], one["run"], _when(one["at"]), one["by"], _labels(one["labels"]),
-                     _estimates(one["estimates"])),
+        found,
+        as_json,
+        ("name", "run", "accepted", "by", "labels", "estimates"),
+        lambda one: (
+            one["name"],
+            one["run"],
+            format_moment(one["at"]),
+            one["by"],
+            format_labels(one["labels"]),
+            _estimates(one["estimates"]),
+        ),
         empty="no references; accept one: lagid references accept NAME RUN",
-    )  # fmt: skip
+    )
 
 
 @app.command()
@@ -266,8 +242,8 @@ def show(
         return
     out.print(f"{found['name']}: {_estimates(found['estimates'])}", markup=False)
     if found["labels"]:
-        out.print(_labels(found["labels"]), markup=False)
-    rows = [(one["run"], _when(one["at"]), one["by"], one["note"])
+        out.print(format_labels(found["labels"]), markup=False)
+    rows = [(one["run"], format_moment(one["at"]), one["by"], one["note"])
             for one in (found, *found["history"])]  # fmt: skip
     print_table(("run", "accepted", "by", "note"), rows, empty="")
 
@@ -288,16 +264,12 @@ def accept(
     if as_json:
         print_json(found)
         return
-    before = f" (before: {found['history'][0]['run']})" if found["history"] else ""
-    out.print(f"{found['name']}: {found['run']}{before}", markup=False)
+    _print_accepted(found)
 
 
-def _when(at: str) -> str:
-    return at[:19].replace("T", " ")
-
-
-def _labels(labels: dict[str, Any]) -> str:
-    return ", ".join(f"{name} = {value}" for name, value in labels.items())
+def _print_accepted(reference: dict[str, Any]) -> None:
+    before = f" (before: {reference['history'][0]['run']})" if reference["history"] else ""
+    out.print(f"{reference['name']}: {reference['run']}{before}", markup=False)
 
 
 def _estimates(estimates: dict[str, Any]) -> str:

@@ -16,16 +16,17 @@ from service.cli.common import (
     Url,
     connected,
     estimate,
-    fail,
+    format_decimals,
     out,
     print_json,
     print_table,
-    read_file,
+    read_object,
     told_at,
+    write_file,
 )
 from service.cli.jobs import runs as listing
 from service.client.calls import DEFAULT_URL
-from service.core.documents import read_yaml
+from service.core.text import format_p_value
 from sysid.core.units import multiplied
 
 LISTING = "list"
@@ -87,9 +88,7 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Simulate the identified model on a new input or under P, PI or PID control."""
-    body = read_yaml(read_file(file))
-    if not isinstance(body, dict):
-        fail(f"{file} does not hold an object (name: value)")
+    body = read_object(file)
     places = Places({"?max_points": "--max-points"}, rest=f"{file} …")
     with connected(url, key) as client, told_at(places):
         found = client.simulate_run(run, body, max_points)
@@ -212,7 +211,7 @@ def _tested(one: dict[str, Any]) -> tuple[object, ...]:
     reason = f": {one['reason']}" if one["reason"] else ""
     return (
         one["test"], one["experiment"] + 1, one["output"], one["input"], one["samples"],
-        _percent(one["inside95"]), _percent(one["inside99"]), _chance(one["p"]),
+        _percent(one["inside95"]), _percent(one["inside99"]), format_p_value(one["p"]),
         f"{one['outcome']}{reason}",
     )  # fmt: skip
 
@@ -224,24 +223,18 @@ def _compared(one: dict[str, Any], parameters: list[dict[str, Any]]) -> tuple[ob
     ]
     passed = {True: "passed", False: "failed", None: None}[one["residuals_passed"]]
     return (
-        one["run"], one["title"], one["parameters"], one["samples"], one["rms"],
-        _two(one["fit_estimation"]), _two(one["fit_validation"]), _two(one["aic"]),
-        _two(one["bic"]), passed, *values,
-    )  # fmt: skip
+        *(one[name] for name in ("run", "title", "parameters", "samples", "rms")),
+        *(
+            format_decimals(one[name])
+            for name in ("fit_estimation", "fit_validation", "aic", "bic")
+        ),
+        passed,
+        *values,
+    )
 
 
 def _percent(part: float | None) -> str | None:
     return None if part is None else f"{100 * part:.0f}"
-
-
-def _chance(p: float | None) -> str | None:
-    if p is None:
-        return None
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"
-
-
-def _two(value: float | None) -> str | None:
-    return None if value is None else f"{value:.2f}"
 
 
 PLACES = Places({"?format": "--format", "?pade_order": "--pade-order"})
@@ -268,8 +261,5 @@ def export(
     if output is None:
         typer.echo(text, nl=False)
         return
-    try:
-        output.write_text(text, encoding="utf-8")
-    except OSError as error:
-        fail(f"{output} cannot be written: {error.strerror}")
+    write_file(output, text)
     out.print(str(output), markup=False)

@@ -1,7 +1,6 @@
 """`lagid sweep noise`: how far noise moves what is found, as one job and one table."""
 
 from decimal import Decimal, InvalidOperation
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -11,20 +10,25 @@ from service.cli.common import (
     Key,
     Places,
     Url,
+    check_succeeded,
     connected,
-    err,
     out,
+    parse_channels,
+    parse_number,
+    parse_pairs,
+    print_job,
     print_json,
+    print_line,
     print_table,
     put,
-    read_file,
+    read_model,
+    split_names,
     told_at,
     usage,
-    with_unit,
 )
 from service.cli.watch import follow
 from service.client.calls import DEFAULT_URL
-from service.core.documents import read_yaml
+from service.core.text import append_unit
 from sysid.core.settings import METHODS
 
 if TYPE_CHECKING:
@@ -34,7 +38,6 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Recipes: sweeps made for one purpose.", no_args_is_help=True)
 
 MOST_POINTS = 100_000
-MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 SIGMA, RELATIVE, METHOD = "/noise/sigma", "relative", "/algorithm/method"
 # Of a relative σ the rows tell what was typed beside what it is in the output's unit.
 GROUPS = {False: None, True: [RELATIVE, SIGMA, METHOD]}
@@ -107,9 +110,9 @@ def noise(
     """
     truth = _truth(true, inputs, samples, sample_time)
     body: dict[str, Any] = {
-        "model": _model(model), "sigma": [one for text in sigma for one in grid(text)],
-        "relative": relative, "replicates": replicates, "methods": _names(methods), "seed": seed,
-        "channels": dict(_pairs("--channels", _names(channels or ""))),
+        "model": read_model(model), "sigma": [one for text in sigma for one in grid(text)],
+        "relative": relative, "replicates": replicates, "methods": split_names(methods),
+        "seed": seed, "channels": parse_channels(channels),
         **_source(data, truth), **({} if name is None else {"name": name}),
     }  # fmt: skip
     for change in changes or []:
@@ -128,7 +131,7 @@ def grid(text: str) -> list[float]:
     Counted in decimals, so that the third of 0:1:0.05 is 0.15 and no number beside it.
     """
     found: list[float] = []
-    for part in _names(text):
+    for part in split_names(text):
         ends = [_decimal(text, one) for one in part.split(":")]
         if len(ends) == 1:
             found.append(float(ends[0]))
@@ -164,7 +167,7 @@ def tables_of(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]
     one_output = None if unit == "σ" else unit
     keys = [
         *relative,
-        f">{with_unit('σ', one_output)}",
+        f">{append_unit('σ', one_output)}",
         *(key.rsplit("/", 1)[-1] for key in others),
     ]
     found = [(
@@ -207,8 +210,7 @@ def _tell(
         if as_json:
             print_json(job)
         else:
-            runs = job["progress"]["runs"]
-            out.print(f"{job['id']}  {job['name']}: {runs} runs, {job['state']}", markup=False)
+            print_job(job)
         return
     summary = client.summary(job["id"], GROUPS[is_relative])
     if as_json:
@@ -218,23 +220,23 @@ def _tell(
             print_table(headings, rows, empty="no runs")
             out.print()
         for note in [*summary["notes"], *([IN_DEVIATIONS] if is_relative else [])]:
-            out.print(f"note: {note}", markup=False, soft_wrap=True)
+            print_line(f"note: {note}")
         out.print(f"{job['id']}: {summary['reused']} of {summary['runs']} runs reused",
                   markup=False)  # fmt: skip
-    if job["state"] != "succeeded":
-        reason = f": {job['error']}" if job["error"] else ""
-        err.print(f"lagid: {job['id']} {job['state']}{reason}", markup=False)
-        raise typer.Exit(1)
+    check_succeeded(job)
 
 
 def _truth(
     true: Named, inputs: Named, samples: int | None, sample_time: float | None
 ) -> dict[str, Any]:
     return {
-        "parameters": {one: _number("--true", one, value) for one, value in _pairs("--true", true)},
+        "parameters": {
+            one: parse_number(f"--true {one}={value}", value)
+            for one, value in parse_pairs("--true", true or ()).items()
+        },
         "inputs": {
             one: {"kind": "expression", "expression": text}
-            for one, text in _pairs("--input", inputs)
+            for one, text in parse_pairs("--input", inputs or ()).items()
         },
         "samples": samples, "sample_time": sample_time,
     }  # fmt: skip
@@ -244,33 +246,7 @@ def _source(data: str | None, truth: dict[str, Any]) -> dict[str, Any]:
     given = {name: value for name, value in truth.items() if value}
     if (data is None) == (not given):
         usage("give either --data, or --true, --input, --samples and --sample-time to simulate")
-    return {"truth": given} if data is None else {"datasets": _names(data)}
-
-
-def _model(name: str) -> Any:
-    path = Path(name)
-    return read_yaml(read_file(path)) if path.suffix in MODEL_SUFFIXES else name
-
-
-def _names(text: str) -> list[str]:
-    return [one.strip() for one in text.split(",") if one.strip()]
-
-
-def _pairs(option: str, texts: Named) -> list[tuple[str, str]]:
-    pairs = []
-    for text in texts or []:
-        name, equals, value = text.partition("=")
-        if not (equals and name.strip() and value.strip()):
-            usage(f"{option} {text}: need NAME=VALUE")
-        pairs.append((name.strip(), value.strip()))
-    return pairs
-
-
-def _number(option: str, name: str, value: str) -> float:
-    try:
-        return float(value)
-    except ValueError:
-        usage(f"{option} {name}={value}: need NAME=VALUE with a number, such as c=0.2")
+    return {"truth": given} if data is None else {"datasets": split_names(data)}
 
 
 def _decimal(text: str, part: str) -> Decimal:

@@ -10,9 +10,18 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from service.cli.common import Places, estimate, out, print_json, print_table, status_of, with_unit
+from service.cli.common import (
+    Places,
+    estimate,
+    out,
+    print_json,
+    print_line,
+    print_table,
+    status_of,
+)
 from service.client.calls import ProblemError
-from service.trends.text import Quantity, flags, law_text, notes, reference_text, span_text
+from service.core.text import DASH, append_unit, format_labels, plain_unit
+from service.trends.text import PLAIN, build_tables, notes, reference_text
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -26,7 +35,7 @@ def place_of(run: dict[str, Any]) -> dict[str, object]:
     """Labels and values of axes of a run; where labels tell of the data, their ids are left out."""
     labels = run["labels"]
     cell = {
-        path.removeprefix("/").replace("/", "."): _brief(value)
+        path.removeprefix("/").replace("/", "."): value
         for path, value in run["cell"].items()
         if not (labels and path.startswith(DATA))
     }
@@ -38,10 +47,9 @@ def show_run(run: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(run)
         return
-    _line(f"{run['id']}  run {run['number'] + 1} of {run['job']}: {run['state']}")
-    place = [f"{name} = {_plain(value)}" for name, value in place_of(run).items()]
-    if place:
-        _line(", ".join(place))
+    print_line(f"{run['id']}  run {run['number'] + 1} of {run['job']}: {run['state']}")
+    if place := place_of(run):
+        print_line(format_labels(place))
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "95 % interval", "status"),
         [[one["name"], estimate(one), one["unit"], _interval(one["interval95"]), status_of(one)]
@@ -49,13 +57,13 @@ def show_run(run: dict[str, Any], as_json: bool) -> None:
         empty="no estimates" if run["finished_at"] else "no estimates yet",
     )  # fmt: skip
     if run["rms"] is not None:
-        _line(_fit(run))
+        print_line(_fit(run))
     if run["error"]:
-        _line(run["error"])
+        print_line(run["error"])
     if run.get("reused_from"):
-        _line(f"note: {REUSED.format(run['reused_from'])}")
+        print_line(f"note: {REUSED.format(run['reused_from'])}")
     for warning in run.get("warnings", []):
-        _line(f"note: {warning}")
+        print_line(f"note: {warning}")
 
 
 def tell_reused(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: str) -> None:
@@ -67,7 +75,7 @@ def tell_reused(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: str) 
         text = REUSED.format(runs[0]["reused_from"])
     else:
         text = f"{reused} of {n_runs} runs were computed before: their results are shown"
-    _line(f"note: {text}; to compute anew: {cure}")
+    print_line(f"note: {text}; to compute anew: {cure}")
 
 
 def _fit(run: dict[str, Any]) -> str:
@@ -85,27 +93,15 @@ def _fit(run: dict[str, Any]) -> str:
 
 
 def _with_unit(run: dict[str, Any], name: str) -> str:
-    unit = {"1": "", "σ": " standard deviations"}.get(run["rms_unit"], f" {run['rms_unit']}")
-    return f"{run[name]:.6g}{unit}"
+    unit = "standard deviations" if run["rms_unit"] == "σ" else run["rms_unit"]
+    return f"{run[name]:.6g}{plain_unit(unit)}"
 
 
 def _interval(ends: list[float | None] | None) -> str:
     if ends is None:
-        return "–"
+        return DASH
     low, high = ("open" if end is None else f"{end:.6g}" for end in ends)
     return f"{low} to {high}"
-
-
-def _plain(value: object) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def _brief(value: object) -> object:
-    return value.get("name", "…") if isinstance(value, dict) else value
-
-
-def _line(text: str) -> None:
-    out.print(text, markup=False, soft_wrap=True)
 
 
 MOST = 50
@@ -119,9 +115,9 @@ def print_many(client: "Client", job: dict[str, Any], runs: list[dict[str, Any]]
     """Print a summary of a job instead of its runs."""
     states = Counter(run["state"] for run in runs)
     told = ", ".join(f"{count} {state}" for state, count in states.most_common())
-    _run_line(f"{job['id']}: {len(runs)} runs, {told}")
+    print_line(f"{job['id']}: {len(runs)} runs, {told}")
     _groups(client, job)
-    _run_line(f"single runs: lagid runs {job['id']}")
+    print_line(f"single runs: lagid runs {job['id']}")
     _kinds([warning for run in runs for warning in run.get("warnings", [])])
 
 
@@ -129,16 +125,16 @@ def _groups(client: "Client", job: dict[str, Any]) -> None:
     try:
         summary = client.summary(job["id"])
     except ProblemError as error:  # more groups than the server parts runs into
-        _run_line(f"no groups: {error}")
+        print_line(f"no groups: {error}")
         return
     groups, places = summary["groups"], [summary["quantiles"].index(q) for q in (LOW, MIDDLE, HIGH)]
     units = {one["name"]: one["unit"] for group in groups for one in group["parameters"]}
     headings = [*(key.removeprefix("/").replace("/", ".") for key in summary["by"]), ">runs",
-                ">success", f"{with_unit('RMS', summary['rms_unit'])}: median, 5 to 95 %",
-                *(with_unit(*one) for one in units.items())]  # fmt: skip
+                ">success", f"{append_unit('RMS', summary['rms_unit'])}: median, 5 to 95 %",
+                *(append_unit(*one) for one in units.items())]  # fmt: skip
     print_table(headings, [_row(one, units, places) for one in groups[:MOST]], empty="no runs")
     if len(groups) > MOST:
-        _run_line(f"… and {len(groups) - MOST} groups more")
+        print_line(f"… and {len(groups) - MOST} groups more")
 
 
 def _row(group: dict[str, Any], units: dict[str, str], places: Sequence[int]) -> list[object]:
@@ -161,76 +157,37 @@ def _kinds(warnings: list[str]) -> None:
     kinds = Counter(NUMBER.sub("…", one) for one in warnings)
     first = {NUMBER.sub("…", one): one for one in reversed(warnings)}
     for kind, count in kinds.most_common(MOST_KINDS):
-        _run_line(f"note ({count} ×, such as): {first[kind]}")
+        print_line(f"note ({count} ×, such as): {first[kind]}")
     if len(kinds) > MOST_KINDS:
-        _run_line(f"… and {len(kinds) - MOST_KINDS} kinds of notes more")
-
-
-def _run_line(text: str) -> None:
-    out.print(text, markup=False, soft_wrap=True)
+        print_line(f"… and {len(kinds) - MOST_KINDS} kinds of notes more")
 
 
 def print_trend(trend: dict[str, Any], places: Places) -> None:
     """Print what `GET /v1/jobs/{id}/trend` tells, with notes that name the user's `places`."""
-    shown = [
-        one for one in trend["quantities"] if any(p["value"] is not None for p in one["points"])
-    ]
-    headings = [f">{trend['x']}", *(f">{_title(one)}" for one in shown), ">measured span",
+    tables = build_tables(trend, PLAIN)
+    headings = [f">{trend['x']}", *(f">{one}" for one in tables.headings), ">measured span",
                 ">evaluations", "flags"]  # fmt: skip
-    rows = [_trend_row(place, shown) for place in trend["places"]]
+    rows = [
+        (row.x_text, *row.cells, row.span_text, row.evaluations, "; ".join(row.flags))
+        for row in tables.rows
+    ]
     print_table(headings, rows, empty="no run has succeeded")
     out.print()
-    laws = [row for one in shown for row in _laws(one, trend["x"])]
+    laws = [
+        (law.quantity, law.text, f"{law.aic:.2f}", f"{law.birge:.2f}", law.is_chosen * "chosen")
+        for law in tables.laws
+    ]
     print_table(("quantity", "law", ">AIC", ">Birge ratio", ""), laws, empty="")
-    for one in shown:
-        if one["reason"]:
-            out.print(f"{one['name']}: no law: {one['reason']}", markup=False, soft_wrap=True)
+    for name, reason in tables.reasons:
+        print_line(f"{name}: no law: {reason}")
     out.print()
-    predicted = [row for one in shown for row in _predictions(one)]
-    if predicted:
+    if tables.predictions:
         above = ("predicted", f">{trend['x']}", ">value", "95 % interval for a new estimate", "")
-        print_table(above, predicted, empty="")
+        print_table(above, tables.predictions, empty="")
         out.print()
     if trend["reference"] is not None:
         named = reference_text(trend)
         text = f"compared with {trend['reference']}{named and ', '}{named}"
-        out.print(text, markup=False, soft_wrap=True)
+        print_line(text)
     for note in notes(trend):
-        out.print(f"note: {places.in_note(note)}", markup=False, soft_wrap=True)
-
-
-def _trend_row(place: dict[str, Any], quantities: list[Quantity]) -> list[object]:
-    points = [next((p for p in one["points"] if p["x"] == place["x"]), None) for one in quantities]
-    cells = [None if p is None or p["value"] is None else estimate(p) for p in points]
-    told = flags(place, quantities)
-    return [
-        place["x"], *cells, "; ".join(map(span_text, place["spans"])) or None, place["evaluations"],
-        "; ".join(told),
-    ]  # fmt: skip
-
-
-def _laws(one: Quantity, x: str) -> list[list[object]]:
-    name = str(one["name"])
-    return [
-        [name, law_text(name, law, x, estimate), f"{law['aic']:.2f}", f"{law['birge']:.2f}",
-         "chosen" if law["is_chosen"] else ""]
-        for law in one["laws"]
-    ]  # fmt: skip
-
-
-def _predictions(one: Quantity) -> list[list[object]]:
-    return [_predicted(one, place) for place in one["predictions"]]
-
-
-def _predicted(one: Quantity, place: dict[str, Any]) -> list[object]:
-    told: list[object] = [one["name"], place["x"]]
-    if place["value"] is None or place["lower"] is None:
-        return [*told, None, "–", "the law has no value here"]
-    unit = "" if one["unit"] in ("", "1") else f" {one['unit']}"
-    interval = f"{place['lower']:.4g} to {place['upper']:.4g}{unit}"
-    outside = "extrapolated" if place["is_outside"] else ""
-    return [*told, f"{place['value']:.4g}{unit}", interval, outside]
-
-
-def _title(one: Quantity) -> str:
-    return str(one["name"]) + ("" if one["unit"] in ("", "1") else f" [{one['unit']}]")
+        print_line(f"note: {places.in_note(note)}")

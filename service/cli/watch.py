@@ -7,13 +7,14 @@ data or under other noise it tells nothing.
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from service.client.calls import TERMINAL
-from service.figures.formats import duration
+from service.core.text import format_duration, format_value, plain_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -43,7 +44,8 @@ def follow(client: "Client", job_id: str, *, quiet: bool = False) -> Document:
     console = Console(stderr=True, highlight=False)
     many = Many(lambda: _newest(client, job_id), first["rms_unit"])
     if not console.is_terminal:
-        return client.wait(job_id, progress=Lines(lambda text: _print(console, text), many).show)
+        lines = Lines(partial(console.print, markup=False, soft_wrap=True), many)
+        return client.wait(job_id, progress=lines.show)
     with Progress(*COLUMNS, console=console, refresh_per_second=5) as progress:
         bars = _Bars(client, progress, many, is_one=first["progress"]["runs"] > MANY)
         return client.wait(job_id, progress=bars.show)
@@ -79,13 +81,12 @@ class Many:
         pace = self._pace(done["finished"]) if job["state"] == "running" else 0.0
         parts += [f"{pace:.3g} runs/s"] if pace > 0 else []
         if done["seconds_left"] is not None:
-            parts.append(f"{duration(done['seconds_left'])} left".replace("\u202f", " "))
+            parts.append(f"{format_duration(done['seconds_left'])} left".replace("\u202f", " "))
         return [*parts, *([text] if (text := self._last(done["finished"])) else [])]
 
     def rms(self, value: float | None) -> str:
         """An RMS with its unit."""
-        unit = "" if self.unit in (None, "1") else f" {self.unit}"
-        return "RMS –" if value is None else f"RMS {value:.6g}{unit}"
+        return "RMS –" if value is None else f"RMS {value:.6g}{plain_unit(self.unit)}"
 
     def _pace(self, finished: int) -> float:
         """Runs a second since the first look at the running job."""
@@ -175,12 +176,7 @@ def _newest(client: "Client", job_id: str) -> Document | None:
     return found[0] if found else None
 
 
-def _print(console: Console, text: str) -> None:
-    console.print(text, markup=False, soft_wrap=True)
-
-
 def _values(run: Document) -> str:
     """Labels and values of axes of a run, without those that are data or models."""
     values = [*run["labels"].values(), *run["cell"].values()]
-    return ", ".join(f"{one:g}" if isinstance(one, float) else str(one)
-                     for one in values if not isinstance(one, dict | list))  # fmt: skip
+    return ", ".join(format_value(one) for one in values if not isinstance(one, dict | list))

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import quote
 from uuid import uuid4
 
+from service.core.states import State
+
 if TYPE_CHECKING:
     import httpx
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 Document: TypeAlias = dict[str, Any]
 
 DEFAULT_URL = "http://127.0.0.1:8000"
-TERMINAL = frozenset({"succeeded", "failed", "cancelled"})
+TERMINAL = frozenset(state.value for state in State if state.is_terminal)
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 MEDIA_TYPES = {".csv": "text/csv", ".txt": "text/csv", ".mcap": "application/x-mcap"}
 IDEMPOTENCY = "Idempotency-Key"

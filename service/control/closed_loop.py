@@ -14,13 +14,12 @@ from service.control.schemas import (
     TuningIn,
     TuningOut,
 )
-from service.core.documents import to_finite
 from service.core.errors import FieldError, InvalidRequest
+from service.core.text import plain_unit
 from service.datasets.schemas import StepInput
 from service.datasets.simulated import check_finite
 from sysid.core.errors import InvalidSettings, nearest
 from sysid.core.types import FloatArray
-from sysid.core.units import format_unit
 from sysid.data.records import Channel
 from sysid.models.model import Model
 
@@ -172,14 +171,13 @@ def _tuned(
         closed_loop_time_constant=tuning.closed_loop_time_constant, transport=transport,
     )  # fmt: skip
     process = found.process
-    told = TuningOut(
-        rule=found.rule, controller=found.controller,
-        closed_loop_time_constant=found.closed_loop_time_constant,
-        process_gain=process.gain, process_delay=process.delay,
-        process_time_constant=to_finite(process.time_constant),
+    told = TuningOut.from_source(
+        found,
+        process_gain=process.gain,
+        process_delay=process.delay,
+        process_time_constant=process.time_constant,
         process_second_time_constant=process.second_time_constant,
-        formulas=list(found.formulas), reference=found.reference,
-    )  # fmt: skip
+    )
     return found.gain, found.integral_time, found.derivative_time, told
 
 
@@ -189,15 +187,9 @@ def _margins(identified: "Identified", control: "PidControl") -> MarginsOut | No
     from sysid.control.margins import margins
 
     try:
-        found = margins(identified, control)
+        return MarginsOut.from_source(margins(identified, control))
     except NotLinear:
         return None
-    return MarginsOut(
-        is_stable=found.is_stable, gain_margin=to_finite(found.gain_margin),
-        phase_margin=to_finite(found.phase_margin), delay_margin=to_finite(found.delay_margin),
-        crossover_frequency=to_finite(found.crossover_frequency),
-        sensitivity_peak=to_finite(found.sensitivity_peak),
-    )  # fmt: skip
 
 
 def _controller_told(used: "PidControl", command: FloatArray) -> ControllerOut:
@@ -206,14 +198,16 @@ def _controller_told(used: "PidControl", command: FloatArray) -> ControllerOut:
     for limit, sign in ((low, -1.0), (high, 1.0)):
         if limit is not None:
             at_limit |= sign * command >= sign * limit - _AT_LIMIT * abs(limit)
-    return ControllerOut(
-        gain=used.gain, integral_time=used.integral_time if used.integrates else None,
-        derivative_time=used.derivative_time, derivative_filter=used.derivative_filter,
-        derivative_on=used.derivative_on, setpoint_weight=used.setpoint_weight,
-        lower=low, upper=high, tracking_time=used.tracking,
-        command_min=float(np.min(command)), command_max=float(np.max(command)),
+    return ControllerOut.from_source(
+        used,
+        integral_time=used.integral_time if used.integrates else None,
+        lower=low,
+        upper=high,
+        tracking_time=used.tracking,
+        command_min=float(np.min(command)),
+        command_max=float(np.max(command)),
         saturated_percent=100.0 * float(np.mean(at_limit)),
-    )  # fmt: skip
+    )
 
 
 def _check_finite(
@@ -254,16 +248,7 @@ def _metrics(
     found = step_metrics(
         times, output.values, at=step.time, before=step.offset, after=step.offset + step.amplitude
     )
-    return StepMetricsOut(
-        output=output.name, unit=output.unit, rise_time=to_finite(found.rise_time),
-        overshoot_percent=to_finite(found.overshoot_percent),
-        overshoot_of_final_percent=to_finite(found.overshoot_of_final_percent),
-        settling_time=to_finite(found.settling_time), band=found.band,
-        steady_error=to_finite(found.steady_error), final_value=to_finite(found.final_value),
-        runs_away=found.runs_away, is_settled=found.is_settled,
-        iae=to_finite(found.iae), itae=to_finite(found.itae),
-        swing=to_finite(found.swing), swing_period=to_finite(found.swing_period),
-    )  # fmt: skip
+    return StepMetricsOut.from_source(found, output=output.name, unit=output.unit)
 
 
 def _tuning_notes(tuning: TuningOut) -> Iterator[str]:
@@ -287,7 +272,7 @@ def _start_notes(
     start = float(output.values[0])
     if abs(start - step.offset) <= band:
         return
-    unit = format_unit(output.unit)
+    unit = plain_unit(output.unit)
     yield (
         f"{output.name} starts at {start:.4g}{unit} with a reference of {step.offset:.4g}{unit} "
         f"before the step: unless the loop rests there, {_MORE}"
@@ -299,7 +284,7 @@ def _stability_notes(
 ) -> Iterator[str]:
     """That a loop is unstable or keeps swinging, said plainly."""
     if metrics is not None and metrics.swing is not None:
-        unit = format_unit(metrics.unit)
+        unit = plain_unit(metrics.unit)
         decays = margins is not None and margins.is_stable and not controller.saturated_percent
         yield (
             f"{metrics.output} keeps swinging and does not settle: {metrics.swing:.4g}{unit} from "

@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from service.core.wire import Answer, Body
+from service.core.wire import Answer, Body, Finite
 from service.datasets.schemas import MAX_SIMULATED, DatasetOut, RunInputIn, SampleTime, Series
 from sysid.control.controllers import AntiWindup, DerivativeOn
 from sysid.control.tuning import Kind, Rule
@@ -104,19 +104,19 @@ class StepMetricsOut(Answer):
 
     output: str
     unit: str
-    rise_time: float | None
-    overshoot_percent: float | None
-    overshoot_of_final_percent: float | None
-    settling_time: float | None
+    rise_time: Finite
+    overshoot_percent: Finite
+    overshoot_of_final_percent: Finite
+    settling_time: Finite
     band: float
-    steady_error: float | None
-    final_value: float | None
+    steady_error: Finite
+    final_value: Finite
     runs_away: bool = False
     is_settled: bool = True
-    iae: float | None = None
-    itae: float | None = None
-    swing: float | None = None
-    swing_period: float | None = None
+    iae: Finite = None
+    itae: Finite = None
+    swing: Finite = None
+    swing_period: Finite = None
 
 
 class ControllerOut(Answer):
@@ -153,7 +153,7 @@ class TuningOut(Answer):
     closed_loop_time_constant: float | None
     process_gain: float
     process_delay: float
-    process_time_constant: float | None
+    process_time_constant: Finite
     process_second_time_constant: float
     formulas: list[str]
     reference: str
@@ -167,11 +167,11 @@ class MarginsOut(Answer):
     """
 
     is_stable: bool
-    gain_margin: float | None
-    phase_margin: float | None
-    delay_margin: float | None
-    crossover_frequency: float | None
-    sensitivity_peak: float | None
+    gain_margin: Finite
+    phase_margin: Finite
+    delay_margin: Finite
+    crossover_frequency: Finite
+    sensitivity_peak: Finite
 
 
 class RunSimulationOut(Answer):

@@ -75,17 +75,14 @@ def simulate(
     dataset = (
         _stored(database, store, run_id, body, asked, found, reference) if body.store else None
     )
-    return RunSimulationOut(
+    return RunSimulationOut.from_source(
+        loop,
         id=run_id,
         parameters=asked.values,
         outputs=[series(one, max_points) for one in found.outputs],
         inputs=[series(one, max_points) for one in found.inputs],
         reference=None if reference is None else series(reference, max_points),
         command=series(loop.command, max_points) if loop else None,
-        metrics=loop.metrics if loop else None,
-        controller=loop.controller if loop else None,
-        tuning=loop.tuning if loop else None,
-        margins=loop.margins if loop else None,
         notes=found.notes,
         dataset=dataset,
     )

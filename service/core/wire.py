@@ -1,10 +1,12 @@
 """What every wire type shares. The client imports no wire type, so that it stays light."""
 
 from collections.abc import Iterable
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Annotated, Any, Generic, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic_core import PydanticCustomError
+
+from service.core.documents import to_finite
 
 Item = TypeVar("Item")
 
@@ -40,9 +42,23 @@ class Body(BaseModel):
 
 
 class Answer(BaseModel):
-    """A response body."""
+    """A response body; it is read from a mapping, or from a row or value by its attributes."""
 
-    model_config = ConfigDict(frozen=True)
+    model_config = ConfigDict(frozen=True, from_attributes=True)
+
+    @classmethod
+    def from_source(cls, source: object, **fields: Any) -> Self:
+        """The answer with a row's or value's attributes; `fields` are what it says otherwise."""
+        found = {
+            name: getattr(source, name)
+            for name in cls.model_fields
+            if name not in fields and hasattr(source, name)
+        }
+        return cls.model_validate(found | fields)
+
+
+Finite = Annotated[float | None, BeforeValidator(to_finite)]
+"""A number of an answer; null where there is none, or none that is finite."""
 
 
 class Page(Answer, Generic[Item]):

@@ -21,7 +21,6 @@ from service.core.settings import Settings
 from service.core.wire import Page
 from service.datasets.recordings import recording_of
 from service.datasets.schemas import (
-    ChannelOut,
     DatasetOut,
     DeriveIn,
     Edge,
@@ -48,8 +47,7 @@ def of_dataset(session: Session, dataset_id: str) -> LineageOut:
     row = DatasetRepository(session).get(dataset_id)
     repository = LineageRepository(session)
     edges = {*repository.ancestors(row.id), *repository.descendants(row.id)}
-    told = [Edge(parent=e.parent, child=e.child, relation=e.relation) for e in sorted(edges)]
-    return LineageOut(id=row.id, edges=told)
+    return LineageOut(id=row.id, edges=[Edge.from_source(edge) for edge in sorted(edges)])
 
 
 def dataset_of(session: Session, reference: str) -> Dataset | str:
@@ -182,13 +180,13 @@ def described(
 def told(row: Dataset) -> DatasetOut:
     """A dataset as it is told."""
     details = dict(row.details)
-    return DatasetOut(
-        id=row.id, name=row.name, kind=row.kind, sha256=row.sha256, size_bytes=row.size_bytes,
-        channels=[ChannelOut.model_validate(channel) for channel in row.channels],
-        samples=row.n_samples, duration=row.duration, sample_time=row.sample_time,
-        segments=details.pop("segments", []), warnings=details.pop("warnings", []),
-        details=details, created_at=row.created_at,
-    )  # fmt: skip
+    return DatasetOut.from_source(
+        row,
+        samples=row.n_samples,
+        segments=details.pop("segments", []),
+        warnings=details.pop("warnings", []),
+        details=details,
+    )
 
 
 def told_again(stored: Stored, name: str | None) -> DatasetOut:

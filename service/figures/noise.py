@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from service.core.text import append_unit, bracket_unit, format_value
 from service.figures import theme
-from service.figures.formats import bracketed
-from service.figures.plotly import MARGIN, Figure, finite, layout
+from service.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
+from service.figures.plotly import Figure, finite, layout
 from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
 
 SIGMA = "/noise/sigma"
@@ -21,10 +22,6 @@ _STYLES: Mapping[str, dict[str, Any]] = {
 }
 _OTHERS = ((theme.GREEN, "solid"), (theme.OCHRE, "dashdot"), (theme.PURPLE, "solid"))
 _FLOOR = {"color": theme.GREY, "dash": "dash", "width": 1.6}
-_CAPTION_PX, _PLOT_PX, _AXIS_PX = 30, 250, 54
-_ROW_PX = _CAPTION_PX + _PLOT_PX + _AXIS_PX
-_MARGIN = {**MARGIN, "l": 72, "t": 36, "b": 6}
-_GAP = 0.1
 
 
 @dataclass(slots=True)
@@ -67,32 +64,24 @@ def noise_sweep(summary: SummaryOut, unit: str, columns: int = 2) -> Figure:
     succeeded.
     """
     panels = _panels(summary, unit)
-    columns = max(1, min(columns, len(panels)))
-    rows = -(-len(panels) // columns)
+    grid = wide_grid(len(panels), columns)
     figure: Figure = {
         "data": [],
-        "layout": layout(noise_height(len(panels), columns), annotations=[], margin=_MARGIN),
+        "layout": layout(grid.height(WIDE_MARGIN), annotations=[], margin=WIDE_MARGIN),
     }
     told: set[str] = set()
     for number, panel in enumerate(panels):
-        row, column = divmod(number, columns)
-        wide = (1 - _GAP * (columns - 1)) / columns
-        left = column * (wide + _GAP)
-        top = 1 - (row * _ROW_PX + _CAPTION_PX) / (rows * _ROW_PX)
-        bottom = max(top - _PLOT_PX / (rows * _ROW_PX), 0.0)
-        place = (left, min(left + wide, 1.0)), (bottom, top)
-        _add(figure, number, panel, place, unit, told)
+        _add(figure, number, panel, grid.place(number), unit, told)
     return figure
 
 
 def noise_height(n_panels: int, columns: int = 2) -> int:
     """Height (px) of the figure, so that a page can leave room for it."""
-    rows = -(-n_panels // max(1, min(columns, n_panels)))
-    return max(rows, 1) * _ROW_PX + int(_MARGIN["t"] + _MARGIN["b"])
+    return wide_grid(n_panels, columns).height(WIDE_MARGIN)
 
 
 def _panels(summary: SummaryOut, unit: str) -> list[_Panel]:
-    suffix = bracketed(unit)
+    suffix = bracket_unit(unit)
     response = _Panel("<b>RMS error</b> of the response", f"RMS error{suffix}", is_signed=False)
     panels = {"": response}
     for group in summary.groups:
@@ -116,7 +105,7 @@ def _add_error(panel: _Panel, name: str, sigma: float, one: ParameterSummaryOut)
 
 
 def _panel_of(one: ParameterSummaryOut) -> _Panel:
-    suffix = bracketed(one.unit)
+    suffix = bracket_unit(one.unit)
     known = "" if one.reference is None else f" − {one.reference:.6g}".replace("−-", "+")
     return _Panel(f"<b>{one.name}</b>{known}", f"error of {one.name}{suffix}", is_signed=True)
 
@@ -134,10 +123,7 @@ def _series(group: GroupOut) -> str:
     rest = {key: value for key, value in group.key.items() if key != SIGMA}
     if list(rest) == [METHOD]:
         return str(rest[METHOD])
-    words = (
-        value.get("name", "…") if isinstance(value, dict) else value for value in rest.values()
-    )
-    return ", ".join(map(str, words)) or "all runs"
+    return ", ".join(map(format_value, rest.values())) or "all runs"
 
 
 def _look(name: str, number: int) -> dict[str, Any]:
@@ -150,33 +136,33 @@ def _look(name: str, number: int) -> dict[str, Any]:
 
 
 def _add(
-    figure: Figure, number: int, panel: _Panel,
-    place: tuple[tuple[float, float], tuple[float, float]], unit: str, told: set[str],
-) -> None:  # fmt: skip
-    axis = "" if number == 0 else str(number + 1)
-    across, upward = place
-    at = {"xaxis": f"x{axis}", "yaxis": f"y{axis}"}
+    figure: Figure, number: int, panel: _Panel, place: Place, unit: str, told: set[str]
+) -> None:
+    small = {"size": 11}
+    at = add_axes(
+        figure,
+        number,
+        place,
+        {
+            "rangemode": "tozero",
+            "nticks": 7,
+            "title": {"text": append_unit("σ", unit), "font": small, "standoff": 4},
+            **({} if number == 0 else {"matches": "x"}),
+        },
+        {
+            "nticks": 6,
+            "zeroline": True,
+            **({} if panel.is_signed else {"rangemode": "tozero"}),
+            "title": {"text": panel.title, "font": small},
+        },
+    )
     for place_in_order, (name, band) in enumerate(panel.bands.items()):
         first = name not in told
         told.add(name)
         label = name if number == 0 else f"{panel.title}: {name}"
         figure["data"] += _drawn(band, label, name, _look(name, place_in_order), at, first)
     figure["data"] += _floors(panel, at, told)
-    figure["layout"][f"xaxis{axis}"] = {
-        "domain": across, "anchor": f"y{axis}", "rangemode": "tozero", "nticks": 7,
-        "title": {"text": "σ" + bracketed(unit), "font": {"size": 11},
-                  "standoff": 4},
-        **({} if number == 0 else {"matches": "x"}),
-    }  # fmt: skip
-    figure["layout"][f"yaxis{axis}"] = {
-        "domain": upward, "anchor": f"x{axis}", "nticks": 6, "zeroline": True,
-        **({} if panel.is_signed else {"rangemode": "tozero"}),
-        "title": {"text": panel.title, "font": {"size": 11}},
-    }  # fmt: skip
-    figure["layout"]["annotations"].append({
-        "text": panel.caption, "xref": "paper", "yref": "paper", "x": across[0], "y": upward[1],
-        "xanchor": "left", "yanchor": "bottom", "yshift": 4, "showarrow": False, "align": "left",
-    })  # fmt: skip
+    add_caption(figure, panel.caption, place)
 
 
 def _drawn(
@@ -194,7 +180,7 @@ def _drawn(
     return [
         {**edge, "name": f"{label}, 5 %", "y": low},
         {**edge, "name": f"{label}, 95 %", "y": high, "fill": "tonexty",
-         "fillcolor": _faint(line["color"])},
+         "fillcolor": theme.fade(line["color"], 0.15)},
         {**shared, "mode": "lines+markers", "name": label, "y": middle, "line": line,
          "marker": {"size": 5, "color": line["color"]}, "showlegend": first,
          "hovertemplate": f"{group}<br>σ %{{x:.4g}}: %{{y:.4g}}<extra></extra>"},
@@ -218,8 +204,3 @@ def _floors(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dict[str,
         })  # fmt: skip
         told.add(name)
     return lines
-
-
-def _faint(colour: str) -> str:
-    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
-    return f"rgba({red},{green},{blue},0.15)"

@@ -11,10 +11,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from service.figures import formats, theme
+from service.core.text import append_unit, bracket_unit, join_estimate, plain_unit
+from service.figures import theme
 from service.figures.data import Floats, Improvement, RunEvidence, SoughtParameter
+from service.figures.grid import Place, PlotGrid, add_axes, add_caption
 from service.figures.theme import strided
-from sysid.core.units import format_unit
 
 Figure = dict[str, Any]
 Abscissa = Literal["generations", "evaluations"]
@@ -49,6 +50,11 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
     return {**shared, **more}
 
 
+def empty_figure() -> Figure:
+    """A figure with nothing to show yet."""
+    return {"data": [], "layout": layout(200)}
+
+
 def in_theme(figure: Figure, paper: theme.Theme) -> Figure:
     """The same figure on light or dark paper."""
     return {**figure, "layout": {**figure["layout"], "template": theme.template(paper)}}
@@ -79,8 +85,7 @@ def history(run: RunEvidence, abscissa: Abscissa = "generations") -> Figure:
 def convergence(run: RunEvidence, columns: int = 3) -> Figure:
     """Every free parameter of the islands' champions over generations, between its bounds."""
     parameters = run.parameters
-    columns = max(1, min(columns, len(parameters)))
-    rows = -(-len(parameters) // columns)
+    grid = _parameter_grid(len(parameters), columns)
     figure: Figure = {
         "data": [],
         "layout": layout(
@@ -92,15 +97,21 @@ def convergence(run: RunEvidence, columns: int = 3) -> Figure:
     }
     figure["layout"]["margin"] = {**MARGIN, "b": 36}
     for number, parameter in enumerate(parameters):
-        row, column = divmod(number, columns)
-        _small_plot(figure, run, number, parameter, (row, rows), (column, columns))
+        _small_plot(figure, run, number, parameter, grid.place(number))
     return figure
 
 
 def convergence_height(n_parameters: int, columns: int) -> int:
     """Height (px) of the small plots, so that a page can leave room for them."""
-    rows = -(-n_parameters // max(1, min(columns, n_parameters)))
-    return max(rows, 1) * 214 + 20
+    return _parameter_grid(n_parameters, columns).n_rows * 214 + 20
+
+
+def _parameter_grid(n_parameters: int, columns: int) -> PlotGrid:
+    n_columns = max(1, min(columns, n_parameters))
+    gap = 0.15 / (n_columns - 0.15) if n_columns > 1 else 0.0
+    return PlotGrid(
+        n_parameters, columns, caption=0, plot=0.66, axis=0.34, gap=gap, has_last_axis=False
+    )
 
 
 def correlation_height(n_parameters: int) -> int:
@@ -247,7 +258,7 @@ def _some(epochs: Sequence[int]) -> list[int]:
 
 def _fitness_axis(run: RunEvidence, data: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The axis of the fitness; `data` are the traces upon it."""
-    title = {"text": run.fitness + formats.bracketed(run.unit)}
+    title = {"text": run.fitness + bracket_unit(run.unit)}
     # Over less than a decade the digits between its powers would stand alone, without any power.
     axis = {"title": title, "type": "log", "exponentformat": "e", "minorloglabels": "complete"}
     positive = [y for trace in data for y in trace["y"] if y is not None and y > 0]
@@ -269,16 +280,19 @@ def _last(island: tuple[float, float | None]) -> float:
 
 
 def _small_plot(
-    figure: Figure,
-    run: RunEvidence,
-    number: int,
-    parameter: SoughtParameter,
-    row: tuple[int, int],
-    column: tuple[int, int],
+    figure: Figure, run: RunEvidence, number: int, parameter: SoughtParameter, place: Place
 ) -> None:
-    axis = "" if number == 0 else str(number + 1)
-    left, right = _share(*column, gap=0.15)
-    bottom, top = (1 - v for v in reversed(_share(*row, gap=0.34)))
+    at = add_axes(
+        figure,
+        number,
+        place,
+        {
+            "rangemode": "tozero",
+            "nticks": 5,
+            **({} if number == 0 else {"matches": "x"}),
+        },
+        {"nticks": 5, **_between_bounds(parameter)},
+    )
     end = _end(run, "generations")
     for island, points in enumerate(run.history):
         if points:
@@ -287,30 +301,14 @@ def _small_plot(
             figure["data"].append({
                 "type": "scatter", "mode": "lines",
                 "name": f"{parameter.name}, island {island + 1}",
-                "x": x, "y": finite(y), "xaxis": f"x{axis}", "yaxis": f"y{axis}",
+                "x": x, "y": finite(y), "xaxis": at["xaxis"], "yaxis": at["yaxis"],
                 "line": {**theme.series_style(island), "shape": "hv"},
                 "hovertemplate": f"island {island + 1}<br>%{{x}}: %{{y:.6g}}<extra></extra>",
             })  # fmt: skip
-    figure["layout"][f"xaxis{axis}"] = {
-        "domain": [left, right], "anchor": f"y{axis}", "rangemode": "tozero", "nticks": 5,
-        **({} if number == 0 else {"matches": "x"}),
-    }  # fmt: skip
-    figure["layout"][f"yaxis{axis}"] = {
-        "domain": [bottom, top], "anchor": f"x{axis}", "nticks": 5, **_between_bounds(parameter),
-    }  # fmt: skip
     figure["layout"]["shapes"] += [
-        _level(bound, axis) for bound in (parameter.lower, parameter.upper)
+        _level(bound, at) for bound in (parameter.lower, parameter.upper)
     ]
-    figure["layout"]["annotations"].append({
-        "text": _caption(parameter), "xref": "paper", "yref": "paper", "x": left, "y": top,
-        "xanchor": "left", "yanchor": "bottom", "yshift": 4, "showarrow": False, "align": "left",
-    })  # fmt: skip
-
-
-def _share(number: int, of: int, gap: float) -> tuple[float, float]:
-    """Domain of the numbered of several equal parts, `gap` of a part left free between."""
-    part = 1 / (of - gap) if of > 1 else 1.0
-    return number * part, min(number * part + part * (1 - gap if of > 1 else 1), 1.0)
+    add_caption(figure, _caption(parameter), place)
 
 
 def _between_bounds(parameter: SoughtParameter) -> dict[str, Any]:
@@ -321,17 +319,16 @@ def _between_bounds(parameter: SoughtParameter) -> dict[str, Any]:
     return {"range": [lower - room, upper + room], "type": parameter.scale}
 
 
-def _level(y: float, axis: str) -> dict[str, Any]:
+def _level(y: float, at: dict[str, str]) -> dict[str, Any]:
     return {
-        "type": "line", "xref": f"x{axis} domain", "x0": 0, "x1": 1, "yref": f"y{axis}",
+        "type": "line", "xref": f"{at['xaxis']} domain", "x0": 0, "x1": 1, "yref": at["yaxis"],
         "y0": y, "y1": y, "layer": "below",
         "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dash"},
     }  # fmt: skip
 
 
 def _caption(parameter: SoughtParameter) -> str:
-    unit = format_unit(parameter.unit)
     if parameter.value is None:
-        return f"<b>{parameter.name}</b>{f' [{parameter.unit}]' if unit else ''}"
-    value, error = formats.estimate(parameter.value, parameter.stderr)
-    return f"<b>{parameter.name}</b> = {value}{f' ± {error}' if error else ''}{unit}"
+        return append_unit(f"<b>{parameter.name}</b>", parameter.unit)
+    estimate = join_estimate(parameter.value, parameter.stderr)
+    return f"<b>{parameter.name}</b> = {estimate}{plain_unit(parameter.unit)}"

@@ -7,13 +7,10 @@ import numpy as np
 
 from service.figures import theme
 from service.figures.data import CorrelationTrace, Floats
+from service.figures.grid import Place, PlotGrid, add_axes, add_caption
 from service.figures.plotly import MARGIN, Figure, finite, layout
 
-# A row (px): its caption, the plot, and the axis below it; columns are a part of the width apart.
-_CAPTION_PX, _PLOT_PX, _AXIS_PX = 24, 150, 50
-_ROW_PX = _CAPTION_PX + _PLOT_PX + _AXIS_PX
 _MARGIN = {**MARGIN, "t": 34, "b": 6}
-_GAP = 0.08
 _BAND95 = "rgba(138,146,155,0.22)"
 
 
@@ -25,57 +22,53 @@ def residuals(
     Lag 0 of an autocorrelation, which is 1, is not drawn: it would dwarf the others. `names` are
     those of all experiments.
     """
-    columns = max(1, min(columns, len(functions)))
-    rows = -(-len(functions) // columns)
+    grid = _grid(len(functions), columns)
     figure: Figure = {
         "data": [],
         "layout": layout(
-            residuals_height(len(functions), columns), annotations=[], bargap=0.45,
-            margin=_MARGIN, meta={"experiments": list(names)},
+            grid.height(_MARGIN),
+            annotations=[],
+            bargap=0.45,
+            margin=_MARGIN,
+            meta={"experiments": list(names)},
         ),
-    }  # fmt: skip
+    }
     for number, one in enumerate(functions):
-        row, column = divmod(number, columns)
-        wide = (1 - _GAP * (columns - 1)) / columns
-        left = column * (wide + _GAP)
-        top = 1 - (row * _ROW_PX + _CAPTION_PX) / (rows * _ROW_PX)
-        bottom = max(top - _PLOT_PX / (rows * _ROW_PX), 0.0)
-        _add(figure, number, one, ((left, min(left + wide, 1.0)), (bottom, top)))
+        _add(figure, number, one, grid.place(number))
     return figure
+
+
+def _grid(n_functions: int, columns: int) -> PlotGrid:
+    return PlotGrid(n_functions, columns, caption=24, plot=150, axis=50, gap=0.08)
 
 
 def residuals_height(n_functions: int, columns: int = 2) -> int:
     """Height (px) of the figure, so that a page can leave room for it."""
-    rows = -(-n_functions // max(1, min(columns, n_functions)))
-    return max(rows, 1) * _ROW_PX + _MARGIN["t"] + _MARGIN["b"]
+    return _grid(n_functions, columns).height(_MARGIN)
 
 
-def _add(
-    figure: Figure, number: int, one: CorrelationTrace,
-    place: tuple[tuple[float, float], tuple[float, float]],
-) -> None:  # fmt: skip
-    axis = "" if number == 0 else str(number + 1)
-    across, upward = place
+def _add(figure: Figure, number: int, one: CorrelationTrace, place: Place) -> None:
     shown = one.lags != 0 if one.is_auto else np.ones(one.lags.size, dtype=bool)
     lags, values = one.lags[shown], one.values[shown]
     bands = one.band95[shown], one.band99[shown]
-    figure["data"] += _bands(lags, bands, axis, first=number == 0)
-    figure["data"].append(_bars(one, lags, values, bands[1], axis))
     reach = 1.2 * max(float(np.max(np.abs(values))), float(np.max(bands[1])), 1e-12)
     edge = 0.7
-    figure["layout"][f"xaxis{axis}"] = {
-        "domain": across, "anchor": f"y{axis}", "nticks": 7, "showgrid": False,
-        "range": [float(lags[0]) - edge, float(lags[-1]) + edge], "zeroline": False,
-        "title": {"text": _lag_title(one), "font": {"size": 11}, "standoff": 4},
-    }  # fmt: skip
-    figure["layout"][f"yaxis{axis}"] = {
-        "domain": upward, "anchor": f"x{axis}", "nticks": 5,
-        "range": [-reach, reach],
-    }  # fmt: skip
-    figure["layout"]["annotations"].append({
-        "text": one.title, "xref": "paper", "yref": "paper", "x": across[0], "y": upward[1],
-        "xanchor": "left", "yanchor": "bottom", "yshift": 3, "showarrow": False, "align": "left",
-    })  # fmt: skip
+    at = add_axes(
+        figure,
+        number,
+        place,
+        {
+            "nticks": 7,
+            "showgrid": False,
+            "range": [float(lags[0]) - edge, float(lags[-1]) + edge],
+            "zeroline": False,
+            "title": {"text": _lag_title(one), "font": {"size": 11}, "standoff": 4},
+        },
+        {"nticks": 5, "range": [-reach, reach]},
+    )
+    figure["data"] += _bands(lags, bands, at, first=number == 0)
+    figure["data"].append(_bars(one, lags, values, bands[1], at))
+    add_caption(figure, one.title, place, shift=3)
 
 
 def _lag_title(one: CorrelationTrace) -> str:
@@ -85,13 +78,13 @@ def _lag_title(one: CorrelationTrace) -> str:
 
 
 def _bands(
-    lags: Floats, bands: tuple[Floats, Floats], axis: str, *, first: bool
+    lags: Floats, bands: tuple[Floats, Floats], at: dict[str, str], *, first: bool
 ) -> list[dict[str, Any]]:
     """The 95 % band as an area, the 99 % band as dashed lines about it."""
     # Half a lag further at each end, so that the first and the last bar stand on the band.
     x = finite(np.concatenate([[lags[0] - 0.5], lags, [lags[-1] + 0.5]]))
     shared = {
-        "type": "scatter", "mode": "lines", "x": x, "xaxis": f"x{axis}", "yaxis": f"y{axis}",
+        "type": "scatter", "mode": "lines", "x": x, **at,
         "hoverinfo": "skip",
     }  # fmt: skip
     drawn = []
@@ -111,12 +104,12 @@ def _bands(
 
 
 def _bars(
-    one: CorrelationTrace, lags: Floats, values: Floats, band99: Floats, axis: str
+    one: CorrelationTrace, lags: Floats, values: Floats, band99: Floats, at: dict[str, str]
 ) -> dict[str, Any]:
     outside = np.abs(values) > band99
     return {
         "type": "bar", "name": one.title.partition("<br>")[0], "x": finite(lags),
-        "y": finite(values), "xaxis": f"x{axis}", "yaxis": f"y{axis}", "showlegend": False,
+        "y": finite(values), **at, "showlegend": False,
         "marker": {"color": [theme.VERMILLION if out else theme.BLUE for out in outside]},
         "hovertemplate": "lag %{x}: %{y:.3f}<extra></extra>",
     }  # fmt: skip

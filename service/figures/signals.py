@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from service.core.text import bracket_unit
 from service.figures import theme
 from service.figures.data import Experiment, Floats, OutputTraces, Trace
-from service.figures.formats import bracketed
 from service.figures.plotly import MARGIN, Figure, finite, layout
 from service.figures.theme import MAX_POINTS, thinned, window
 
@@ -32,7 +32,7 @@ def response(
         span = window(output.measured.times, start, stop)
         figure["data"] += _output_traces(output, span, f"y{2 * number + 1}", number == 0)
         figure["data"].append(_residual(output, span, f"y{2 * number + 2}", number == 0))
-        unit = bracketed(output.measured.unit)
+        unit = bracket_unit(output.measured.unit)
         name_axis(figure, 2 * number + 1, f"{output.measured.name}{unit}")
         name_axis(figure, 2 * number + 2, f"residual<br>{unit}")
     for number, signal in enumerate(experiment.inputs, 2 * len(experiment.outputs) + 1):
@@ -40,7 +40,7 @@ def response(
         figure["data"].append(line(signal, span, f"y{number}", theme.GREEN, legend=True))
         known = _near(signal, _SHOWN_BEFORE * _duration(experiment))
         figure["data"] += _before(known, start, stop, f"y{number}", theme.GREEN)
-        name_axis(figure, number, f"{signal.name}{bracketed(signal.unit)}")
+        name_axis(figure, number, f"{signal.name}{bracket_unit(signal.unit)}")
     figure["layout"].update(_shading(experiment), uirevision=experiment.name)
     traces = [output.measured for output in experiment.outputs] + list(experiment.inputs)
     figure["layout"]["meta"] = {"thinned": _is_thinned(traces)}
@@ -67,7 +67,7 @@ def signals(
         colour = theme.SERIES[(number - 1) % len(theme.SERIES)]
         figure["data"].append(line(signal, span, f"y{number}", colour, legend=False))
         figure["data"] += _before(signal.history, start, stop, f"y{number}", colour)
-        name_axis(figure, number, f"{signal.name}{bracketed(signal.unit)}")
+        name_axis(figure, number, f"{signal.name}{bracket_unit(signal.unit)}")
     figure["layout"]["meta"] = {"thinned": _is_thinned(channels)}
     return figure
 

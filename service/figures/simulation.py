@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from service.control.schemas import ControllerOut, RunSimulationOut, StepMetricsOut
+from service.core.text import bracket_unit
 from service.datasets.schemas import Series
 from service.figures import theme
 from service.figures.data import Trace
-from service.figures.formats import bracketed
 from service.figures.plotly import Figure
 from service.figures.signals import axis_id, line, name_axis, stack
 
@@ -35,7 +35,7 @@ def simulation(found: RunSimulationOut, step_time: float | None = None) -> Figur
         if found.reference is not None and controlled in (None, output.name):
             figure["data"].append(_drawn(found.reference, number, theme.GREY, dash="dash"))
         figure["data"].append(_drawn(output, number, theme.BLUE))
-        name_axis(figure, number, f"{output.name}{bracketed(output.unit)}")
+        name_axis(figure, number, f"{output.name}{bracket_unit(output.unit)}")
         if found.metrics is not None and output.name == controlled:
             figure["layout"]["shapes"] = [*_settling(found.metrics, number, step_time or 0.0)]
     for number, signal in enumerate(below, len(found.outputs) + 1):
@@ -45,7 +45,7 @@ def simulation(found: RunSimulationOut, step_time: float | None = None) -> Figur
         if found.command is not None and signal.values == found.command.values:
             figure["layout"].setdefault("shapes", []).extend(_limits(found.controller, number))
         name = "command" if is_command else signal.name
-        name_axis(figure, number, f"{name}{bracketed(signal.unit)}")
+        name_axis(figure, number, f"{name}{bracket_unit(signal.unit)}")
     return figure
 
 

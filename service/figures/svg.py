@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from service.figures import formats
+from service.core.text import format_number
 from service.figures.plotly import Figure
 from service.figures.theme import strided, thinned
 
@@ -134,7 +134,7 @@ def label_of(value: float) -> str:
         if 10_000 <= size < 1e13 and size >= unit:
             return f"{value / unit:.6g}{prefix}".replace("-", "−")
     if size >= 1e13 or 0 < size < 1e-3:
-        return formats.number(value, 1 if _is_round(value) else 2)
+        return format_number(value, 1 if _is_round(value) else 2)
     return f"{value:.6g}".replace("-", "−")
 
 

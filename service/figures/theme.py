@@ -99,3 +99,9 @@ def strided(count: int, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
     if count <= max_points:
         return np.arange(count)
     return np.unique(np.linspace(0, count - 1, max_points).round().astype(np.intp))
+
+
+def fade(colour: str, opacity: float) -> str:
+    """A colour (``#rrggbb``) that lets through what lies below."""
+    red, green, blue = (int(colour[i : i + 2], 16) for i in (1, 3, 5))
+    return f"rgba({red},{green},{blue},{opacity:g})"

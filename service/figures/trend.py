@@ -2,15 +2,12 @@
 
 from typing import Any
 
+from service.core.text import append_unit
 from service.figures import theme
-from service.figures.formats import bracketed
-from service.figures.plotly import MARGIN, Figure, finite, layout
+from service.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
+from service.figures.plotly import Figure, finite, layout
 from service.trends.schemas import LawOut, PlaceOut, PointOut, QuantityOut, TrendOut
 
-_CAPTION_PX, _PLOT_PX, _AXIS_PX = 30, 250, 54
-_ROW_PX = _CAPTION_PX + _PLOT_PX + _AXIS_PX
-_MARGIN = {**MARGIN, "l": 72, "t": 36, "b": 6}
-_GAP = 0.1
 _BAND = "rgba(42,131,196,0.15)"
 _ESTIMATES, _LAW, _OTHER = "estimate ± standard error", "chosen law, 95 % band", "other law"
 _PREDICTED, _FLAGGED = "prediction, 95 % interval", "outlier or drift"
@@ -26,20 +23,14 @@ def trend_figure(found: TrendOut, columns: int = 2) -> Figure:
     diamonds with their intervals, and rings round outliers and what has drifted.
     """
     shown = [one for one in found.quantities if any(p.value is not None for p in one.points)]
-    columns = max(1, min(columns, len(shown)))
-    rows = -(-len(shown) // columns)
+    grid = wide_grid(len(shown), columns)
     figure: Figure = {
         "data": [],
-        "layout": layout(trend_height(len(shown), columns), annotations=[], margin=_MARGIN),
+        "layout": layout(grid.height(WIDE_MARGIN), annotations=[], margin=WIDE_MARGIN),
     }
     told: set[str] = set()
     for number, one in enumerate(shown):
-        row, column = divmod(number, columns)
-        wide = (1 - _GAP * (columns - 1)) / columns
-        left = column * (wide + _GAP)
-        top = 1 - (row * _ROW_PX + _CAPTION_PX) / (rows * _ROW_PX)
-        bottom = max(top - _PLOT_PX / (rows * _ROW_PX), 0.0)
-        at = _axes(figure, number, one, found.x, ((left, min(left + wide, 1.0)), (bottom, top)))
+        at = _axes(figure, number, one, found.x, grid.place(number))
         for trace in _traces(one):
             name = trace["legendgroup"]
             first = name not in told and trace.get("showlegend", True)
@@ -51,31 +42,25 @@ def trend_figure(found: TrendOut, columns: int = 2) -> Figure:
 
 def trend_height(n_quantities: int, columns: int = 2) -> int:
     """Height (px) of the figure, so that a page can leave room for it."""
-    rows = -(-n_quantities // max(1, min(columns, n_quantities)))
-    return max(rows, 1) * _ROW_PX + int(_MARGIN["t"] + _MARGIN["b"])
+    return wide_grid(n_quantities, columns).height(WIDE_MARGIN)
 
 
-def _axes(
-    figure: Figure, number: int, one: QuantityOut, x: str,
-    place: tuple[tuple[float, float], tuple[float, float]],
-) -> Axes:  # fmt: skip
-    axis = "" if number == 0 else str(number + 1)
-    across, upward = place
-    unit = bracketed(one.unit)
-    figure["layout"][f"xaxis{axis}"] = {
-        "domain": across, "anchor": f"y{axis}", "nticks": 7, "rangemode": "tozero",
-        "title": {"text": x, "font": {"size": 11}, "standoff": 4},
-        **({} if number == 0 else {"matches": "x"}),
-    }  # fmt: skip
-    figure["layout"][f"yaxis{axis}"] = {
-        "domain": upward, "anchor": f"x{axis}", "nticks": 6,
-        "title": {"text": f"{one.name}{unit}", "font": {"size": 11}},
-    }  # fmt: skip
-    figure["layout"]["annotations"].append({
-        "text": _caption(one), "xref": "paper", "yref": "paper", "x": across[0], "y": upward[1],
-        "xanchor": "left", "yanchor": "bottom", "yshift": 4, "showarrow": False, "align": "left",
-    })  # fmt: skip
-    return {"xaxis": f"x{axis}", "yaxis": f"y{axis}"}
+def _axes(figure: Figure, number: int, one: QuantityOut, x: str, place: Place) -> Axes:
+    small = {"size": 11}
+    at = add_axes(
+        figure,
+        number,
+        place,
+        {
+            "nticks": 7,
+            "rangemode": "tozero",
+            "title": {"text": x, "font": small, "standoff": 4},
+            **({} if number == 0 else {"matches": "x"}),
+        },
+        {"nticks": 6, "title": {"text": append_unit(one.name, one.unit), "font": small}},
+    )
+    add_caption(figure, _caption(one), place)
+    return at
 
 
 def _caption(one: QuantityOut) -> str:

@@ -1,12 +1,10 @@
 """Use cases of references: accept a run under a name, read them, find the run to start from."""
 
-from typing import Any
-
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
 from service.core.wire import Page
-from service.jobs.schemas import REFERENCE, RUN, AcceptedOut, ReferenceIn, ReferenceOut
+from service.jobs.schemas import REFERENCE, RUN, ReferenceIn, ReferenceOut
 from service.jobs.stored_run import load_run
 from service.models.models import says_the_same
 from service.repositories.references import InUse, ReferenceRepository
@@ -118,12 +116,17 @@ def _nearest(session: Session, name: str) -> str:
 
 
 def _told(one: InUse, before: list[AcceptedReference]) -> ReferenceOut:
-    latest, estimates = one.accepted, dict[str, Any](one.estimates or {})
-    return ReferenceOut(
-        name=latest.name, run=latest.run_id, job=one.job_id, by=latest.accepted_by,
-        note=latest.note, at=latest.accepted_at, labels=one.labels, estimates=estimates,
-        history=[
-            AcceptedOut(run=old.run_id, by=old.accepted_by, note=old.note, at=old.accepted_at)
-            for old in before
-        ],
-    )  # fmt: skip
+    latest, *earlier = (
+        {"run": row.run_id, "by": row.accepted_by, "note": row.note, "at": row.accepted_at}
+        for row in (one.accepted, *before)
+    )
+    return ReferenceOut.model_validate(
+        {
+            **latest,
+            "name": one.accepted.name,
+            "job": one.job_id,
+            "labels": one.labels,
+            "estimates": one.estimates or {},
+            "history": earlier,
+        }
+    )

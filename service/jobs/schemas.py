@@ -7,11 +7,12 @@ What is told about accepted references.
 """
 
 from datetime import datetime
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from service.core.states import StateName
 from service.core.wire import Answer, Body, NoiseIn, Pointer, Seed, not_too_deep
 from sysid.core.settings import (
     MAX_BITS,
@@ -301,7 +302,7 @@ class JobOut(Answer):
 
     id: str
     name: str
-    state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
+    state: StateName
     cancel_requested: bool = False
     created_at: datetime
     started_at: datetime | None = None

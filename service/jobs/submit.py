@@ -169,18 +169,19 @@ def clone(database: Database, job_id: str, settings: Settings) -> JobOut:
 def told(job: Job, *, with_request: bool = False, rms_unit: str | None = None) -> JobOut:
     """A job as it is told."""
     model = job.spec["model"]
-    return JobOut(
-        id=job.id, name=job.name, state=job.state.value, cancel_requested=job.cancel_requested,
-        created_at=job.created_at, started_at=job.started_at, finished_at=job.finished_at,
-        attempt=job.attempt, error=job.error,
-        model=model["name"] if isinstance(model, Mapping) else model, priority=job.priority,
-        progress=Progress(
-            runs=job.n_runs, finished=job.n_done, failed=job.n_failed, reused=job.n_reused,
-            best_rms=job.best_rms, evaluations=job.evaluations, generation=job.generation,
-            seconds_left=job.seconds_left,
+    return JobOut.from_source(
+        job,
+        model=model["name"] if isinstance(model, Mapping) else model,
+        progress=Progress.from_source(
+            job,
+            runs=job.n_runs,
+            finished=job.n_done,
+            failed=job.n_failed,
+            reused=job.n_reused,
         ),
-        request=job.spec if with_request else None, rms_unit=rms_unit,
-    )  # fmt: skip
+        request=job.spec if with_request else None,
+        rms_unit=rms_unit,
+    )
 
 
 def page(session: Session, cursor: str | None, limit: int, states: list[State]) -> Page[JobOut]:

@@ -147,21 +147,16 @@ def _stored(row: StoredModel, *, with_document: bool = False) -> ModelOut:
 
 
 def _told(model: Model, version: int, document: Mapping[str, Any] | None) -> ModelOut:
-    return ModelOut(
-        name=model.name,
+    fields = ("lower", "upper", "unit", "scale", "fixed", "tied")
+    return ModelOut.from_source(
+        model,
         version=version,
         builtin=version == 0,
-        title=model.title,
-        form=model.form,
         inputs={quantity.name: quantity.unit for quantity in model.inputs},
         outputs={output.name: output.unit for output in model.outputs},
-        parameters={
-            p.name: {"lower": p.lower, "upper": p.upper, "unit": p.unit, "scale": p.scale,
-                     "fixed": p.fixed, "tied": p.tied}
-            for p in model.parameters
-        },
-        document=None if document is None else dict(document),
-    )  # fmt: skip
+        parameters={p.name: {name: getattr(p, name) for name in fields} for p in model.parameters},
+        document=document,
+    )
 
 
 _BESIDES = ("name", "title", "description", "source", "parameters", "initial", "solver")

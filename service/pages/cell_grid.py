@@ -8,7 +8,7 @@ from urllib.parse import urlencode
 
 from sqlalchemy.orm import Session
 
-from service.figures import formats
+from service.core.text import format_count, format_number, format_value
 from service.figures.noise import SIGMA
 from service.repositories.summaries import Group, GroupKey, Quantity
 from service.storage.columns import to_json
@@ -66,7 +66,7 @@ def grid_of(session: Session, job: Job, chosen: Mapping[str, Any]) -> GridView |
         for one, share in zip(found, shares, strict=True)
     }
     rows = [
-        ([_text(value) for value in row],
+        ([format_value(value) for value in row],
          [cells.get(to_json((*row, *column))) for column in columns])
         for row in _distinct([one.key[:split] for one in found])
     ]  # fmt: skip
@@ -74,7 +74,7 @@ def grid_of(session: Session, job: Job, chosen: Mapping[str, Any]) -> GridView |
         quantity="RMS error against the record without noise" if SIGMA in keys else "RMS",
         row_names=[_name(path) for path in keys[:split]],
         column_name=_name(keys[-1]) if split < len(keys) else "",
-        columns=[_text(column[0]) if column else "all" for column in columns],
+        columns=[format_value(column[0]) if column else "all" for column in columns],
         rows=rows, is_cut=is_cut,
     )  # fmt: skip
 
@@ -101,10 +101,10 @@ def _cell(
     total = sum(group.states.values())
     over = sum(n for state, n in group.states.items() if state.is_terminal)
     failed = group.states[State.FAILED]
-    count = formats.count(total) if over == total else f"{over} of {total}"
+    count = format_count(total) if over == total else f"{over} of {total}"
     return CellView(
         href=query_of(cell),
-        text="–" if quantiles is None else formats.number(quantiles[MIDDLE], 3),
+        text="–" if quantiles is None else format_number(quantiles[MIDDLE], 3),
         count_text=f"{count} runs{f', {failed} failed' if failed else ''}",
         state=_state(group, over == total),
         share=share,
@@ -135,11 +135,3 @@ def _shares(found: Sequence[Group], error: Quantity) -> list[float]:
 
 def _name(path: str) -> str:
     return "σ" if path == SIGMA else path.rsplit("/", 1)[-1]
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, dict):
-        return str(value.get("name", "…"))
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -6,6 +6,7 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
+from service.core.text import format_labels
 from service.pages.views import DATASETS, axes_of
 from service.repositories.datasets import DatasetRepository
 from service.repositories.lineage import LineageRepository
@@ -39,17 +40,12 @@ def _of(spec: Document) -> Iterator[tuple[str, str, str]]:
         labels = axis.get("labels") or [{}] * len(axis["values"])
         for value, label in zip(axis["values"], labels, strict=True):
             for one in [value] if isinstance(value, str) else value:
-                yield "estimation", _label(label), one
+                yield "estimation", format_labels(label), one
     if not axes:
         for one in spec.get("datasets", []):
             yield "estimation", "", one
     for one in (spec.get("validation") or {}).get("datasets") or []:
         yield "validation", "", one
-
-
-def _label(label: Document) -> str:
-    texts = {name: f"{v:g}" if isinstance(v, float) else str(v) for name, v in label.items()}
-    return ", ".join(f"{name} = {text}" for name, text in texts.items())
 
 
 def _name(session: Session, dataset_id: str) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.figures import formats
+from service.core.text import DASH, format_estimate, format_number, format_p_value, join_estimate
 from service.figures.data import CorrelationTrace
 from service.figures.plotly import Figure
 from service.figures.residuals import residuals
@@ -79,8 +79,8 @@ def findings_of(result: Document) -> Findings:
         groups=[_group(one) for one in groups if isinstance(one, dict)],
         criteria=result.get("criteria") or {},
         selection=[
-            SelectedView(one["term"], formats.number(one["err"]),
-                         formats.number(max(1.0 - one["cumulated"], 0.0)))
+            SelectedView(one["term"], format_number(one["err"]),
+                         format_number(max(1.0 - one["cumulated"], 0.0)))
             for one in result.get("selection") or ()
         ],
     )  # fmt: skip
@@ -107,24 +107,17 @@ def residual_figure(tested: Tested, experiment: int, columns: int = 2) -> Figure
     return residuals(functions, columns, tested.names)
 
 
-def chance(p: float | None) -> str:
-    """A probability of a test."""
-    if p is None:
-        return formats.DASH
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"
-
-
 def _test(one: Document) -> TestView:
     what = "white" if one["test"] == "whiteness" else f"independent of {one['input']}"
     return TestView(
         experiment=one["experiment"] + 1, output=one["output"], what=what,
         inside95=_share(one.get("inside95")), inside99=_share(one.get("inside99")),
-        p=chance(one.get("p")), outcome=one["outcome"], reason=one.get("reason") or "",
+        p=format_p_value(one.get("p")), outcome=one["outcome"], reason=one.get("reason") or "",
     )  # fmt: skip
 
 
 def _share(part: float | None) -> str:
-    return formats.DASH if part is None else f"{100 * part:.0f}\u202f%"
+    return DASH if part is None else f"{100 * part:.0f}\u202f%"
 
 
 def _onset(one: Document, several: bool) -> OnsetView:
@@ -132,12 +125,11 @@ def _onset(one: Document, several: bool) -> OnsetView:
     pair = f"{one['output']} behind {one['input']}{where}"
     if one["delay"] is None:
         return OnsetView(pair, "", one.get("reason") or "")
-    value, spread = formats.estimate(one["delay"], one.get("spread"))
+    value, spread = format_estimate(one["delay"], one.get("spread"))
     steps = "one step" if one["events"] == 1 else f"{one['events']} steps"
     scatter = f", spread {spread}\u202fs" if spread else ""
     return OnsetView(pair, f"{value}\u202fs", f"{steps}{scatter}")
 
 
 def _group(one: Document) -> str:
-    value, stderr = formats.estimate(one["value"], one.get("stderr"))
-    return f"{one['expression']} = {value}{f' ± {stderr}' if stderr else ''}"
+    return f"{one['expression']} = {join_estimate(one['value'], one.get('stderr'))}"

@@ -54,7 +54,7 @@ def run_figure(
     if name == "response":
         experiments = experiments_of(session, store, stored)
         if not experiments:
-            return {"data": [], "layout": figures.layout(200)}
+            return figures.empty_figure()
         _check_experiment(choice.experiment, len(experiments))
         figure = figures_signals.response(experiments[choice.experiment], choice.start, choice.stop)
         figure["layout"]["meta"]["experiments"] = [one.name for one in experiments]
@@ -62,7 +62,7 @@ def run_figure(
     if name == "residuals":
         tested = residuals_of(session, store, stored)
         if tested is None:
-            return {"data": [], "layout": figures.layout(200)}
+            return figures.empty_figure()
         _check_experiment(choice.experiment, len(tested.names))
         return residual_figure(tested, choice.experiment, min(choice.columns, 2))
     evidence = evidence_of(session, stored)
@@ -78,7 +78,7 @@ def job_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
     job = JobRepository(session).get(job_id)
     keys = noise_keys(job.spec.get("sweep", {}).get("axes", []))
     if keys is None:
-        return {"data": [], "layout": figures.layout(200)}
+        return figures.empty_figure()
     found = summary(session, job.id, keys, errors_only=True)
     return noise_sweep(found, unit_of(session, job.spec), min(choice.columns, 2))
 
@@ -87,7 +87,7 @@ def trend_of_job(session: Session, job_id: str, choice: FigureChoice) -> Figure:
     """Estimates over the label of a batch; empty where the job asks for no trend."""
     found = trend_of(session, JobRepository(session).get(job_id))
     if found is None:
-        return {"data": [], "layout": figures.layout(200)}
+        return figures.empty_figure()
     return trend_figure(found, min(choice.columns, 2))
 
 

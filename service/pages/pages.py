@@ -12,8 +12,8 @@ from urllib.parse import urlencode
 import yaml
 from sqlalchemy.orm import Session
 
+from service.core.text import join_estimate
 from service.datasets.rms_unit import unit_of
-from service.figures import formats
 from service.figures import signals as figures_signals
 from service.figures.noise import noise_height, noise_keys
 from service.figures.plotly import WATERFALL_HEIGHT, convergence_height, correlation_height
@@ -119,8 +119,8 @@ def compare_page(session: Session, runs: Sequence[str]) -> str:
     found = compare(session, runs)
     rows = []
     for one in found.parameters:
-        known = {value.run: formats.estimate(value.value, value.stderr) for value in one.values}
-        texts = [" ± ".join(filter(None, known.get(run.run, ()))) for run in found.runs]
+        known = {value.run: join_estimate(value.value, value.stderr) for value in one.values}
+        texts = [known.get(run.run, "") for run in found.runs]
         rows.append({"name": one.name, "unit": one.unit, "differs": one.differs, "texts": texts})
     return render("compare.html", found=found, parameters=rows)
 

@@ -18,7 +18,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from service.figures import formats
+from service.core.text import TEMPLATE_FILTERS
 from sysid.core.settings import GeneticAlgorithm
 
 STATIC = Path(__file__).parent / "static"
@@ -74,7 +74,7 @@ def environment() -> Environment:
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    made.filters.update(formats.FILTERS)
+    made.filters.update(TEMPLATE_FILTERS)
     made.globals["default_algorithm"] = GeneticAlgorithm()
     made.globals.update(static=lambda name: f"/static/{name}", plotly=f"/static/{plotly_name()}")
     return made

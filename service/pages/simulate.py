@@ -12,10 +12,10 @@ from sqlalchemy.orm import Session
 from service.control import simulate as run_simulations
 from service.control.schemas import RunSimulateIn, RunSimulationOut, StepMetricsOut
 from service.core.errors import FieldError, InvalidRequest, ServiceError, Unavailable, faults_of
+from service.core.text import bracket_unit
 from service.core.validation import explained
 from service.figures.data import Experiment, OutputTraces, Trace
 from service.figures.embed import as_json, bare, templates
-from service.figures.formats import bracketed
 from service.figures.plotly import Figure, as_csv
 from service.figures.signals import response
 from service.figures.simulation import in_units, simulation
@@ -137,7 +137,7 @@ def simulate_page(
                 **_numbers(context.get("result"))},
         faults={f.pointer[1:]: f.detail for f in faults},
         lines=[_line(one) for one in faults], query=_address(query), label_of=label_of,
-        times=multiplied, bracket=bracketed,
+        times=multiplied, bracket=bracket_unit,
         **{"result": None, "free": None, "figure": None, **context},
     )  # fmt: skip
     return Shown(page, is_csv=False, status=status)

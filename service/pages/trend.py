@@ -1,30 +1,24 @@
 """What pages and reports show of a trend: tables as texts, ready to be written."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
-from service.figures import formats
+from service.core.text import format_number
 from service.figures.trend import trend_height
 from service.storage.tables import Job
 from service.trends.schemas import TrendOut
-from service.trends.text import Quantity, flags, law_text, notes, reference_text, span_text
+from service.trends.text import (
+    TYPESET,
+    PlaceRow,
+    PredictionRow,
+    build_tables,
+    notes,
+    reference_text,
+)
 from service.trends.trend import has_trend, trend
-
-
-@dataclass(frozen=True, slots=True)
-class RowView:
-    """The runs of one label."""
-
-    x_text: str
-    cells: Sequence[str]
-    span_text: str
-    evaluations: int
-    flags: Sequence[str]
-    runs: Sequence[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +31,9 @@ class TrendView:
 
     x: str
     headings: Sequence[str]
-    rows: Sequence[RowView]
+    rows: Sequence[PlaceRow]
     laws: Sequence[tuple[str, str, str, bool]]
-    predictions: Sequence[tuple[str, str, str, str, str]]
+    predictions: Sequence[PredictionRow]
     reasons: Sequence[str]
     notes: Sequence[str]
     reference: str | None
@@ -62,24 +56,24 @@ def trend_of(session: Session, job: Job) -> TrendOut | None:
 def trend_view(found: TrendOut) -> TrendView:
     """The tables of a trend."""
     document = found.model_dump()
-    shown: list[Quantity] = [
-        one for one in document["quantities"] if any(p["value"] is not None for p in one["points"])
-    ]
+    tables = build_tables(document, TYPESET)
     return TrendView(
         x=found.x,
-        headings=[one["name"] + (f" [{one['unit']}]" if _has_unit(one) else "") for one in shown],
-        rows=[_row(place, shown) for place in document["places"]],
+        headings=tables.headings,
+        rows=tables.rows,
         laws=[
-            (law_text(one["name"], law, found.x, _estimate), formats.number(law["aic"]),
-             formats.number(law["birge"], 3), law["is_chosen"])
-            for one in shown for law in one["laws"]
+            (law.text, format_number(law.aic), format_number(law.birge, 3), law.is_chosen)
+            for law in tables.laws
         ],
-        predictions=[_prediction(one, at) for one in shown for at in one["predictions"]],
-        reasons=[f"{one['name']}: {one['reason']}" for one in shown if one["reason"]],
-        notes=notes(document), reference=found.reference, reference_text=reference_text(document),
-        offered=_offered(found), offered_name=next(iter(found.reference_names), ""),
-        height=trend_height(max(len(shown), 1)),
-    )  # fmt: skip
+        predictions=tables.predictions,
+        reasons=[f"{name}: {reason}" for name, reason in tables.reasons],
+        notes=notes(document),
+        reference=found.reference,
+        reference_text=reference_text(document),
+        offered=_offered(found),
+        offered_name=next(iter(found.reference_names), ""),
+        height=trend_height(max(len(tables.headings), 1)),
+    )
 
 
 def _offered(found: TrendOut) -> str:
@@ -87,35 +81,3 @@ def _offered(found: TrendOut) -> str:
     middle = list(runs.values())[len(runs) // 2 : len(runs) // 2 + 1]
     known = None if found.reference_x is None else runs.get(found.reference_x)
     return known or next(iter(middle), "")
-
-
-def _row(place: dict[str, Any], quantities: Sequence[Quantity]) -> RowView:
-    known: list[Mapping[str, Any] | None] = [
-        next((point for point in one["points"] if point["x"] == place["x"]), None)
-        for one in quantities
-    ]
-    return RowView(
-        x_text=f"{place['x']:g}".replace("-", "−"),
-        cells=[formats.DASH if p is None or p["value"] is None else _estimate(p) for p in known],
-        span_text="; ".join(map(span_text, place["spans"])) or formats.DASH,
-        evaluations=place["evaluations"], flags=flags(place, list(quantities)),
-        runs=place["runs"],
-    )  # fmt: skip
-
-
-def _estimate(one: Mapping[str, Any]) -> str:
-    return " ± ".join(filter(None, formats.estimate(one["value"], one["stderr"])))
-
-
-def _prediction(one: Quantity, at: Mapping[str, Any]) -> tuple[str, str, str, str, str]:
-    name, x = str(one["name"]), f"{at['x']:g}"
-    if at["value"] is None or at["lower"] is None:
-        return name, x, formats.DASH, formats.DASH, "the law has no value here"
-    ends = " … ".join(formats.number(at[end]) for end in ("lower", "upper"))
-    unit = formats.unit(one["unit"])
-    outside = "extrapolated" if at["is_outside"] else ""
-    return name, x, formats.number(at["value"]) + unit, ends + unit, outside
-
-
-def _has_unit(one: Quantity) -> bool:
-    return one["unit"] not in ("", "1")

@@ -1,4 +1,4 @@
-"""What the templates show of jobs and runs: values of their rows, ready to be written."""
+"""What the templates show of jobs and runs: their documents, with texts ready to be written."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -6,9 +6,13 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from service.figures import formats
+from service.core.states import OPEN, StateName
+from service.core.text import format_count, format_estimate, format_interval, format_value
+from service.core.wire import Answer
+from service.jobs.schemas import JobOut
+from service.jobs.submit import told
 from service.pages.diagnostics import Findings, findings_of
-from service.storage.tables import Event, Job, Run, State
+from service.storage.tables import Event, Job, Run
 
 Document = Mapping[str, Any]
 
@@ -30,14 +34,13 @@ class EstimateView:
 DATASETS = "/datasets"
 
 
-@dataclass(frozen=True, slots=True)
-class RunView:
+class RunView(Answer):
     """One run: what it gave, or how far it is."""
 
     id: str
     number: int
     title: str
-    state: str
+    state: StateName
     is_open: bool
     cell_text: str
     unit: str
@@ -56,39 +59,75 @@ class RunView:
     findings: Findings
 
 
-@dataclass(frozen=True, slots=True)
-class JobView:
-    """One job: its state, how far it is, and its request.
+class JobView(JobOut):
+    """The document of a job as REST gives it, and what pages say besides, as of `now`.
 
     The RMS of a batch, whose runs see different recordings, do not compare: it has no best one.
     """
 
-    id: str
-    name: str
-    state: str
-    is_open: bool
-    can_resume: bool
-    cancel_requested: bool
-    model_name: str
-    unit: str
-    starts: int
+    request: dict[str, Any]
     lost_leases: int
     max_attempts: int
-    n_runs: int
-    n_done: int
-    n_failed: int
-    n_reused: int
-    progress: float
-    progress_text: str
-    best_rms: float | None
-    is_batch: bool
-    evaluations: int
-    rate: float | None
-    seconds_left: float | None
-    took: float | None
-    created_at: datetime
-    error: str | None
-    request: Document
+    now: datetime
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it waits or runs."""
+        return self.state in OPEN
+
+    @property
+    def can_resume(self) -> bool:
+        """Whether it ended before it was done."""
+        return self.state in ("failed", "cancelled")
+
+    @property
+    def is_batch(self) -> bool:
+        """Whether its runs see different recordings."""
+        return any(axis["path"].startswith(DATASETS) for axis in axes_of(self.request))
+
+    @property
+    def best_rms(self) -> float | None:
+        """RMS of the best run."""
+        return None if self.is_batch else self.progress.best_rms
+
+    @property
+    def took(self) -> float | None:
+        """Seconds since it was begun, up to its end."""
+        if self.started_at is None:
+            return None
+        return max(((self.finished_at or self.now) - self.started_at).total_seconds(), 0.0)
+
+    @property
+    def rate(self) -> float | None:
+        """Evaluations per second."""
+        seconds, evaluations = self.took, self.progress.evaluations
+        return evaluations / seconds if seconds and evaluations else None
+
+    @property
+    def share(self) -> float:
+        """How much is done, from 0 to 1: runs, and the generations of a single one."""
+        done = self.progress
+        if self.state == "succeeded":
+            return 1.0
+        if done.runs > 1 or self.state == "queued":
+            return min(done.finished / max(done.runs, 1), 1.0)
+        algorithm = self.request["algorithm"]
+        parts: list[float] = [done.generation / max(algorithm["generations"], 1)]
+        if budget := algorithm["stop"]["evaluations"]:
+            parts.append(done.evaluations / budget)
+        return min(max(parts), 1.0)
+
+    @property
+    def progress_text(self) -> str:
+        """How far it is, in words."""
+        done = self.progress
+        if done.runs > 1:
+            return f"{format_count(done.finished)} of {format_count(done.runs)} runs"
+        if self.state == "queued":
+            return "waiting"
+        if self.state != "succeeded":
+            return f"generation {format_count(done.generation)}" if done.generation else ""
+        return f"{100 * self.share:.0f}\u202f%"
 
     @property
     def request_text(self) -> str:
@@ -107,49 +146,38 @@ class EventView:
 
 def job_view(job: Job, unit: str, now: datetime) -> JobView:
     """What pages show of a job; `unit` is that of its RMS."""
-    took = None if job.started_at is None else ((job.finished_at or now) - job.started_at)
-    seconds = None if took is None else max(took.total_seconds(), 0.0)
-    share = progress(job)
-    is_batch = any(axis["path"].startswith(DATASETS) for axis in axes_of(job.spec))
-    return JobView(
-        id=job.id, name=job.name, state=job.state.value, is_open=not job.state.is_terminal,
-        can_resume=job.state in (State.FAILED, State.CANCELLED),
-        cancel_requested=job.cancel_requested, model_name=model_name(job.spec), unit=unit,
-        starts=job.attempt, lost_leases=job.lost_leases, max_attempts=job.max_attempts,
-        n_runs=job.n_runs, n_done=job.n_done,
-        n_failed=job.n_failed, n_reused=job.n_reused,
-        progress=share, progress_text=_progress_text(job, share),
-        best_rms=None if is_batch else job.best_rms, is_batch=is_batch, evaluations=job.evaluations,
-        rate=job.evaluations / seconds if seconds and job.evaluations else None,
-        seconds_left=job.seconds_left, took=seconds, created_at=job.created_at,
-        error=job.error, request=job.spec,
-    )  # fmt: skip
+    document = told(job, with_request=True, rms_unit=unit)
+    return JobView.from_source(
+        document, lost_leases=job.lost_leases, max_attempts=job.max_attempts, now=now
+    )
 
 
 def run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
     """What pages show of a run; `heights` (px) are those of its plots."""
     result = run.result or {}
-    return RunView(
-        id=run.id, number=run.number, title=_run_title(run), state=run.state.value,
-        is_open=not run.state.is_terminal, cell_text=cell_text(run.cell, run.labels), unit=unit,
-        valid=run.valid, best_rms=run.best_rms, fit_estimation=run.fit_estimation,
-        fit_validation=run.fit_validation, evaluations=run.evaluations,
-        generations=run.generations, seconds=run.seconds, error=run.error,
+    return RunView.from_source(
+        run,
+        title=f"run {run.number + 1}",
+        is_open=not run.state.is_terminal,
+        cell_text=cell_text(run.cell, run.labels),
+        unit=unit,
         estimates=[estimate_view(one) for one in result.get("parameters", ())],
-        warnings=list(result.get("warnings", ())), has_signals=run.signals_sha256 is not None,
-        heights=heights, findings=findings_of(result),
-    )  # fmt: skip
+        warnings=result.get("warnings", ()),
+        has_signals=run.signals_sha256 is not None,
+        heights=heights,
+        findings=findings_of(result),
+    )
 
 
 def estimate_view(one: Document) -> EstimateView:
     """A line of the table, from an entry of the result's ``parameters``."""
     stderr = one.get("stderr")
-    value, error = formats.estimate(one["value"], stderr)
+    value, error = format_estimate(one["value"], stderr)
     bounds = [one[name] for name in ("lower", "upper") if one.get(name) is not None]
     status = one.get("status", "")
     return EstimateView(
         name=one["name"], unit=one.get("unit", "1"), value_text=value, stderr_text=error,
-        interval_text=formats.interval(one.get("interval95"), stderr),
+        interval_text=format_interval(one.get("interval95"), stderr),
         bounds_text=" … ".join(f"{bound:.6g}".replace("-", "−") for bound in bounds),
         status=status, reason=one.get("reason") or "",
     )  # fmt: skip
@@ -165,28 +193,10 @@ def event_view(event: Event) -> EventView:
     text = data.get("message") or data.get("text")
     if text is None:
         known = ((name.replace("_", " "), value) for name, value in data.items())
-        text = ", ".join(f"{name} {_plain(value)}" for name, value in known if value is not None)
+        text = ", ".join(
+            f"{name} {format_value(value)}" for name, value in known if value is not None
+        )
     return EventView(event.created_at, event.kind, str(text))
-
-
-def model_name(spec: Document) -> str:
-    """Name of the model that a job names or carries."""
-    model = spec.get("model", "")
-    return model if isinstance(model, str) else str(model.get("name", "own equations"))
-
-
-def progress(job: Job) -> float:
-    """How much of a job is done, from 0 to 1: runs, and the generations of a single one."""
-    if job.state is State.SUCCEEDED:
-        return 1.0
-    if job.n_runs > 1 or job.state is State.QUEUED:
-        return min(job.n_done / max(job.n_runs, 1), 1.0)
-    algorithm = job.spec.get("algorithm", {})
-    budget = (algorithm.get("stop") or {}).get("evaluations")
-    parts: list[float] = [job.generation / max(algorithm.get("generations", 1), 1)]
-    if budget:
-        parts.append(job.evaluations / budget)
-    return min(max(parts), 1.0)
 
 
 def axes_of(spec: Document) -> list[Document]:
@@ -198,7 +208,7 @@ def cell_text(cell: Document, labels: Document) -> str:
     """What distinguishes a run from the others of its job; labels tell data better than ids."""
     told = {path: value for path, value in cell.items() if not (labels and path == DATASETS)}
     pairs = [(_field_name(path, told), value) for path, value in told.items()]
-    return ", ".join(f"{name} {_plain(value)}" for name, value in [*labels.items(), *pairs])
+    return ", ".join(f"{name} {format_value(value)}" for name, value in [*labels.items(), *pairs])
 
 
 def _field_name(path: str, others: Iterable[str]) -> str:
@@ -206,26 +216,3 @@ def _field_name(path: str, others: Iterable[str]) -> str:
     last = path.rsplit("/", 1)[-1]
     same = [one for one in others if one.rsplit("/", 1)[-1] == last]
     return last if len(same) == 1 else path.removeprefix("/").replace("/", " ")
-
-
-def _run_title(run: Run) -> str:
-    return f"run {run.number + 1}"
-
-
-def _progress_text(job: Job, share: float) -> str:
-    if job.n_runs > 1:
-        return f"{formats.count(job.n_done)} of {formats.count(job.n_runs)} runs"
-    if job.state is State.QUEUED:
-        return "waiting"
-    if job.state is not State.SUCCEEDED:
-        return f"generation {formats.count(job.generation)}" if job.generation else ""
-    return f"{100 * share:.0f}\u202f%"
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, float):
-        return formats.number(value)
-    if isinstance(value, dict | list):
-        text = json.dumps(value, ensure_ascii=False)
-        return text if len(text) <= 60 else f"{text[:57]}…"
-    return str(value)

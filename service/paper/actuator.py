@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from service.figures import formats, theme
+from service.core.text import format_number
+from service.figures import theme
 from service.paper import figures, published
 from service.paper.bench import METHODS, Bench, Found
 from service.paper.document import Check, Plot, Section, Table
@@ -86,7 +87,7 @@ def _printed(bench: Bench, record: str) -> Section:
     found = bench.methods(job(record, SECOND, "as printed, k_b by itself"))
     groups = (found["improved"].run.get("identifiability") or {}).get("groups") or []
     told = "; ".join(
-        f"{one['expression']} = {formats.number(one['value'], 5)}"
+        f"{one['expression']} = {format_number(one['value'], 5)}"
         for one in groups
         if isinstance(one, dict) and one.get("value") is not None
     )

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from service.core.text import append_unit
 from service.figures import theme
 from service.figures.data import Floats
 from service.figures.plotly import Figure, finite, layout
@@ -69,7 +70,7 @@ def convergence(found: Mapping[str, Found], names: Sequence[str],
         }
         axes[f"xaxis{tag}"] = axis("generation", anchor=f"y{tag}", rangemode="tozero", **span)
         unit = next(iter(found.values())).parameter(name)["unit"]
-        axes[f"yaxis{tag}"] = axis(_with_unit(name, unit), anchor=f"x{tag}")
+        axes[f"yaxis{tag}"] = axis(append_unit(name, unit), anchor=f"x{tag}")
     return {"data": data, "layout": layout(HEIGHT, **axes)}
 
 
@@ -125,8 +126,8 @@ def responses(found: Mapping[str, Found], experiment: int = 0) -> Figure:
     unit = first["unit"]
     axes = {
         "xaxis": axis("time [s]", anchor="y2"),
-        "yaxis": axis(_with_unit(first["name"], unit), domain=[0.42, 1]),
-        "yaxis2": axis(_with_unit("residual", unit), domain=[0, 0.32], nticks=4),
+        "yaxis": axis(append_unit(first["name"], unit), domain=[0.42, 1]),
+        "yaxis2": axis(append_unit("residual", unit), domain=[0, 0.32], nticks=4),
     }
     return {"data": data, "layout": layout(HEIGHT + 100, **axes)}
 
@@ -137,7 +138,7 @@ def _numbers(values: Sequence[float | None]) -> Floats:
 
 def band(x: Sequence[float], lower: Sequence[float], upper: Sequence[float], method: str) -> Line:
     """The area between two lines, in the method's colour."""
-    colour = theme.SHADE if method == "" else _faint(style(method)["color"])
+    colour = theme.SHADE if method == "" else theme.fade(style(method)["color"], 0.16)
     around = [*x, *reversed(x)], [*upper, *reversed(lower)]
     return line("", *around, fill="toself", fillcolor=colour, line={"width": 0},
                 hoverinfo="skip", showlegend=False)  # fmt: skip
@@ -147,15 +148,6 @@ def points(name: str, x: Sequence[float], y: Sequence[float], method: str) -> Li
     """Single runs of a method."""
     marker = {"color": style(method)["color"], "size": 4, "opacity": 0.45}
     return line(name, x, y, mode="markers", marker=marker, showlegend=False)
-
-
-def _faint(colour: str) -> str:
-    red, green, blue = (int(colour[n : n + 2], 16) for n in (1, 3, 5))
-    return f"rgba({red},{green},{blue},0.16)"
-
-
-def _with_unit(name: str, unit: str) -> str:
-    return name if unit == "1" else f"{name} [{unit}]"
 
 
 def _end(found: Mapping[str, Found]) -> float:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from service.figures import formats
+from service.core.text import format_number, join_estimate
 from service.figures.data import Floats
 from service.paper import figures, published
 from service.paper.bench import METHODS, Bench, Found
@@ -126,7 +126,7 @@ def estimates(example: Example, found: Mapping[str, Found], least: Mapping[str, 
             f"{name} [{unit}]", f"{true:g}", f"{example.columns.simple[name]:.6f}",
             f"{example.columns.proposed[name]:.6f}",
             *(estimate_text(found[method], name) for method in METHODS),
-            formats.number(least[name], 2),
+            format_number(least[name], 2),
         ])  # fmt: skip
     for name, true in example.true.items():
         printed = (example.columns.simple[name], example.columns.proposed[name])
@@ -163,10 +163,8 @@ def _against_bound(example: Example, least: Mapping[str, float]) -> str:
 
 def estimate_text(found: Found, name: str) -> str:
     """An estimate with its standard error; why there is none where there is none."""
-    value, error = formats.estimate(found.value(name), found.stderr(name))
-    if error:
-        return f"{value} ± {error}"
-    return f"{value} ({found.parameter(name)['status']})"
+    text = join_estimate(found.value(name), found.stderr(name))
+    return text if "±" in text else f"{text} ({found.parameter(name)['status']})"
 
 
 def efforts(found: Mapping[str, Found]) -> Table:

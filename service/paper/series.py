@@ -3,7 +3,8 @@
 from math import exp, factorial
 from typing import Any
 
-from service.figures import formats, theme
+from service.core.text import format_number
+from service.figures import theme
 from service.paper import figures
 from service.paper.bench import Bench
 from service.paper.document import Plot, Section, Table
@@ -37,7 +38,7 @@ def sections(bench: Bench) -> list[Section]:
     for title, period in READINGS:
         bench.say(f"paper Figures 2 and 3, {title}")
         lines = {n: _simulated(bench, n, period) for n in TERMS}
-        rows.append([title, *(formats.number(y[-1] - exact(t[-1])) for t, y in lines.values())])
+        rows.append([title, *(format_number(y[-1] - exact(t[-1])) for t, y in lines.values())])
         plots += _plots(title, lines)
     return [
         Section(

@@ -7,11 +7,11 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
+from service.core.text import plain_estimate, plain_unit
 from service.jobs.results import is_free, read_noise_model
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import ComparedParameter, ComparedRun, ComparedValue, ComparisonOut
 from service.storage.errors import NotFound
-from sysid.core.units import format_unit
 
 Document = Mapping[str, Any]
 
@@ -148,11 +148,7 @@ def _parameters(
         known = sum(_has_ends(estimate["interval95"]) for _, estimate in found)
         yield ComparedParameter(
             name=name, unit=unit, differs=None if known < 2 else pair is not None, note=note,
-            values=[
-                ComparedValue(run=one.run.id, value=e["value"], stderr=e["stderr"],
-                              interval95=e["interval95"], status=e["status"])
-                for one, e in found
-            ],
+            values=[ComparedValue.model_validate({**e, "run": one.run.id}) for one, e in found],
         )  # fmt: skip
 
 
@@ -175,20 +171,11 @@ def _has_ends(interval: Sequence[float | None] | None) -> bool:
 def _note(
     name: str, unit: str, pair: Sequence[tuple[str, Document]], *, same_model: bool
 ) -> str:  # fmt: skip
-    symbol = format_unit(unit)
-    told = ", ".join(f"{_plus_minus(estimate)}{symbol} with {title}" for title, estimate in pair)
+    told = ", ".join(
+        f"{plain_estimate(estimate['value'], estimate['stderr'])}{plain_unit(unit)} with {title}"
+        for title, estimate in pair
+    )
     return f"{name} depends on the {'run' if same_model else 'model'}: {told}"
-
-
-def _plus_minus(estimate: Document) -> str:
-    """A value and its standard error, both to the error's second digit."""
-    value, stderr = float(estimate["value"]), estimate["stderr"]
-    if not stderr or stderr <= 0:
-        return f"{value:.6g}"
-    decimals = 1 - int(f"{stderr:.1e}".partition("e")[2])
-    if not 0 <= decimals <= 9:
-        return f"{value:.6g} ± {stderr:.2g}"
-    return f"{value:.{decimals}f} ± {stderr:.{decimals}f}"
 
 
 def _unit(ordered: Sequence[StoredRun]) -> str:

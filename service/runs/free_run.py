@@ -13,7 +13,6 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core.concurrency import simulating
-from service.core.documents import to_finite
 from service.core.errors import FieldError, InvalidRequest
 from service.datasets.datasets import series
 from service.datasets.recordings import read_records
@@ -72,18 +71,17 @@ def free_run(
         If the recording does not have what the model needs, or the simulation diverges.
     """
     found = judged(database, store, run_id, body)
-    return FreeRunOut(
-        id=found.run, dataset=found.dataset, unit=found.metrics.unit, rms=found.metrics.rms,
-        fit_percent=to_finite(found.metrics.fit_percent), starts=found.starts,
+    return FreeRunOut.from_source(
+        found.metrics,
+        id=found.run,
+        dataset=found.dataset,
+        starts=found.starts,
         agreement=[
-            AgreementOut(
-                experiment=one.experiment + 1, output=one.output, unit=one.unit,
-                samples=one.samples, rms=one.rms, fit_percent=to_finite(one.fit_percent),
-            )
+            AgreementOut.from_source(one, experiment=one.experiment + 1)
             for one in found.metrics.channels
         ],
         experiments=list(_experiments(found, max_points)),
-    )  # fmt: skip
+    )
 
 
 @simulating.one()

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from service.core.documents import to_finite
 from service.core.errors import Conflict, InvalidRequest
 from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.runs.schemas import ProfileIn, ProfileOut, Profiles
@@ -92,13 +91,13 @@ def _computed(
                 "fewer parameters or points, or use sysid.uncertainty.profile_likelihood.profile",
             )
         others = [free for free in problem.free_names if free != name]
-        yield ProfileOut(
-            name=name, unit=found.unit, estimate=found.estimate, interval95=found.interval,
-            values=found.values.tolist(), ratio=[to_finite(value) for value in found.ratio],
-            rms=[to_finite(value) for value in found.rms],
+        yield ProfileOut.from_source(
+            found,
+            name=name,
+            interval95=found.interval,
             others=dict(zip(others, found.others.T.tolist(), strict=True)),
-            evaluations=found.evaluations,
-        )  # fmt: skip
+            **{key: getattr(found, key).tolist() for key in ("values", "ratio", "rms")},
+        )
 
 
 def _estimate(problem: "Problem", stored: StoredRun) -> FloatArray:

@@ -94,13 +94,12 @@ def _coefficients(session: Session, stored: StoredRun) -> dict[str, int]:
 
 
 def _out(one: Correlation) -> CorrelationOut:
+    functions = {
+        name: getattr(one, name).tolist() for name in ("lags", "values", "band95", "band99")
+    }
     return CorrelationOut.model_validate(
-        {
-            **test_document(one.test), "period": one.period, "lags": one.lags.tolist(),
-            "values": one.values.tolist(), "band95": one.band95.tolist(),
-            "band99": one.band99.tolist(),
-        }
-    )  # fmt: skip
+        {**test_document(one.test), "period": one.period, **functions}
+    )
 
 
 def _series(

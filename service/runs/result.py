@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from service.core.documents import to_finite
-from sysid.identifiability.combinations import Group
 from sysid.identification.result import Identification
 from sysid.residuals.onset_delay import OnsetDelay
 from sysid.residuals.residual_tests import LEVEL, ResidualTest, ResidualTests
@@ -32,19 +31,11 @@ def residual_document(found: ResidualTests | None) -> dict[str, Any]:
 def test_document(one: ResidualTest) -> dict[str, Any]:
     """One test; what was not tested has null for its numbers, and says why."""
     return {
-        "experiment": one.experiment,
-        "output": one.output,
+        **_read(one, "experiment", "output"),
         "test": one.kind,
-        "input": one.input,
-        "outcome": one.outcome,
-        "reason": one.reason,
-        "samples": one.samples,
+        **_read(one, "input", "outcome", "reason", "samples"),
         "lags_tested": one.lags,
-        "inside95": to_finite(one.inside95),
-        "inside99": to_finite(one.inside99),
-        "statistic": to_finite(one.statistic),
-        "degrees": to_finite(one.degrees),
-        "p": to_finite(one.p),
+        **_read(one, "inside95", "inside99", "statistic", "degrees", "p"),
     }
 
 
@@ -52,15 +43,9 @@ def onset_document(found: Sequence[OnsetDelay]) -> list[dict[str, Any]]:
     """Onset delays in seconds; one that cannot be told is null and says why."""
     return [
         {
-            "experiment": one.experiment,
-            "input": one.input,
-            "output": one.output,
-            "delay": to_finite(one.delay),
+            **_read(one, "experiment", "input", "output", "delay"),
             "unit": "s",
-            "spread": to_finite(one.spread),
-            "events": one.events,
-            "threshold": to_finite(one.threshold),
-            "reason": one.reason,
+            **_read(one, "spread", "events", "threshold", "reason"),
         }
         for one in found
     ]
@@ -85,12 +70,7 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
         "generations": found.generations,
         "seconds": seconds,
         "islands": [
-            {
-                "champion_rms": to_finite(island.champion_rms),
-                "refined_rms": to_finite(island.refined_rms),
-                "evaluations": island.evaluations,
-                "parameters": [to_finite(value) for value in island.parameters],
-            }
+            _read(island, "champion_rms", "refined_rms", "evaluations", "parameters")
             for island in found.islands
         ],
         "identifiability": _identifiability(found.uncertainty),
@@ -112,65 +92,45 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
 
 
 def _estimate(one: Estimate) -> dict[str, Any]:
-    return {
-        "name": one.name,
-        "unit": one.unit,
-        "value": float(one.value),
-        "lower": float(one.lower),
-        "upper": float(one.upper),
-        "stderr": to_finite(one.stderr),
-        "interval95": None if one.interval95 is None else [to_finite(v) for v in one.interval95],
-        "status": one.status,
-        "reason": one.reason,
-    }
+    return _read(
+        one, "name", "unit", "value", "lower", "upper", "stderr", "interval95", "status", "reason"
+    )
 
 
 def _agreement(one: ChannelMetrics) -> dict[str, Any]:
-    return {
-        "experiment": one.experiment,
-        "output": one.output,
-        "unit": one.unit,
-        "samples": one.samples,
-        "rms": to_finite(one.rms),
-        "fit_percent": to_finite(one.fit_percent),
-        "span": [to_finite(value) for value in one.span],
-    }
+    return _read(one, "experiment", "output", "unit", "samples", "rms", "fit_percent", "span")
 
 
 def _identifiability(uncertainty: Uncertainty | None) -> dict[str, Any]:
     if uncertainty is None:
         return {"condition": None, "groups": [], "singular_values": []}
+    groups = [_read(one, "members", "expression", "value", "stderr") for one in uncertainty.groups]
     return {
-        "condition": to_finite(uncertainty.condition),
-        "groups": [_group(one) for one in uncertainty.groups],
-        "singular_values": [to_finite(value) for value in uncertainty.singular_values],
-    }
-
-
-def _group(one: Group) -> dict[str, Any]:
-    return {
-        "members": list(one.members),
-        "expression": one.expression,
-        "value": to_finite(one.value),
-        "stderr": to_finite(one.stderr),
+        **_read(uncertainty, "condition"),
+        "groups": groups,
+        **_read(uncertainty, "singular_values"),
     }
 
 
 def _criteria(one: Criteria | None) -> dict[str, Any] | None:
-    if one is None:
-        return None
-    return {
-        "aic": to_finite(one.aic),
-        "aicc": to_finite(one.aicc),
-        "bic": to_finite(one.bic),
-        "samples": one.samples,
-        "parameters": one.parameters,
-    }
+    return None if one is None else _read(one, "aic", "aicc", "bic", "samples", "parameters")
 
 
 def _correlation(uncertainty: Uncertainty | None) -> dict[str, Any] | None:
     if uncertainty is None:
         return None
-    rows = np.asarray(uncertainty.correlation)
-    matrix = [[to_finite(value) for value in row] for row in rows]
-    return {"names": list(uncertainty.names), "matrix": matrix}
+    return {"names": list(uncertainty.names), "matrix": _to_json(uncertainty.correlation)}
+
+
+def _read(source: object, *names: str) -> dict[str, Any]:
+    """Attributes of a value as a document."""
+    return {name: _to_json(getattr(source, name)) for name in names}
+
+
+def _to_json(value: Any) -> Any:
+    """A value as JSON takes it: arrays as lists, what is not finite as null."""
+    if isinstance(value, float):
+        return to_finite(value)
+    if isinstance(value, tuple | list | np.ndarray):
+        return [_to_json(item) for item in value]
+    return value

@@ -87,24 +87,14 @@ def history(session: Session, run_id: str) -> HistoryOut:
     for row in RunRepository(session).history(run_id):
         while len(islands) <= row.island:
             islands.append([])
-        islands[row.island].append(
-            ImprovementOut(
-                generation=row.generation, evaluations=row.evaluations, rms=row.rms,
-                phase=row.phase, parameters=list(row.parameters),
-            )
-        )  # fmt: skip
+        islands[row.island].append(ImprovementOut.from_source(row))
     return HistoryOut(id=stored.run.id, names=_free_names(session, stored), islands=islands)
 
 
 def migrations(session: Session, run_id: str) -> MigrationsOut:
     """The migration log."""
-    migrants = [
-        MigrantOut(
-            epoch=row.epoch, source=row.source, destination=row.destination, fitness=row.fitness
-        )
-        for row in RunRepository(session).migrations(run_id)
-    ]
-    return MigrationsOut(id=run_id, migrants=migrants)
+    rows = RunRepository(session).migrations(run_id)
+    return MigrationsOut(id=run_id, migrants=[MigrantOut.from_source(row) for row in rows])
 
 
 def _best_so_far(session: Session, stored: StoredRun) -> list[dict[str, Any]]:

@@ -12,10 +12,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from service.core.wire import Answer, Body
+from service.core.states import StateName
+from service.core.wire import Answer, Body, Finite
 from service.datasets.schemas import Series
-
-RunState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
 
 class RunOut(Answer):
@@ -32,7 +31,7 @@ class RunOut(Answer):
     number: int
     cell: dict[str, Any]
     labels: dict[str, Any]
-    state: RunState
+    state: StateName
     valid: bool | None = None
     rms: float | None = None
     rms_unit: str | None = Field(
@@ -165,8 +164,8 @@ class ProfileOut(Answer):
     estimate: float
     interval95: tuple[float | None, float | None]
     values: list[float]
-    ratio: list[float | None]
-    rms: list[float | None]
+    ratio: list[Finite]
+    rms: list[Finite]
     others: dict[str, list[float]]
     evaluations: int
 
@@ -268,7 +267,7 @@ class AgreementOut(Answer):
     unit: str
     samples: int
     rms: float
-    fit_percent: float | None
+    fit_percent: Finite
 
 
 class FreeRunOut(Answer):
@@ -283,7 +282,7 @@ class FreeRunOut(Answer):
     dataset: str
     unit: str
     rms: float
-    fit_percent: float | None
+    fit_percent: Finite
     agreement: list[AgreementOut]
     starts: dict[str, float]
     experiments: list[ExperimentOut]

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from service.core.text import append_unit
 from service.datasets.rms_unit import unit_of
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
@@ -70,9 +71,9 @@ def table(database: Database, job_id: str) -> Iterator[str]:
 def _parts(
     database: Database, job_id: str, layout: _Layout, units: Mapping[str, str]
 ) -> Iterator[str]:
-    fixed = [_heading(name, units.get(name, "1")) for name in COLUMNS]
+    fixed = [append_unit(name, units.get(name, "1")) for name in COLUMNS]
     estimates = [
-        _heading(what + name, unit)
+        append_unit(what + name, unit)
         for name, unit in layout.parameters
         for what in ("", "stderr of ")
     ]
@@ -106,10 +107,6 @@ def _told(run: Run) -> list[dict[str, Any]]:
     """The estimates of a run's result."""
     found: list[dict[str, Any]] = (run.result or {}).get("parameters", [])
     return found
-
-
-def _heading(name: str, unit: str) -> str:
-    return name if unit == "1" else f"{name} [{unit}]"
 
 
 def _plain(value: object) -> object:

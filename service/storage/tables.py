@@ -1,12 +1,13 @@
 """The tables. Times are UTC, identifiers sort by time, and what a user owns names its project."""
 
 from datetime import datetime
-from enum import StrEnum
 from typing import Any
 
 from sqlalchemy import ForeignKey, Index, LargeBinary, MetaData, UniqueConstraint, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
+from service.core.states import OPEN as OPEN
+from service.core.states import State as State
 from service.storage.columns import (
     Document,
     DocumentType,
@@ -19,24 +20,6 @@ from service.storage.columns import (
 )
 
 DEFAULT_PROJECT = "proj_default"
-
-
-class State(StrEnum):
-    """How far a job or a run has come."""
-
-    QUEUED = "queued"
-    RUNNING = "running"
-    SUCCEEDED = "succeeded"
-    FAILED = "failed"
-    CANCELLED = "cancelled"
-
-    @property
-    def is_terminal(self) -> bool:
-        """Whether no dispatcher will ever change it again."""
-        return self not in OPEN
-
-
-OPEN = (State.QUEUED, State.RUNNING)
 
 
 class Base(DeclarativeBase):

@@ -83,10 +83,10 @@ def _notes(job: Job, floors: Floors) -> Iterator[str]:
 
 def _reference(problem: Mapping[str, Any]) -> ReferenceOut:
     known = problem["reference"] or {}
-    return ReferenceOut(
-        cell=problem["cell"], kind=known.get("kind"), run=known.get("run"),
-        sigma=known.get("sigma"), parameters=known.get("values", {}), note=problem["note"],
-    )  # fmt: skip
+    none = {"kind": None, "run": None, "sigma": None}
+    return ReferenceOut.model_validate(
+        {**none, **known, **problem, "parameters": known.get("values", {})}
+    )
 
 
 def _keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:

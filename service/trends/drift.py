@@ -84,7 +84,4 @@ def _estimate(run: Run, name: str) -> Estimate | None:
 
 def _told(kind: Literal["run", "trend"], expected: float, moved: Drift) -> DriftOut:
     z = max(min(moved.z, 1e300), -1e300)
-    return DriftOut(
-        kind=kind, expected=expected, difference=moved.difference, z=z, limit=moved.limit,
-        drifted=moved.has_drifted,
-    )  # fmt: skip
+    return DriftOut.from_source(moved, kind=kind, expected=expected, z=z, drifted=moved.has_drifted)

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.core.wire import Answer
+from service.core.wire import Answer, Finite
 
 
 class SpanOut(Answer):
@@ -38,11 +38,11 @@ class PointOut(Answer):
 
     x: float
     value: float | None
-    stderr: float | None
+    stderr: Finite
     runs: list[str]
     status: str
     is_used: bool = Field(description="whether the laws go through it")
-    studentised: float | None = Field(default=None, description="deleted residual")
+    studentised: Finite = Field(default=None, description="deleted residual")
     p_value: float | None = Field(default=None, description="Bonferroni's, of being no outlier")
     is_outlier: bool = False
     drifts: list[DriftOut] = Field(default=[])
@@ -67,17 +67,17 @@ class LawOut(Answer):
     degrees: int
     birge: float = Field(description="√(χ²/ν); errors are multiplied by it where it is above 1")
     aic: float
-    aicc: float | None = Field(description="null with too few points for it")
+    aicc: Finite = Field(description="null with too few points for it")
 
 
 class PlaceOut(Answer):
     """A law at one x with its 95 % interval."""
 
     x: float
-    value: float | None
-    stderr: float | None
-    lower: float | None
-    upper: float | None
+    value: Finite
+    stderr: Finite
+    lower: Finite
+    upper: Finite
     is_outside: bool = Field(description="whether x is outside the measured range")
 
 

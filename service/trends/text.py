@@ -3,13 +3,131 @@
 All work on the document of ``GET /v1/jobs/{id}/trend``.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from service.core.text import (
+    DASH,
+    append_unit,
+    format_number,
+    format_unit,
+    join_estimate,
+    plain_estimate,
+    plain_unit,
+)
 
 Quantity = dict[str, Any]
 
 USUAL = ("identified", "group", "measured", "not told")
 """Statuses that need no second look."""
+
+
+class Style(NamedTuple):
+    """How numbers are written; `between` joins the ends of an interval."""
+
+    estimate: Callable[[float, float | None], str]
+    number: Callable[[float], str]
+    label: Callable[[float], str]
+    unit: Callable[[str], str]
+    between: str
+
+
+PLAIN = Style(plain_estimate, "{:.4g}".format, "{:g}".format, plain_unit, " to ")
+"""For terminals."""
+TYPESET = Style(
+    join_estimate, format_number, lambda x: f"{x:g}".replace("-", "−"), format_unit, " … "
+)
+"""For pages and reports."""
+
+
+class PlaceRow(NamedTuple):
+    """The runs of one label; `cells` has one text for each quantity."""
+
+    x_text: str
+    cells: Sequence[str]
+    span_text: str
+    evaluations: int
+    flags: Sequence[str]
+    runs: Sequence[str]
+
+
+class LawRow(NamedTuple):
+    """A law that was fitted to a quantity."""
+
+    quantity: str
+    text: str
+    aic: float
+    birge: float
+    is_chosen: bool
+
+
+class PredictionRow(NamedTuple):
+    """A law at one label, with its interval and what is to be said of it."""
+
+    quantity: str
+    x_text: str
+    value: str
+    interval: str
+    remark: str
+
+
+class TrendTables(NamedTuple):
+    """A trend as tables; `reasons` are quantities without a law, each with the reason."""
+
+    headings: Sequence[str]
+    rows: Sequence[PlaceRow]
+    laws: Sequence[LawRow]
+    predictions: Sequence[PredictionRow]
+    reasons: Sequence[tuple[str, str]]
+
+
+def build_tables(trend: dict[str, Any], style: Style) -> TrendTables:
+    """The tables of a trend; quantities without any value are left out."""
+    shown: list[Quantity] = [
+        one for one in trend["quantities"] if any(p["value"] is not None for p in one["points"])
+    ]
+    return TrendTables(
+        headings=[append_unit(one["name"], one["unit"]) for one in shown],
+        rows=[_place_row(place, shown, style) for place in trend["places"]],
+        laws=[
+            LawRow(
+                one["name"],
+                law_text(one["name"], law, trend["x"], style),
+                law["aic"],
+                law["birge"],
+                law["is_chosen"],
+            )
+            for one in shown
+            for law in one["laws"]
+        ],
+        predictions=[_prediction_row(one, at, style) for one in shown for at in one["predictions"]],
+        reasons=[(one["name"], one["reason"]) for one in shown if one["reason"]],
+    )
+
+
+def _place_row(place: dict[str, Any], quantities: list[Quantity], style: Style) -> PlaceRow:
+    points = [next((p for p in one["points"] if p["x"] == place["x"]), None) for one in quantities]
+    return PlaceRow(
+        x_text=style.label(place["x"]),
+        cells=[
+            DASH if p is None or p["value"] is None else style.estimate(p["value"], p["stderr"])
+            for p in points
+        ],
+        span_text="; ".join(map(span_text, place["spans"])) or DASH,
+        evaluations=place["evaluations"],
+        flags=flags(place, quantities),
+        runs=place["runs"],
+    )
+
+
+def _prediction_row(one: Quantity, at: dict[str, Any], style: Style) -> PredictionRow:
+    name, x = str(one["name"]), style.label(at["x"])
+    if at["value"] is None or at["lower"] is None:
+        return PredictionRow(name, x, DASH, DASH, "the law has no value here")
+    interval = style.between.join(style.number(at[end]) for end in ("lower", "upper"))
+    unit = style.unit(one["unit"])
+    remark = "extrapolated" if at["is_outside"] else ""
+    return PredictionRow(name, x, style.number(at["value"]) + unit, interval + unit, remark)
 
 
 def flags(place: dict[str, Any], quantities: list[Quantity]) -> list[str]:
@@ -54,13 +172,16 @@ def reference_text(trend: dict[str, Any]) -> str:
 
 def span_text(one: dict[str, Any]) -> str:
     """From where to where an output went; the channel's name where it has no unit."""
-    unit = f" {one['unit']}" if one["unit"] not in ("", "1") else f" ({one['channel']})"
+    unit = plain_unit(one["unit"]) or f" ({one['channel']})"
     return f"{one['lower']:.6g} to {one['upper']:.6g}{unit}"
 
 
-def law_text(name: str, law: dict[str, Any], x: str, shown: Callable[[dict[str, Any]], str]) -> str:
-    """A law with its coefficients, each written by `shown`."""
-    known = {one["name"]: f"({shown(one)})" for one in law["coefficients"]}
+def law_text(name: str, law: dict[str, Any], x: str, style: Style) -> str:
+    """A law with its coefficients and their standard errors."""
+    known = {
+        one["name"]: f"({style.estimate(one['value'], one['stderr'])})"
+        for one in law["coefficients"]
+    }
     a, b = known["a"], known["b"]
     text = f"{a} + {b}·{x}" if law["law"] == "line" else f"{a}·{x}^{b}"
     return f"{name} = {text}"

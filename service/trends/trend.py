@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 from sqlalchemy.orm import Session
 
-from service.core.documents import to_finite
 from service.core.errors import Conflict, InvalidRequest
 from service.core.json_pointer import body_of
 from service.jobs.results import read_noise_model
@@ -18,7 +17,6 @@ from service.trends.notes import noise_model_note, quantity_notes
 from service.trends.points import Point, Quantity, by_label, place, quantities
 from service.trends.reference_differences import channels_of, differences
 from service.trends.schemas import (
-    CoefficientOut,
     DriftOut,
     LawOut,
     PlaceOut,
@@ -27,7 +25,7 @@ from service.trends.schemas import (
     TrendOut,
 )
 from sysid.trends.laws import FORMULAS, Law
-from sysid.trends.trend import Influence, Place, Trend, fit_trend
+from sysid.trends.trend import Influence, Trend, fit_trend
 
 MOST_RUNS = 5_000
 
@@ -143,42 +141,37 @@ def _told(
                drifts.get(point.x, []), bool(fitted.laws))
         for point in one.points
     ]  # fmt: skip
-    return QuantityOut(
-        name=one.name, unit=one.unit, kind=one.kind, points=points, between_runs=one.between,
-        laws=[_law(law, law is fitted.chosen) for law in fitted.laws], reason=fitted.reason,
-        band=[_place(at) for at in fitted.band],
-        predictions=[_place(at) for at in fitted.predictions],
+    return QuantityOut.from_source(
+        one,
+        points=points,
+        between_runs=one.between,
+        laws=[_law(law, law is fitted.chosen) for law in fitted.laws],
+        reason=fitted.reason,
+        band=[PlaceOut.from_source(at) for at in fitted.band],
+        predictions=[PlaceOut.from_source(at) for at in fitted.predictions],
         notes=quantity_notes(one, fitted),
-    )  # fmt: skip
+    )
 
 
 def _point(
     point: Point, influence: Influence | None, drifts: list[DriftOut], has_laws: bool
 ) -> PointOut:
-    error = None if point.estimate is None else to_finite(point.estimate.stderr)
-    return PointOut(
-        x=point.x, value=point.value, stderr=error, runs=list(point.runs), status=point.status,
+    judged = {} if influence is None else influence._asdict()
+    return PointOut.from_source(
+        point,
+        **{name: judged[name] for name in ("studentised", "p_value", "is_outlier") if judged},
+        stderr=None if point.estimate is None else point.estimate.stderr,
         is_used=has_laws and point.estimate is not None,
-        studentised=None if influence is None else to_finite(influence.studentised),
-        p_value=None if influence is None else influence.p_value,
-        is_outlier=influence is not None and influence.is_outlier, drifts=drifts,
-    )  # fmt: skip
+        drifts=drifts,
+    )
 
 
 def _law(law: Law, is_chosen: bool) -> LawOut:
-    return LawOut(
-        law=law.kind, formula=FORMULAS[law.kind], is_chosen=is_chosen,
-        coefficients=[
-            CoefficientOut(name=name, value=value, stderr=error)
-            for name, value, error in law.coefficients
-        ],
-        chi_squared=law.chi_squared, degrees=law.degrees, birge=law.birge, aic=law.aic,
-        aicc=to_finite(law.aicc),
-    )  # fmt: skip
-
-
-def _place(at: Place) -> PlaceOut:
-    return PlaceOut(
-        x=at.x, value=to_finite(at.value), stderr=to_finite(at.stderr), lower=to_finite(at.lower),
-        upper=to_finite(at.upper), is_outside=at.is_outside,
-    )  # fmt: skip
+    names = ("name", "value", "stderr")
+    return LawOut.from_source(
+        law,
+        law=law.kind,
+        formula=FORMULAS[law.kind],
+        is_chosen=is_chosen,
+        coefficients=[dict(zip(names, one, strict=True)) for one in law.coefficients],
+    )

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service.core.text import format_p_value
 from service.figures import plotly as figures
 from service.figures.data import CorrelationTrace
 from service.figures.residuals import residuals, residuals_height
-from service.pages.diagnostics import chance, findings_of
+from service.pages.diagnostics import findings_of
 
 
 def trace(
@@ -110,4 +111,4 @@ def test_onset_delays_tell_steps_and_spread_or_the_reason() -> None:
 
 @pytest.mark.parametrize(("p", "text"), [(None, "–"), (0.0, "< 0.001"), (0.0414, "0.041")])
 def test_chances(p: float | None, text: str) -> None:
-    assert chance(p) == text
+    assert format_p_value(p) == text

@@ -2,7 +2,15 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from service.figures import formats
+from service.core.text import (
+    format_age,
+    format_count,
+    format_duration,
+    format_estimate,
+    format_interval,
+    format_number,
+    format_unit,
+)
 
 
 @pytest.mark.parametrize(
@@ -11,7 +19,7 @@ from service.figures import formats
      (None, "–"), (float("inf"), "–"), (1.5e-7, "1.500·10⁻⁷"), (2.5e9, "2.500·10⁹")],
 )  # fmt: skip
 def test_a_number_has_four_significant_digits(value: float | None, text: str) -> None:
-    assert formats.number(value) == text
+    assert format_number(value) == text
 
 
 @pytest.mark.parametrize(
@@ -23,12 +31,12 @@ def test_a_number_has_four_significant_digits(value: float | None, text: str) ->
 def test_an_estimate_ends_where_its_error_does(
     value: float, stderr: float | None, texts: tuple[str, str]
 ) -> None:
-    assert formats.estimate(value, stderr) == texts
+    assert format_estimate(value, stderr) == texts
 
 
 def test_an_interval_has_the_digits_of_the_error() -> None:
-    assert formats.interval((0.11851, 0.12012), 0.0004) == "0.11851 … 0.12012"
-    assert formats.interval(None, 0.1) == ""
+    assert format_interval((0.11851, 0.12012), 0.0004) == "0.11851 … 0.12012"
+    assert format_interval(None, 0.1) == ""
 
 
 @pytest.mark.parametrize(
@@ -36,7 +44,7 @@ def test_an_interval_has_the_digits_of_the_error() -> None:
     [(0.0184, "18.4 ms"), (3.14159, "3.14 s"), (61, "1 min 1 s"), (3700, "1 h 1 min"), (None, "–")],
 )
 def test_a_duration_has_the_unit_that_suits_it(seconds: float | None, text: str) -> None:
-    assert formats.duration(seconds).replace("\u202f", " ") == text
+    assert format_duration(seconds).replace("\u202f", " ") == text
 
 
 @pytest.mark.parametrize(
@@ -46,10 +54,10 @@ def test_a_duration_has_the_unit_that_suits_it(seconds: float | None, text: str)
 )  # fmt: skip
 def test_an_age_is_told_in_its_largest_unit(ago: timedelta, text: str) -> None:
     now = datetime(2026, 1, 1, tzinfo=UTC)
-    assert formats.age(now - ago, now).replace("\u202f", " ") == text
+    assert format_age(now - ago, now).replace("\u202f", " ") == text
 
 
 def test_large_counts_are_grouped_and_units_of_pure_numbers_are_not_written() -> None:
-    assert formats.count(1234567).replace("\u202f", " ") == "1 234 567"
-    assert formats.unit("1") == ""
-    assert formats.unit("kPa").strip() == "kPa"
+    assert format_count(1234567).replace("\u202f", " ") == "1 234 567"
+    assert format_unit("1") == ""
+    assert format_unit("kPa").strip() == "kPa"
