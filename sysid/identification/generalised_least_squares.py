@@ -34,7 +34,7 @@ from sysid.core.types import FloatArray
 from sysid.residuals.autocorrelation import laid_out
 from sysid.residuals.coloured import Part, is_coloured, parts
 from sysid.residuals.whitening import Whitening, owed
-from sysid.search.levenberg_marquardt import damped_step
+from sysid.search.least_squares import TRIED, Scored, Solution, fill_jacobian, solve, steps_at_once
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import located, placed
 from sysid.uncertainty.linear_model import drawn_along, moves_of
@@ -42,10 +42,6 @@ from sysid.uncertainty.linear_model import drawn_along, moves_of
 _ROUNDS = 12
 _SAME = 1e-3  # relative: correlation times that differ by less
 _STEPS = 40  # of least squares in a round
-_DIFFERENCE = 1e-6  # of the range
-_DAMPINGS = np.array([0.0, 1e-4, 1e-2, 1.0, 1e2])
-_LEAST, _MOST = 1e-11, 1e12
-_TOLERANCE = 1e-10  # of the sum: the part that a step must promise
 _SIZES = np.array([0.3, 1.0, 2.0])  # standard errors by which drawn places are off
 _DRAWN, _STARTS = 96, 6
 _WORK = 50_000_000  # steps of integration or recursion: no places are drawn on longer records
@@ -126,8 +122,9 @@ def generalised(
             spread = _spread(search.slopes(place, error), error, whitening(problem, known))
             found = _correlation_times(problem, coloured, error, spread)
         known, white = found, whitening(problem, found)
-        starts = _starts(search, place, white, covariance, random) if i == 0 or is_last else ()
-        place, error = search.lowest((place, error), starts, white)
+        starts = _starts(search, place, white, covariance, random) if i == 0 or is_last else []
+        place = search.lowest([place, *starts], white)
+        error = search.errors(place[None])[0]
         if is_last:
             break
     return _told(problem, theta, place, known, search, not search.is_cut)
@@ -157,8 +154,8 @@ def _told(
 def _starts(
     search: "_Search", place: FloatArray, white: Whitening, covariance: FloatArray,
     random: np.random.Generator,
-) -> list[tuple[FloatArray, FloatArray]]:  # fmt: skip
-    """Places around one (D,), and their residuals, those that lie lowest of some that are drawn."""
+) -> list[FloatArray]:  # fmt: skip
+    """Places around one (D,), those that lie lowest of some that are drawn."""
     count = _DRAWN + _STARTS * search.round
     if search.left < count or count * search.problem.n_steps > _WORK:
         return []
@@ -167,9 +164,8 @@ def _starts(
     moves = moves * random.standard_normal((_DRAWN, place.size)) @ drawn_along(covariance).T
     theta = located(evaluator, place[None]) + moves
     places = placed(evaluator, np.clip(theta, evaluator.lower, evaluator.upper))
-    errors = search.errors(places)
-    best = np.argsort(_sums(white.of(errors)), kind="stable")[:_STARTS]
-    return [(places[i], errors[i]) for i in best]
+    totals = _sums(white.of(search.errors(places)))
+    return [places[i] for i in np.argsort(totals, kind="stable")[:_STARTS]]
 
 
 def _are_alike(found: Mapping[str, float], known: Mapping[str, float]) -> bool:
@@ -245,11 +241,11 @@ class _Search:
         self.problem, self._budget, self.evaluations = problem, budget, 0
         self.is_cut = False  # whether a minimum was left before its end for want of simulations
         self.ends, self.rms = np.zeros((0, len(problem.space))), np.zeros(0)  # of the last round
-        self._rows = np.flatnonzero(problem.evaluator.weight > 0)
-        self._weight = problem.evaluator.weight[self._rows]
-        self._measured = problem.evaluator.measured[self._rows]
-        self._step = len(problem.space) + _DAMPINGS.size
-        self.round = len(problem.space) + self._step  # simulations without which no round begins
+        rows = problem.scored
+        self._scored = Scored(problem.evaluator, rows, problem.evaluator.weight[rows])
+        self._step = len(problem.space) + TRIED
+        # Simulations without which no round begins: the slopes, a step, residuals at both ends.
+        self.round = len(problem.space) + self._step + 2
 
     @property
     def left(self) -> int:
@@ -260,63 +256,38 @@ class _Search:
         """Weighted residuals (P, n) of places (P, D)."""
         self.evaluations += places.shape[0]
         predicted = self.problem.predictions(located(self.problem.evaluator, places))
-        return np.asarray(self._weight * (predicted[:, self._rows] - self._measured))
+        scored = self._scored
+        measured = scored.evaluator.measured[scored.rows]
+        return np.asarray(scored.weight * (predicted[:, scored.rows] - measured))
 
     def slopes(self, place: FloatArray, error: FloatArray) -> FloatArray:
-        """Slopes (n, D) of the residuals, by differences away from the nearer bound."""
-        steps = np.where(place < 0.5, _DIFFERENCE, -_DIFFERENCE)
-        with np.errstate(invalid="ignore", over="ignore"):
-            found = (self.errors(place + np.diag(steps)) - error).T / steps
-        return np.where(np.isfinite(found), found, 0.0)
+        """Slopes (n, D) of the residuals."""
+        columns = np.empty((place.size, error.size))
+        fill_jacobian(self._scored, place, error, columns)
+        self.evaluations += place.size
+        return columns.T
 
-    def lowest(
-        self, here: tuple[FloatArray, FloatArray], starts: Sequence[tuple[FloatArray, FloatArray]],
-        white: Whitening,
-    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
-        """The lowest minimum from a place with its residuals and from other such starts."""
-        ends = [self.minimum(*start, white) for start in (here, *starts)]
-        totals = _sums(white.of(np.array([error for _, error in ends])))
-        self.ends, self.rms = np.array([place for place, _ in ends]), np.sqrt(totals)
-        return ends[int(np.argmin(totals))]
-
-    def minimum(
-        self, place: FloatArray, error: FloatArray, white: Whitening
-    ) -> tuple[FloatArray, FloatArray]:
-        """The minimum that Levenberg-Marquardt finds from a place (D,), and its residuals (n,)."""
-        damping, columns = 1e-3, None
-        for _ in range(_STEPS):
-            if self.left < (self._step if columns is None else _DAMPINGS.size):
+    def lowest(self, starts: Sequence[FloatArray], white: Whitening) -> FloatArray:
+        """The lowest minimum from places (D,), of which the first is sure to be searched from."""
+        found = []
+        for start in starts:
+            steps = min(_STEPS, (self.left - 2) // self._step)
+            if steps < 1:
                 self.is_cut = True
                 break
-            if columns is None:
-                columns = white.of(self.slopes(place, error).T)
-            seen = white.of(error)
-            total, tried = float(seen @ seen), np.maximum(_DAMPINGS * damping, _LEAST)
-            places, promised = _proposals(columns, seen, place, tried)
-            if promised <= _TOLERANCE * total:
-                break
-            errors = self.errors(places)
-            totals = _sums(white.of(errors))
-            best = int(np.argmin(totals))
-            if totals[best] < total:
-                place, error, columns = places[best], errors[best], None
-                damping = float(np.clip(tried[best] if best else 1e-2 * damping, _LEAST, _MOST))
-            else:
-                damping *= 1e3
-                if damping > _MOST:
-                    break
-        return place, error
+            solution = self._solve(start, white, steps)
+            self.is_cut |= steps < _STEPS and not solution.is_converged
+            found.append(solution)
+        self.ends = np.array([one.place for one in found])
+        self.rms = np.sqrt([one.loss for one in found])
+        return found[int(np.argmin(self.rms))].place
 
-
-def _proposals(
-    columns: FloatArray, error: FloatArray, place: FloatArray, dampings: FloatArray
-) -> tuple[FloatArray, float]:
-    """Places (P, D) after the step of each damping (P,), and the most that one promises."""
-    normal, slope = columns @ columns.T, columns @ error
-    places = np.empty((dampings.size, place.size))
-    for one, damping in zip(places, dampings, strict=True):
-        damped_step(normal, slope, place, float(damping), one)
-    return places, max(0.0, float(np.max((place - places) @ slope)))
+    def _solve(self, place: FloatArray, white: Whitening, steps: int) -> Solution:
+        at_once = steps_at_once(place.size, self.problem.n_steps)
+        scored = self._scored._replace(owed=white.owed)
+        solution = solve(scored, place, 0.0, steps=steps, at_once=at_once)
+        self.evaluations += solution.evaluations
+        return solution
 
 
 def _sums(errors: FloatArray) -> FloatArray:

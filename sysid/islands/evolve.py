@@ -17,7 +17,7 @@ from sysid.islands.archipelago import shared_plans
 from sysid.islands.migration import Routes, routes, send
 from sysid.islands.packed import Fleet, News, dealt, empty_news, gathered, migrations
 from sysid.islands.stopping import Ends, has_ended
-from sysid.search.evolution import generations
+from sysid.search.evolution import generations, is_done
 from sysid.search.island import NEVER, Island
 from sysid.search.state import RMS, VALUES, IslandArrays, Migrant, Plan
 from sysid.simulation.evaluator import Evaluator
@@ -223,7 +223,7 @@ def rests(plan: Plan, island: IslandArrays, rms: float) -> bool:
     """
     if np.all(np.isnan(island.fitness)):
         return False
-    return bool(island.search.evaluations >= plan.evaluations or rms <= plan.rms)
+    return is_done(plan, island.search, rms)
 
 
 @compiled

@@ -10,16 +10,11 @@ from sysid.core.settings import Migration
 from sysid.core.types import FloatArray, IntArray, WordArray
 from sysid.islands.packed import Fleet, News, dealt, empty_news, gathered, migrations
 from sysid.islands.topology import edges
+from sysid.search.evolution import reset_evidence, write_improvement
 from sysid.search.island import Island
 from sysid.search.operators import coded, decoded, rank
 from sysid.search.state import (
-    AT_EVALUATIONS,
-    AT_GENERATION,
     MIGRATION,
-    PHASE,
-    RMS,
-    SAME,
-    VALUES,
     Migrant,
 )
 
@@ -122,12 +117,9 @@ def _lead(fleet: Fleet, island: int, fitness: float, values: FloatArray, news: N
     search, row = fleet.search[island], news.improvements[news.written[0]]
     news.owners[news.written[0]] = island
     news.written[0] += 1
-    row[AT_GENERATION], row[AT_EVALUATIONS] = search.generation, search.evaluations
-    row[RMS], row[PHASE] = fitness, MIGRATION
+    write_improvement(search, fitness, MIGRATION, values, row)
     search.stagnation, search.champion_converged = 0, 0
-    if fitness < fleet.rms[island] * (1.0 - SAME):
-        search.confirmed_starts, search.champion_discontinuities = 0, 0
-        search.hop_count, search.returned_hops = 0, 0
+    reset_evidence(search, fitness, fleet.rms[island])
     fleet.rms[island] = fitness
     for d in range(values.size):
-        fleet.champions[island, d] = row[VALUES + d] = values[d]
+        fleet.champions[island, d] = values[d]

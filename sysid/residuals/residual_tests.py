@@ -44,6 +44,7 @@ from sysid.residuals.autocorrelation import (
 )
 from sysid.residuals.past_outputs import coefficients_on_past_outputs
 from sysid.residuals.whitening import Whitening, owed
+from sysid.simulation.loss import compute_influence
 
 if TYPE_CHECKING:  # the pages read these results without a compiler
     from sysid.simulation.problem import Problem
@@ -200,7 +201,7 @@ def series(
     """
     with np.errstate(all="ignore"):  # a missing measurement, or a simulation that diverged
         error = measured - simulated
-        seen = error / np.sqrt(1.0 + np.square(error / loss_scale)) if loss_scale > 0 else error
+        seen = compute_influence(error, loss_scale)
     where = np.flatnonzero(scored & np.isfinite(seen))[-_MOST:]
     usable = np.zeros(times.size, dtype=np.bool_)
     usable[where] = True

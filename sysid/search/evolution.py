@@ -214,12 +214,33 @@ def _turn(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
 def _note(
     evaluator: Evaluator, plan: Plan, island: IslandArrays, phase: int, row: FloatArray
 ) -> None:
-    search = island.search
+    values = located(evaluator, decoded(island.chromosomes[:1], plan.bits))[0]
+    write_improvement(island.search, island.fitness[0], phase, values, row)
+
+
+@compiled
+def write_improvement(
+    search: np.record, rms: float, phase: int, values: FloatArray, row: FloatArray
+) -> None:
+    """Write the row of a better champion with these physical values (D,)."""
     row[AT_GENERATION], row[AT_EVALUATIONS] = search.generation, search.evaluations
-    row[RMS], row[PHASE] = island.fitness[0], phase
-    values = located(evaluator, decoded(island.chromosomes[:1], plan.bits))
-    for d in range(values.shape[1]):
-        row[VALUES + d] = values[0, d]
+    row[RMS], row[PHASE] = rms, phase
+    for d in range(values.size):
+        row[VALUES + d] = values[d]
+
+
+@compiled
+def reset_evidence(search: np.record, rms: float, before: float) -> None:
+    """Forget what spoke for the champion before, where the new one is another optimum."""
+    if rms < before * (1.0 - SAME):
+        search.confirmed_starts, search.champion_discontinuities = 0, 0
+        search.hop_count, search.returned_hops = 0, 0
+
+
+@compiled
+def is_done(plan: Plan, search: np.record, rms: float) -> bool:
+    """Whether an island has used up its evaluations or reached the target RMS."""
+    return bool(search.evaluations >= plan.evaluations or rms <= plan.rms)
 
 
 @compiled
@@ -242,7 +263,7 @@ def generations(
             _note(evaluator, plan, island, phase, improvements[0])
             written = 1
     for _ in range(count):
-        if search.evaluations >= plan.evaluations or fitness[0] <= plan.rms:
+        if is_done(plan, search, fitness[0]):
             break
         _turn(evaluator, plan, island)
         best, phase = fitness[0], LOCAL if search.in_sequence_search else GENETIC
@@ -251,9 +272,7 @@ def generations(
         search.stagnation += 1
         if fitness[0] < best:
             search.stagnation = 0
-            if fitness[0] < best * (1.0 - SAME):
-                search.confirmed_starts, search.champion_discontinuities = 0, 0
-                search.hop_count, search.returned_hops = 0, 0
+            reset_evidence(search, fitness[0], best)
             if phase == GENETIC:
                 search.champion_converged = 0
             _note(evaluator, plan, island, phase, improvements[written])

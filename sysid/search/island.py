@@ -83,9 +83,12 @@ def evolve(evaluator: Evaluator, plan: Plan, island: Island, count: int) -> Isla
     ``evolve(…, a + b)`` equals ``evolve(…, b)`` of ``evolve(…, a)``, bit for bit.
     """
     after = replace(
-        island, words=island.words.copy(), fitness=island.fitness.copy(),
-        search=island.search.copy(), point=island.point.copy(),
-    )  # fmt: skip
+        island,
+        words=island.words.copy(),
+        fitness=island.fitness.copy(),
+        search=island.search.copy(),
+        point=island.point.copy(),
+    )
     rows = np.empty((count + 1, VALUES + island.point.size))
     written = generations(evaluator, plan, count, after.arrays, rows)
     better = tuple(improvement(row) for row in rows[:written].tolist())

@@ -19,7 +19,14 @@ import numpy as np
 
 from sysid.core.jit import compiled
 from sysid.core.types import FloatArray, IntArray
-from sysid.search.levenberg_marquardt import damped_step, product
+from sysid.search.levenberg_marquardt import (
+    FINE_DIFFERENCE,
+    compute_loss,
+    damped_step,
+    form_normal_equations,
+    product,
+    step_aside,
+)
 from sysid.simulation.evaluator import Evaluator, partial_predictions
 from sysid.simulation.scaling import located
 
@@ -27,22 +34,58 @@ _DAMPINGS = np.array([0.0, 1e-4, 1e-2, 1.0, 1e2])
 """Tried in one batch, times the present damping; 0 stands for the least one."""
 TRIED = _DAMPINGS.size
 """Simulations of a batch of steps; the Jacobian takes one for each parameter besides."""
-_LEAST, _MOST = 1e-11, 1e12
+_FIRST, _LEAST, _MOST = 1e-3, 1e-11, 1e12
 _STOPPED = 2  # steps in a row that gain next to nothing
-_DIFFERENCE = 1e-6  # of the range
+_AT_ONCE = 10_000_000  # steps of integration or recursion in one compiled call: about 0.1 s
 
-_N_MEMORY = 6
-_VALUE, _DAMPING, _IDLE, _FRESH, _SPENT, _END = range(_N_MEMORY)
-"""What a search remembers: the loss at its place, the damping, steps in a row that gained next to
-nothing, whether the Jacobian is of this place, simulations run, whether it is at its end."""
+_DESCENT_FIELDS = [
+    ("loss", np.float64),  # at the place
+    ("damping", np.float64),
+    ("idle_steps", np.int64),  # in a row, that gained next to nothing
+    ("has_jacobian", np.int64),  # 0 or 1: the slopes are of this place
+    ("evaluations", np.int64),
+    ("has_ended", np.int64),
+]
+_DESCENT_RECORD = np.dtype((np.record, _DESCENT_FIELDS))
 
 
 class Scored(NamedTuple):
-    """A problem's scored samples: which of the M measured values, and the weight of each."""
+    """A problem's scored samples: which of the M measured values, and the weight of each.
+
+    Attributes
+    ----------
+    evaluator : Evaluator
+    rows : IntArray, shape (n,)
+    weight : FloatArray, shape (n,)
+    owed : FloatArray, shape (n,), or empty
+        What residuals owe to those before them (`sysid.residuals.whitening.Whitening`); empty:
+        they are taken as they are.
+    """
 
     evaluator: Evaluator
     rows: IntArray
     weight: FloatArray
+    owed: FloatArray = np.zeros(0)
+
+
+class _Descent(NamedTuple):
+    """A search between two compiled calls, which change it in place.
+
+    Attributes
+    ----------
+    place : FloatArray, shape (D,)
+    error : FloatArray, shape (n,)
+        Residuals there.
+    columns : FloatArray, shape (D, n)
+        Their slopes.
+    progress : np.record
+        A record of `_DESCENT_RECORD`.
+    """
+
+    place: FloatArray
+    error: FloatArray
+    columns: FloatArray
+    progress: np.record
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +101,8 @@ class Solution:
         too late.
     evaluations : int
         Simulations run.
+    loss : float
+        Of the residuals at the place.
     is_cut_short : bool
         Whether it was too late to go on.
     """
@@ -65,6 +110,7 @@ class Solution:
     place: FloatArray
     is_converged: bool
     evaluations: int
+    loss: float
     is_cut_short: bool = False
 
 
@@ -87,60 +133,71 @@ def solve(
     is_late : callable or None
         Asked after each call: whether to leave it at that.
     """
-    place = np.array(place)
-    error, columns = np.empty(scored.rows.size), np.empty((place.size, scored.rows.size))
-    memory, is_cut_short = np.zeros(_N_MEMORY), False
-    while steps > 0 and not memory[_END] and not is_cut_short:
-        _descend(scored, place, error, columns, memory, scale, min(steps, at_once), tolerance)
+    progress = np.zeros((), _DESCENT_RECORD).view(np.recarray)
+    size, is_cut_short = scored.rows.size, False
+    descent = _Descent(np.array(place), np.empty(size), np.empty((place.size, size)), progress[()])
+    while steps > 0 and not progress.has_ended and not is_cut_short:
+        _descend(scored, descent, scale, min(steps, at_once), tolerance)
         steps -= at_once
-        goes_on = steps > 0 and not memory[_END]
+        goes_on = steps > 0 and not progress.has_ended
         is_cut_short = goes_on and is_late is not None and is_late()
-    return Solution(place, bool(memory[_END]), int(memory[_SPENT]), is_cut_short)
+    return Solution(
+        descent.place,
+        bool(progress.has_ended),
+        int(progress.evaluations),
+        float(progress.loss),
+        is_cut_short,
+    )
+
+
+def steps_at_once(n_parameters: int, n_steps: int) -> int:
+    """Steps in one compiled call of about 0.1 s.
+
+    A simulation takes `n_steps` steps of integration or recursion.
+    """
+    return max(1, _AT_ONCE // ((n_parameters + TRIED) * n_steps))
 
 
 @compiled
-def _descend(
-    scored: Scored, place: FloatArray, error: FloatArray, columns: FloatArray, memory: FloatArray,
-    scale: float, steps: int, tolerance: float,
-) -> None:  # fmt: skip
-    """Go some steps on from a place (D,) with residuals (n,) and slopes (D, n), all in place."""
-    if memory[_SPENT] == 0.0:
-        error[:] = residuals(scored, place.reshape((1, place.size)))[0]
-        memory[_VALUE], memory[_DAMPING], memory[_SPENT] = _total(error, scale), 1e-3, 1.0
+def _descend(scored: Scored, descent: _Descent, scale: float, steps: int, tolerance: float) -> None:
+    """Go some steps on, in place."""
+    place, progress = descent.place, descent.progress
+    if progress.evaluations == 0:
+        descent.error[:] = residuals(scored, place.reshape((1, place.size)))[0]
+        progress.loss, progress.damping = _total(descent.error, scale), _FIRST
+        progress.evaluations = 1
     for _ in range(steps):
-        if not memory[_END]:
-            _step(scored, place, error, columns, memory, scale, tolerance)
+        if not progress.has_ended:
+            _step(scored, descent, scale, tolerance)
 
 
 @compiled
-def _step(
-    scored: Scored, place: FloatArray, error: FloatArray, columns: FloatArray, memory: FloatArray,
-    scale: float, tolerance: float,
-) -> None:  # fmt: skip
+def _step(scored: Scored, descent: _Descent, scale: float, tolerance: float) -> None:
     """One step, the best of those tried; or a larger damping where none gains."""
-    if not memory[_FRESH]:
-        _slopes(scored, place, error, columns)
-        memory[_FRESH], memory[_SPENT] = 1.0, memory[_SPENT] + place.size
-    tried = np.maximum(_DAMPINGS * memory[_DAMPING], _LEAST)
-    places, promised = _proposals(error, columns, place, tried, scale)
-    if promised <= tolerance * memory[_VALUE]:
-        memory[_END] = 1.0
+    place, progress = descent.place, descent.progress
+    if not progress.has_jacobian:
+        fill_jacobian(scored, place, descent.error, descent.columns)
+        progress.has_jacobian = 1
+        progress.evaluations += place.size
+    tried = np.maximum(_DAMPINGS * progress.damping, _LEAST)
+    places, promised = _proposals(descent, tried, scale)
+    if promised <= tolerance * progress.loss:
+        progress.has_ended = 1
         return
     errors = residuals(scored, places)
-    memory[_SPENT] += TRIED
-    best, value = _least(errors, memory[_VALUE], scale)
+    progress.evaluations += TRIED
+    best, value = _least(errors, progress.loss, scale)
     if best < 0:
-        memory[_DAMPING] *= 1e3
-        if memory[_DAMPING] > _MOST:  # no step gains: rounding is all that is left
-            memory[_END] = 1.0
+        progress.damping *= 1e3
+        progress.has_ended = progress.damping > _MOST  # rounding is all that is left
         return
-    gained = (memory[_VALUE] - value) / memory[_VALUE]
-    place[:], error[:], memory[_VALUE], memory[_FRESH] = places[best], errors[best], value, 0.0
-    damping = tried[best] if best > 0 else memory[_DAMPING] * 1e-2
-    memory[_DAMPING] = min(max(damping, _LEAST), _MOST)
-    memory[_IDLE] = memory[_IDLE] + 1.0 if gained <= tolerance else 0.0
-    if memory[_IDLE] == _STOPPED:
-        memory[_END] = 1.0
+    gained = (progress.loss - value) / progress.loss
+    place[:], descent.error[:] = places[best], errors[best]
+    progress.loss, progress.has_jacobian = value, 0
+    damping = tried[best] if best > 0 else progress.damping * 1e-2
+    progress.damping = min(max(damping, _LEAST), _MOST)
+    progress.idle_steps = progress.idle_steps + 1 if gained <= tolerance else 0
+    progress.has_ended = progress.idle_steps == _STOPPED
 
 
 @compiled
@@ -164,27 +221,33 @@ def residuals(scored: Scored, places: FloatArray) -> FloatArray:
         row = scored.rows[i]
         for p in range(places.shape[0]):
             errors[p, i] = scored.weight[i] * (predicted[row, p] - evaluator.measured[row])
+    _whiten(scored.owed, errors)
     return errors
 
 
 @compiled
-def _slopes(scored: Scored, place: FloatArray, error: FloatArray, columns: FloatArray) -> None:
+def _whiten(owed: FloatArray, errors: FloatArray) -> None:
+    """Take out of residuals (P, n), in place, what they owe to those before them."""
+    for i in range(owed.size - 1, 0, -1):
+        if owed[i] != 0.0:
+            left = np.sqrt(1.0 - owed[i] * owed[i])
+            for p in range(errors.shape[0]):
+                errors[p, i] = (errors[p, i] - owed[i] * errors[p, i - 1]) / left
+
+
+@compiled
+def fill_jacobian(
+    scored: Scored, place: FloatArray, error: FloatArray, columns: FloatArray
+) -> None:
     """Write the slopes (D, n) of the residuals (n,) at a place (D,); 0 where a neighbour diverges.
 
-    By forward differences away from the nearer bound, one batch of D simulations.
+    By forward differences, one batch of D simulations.
     """
-    evaluator = scored.evaluator
-    places, steps = np.empty((place.size, place.size)), np.empty(place.size)
+    places, steps = step_aside(place, FINE_DIFFERENCE)
+    errors = residuals(scored, places[1:])
     for d in range(place.size):
-        steps[d] = _DIFFERENCE if place[d] < 0.5 else -_DIFFERENCE
-        for k in range(place.size):
-            places[d, k] = place[k] + (steps[d] if k == d else 0.0)
-    predicted = partial_predictions(evaluator, located(evaluator, places), 1.0)
-    for i in range(scored.rows.size):
-        row = scored.rows[i]
-        for d in range(place.size):
-            there = scored.weight[i] * (predicted[row, d] - evaluator.measured[row])
-            slope = (there - error[i]) / steps[d]
+        for i in range(error.size):
+            slope = (errors[d, i] - error[i]) / steps[d]
             columns[d, i] = slope if np.isfinite(slope) else 0.0
 
 
@@ -196,46 +259,17 @@ def _total(error: FloatArray, scale: float) -> float:
     else:
         total = 0.0
         for m in range(error.size):
-            total += 2.0 * scale**2 * (np.sqrt(1.0 + (error[m] / scale) ** 2) - 1.0)
+            total += compute_loss(error[m], scale)
     return total if np.isfinite(total) else np.inf
 
 
 @compiled
-def _normal_equations(
-    error: FloatArray, columns: FloatArray, scale: float
-) -> tuple[FloatArray, FloatArray]:
-    """JᵀJ and Jᵀe of residuals (n,) and slopes (D, n), reweighted for the loss's slope here."""
-    d, n = columns.shape
-    if scale > 0.0:
-        rooted, rows = np.empty(n), np.empty((d, n))
-        for m in range(n):
-            root = (1.0 + (error[m] / scale) ** 2) ** -0.25
-            rooted[m] = root * error[m]
-            for i in range(d):
-                rows[i, m] = root * columns[i, m]
-        error, columns = rooted, rows
-    normal, slope = np.zeros((d, d)), np.empty(d)
-    for i in range(d):
-        slope[i] = product(columns[i], error, n)
-        for j in range(i + 1):
-            normal[i, j] = product(columns[i], columns[j], n)
-    return normal, slope
-
-
-@compiled
-def _proposals(
-    error: FloatArray, columns: FloatArray, place: FloatArray, damping: FloatArray, scale: float
-) -> tuple[FloatArray, float]:
-    """Places (P, D) after the step of each damping (P,), and the largest gain that one promises.
-
-    That of a step cut off at the bounds is less than the whole step's.
-    """
-    normal, slope = _normal_equations(error, columns, scale)
-    places, promised = np.empty((damping.size, place.size)), 0.0
+def _proposals(descent: _Descent, damping: FloatArray, scale: float) -> tuple[FloatArray, float]:
+    """Places (P, D) after the step of each damping (P,), and the largest gain that one promises."""
+    place, promised = descent.place, 0.0
+    matrix, gradient = form_normal_equations(descent.error, descent.columns, scale)
+    places = np.empty((damping.size, place.size))
     for p in range(damping.size):
-        damped_step(normal, slope, place, damping[p], places[p])
-        gain = 0.0
-        for d in range(place.size):
-            gain -= slope[d] * (places[p, d] - place[d])
+        gain = damped_step(matrix, gradient, place, damping[p], places[p])
         promised = max(promised, gain)
     return places, promised

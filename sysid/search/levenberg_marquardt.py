@@ -1,9 +1,19 @@
-"""Linear algebra of Levenberg–Marquardt steps: normal equations, factors, damped steps."""
+"""A step of Levenberg–Marquardt inside the box of places: differences, equations, damped steps.
+
+With the soft-l1 loss the residuals are weighted by 1/√(1 + (e/s)²) (iteratively reweighted
+squares).
+"""
 
 import numpy as np
 
 from sysid.core.jit import compiled
 from sysid.core.types import FloatArray
+from sysid.simulation import loss
+
+compute_loss = compiled(loss.compute_loss)
+_compute_loss_weight = compiled(loss.compute_loss_weight)
+
+FINE_DIFFERENCE = 1e-6  # of the range: far above rounding, far below what curvature needs
 
 
 @compiled
@@ -19,6 +29,44 @@ def product(one: FloatArray, other: FloatArray, count: int) -> float:
     for m in range(whole, count):
         a += one[m] * other[m]
     return (a + b) + (c + d)
+
+
+@compiled
+def step_aside(point: FloatArray, distance: float) -> tuple[FloatArray, FloatArray]:
+    """A point (D,) and its D neighbours (D + 1, D), each one parameter off, and these' distances.
+
+    They lie away from the nearer bound.
+    """
+    n = point.size
+    places, steps = np.empty((n + 1, n)), np.empty(n)
+    for d in range(n):
+        for p in range(n + 1):
+            places[p, d] = point[d]
+        steps[d] = distance if point[d] < 0.5 else -distance
+        places[d + 1, d] += steps[d]
+    return places, steps
+
+
+@compiled
+def form_normal_equations(
+    error: FloatArray, columns: FloatArray, scale: float
+) -> tuple[FloatArray, FloatArray]:
+    """JᵀJ, its lower half, and Jᵀe of residuals (n,) and slopes (D, n), weighted by the loss."""
+    d, n = columns.shape
+    if scale > 0.0:
+        rooted, rows = np.empty(n), np.empty((d, n))
+        for m in range(n):
+            root = np.sqrt(_compute_loss_weight(error[m], scale))
+            rooted[m] = root * error[m]
+            for i in range(d):
+                rows[i, m] = root * columns[i, m]
+        error, columns = rooted, rows
+    matrix, gradient = np.zeros((d, d)), np.empty(d)
+    for i in range(d):
+        gradient[i] = product(columns[i], error, n)
+        for j in range(i + 1):
+            matrix[i, j] = product(columns[i], columns[j], n)
+    return matrix, gradient
 
 
 @compiled
@@ -81,13 +129,13 @@ def damped_step(matrix: FloatArray, gradient: FloatArray, point: FloatArray, dam
                 place: FloatArray) -> float:  # fmt: skip
     """Write the place after the step p of (A + λ diag A) p = −g, kept inside [0, 1].
 
-    Gives −gᵀp: what the whole step promises to gain, in the loss's linear part.
+    Gives −gᵀ of what is left of the step there: its promised gain, in the loss's linear part.
     """
     step = solved(factored(matrix, gradient, point, damping), gradient)
     _shift(point, step, place)
     promised = 0.0
     for d in range(point.size):
-        promised -= gradient[d] * step[d]
+        promised -= gradient[d] * (place[d] - point[d])
     return promised
 
 

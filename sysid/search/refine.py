@@ -7,7 +7,7 @@ import numpy as np
 
 from sysid.core.jit import compiled
 from sysid.core.types import FloatArray
-from sysid.search.least_squares import TRIED, Scored, solve
+from sysid.search.least_squares import TRIED, Scored, solve, steps_at_once
 from sysid.simulation.evaluator import Evaluator, population_fitness
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import AT_BOUND, located, placed
@@ -16,7 +16,6 @@ _SAME = 1e-3  # of the range: nearer champions lie in one valley
 _STEPS = 60
 _LONG = 2_000_000  # measured values times parameters: from here on, few starts and steps
 _ENDS = 3  # simulations of a start and of an end, besides the steps
-_AT_ONCE = 10_000_000  # steps of integration or recursion in one compiled call: about 0.1 s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,9 +87,8 @@ def _refined(
     size = max(problem.output_scale, rms)
     unit = float(np.ldexp(1.0, int(np.frexp(size)[1]))) if size > 0 else 1.0
     evaluator, rows = problem.evaluator, problem.scored
-    batch = place.size + TRIED
-    steps = min(_STEPS, (left - _ENDS) // batch)
-    at_once = max(1, _AT_ONCE // (batch * problem.n_steps))
+    steps = min(_STEPS, (left - _ENDS) // (place.size + TRIED))
+    at_once = steps_at_once(place.size, problem.n_steps)
     solved = solve(
         Scored(evaluator, rows, evaluator.weight[rows] / unit), place, problem.loss_scale / unit,
         steps=steps, at_once=at_once, is_late=is_late,

@@ -37,6 +37,7 @@ from sysid.identifiability.translations import translations
 from sysid.residuals.coloured import Coloured
 from sysid.residuals.correlated_outputs import coloured_jointly
 from sysid.residuals.whitening import Whitening
+from sysid.simulation.loss import compute_influence, compute_loss_weight
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import is_at_bounds, placed
 from sysid.uncertainty.estimates import (
@@ -135,7 +136,7 @@ def _analysed(
     place = placed(problem.evaluator, theta[None])[0]
     # No step of least squares gains from a parameter on a plateau: there the loss is flat.
     sloping = np.where(plateau > 0, 0.0, columns)
-    influence = _influence(error, problem.loss_scale)
+    influence = compute_influence(error, problem.loss_scale)
     gain = _possible_gain(influence, sloping, place)
     pulled = is_pulled(influence, sloping, place)
     scale = physical_scale(problem, theta)
@@ -257,11 +258,6 @@ def _centred(estimate: Estimate, aside: float) -> Estimate:
     return replace(estimate, interval95=(lower + aside, upper + aside))
 
 
-def _influence(error: FloatArray, scale: float) -> FloatArray:
-    """ψ(e): the residuals as the loss sees them, with soft-l1 those of outliers bounded."""
-    return error if scale == 0.0 else error / np.sqrt(1.0 + (error / scale) ** 2)
-
-
 def _possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray) -> float:
     """Part of Σψ² in the span of those sensitivities along which the parameters may move.
 
@@ -290,8 +286,7 @@ def _covariance(
         if colour is not None:
             return widening * inverse @ colour.middle @ inverse, float(np.sqrt(variance))
         return variance * inverse, float(np.sqrt(variance))
-    influence = _influence(error, scale)
-    share = 1.0 / np.sqrt(1.0 + (error / scale) ** 2)
+    influence, share = compute_influence(error, scale), compute_loss_weight(error, scale)
     bread = np.linalg.pinv((columns.T * share**3) @ columns, rcond=RANK**2, hermitian=True)
     filling = (columns.T * influence**2) @ columns if colour is None else colour.middle
     noise = 1.4826 * float(np.median(np.abs(error)))  # of the bulk, not of the outliers

@@ -29,6 +29,7 @@ from sysid.identifiability.exchange import Exchanges, exchanges, ordered
 from sysid.residuals.coloured import QUANTILE
 from sysid.residuals.correlated_outputs import coloured_jointly
 from sysid.search.refine import Refined, refine
+from sysid.simulation.loss import compute_influence
 from sysid.simulation.problem import Problem
 from sysid.simulation.scaling import located, placed
 from sysid.uncertainty.sensitivities import sensitivities
@@ -224,7 +225,7 @@ class _Walk:
     ) -> float:
         """What makes n ln(R/R₀) a ratio of χ², also where the residuals are coloured."""
         scale = self._problem.loss_scale
-        seen = error if scale == 0.0 else error / np.sqrt(1.0 + (error / scale) ** 2)
+        seen = compute_influence(error, scale)
         colour = coloured_jointly(self._problem, seen, columns)
         factor = _factor(error, scale)
         if colour is None or not norm > 0:

@@ -96,9 +96,9 @@ def test_on_long_records_a_compiled_call_makes_few_steps_and_the_bits_are_the_sa
     monkeypatch.setattr(refinement, "solve", noted)
     problem = example()
     whole = refine(problem, [NEAR])[0]
-    monkeypatch.setattr(refinement, "_AT_ONCE", 2 * problem.n_steps * (4 + least_squares.TRIED))
+    monkeypatch.setattr(least_squares, "_AT_ONCE", 2 * problem.n_steps * (4 + least_squares.TRIED))
     cut = refine(problem, [NEAR])[0]
-    monkeypatch.setattr(refinement, "_AT_ONCE", 1)  # a record longer than any
+    monkeypatch.setattr(least_squares, "_AT_ONCE", 1)  # a record longer than any
     single = refine(problem, [NEAR])[0]
     assert calls[0] > 60
     assert calls[1:] == [2, 1]
