@@ -88,7 +88,8 @@ def test_every_name_that_a_field_of_a_job_takes_is_told_and_no_other(path: str) 
     kind = ROWS[path][0]
     if kind.startswith("as "):
         kind = ROWS[kind.removeprefix("as ").strip("`")][0]
-    assert set(re.findall(r"`([^`]+)`", kind)) == CHOICES[path]
+    named = set(re.findall(r"`([^`]+)`", kind))
+    assert named == CHOICES[path], f"docs/job.md, row {path}: {named ^ CHOICES[path]}"
 
 
 def test_the_fields_that_take_names_are_found() -> None:
