@@ -18,7 +18,7 @@ depends_on = None
 
 INTEGER = sa.Integer()
 LARGE = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
-REAL = sa.Double()
+REAL: sa.Double[Any] = sa.Double()
 BINARY = sa.LargeBinary()
 JSON = sa.JSON().with_variant(postgresql.JSONB(), "postgresql")
 ORDERED_JSON = sa.JSON()  # keeps the order of keys, which JSONB does not

@@ -52,7 +52,7 @@ def show_run(run: dict[str, Any], as_json: bool) -> None:
         _line(_fit(run))
     if run["error"]:
         _line(run["error"])
-    if run.get("reused_from"):
+    if run["reused_from"]:
         _line(f"note: {REUSED.format(run['reused_from'])}")
     for warning in run.get("warnings", []):
         _line(f"note: {warning}")

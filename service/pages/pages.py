@@ -142,8 +142,7 @@ def dataset_page(session: Session, dataset_id: str) -> str:
               if edge.parent == dataset.id]  # fmt: skip
     return render(
         "dataset.html", dataset=dataset, height=figures_signals.signals_height(dataset.n_channels),
-        has_history=any(one.get("history_samples") for one in dataset.channels),
-        channels=dataset.channels,
+        has_history=any(one["history_samples"] for one in dataset.channels),
         lineage=[
             {"direction": direction, "id": name, "relation": relation, "href": _href(name)}
             for direction, name, relation in edges
@@ -209,7 +208,7 @@ def _comparable(runs: Sequence[Run]) -> str:
 
 def _noise_height(session: Session, job: Job, run: Run | None) -> int:
     """Height (px) of the figure of a sweep over σ; 0 where it is none."""
-    if job.n_runs == 1 or noise_keys(job.spec.get("sweep", {}).get("axes", [])) is None:
+    if job.n_runs == 1 or noise_keys(job.spec["sweep"]["axes"]) is None:
         return 0
     body = job.spec if run is None else run_body(job, run)
     sought = sought_parameters(session, run, body) if run is not None else []

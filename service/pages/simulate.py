@@ -140,7 +140,7 @@ def simulate_page(
                 **(TAKEN if is_asked(query) else {}), **query,
                 **_numbers(context.get("result"))},
         faults={f.pointer[1:]: f.detail for f in faults},
-        lines=[_line(one) for one in faults], query=_address(query), label_of=label_of,
+        lines=[_line(one) for one in faults], query=_address(query),
         times=multiplied, bracket=bracketed,
         **{"result": None, "free": None, "figure": None, **context},
     )  # fmt: skip
@@ -176,7 +176,7 @@ def _units(model: Model, request: Mapping[str, Any], fitted: Dataset | None) -> 
     """Unit of every signal: the model's, or where it leaves it open that of the recording."""
     recorded = {one["name"]: str(one["unit"]) for one in (fitted.channels if fitted else [])}
     own = {one.name: one.unit for one in model.inputs} | {o.name: o.unit for o in model.outputs}
-    channels = request.get("channels", {})
+    channels = request["channels"]
     return {
         name: recorded.get(channels.get(name, name), unit) if unit == "1" else unit
         for name, unit in own.items()
@@ -187,7 +187,7 @@ def _defaults(model: Model, request: Mapping[str, Any], fitted: Dataset | None) 
     period = (fitted.sample_time or _mean_period(fitted)) if fitted else None
     period = period or model.solver.step or 0.01
     duration = min(fitted.duration if fitted else 10.0, MOST_DEFAULT_SAMPLES * period)
-    channels = request.get("channels", {})
+    channels = request["channels"]
     return {
         "input": model.inputs[0].name if model.inputs else "", "output": model.outputs[0].name,
         "gain": "1", "amplitude": "1", "time": "0", "offset": "0", "skip": "0",

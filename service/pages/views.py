@@ -143,15 +143,14 @@ def run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
 
 def estimate_view(one: Document) -> EstimateView:
     """A line of the table, from an entry of the result's ``parameters``."""
-    stderr = one.get("stderr")
+    stderr = one["stderr"]
     value, error = formats.estimate(one["value"], stderr)
-    bounds = [one[name] for name in ("lower", "upper") if one.get(name) is not None]
-    status = one.get("status", "")
+    bounds = [one[name] for name in ("lower", "upper") if one[name] is not None]
     return EstimateView(
-        name=one["name"], unit=one.get("unit", "1"), value_text=value, stderr_text=error,
-        interval_text=formats.interval(one.get("interval95"), stderr),
+        name=one["name"], unit=one["unit"], value_text=value, stderr_text=error,
+        interval_text=formats.interval(one["interval95"], stderr),
         bounds_text=" … ".join(f"{bound:.6g}".replace("-", "−") for bound in bounds),
-        status=status, reason=one.get("reason") or "",
+        status=one["status"], reason=one["reason"] or "",
     )  # fmt: skip
 
 
@@ -162,7 +161,7 @@ def event_view(event: Event) -> EventView:
         attempt = f", attempt {data['attempt']}" if data.get("attempt") else ""
         error = f": {data['error']}" if data.get("error") else ""
         return EventView(event.created_at, event.kind, f"{data.get('state', '')}{attempt}{error}")
-    text = data.get("message") or data.get("text")
+    text = data.get("message")
     if text is None:
         known = ((name.replace("_", " "), value) for name, value in data.items())
         text = ", ".join(f"{name} {_plain(value)}" for name, value in known if value is not None)
@@ -171,7 +170,7 @@ def event_view(event: Event) -> EventView:
 
 def model_name(spec: Document) -> str:
     """Name of the model that a job names or carries."""
-    model = spec.get("model", "")
+    model = spec["model"]
     return model if isinstance(model, str) else str(model.get("name", "own equations"))
 
 
@@ -181,9 +180,9 @@ def progress(job: Job) -> float:
         return 1.0
     if job.n_runs > 1 or job.state is State.QUEUED:
         return min(job.n_done / max(job.n_runs, 1), 1.0)
-    algorithm = job.spec.get("algorithm", {})
-    budget = (algorithm.get("stop") or {}).get("evaluations")
-    parts: list[float] = [job.generation / max(algorithm.get("generations", 1), 1)]
+    algorithm = job.spec["algorithm"]
+    budget = algorithm["stop"]["evaluations"]
+    parts: list[float] = [job.generation / algorithm["generations"]]
     if budget:
         parts.append(job.evaluations / budget)
     return min(max(parts), 1.0)
@@ -191,7 +190,7 @@ def progress(job: Job) -> float:
 
 def axes_of(spec: Document) -> list[Document]:
     """The axes of a job's sweep."""
-    return list((spec.get("sweep") or {}).get("axes") or [])
+    return list(spec["sweep"]["axes"])
 
 
 def cell_text(cell: Document, labels: Document) -> str:

@@ -9,7 +9,6 @@ import logging
 import os
 import socket
 import threading
-from datetime import timedelta
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -52,7 +51,6 @@ def is_awake(details: Document) -> bool:
 
 def reap(
     database: Database,
-    lease: timedelta,
     clock: Clock | None = None,
     *,
     busy_seconds: float | None = None,
@@ -61,8 +59,6 @@ def reap(
 
     Parameters
     ----------
-    lease : timedelta
-        How long the leases of a dispatcher are that has not told.
     clock : callable, optional
         By default the database's.
     busy_seconds : float, optional
@@ -73,8 +69,7 @@ def reap(
         owners = Owners(
             gone=frozenset(one.owner for one in known if is_gone(one.details)),
             living=frozenset(one.owner for one in known if is_awake(one.details)),
-            lengths={one.owner: length_of(one, lease) for one in known},
-            usual=lease,
+            lengths={one.owner: length_of(one) for one in known},
         )
         if not owners.gone and not Queue(session, clock).has_silent(owners):
             return Reaped()
@@ -115,8 +110,8 @@ def _why(owner: str, owners: Owners) -> str:
 class Reaper:
     """Reaps from a thread of its own until `stopping` is set."""
 
-    def __init__(self, database: Database, lease: timedelta, stopping: threading.Event) -> None:
-        self._database, self._lease, self._stopping = database, lease, stopping
+    def __init__(self, database: Database, stopping: threading.Event) -> None:
+        self._database, self._stopping = database, stopping
         self._thread = threading.Thread(target=self._go_on, name="reaper", daemon=True)
 
     def start(self) -> None:
@@ -131,7 +126,7 @@ class Reaper:
         is_cut_off = False
         while not self._stopping.wait(PAUSE_SECONDS):
             try:
-                reap(self._database, self._lease)
+                reap(self._database)
                 is_cut_off = False
             except SQLAlchemyError as error:  # the database may come back
                 if not is_cut_off:

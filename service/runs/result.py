@@ -160,9 +160,7 @@ def _group(one: Group) -> dict[str, Any]:
     }
 
 
-def _criteria(one: Criteria | None) -> dict[str, Any] | None:
-    if one is None:
-        return None
+def _criteria(one: Criteria) -> dict[str, Any]:
     return {
         "aic": finite(one.aic),
         "aicc": finite(one.aicc),
