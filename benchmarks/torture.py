@@ -45,7 +45,7 @@ FAULTS: dict[str, Fault] = {
     "cancel of a queued and of an orphaned job, dispatcher killed":
         cancelling.cancel_without_dispatcher,
     "Ray not available at start": conditions.withhold_ray,
-    "stopped, upgraded from earlier tables, started": conditions.upgrade,
+    "stopped in order with jobs queued, started": conditions.restart,
 }  # fmt: skip
 POSTGRES_FAULTS: dict[str, Fault] = {"kill -9 of PostgreSQL, restarted": faults.kill_postgres}
 DISK_FAULTS: dict[str, Fault] = {"disk full of objects and checkpoints": conditions.fill_disks}
@@ -159,9 +159,7 @@ class Torture:
 
     def _rows(self, stream: Stream, stuck: int, left: int) -> list[Row]:
         counts = stream.counts
-        told = [
-            kind for kind in counts if kind.startswith(("cancelled ", "upgrades", "full disks"))
-        ]
+        told = [kind for kind in counts if kind.startswith(("cancelled ", "full disks"))]
         figures = [
             ("faults", sum(map(len, self.met.values())), None),
             ("faults without recovery", self.unrecovered, 0),
@@ -172,7 +170,7 @@ class Torture:
             ("runs given up after too many faults", counts["runs given up"], None),
             ("jobs stuck", stuck, 0),
             ("jobs whose summary differs by a bit", len(stream.different), 0),
-            ("runs without signals (disk full, tables went back)", counts["unplotted"], None),
+            ("runs without signals (disk full)", counts["unplotted"], None),
             ("processes, segments, files left", left, 0),
         ]  # fmt: skip
         rows = [Row(f"{self.name}: {what}", number, "", bar) for what, number, bar in figures]

@@ -28,6 +28,6 @@ def ray_crew(_ray: "RayCrew") -> "Iterator[RayCrew]":
     """Two workers of a local Ray; each test must leave both free."""
     yield _ray
     limit = time.monotonic() + FREE_SECONDS
-    while _ray.free_slots() < CPUS:
+    while _ray._ray.available_resources().get("CPU", 0) < CPUS:
         assert time.monotonic() < limit, "the test left work behind on the cluster"
         time.sleep(0.05)

@@ -17,7 +17,7 @@ from service.dispatch.dispatcher import Dispatcher
 from service.dispatch.leases import Leases
 from service.dispatch.supervisor import clear_family, environment_of
 from service.jobs.schemas import JobIn
-from service.jobs.submit import submit
+from service.jobs.submit import submit_to
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore, open_store
@@ -46,8 +46,7 @@ class Place:
         # A test that compares two runs wants both computed.
         default = {"model": "fopdt", "datasets": [self.dataset], "reuse": False, "parameters":
                    {"T": {"upper": 10.0}, "L": {"upper": 2.0}}}  # fmt: skip
-        with self.database.write() as session:
-            return submit(session, JobIn(**{**default, **body}), self.settings).job.id
+        return submit_to(self.database, JobIn(**{**default, **body}), self.settings).id
 
     def job(self, job: str) -> Job:
         with self.database.read() as session:
@@ -94,7 +93,7 @@ class Place:
         recording = Recording((*record.inputs, *record.outputs))
         stored = add_recording(
             self.database, self.store, recording, name="steps", kind="upload", key="steps",
-            details={},
+            details={"warnings": []},
         )  # fmt: skip
         return stored.dataset.id
 

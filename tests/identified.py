@@ -17,8 +17,7 @@ from workers.inline import InlineCrew
 
 def identified(parts: Parts, body: dict[str, Any], steps: int = 5000) -> tuple[str, list[str]]:
     """Submit a job and carry it out; gives its id and those of its runs."""
-    with parts.database.write() as session:
-        job = jobs.submit(session, JobIn.model_validate(body), parts.settings).job.id
+    job = jobs.submit_to(parts.database, JobIn.model_validate(body), parts.settings).id
     return job, carried_out(parts, job, steps)
 
 

@@ -203,10 +203,6 @@ class RayCrew:
         """Whether the processes of a local Ray are there; of a joined one nothing is known."""
         return all(map(_is_running, self._vital))
 
-    def free_slots(self) -> int:
-        """Cores without a task at this moment."""
-        return int(self._ray.available_resources().get("CPU", 0))
-
     def close(self) -> None:
         """Leave the cluster; a local one ends with it."""
         self._left.set()

@@ -57,9 +57,6 @@ class Feeder(Generic[Key]):
         self._jobs: dict[Key, JobWork] = {}
         self._stopped: dict[Key, float] = {}  # when the job was told to stop; inf once forced
 
-    def __len__(self) -> int:
-        return len(self._jobs)
-
     @property
     def is_busy(self) -> bool:
         """Whether every core has a pack."""

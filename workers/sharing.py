@@ -88,10 +88,6 @@ class Shares(Generic[Key]):
         kept = active | set(ahead[:MOST_ABSENT]) if active else set()
         self._projects = {name: one for name, one in self._projects.items() if name in kept}
 
-    def __len__(self) -> int:
-        """Number of projects whose accounts are kept."""
-        return len(self._projects)
-
     def project_of(self, job: Key) -> str:
         """The project that a job belongs to."""
         return self._jobs[job].project

@@ -1,7 +1,7 @@
-"""Faults that last a while: no space, no Ray, tables of an earlier version.
+"""Faults that last a while: no space, no Ray, a service that was stopped.
 
-They are over when there is space, or Ray, again, and recovery counts from then; that of an
-upgrade from the order to stop, without what going back to the earlier tables took.
+They are over when there is space, or Ray, again, and recovery counts from then; that of a restart
+from the order to stop. An upgrade is not among them: there are no earlier tables yet.
 """
 
 import contextlib
@@ -13,14 +13,11 @@ from benchmarks.breaking.audit import owners
 from benchmarks.breaking.disks import filled
 from benchmarks.breaking.faults import LIMIT_SECONDS, Bench, goes_on, kill, known, renewal
 from benchmarks.breaking.stand import until
-from service.storage.migrate import downgrade
 
 FULL_SECONDS = 8.0
 """So long a disk stays full, if the database does not complain before."""
 TRIES = 2
 """So often a dispatcher tries to start Ray in vain."""
-EARLIER = ("0006", "0005", "0004")
-"""Revisions of the tables that hold all numbers that a result consists of."""
 REFUSED = "Ray could not be started"
 FULL = ("the database does not answer", "are not stored", "no heartbeat could be written")
 
@@ -79,19 +76,11 @@ def withhold_ray(bench: Bench) -> float:
     return goes_on(bench, begun)
 
 
-def upgrade(bench: Bench) -> float:
-    """Stop the service with jobs in its queue, go back to earlier tables, start it again."""
-    with bench.stream.quiet():
-        revision = EARLIER[bench.stream.counts["upgrades"] % len(EARLIER)]
-        bench.stream.counts["upgrades"] += 1
+def restart(bench: Bench) -> float:
+    """Stop the service in order with jobs in its queue, and start it again."""
 
-        aside = 0.0
+    def stop_and_start() -> None:
+        with bench.stand.down():
+            pass
 
-        def replace() -> None:
-            nonlocal aside
-            with bench.stand.down():
-                begun = time.monotonic()
-                downgrade(bench.stand.database, revision)
-                aside = time.monotonic() - begun
-
-        return renewal(bench, replace) - aside
+    return renewal(bench, stop_and_start)

@@ -3,8 +3,7 @@
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -137,12 +136,6 @@ class Stream:
         """Hold a job against the undisturbed one when it has ended, for the last of `ends`."""
         with self._lock:
             self._open[job] = _Open(kind, ends)
-
-    @contextmanager
-    def quiet(self) -> Iterator[None]:
-        """Neither submit nor look meanwhile."""
-        with self._lock:
-            yield
 
     def finish(self) -> int:
         """Submit nothing more and wait for what is open; gives the jobs that are stuck."""

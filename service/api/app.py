@@ -2,7 +2,6 @@
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from datetime import timedelta
 from importlib.metadata import version
 
 from fastapi import FastAPI
@@ -75,7 +74,7 @@ def _lifespan(settings: Settings):  # type: ignore[no-untyped-def]
     @asynccontextmanager
     async def run(app: FastAPI) -> AsyncIterator[None]:
         app.state.parts = parts = await run_in_threadpool(open_parts, settings)
-        reaper = Reaper(parts.database, timedelta(seconds=settings.lease_seconds), parts.stopping)
+        reaper = Reaper(parts.database, parts.stopping)
         reaper.start()
         try:
             yield

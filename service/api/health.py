@@ -1,7 +1,6 @@
 """Whether the service is well: for people, supervisors and Prometheus."""
 
 from collections.abc import Callable, Iterator, Mapping
-from datetime import timedelta
 
 from fastapi import APIRouter
 from fastapi.responses import PlainTextResponse
@@ -50,10 +49,9 @@ def ready(parts: PartsDep) -> dict[str, str]:
 
 
 @router.get("/metrics", response_class=PlainTextResponse)
-def metrics(session: ReadSession, parts: PartsDep) -> str:
+def metrics(session: ReadSession) -> str:
     """Gauges in Prometheus' text format."""
-    lease = timedelta(seconds=parts.settings.lease_seconds)
-    alive_now = len(DispatcherRepository(session).alive(lease))
+    alive_now = len(DispatcherRepository(session).alive())
     lines = ["# HELP lagid_jobs Jobs by state.", "# TYPE lagid_jobs gauge"]
     for state, n in JobRepository(session).counts().items():
         lines.append(f'lagid_jobs{{state="{state.value}"}} {n}')
@@ -86,6 +84,5 @@ def _store(parts: Parts) -> None:
 
 def _dispatcher(parts: Parts) -> None:
     with parts.database.read() as session:
-        lease = timedelta(seconds=parts.settings.lease_seconds)
-        if not DispatcherRepository(session).alive(lease):
+        if not DispatcherRepository(session).alive():
             raise Unavailable("no dispatcher is alive; jobs are accepted, and wait for one")

@@ -163,7 +163,7 @@ def tables_of(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]
          *(str(one["key"][key]) for key in others)]
         for one in groups
     ]  # fmt: skip
-    unit = summary.get("rms_unit")
+    unit = summary["rms_unit"]
     one_output = None if unit == "σ" else unit
     keys = [
         *relative,

@@ -60,7 +60,7 @@ def show_run(run: dict[str, Any], as_json: bool) -> None:
         print_line(_fit(run))
     if run["error"]:
         print_line(run["error"])
-    if run.get("reused_from"):
+    if run["reused_from"]:
         print_line(f"note: {REUSED.format(run['reused_from'])}")
     for warning in run.get("warnings", []):
         print_line(f"note: {warning}")

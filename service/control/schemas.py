@@ -59,13 +59,6 @@ class ControlIn(Body):
     reference: RunInputIn
 
 
-LATER_FIELDS = (
-    "integral_time", "derivative_time", "derivative_filter", "derivative_on",
-    "setpoint_weight", "lower", "upper", "anti_windup", "tracking_time", "tuning",
-)  # fmt: skip
-"""Fields that requests had not at first: at their defaults they ask for what was asked then."""
-
-
 _PI_CONTROL = {
     "input": "u", "output": "y", "gain": 0.5, "integral_time": 1.0, "lower": 0, "upper": 0.7,
     "reference": {"kind": "step", "amplitude": 1},

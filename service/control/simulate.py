@@ -2,13 +2,12 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from sqlalchemy.orm import Session
 
 from service.control.closed_loop import Loop, check_transport, closed, control_faults
-from service.control.schemas import LATER_FIELDS, ControlIn, RunSimulateIn, RunSimulationOut
+from service.control.schemas import ControlIn, RunSimulateIn, RunSimulationOut
 from service.core.concurrency import simulating
 from service.core.errors import FieldError, InvalidRequest
 from service.datasets.datasets import add_recording, key_of, series, told
@@ -191,24 +190,12 @@ def _sampled(channel: Channel, times: FloatArray) -> Channel:
     return replace(channel, times=times, values=sampled(channel, times), history=None)
 
 
-def _request(body: RunSimulateIn) -> dict[str, Any]:
-    """The request as its dataset keeps it: as it always was where it asks for nothing new."""
-    request = body.model_dump(mode="json", exclude={"name", "store"})
-    if request["control"] is not None:
-        fields = ControlIn.model_fields
-        request["control"] = {
-            name: value for name, value in request["control"].items()
-            if name not in LATER_FIELDS or value != fields[name].default
-        }  # fmt: skip
-    return request
-
-
 def _stored(
     database: Database, store: ObjectStore, run_id: str, body: RunSimulateIn, asked: _Asked,
     found: _Simulated, reference: Channel | None,
 ) -> DatasetOut:  # fmt: skip
     """The simulation as a dataset that knows its run; the same request gives the same one."""
-    request = _request(body)
+    request = body.model_dump(mode="json", exclude={"name", "store"})
     key = key_of({"run": run_id, "simulation": request, "values": asked.values})
     with database.read() as session:
         known = DatasetRepository(session).by_source(key)

@@ -87,8 +87,6 @@ class ProblemDocument(Answer):
     errors: list[FieldProblem] = Field(default=[])
 
 
-Json = dict[str, Any]
-
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Sigma = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 

@@ -8,7 +8,7 @@ Use case of lineage: what a dataset was made from, and what was made from it.
 import hashlib
 import json
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -69,8 +69,6 @@ def dataset_of(session: Session, reference: str) -> Dataset | str:
 
 Kind = Literal["upload", "simulate", "derive"]
 Format = Literal["csv", "mcap"]
-HISTORY = "known_before"
-"""Of a derived dataset: for how long (s) before its first sample something is known."""
 
 
 def add_upload(
@@ -131,7 +129,7 @@ def derive(database: Database, store: ObjectStore, parent_id: str, body: DeriveI
     return add_recording(
         database, store, recording, name=body.name or f"{parent.name} ({steps})", kind="derive",
         key=_derivation_key(parent, body),
-        details={"steps": body.steps, "warnings": [], HISTORY: _known_before(recording)},
+        details={"steps": body.steps, "warnings": [], "known_before": _known_before(recording)},
         parents=[parent.id],
     )  # fmt: skip
 
@@ -168,7 +166,7 @@ def described(
         channels=[_summary(channel) for channel in recording.channels],
         details={
             **details,
-            "warnings": [*details.get("warnings", ()), *unknown_units(recording.channels)],
+            "warnings": [*details["warnings"], *unknown_units(recording.channels)],
             "segments": [
                 {"start": s.start, "stop": s.stop, "origin": s.origin, "labels": dict(s.labels)}
                 for s in recording.segments
@@ -183,8 +181,8 @@ def told(row: Dataset) -> DatasetOut:
     return DatasetOut.from_source(
         row,
         samples=row.n_samples,
-        segments=details.pop("segments", []),
-        warnings=details.pop("warnings", []),
+        segments=details.pop("segments"),
+        warnings=details.pop("warnings"),
         details=details,
     )
 
@@ -194,30 +192,10 @@ def told_again(stored: Stored, name: str | None) -> DatasetOut:
     answer, row = told(stored.dataset), stored.dataset
     if stored.is_new:
         return answer
-    warnings = [*answer.warnings, *_forgetful(row)]
-    if name not in (None, row.name):
-        warnings.append(f"the same data were stored before, as {row.name!r}; that name stays")
-    return answer.model_copy(update={"warnings": warnings})
-
-
-def _forgetful(row: Dataset) -> Iterator[str]:
-    """What to say of a part that was derived before parts kept what was recorded before them."""
-    steps = row.details.get("steps") or []
-    cut = {name for step in steps for name, given in step.items() if _begins_later(name, given)}
-    if row.kind == "derive" and cut and HISTORY not in row.details:
-        yield (
-            "it was derived by an earlier version, and holds nothing of what was recorded before "
-            f"its first sample; with history: true in {' and '.join(sorted(cut))} it is derived "
-            "anew, with the input's past for lags to read"
-        )
-
-
-def _begins_later(step: str, given: Mapping[str, Any]) -> bool:
-    """Whether a step cuts something off from the beginning."""
-    if step == "split":
-        return bool(given.get("part") == "validation")
-    rows = given.get("rows") or [0]
-    return step == "trim" and ("start" in given or rows[0] > 0)
+    if name in (None, row.name):
+        return answer
+    warning = f"the same data were stored before, as {row.name!r}; that name stays"
+    return answer.model_copy(update={"warnings": [*answer.warnings, warning]})
 
 
 def _known_before(recording: Recording) -> float:
@@ -287,14 +265,14 @@ def _written(store: ObjectStore, recording: Recording, metadata: Mapping[str, st
 
 def _summary(channel: Channel) -> dict[str, Any]:
     sampling, history = channel.sampling, channel.history
-    known = {} if history is None else {"history_samples": history.times.size,
-                                        "history_start": float(history.times[0])}  # fmt: skip
     return {
         "name": channel.name, "unit": channel.unit, "hold": channel.hold,
         "samples": channel.times.size, "start": float(channel.times[0]),
         "stop": float(channel.times[-1]),
         "sample_time": sampling.period if sampling.is_regular else None,
-        "missing": int(np.count_nonzero(~np.isfinite(channel.values))), **known,
+        "missing": int(np.count_nonzero(~np.isfinite(channel.values))),
+        "history_samples": 0 if history is None else history.times.size,
+        "history_start": None if history is None else float(history.times[0]),
     }  # fmt: skip
 
 

@@ -121,8 +121,8 @@ class ChannelOut(Answer):
     stop: float
     sample_time: float | None
     missing: int
-    history_samples: int = 0
-    history_start: float | None = None
+    history_samples: int
+    history_start: float | None
 
 
 class DatasetOut(Answer):

@@ -109,7 +109,7 @@ def simulated(database: Database, store: ObjectStore, body: SimulateIn) -> Store
 def _model(session: Session, reference: Any) -> tuple[Model, Any]:
     if not isinstance(reference, str | Mapping):
         raise InvalidRequest.at("/model", f"need a name or a document; found {reference!r:.60}")
-    return models.resolve(session, reference, is_new=True)
+    return models.resolve(session, reference)
 
 
 def _simulated(

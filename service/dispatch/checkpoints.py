@@ -6,7 +6,7 @@ from importlib.metadata import version
 
 from sysid.islands.state import RunState
 
-_HEADER = f"lagid {version('lagid')} run state 5\n".encode()
+_HEADER = f"lagid {version('lagid')} run state 1\n".encode()
 
 
 def packed(state: RunState) -> bytes:

@@ -70,7 +70,7 @@ def floors_for(database: Database, claim: Claim, source: JobRuns) -> Make | None
     - ``note``: why something is missing, or nothing.
     """
     spec = claim.job.spec
-    axes = spec.get("sweep", {}).get("axes", [])
+    axes = spec["sweep"]["axes"]
     if not spec["noise"]["sigma"] and not any(axis["path"].startswith("/noise") for axis in axes):
         return None
     return _Floors(database, claim.job, source).steps

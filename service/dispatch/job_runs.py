@@ -275,7 +275,7 @@ class JobRuns:
         }
         with self._database.write() as session:
             mark(session, self._lease, hashes)
-            if not self._job.spec.get("reuse", True):
+            if not self._job.spec["reuse"]:
                 return {}
             known = computed(session, set(hashes.values()), self._job.project_id)
         return {run: known[one] for run, one in hashes.items() if one in known}

@@ -74,7 +74,7 @@ class Leases:
     def _announce(self, details: Document) -> None:
         with self._database.write() as session:
             DispatcherRepository(session, self._clock).announce(self.owner, details)
-        reap(self._database, self._length, self._clock)
+        reap(self._database, self._clock)
 
     def claim(self, admission: Admission | None = None) -> Claim | None:
         """Take the next job that `admission` lets in, if one waits."""
@@ -166,7 +166,7 @@ class Leases:
                     self._held.pop(lease, None)
                 elif lease in self._held:
                     self._held[lease] = begun
-        reap(self._database, self._length, self._clock, busy_seconds=self._third)
+        reap(self._database, self._clock, busy_seconds=self._third)
 
     @property
     def _third(self) -> float:

@@ -38,10 +38,6 @@ SaveSignals = Callable[[str, Identification], Shelved | None]
 """Makes the file of a run's fitted signals, which can be stored."""
 
 
-def _nobody(_run: str) -> None:
-    """Where nothing waits for the end of a run."""
-
-
 @dataclass(slots=True)
 class _Live:
     """A run in progress: its latest state, and how much of it is written."""
@@ -85,7 +81,7 @@ class Recorder:
         database: Database,
         claim: Claim,
         save_signals: SaveSignals,
-        tell_failed: Callable[[str], None] = _nobody,
+        tell_failed: Callable[[str], None],
     ) -> None:
         self.lease = claim.lease
         self._tell_failed = tell_failed

@@ -168,7 +168,7 @@ class WarmStarts:
     def chains(self) -> OpenChains | None:
         """The chains of the job, begun where it was left; None if no run waits for another."""
         waits = _Waits(self._job)
-        axes = SweepIn.model_validate(self._job.spec.get("sweep") or {}).axes
+        axes = SweepIn.model_validate(self._job.spec["sweep"]).axes
         chain = Chain.along(axes)
         if chain is None or not waits.any:
             return None
@@ -192,7 +192,7 @@ class WarmStarts:
         StorageError
             If the run that it names is not there.
         """
-        reference = body.get("warm_start")
+        reference = body["warm_start"]
         if reference is None:
             return ()
         if reference != PREVIOUS:
@@ -252,7 +252,7 @@ class _Waits:
         ]
         self._swept = swept[0] if swept else None
         if self._swept is None:
-            self.any = job.spec.get("warm_start") == PREVIOUS
+            self.any: bool = job.spec["warm_start"] == PREVIOUS
         else:
             self.any = PREVIOUS in self._swept[1]
 

@@ -6,7 +6,7 @@ the template (`service.figures.theme`); no line has more than `decimation.MAX_PO
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -172,14 +172,6 @@ def waterfall(run: RunEvidence) -> Figure:
             yaxis=_fitness_axis(run, data),
         ),
     }  # fmt: skip
-
-
-RUN_FIGURES: Mapping[str, Callable[[RunEvidence], Figure]] = {
-    "history": history,
-    "convergence": convergence,
-    "correlation": correlation,
-    "waterfall": waterfall,
-}
 
 
 def as_csv(figure: Figure) -> str:

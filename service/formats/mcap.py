@@ -74,7 +74,6 @@ def write_recording(
     target: Target,
     *,
     metadata: Mapping[str, str] | None = None,
-    attachments: Mapping[str, bytes] | None = None,
 ) -> None:
     """Write a recording as an MCAP file.
 
@@ -86,8 +85,6 @@ def write_recording(
     target : path or writable
     metadata : mapping of str to str
         Added to the record ``lagid.dataset``: hash of the source, parents, name …
-    attachments : mapping of str to bytes
-        JSON documents, such as the model or a calibration, by name.
 
     Raises
     ------
@@ -96,7 +93,7 @@ def write_recording(
     """
     topics, history = topics_of(recording), history_topics_of(recording)
     manifest = manifest_of(recording, topics, metadata or {}, history)
-    _write(target, (*topics, *history), manifest, attachments or {})
+    _write(target, (*topics, *history), manifest)
 
 
 def write_fit(
@@ -105,7 +102,6 @@ def write_fit(
     target: Target,
     *,
     metadata: Mapping[str, str] | None = None,
-    attachments: Mapping[str, bytes] | None = None,
 ) -> None:
     """Write what a run identified as an MCAP file.
 
@@ -129,7 +125,7 @@ def write_fit(
         path = f"/fit/{run}" if number == 0 else f"/fit/{run}/{number + 1}"
         topics.append(make_topic(path, channels, names))
     recording = Recording(tuple(channel for topic in topics for channel in topic.channels))
-    _write(target, topics, manifest_of(recording, topics, metadata or {}), attachments or {})
+    _write(target, topics, manifest_of(recording, topics, metadata or {}))
 
 
 def _channels(fit: FittedOutput) -> tuple[Channel, ...]:
@@ -143,20 +139,13 @@ def _channels(fit: FittedOutput) -> tuple[Channel, ...]:
     return tuple(Channel(f"{named}/{what}", fit.times, data, fit.unit) for what, data in values)
 
 
-def _write(
-    target: Target,
-    topics: Sequence[Topic],
-    manifest: Mapping[str, str],
-    attachments: Mapping[str, bytes],
-) -> None:
+def _write(target: Target, topics: Sequence[Topic], manifest: Mapping[str, str]) -> None:
     if isinstance(target, str | os.PathLike):
         with Path(target).open("wb") as stream:
-            _write(stream, topics, manifest, attachments)
+            _write(stream, topics, manifest)
         return
     file = McapFile(target.write)
     file.add_metadata(DATASET, manifest)
-    for name, content in attachments.items():
-        file.add_attachment(name, "application/json", content)
     numbers = [file.add_topic(topic.path, topic.all_fields) for topic in topics]
     for number, topic in zip(numbers, topics, strict=True):
         file.add_samples(number, topic.log_times, topic.columns)
@@ -181,12 +170,6 @@ def read_recording(source: Readable, limits: Limits = DEFAULT_LIMITS) -> Recordi
         If the file is damaged, too large, or holds no signal.
     """
     return read_mcap(source, limits)[0]
-
-
-def read_metadata(source: Readable, limits: Limits = DEFAULT_LIMITS) -> dict[str, str]:
-    """Read the record ``lagid.dataset`` of a file; empty if there is none."""
-    with _opened(source) as (binary, size):
-        return read_content(binary, size, limits).metadata.get(DATASET, {})
 
 
 def read_fit(source: Readable, limits: Limits = DEFAULT_LIMITS) -> tuple[FittedOutput, ...]:

@@ -14,8 +14,6 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
-    Attachment,
-    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
@@ -69,7 +67,6 @@ class McapFile:
         self._fields: list[tuple[Field, ...]] = []
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
-        self._attachments: list[AttachmentIndex] = []
         self._counts: dict[int, int] = {}
         self._span: tuple[int, int] | None = None
         self._put(MAGIC)
@@ -80,14 +77,6 @@ class McapFile:
         offset = self._offset
         length = self._put_record(Metadata(name, dict(content)))
         self._metadata.append(MetadataIndex(offset, length, name))
-
-    def add_attachment(self, name: str, media_type: str, content: bytes) -> None:
-        """Add an attachment; its times are 0, so that equal content gives equal bytes."""
-        offset = self._offset
-        length = self._put_record(Attachment(0, 0, name, media_type, content))
-        self._attachments.append(
-            AttachmentIndex(offset, length, 0, 0, len(content), name, media_type)
-        )
 
     def add_topic(self, path: str, fields: Sequence[str]) -> int:
         """Register a schema and a channel of doubles; return the channel's number."""
@@ -148,7 +137,7 @@ class McapFile:
     def _summary(self) -> list[tuple[int, Sequence[McapRecord | bytes]]]:
         first, last = self._span or (0, 0)
         statistics = Statistics(
-            attachment_count=len(self._attachments),
+            attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts=self._counts,
             chunk_count=len(self._chunks),
@@ -163,7 +152,6 @@ class McapFile:
             (Opcode.CHANNEL, self._channels),
             (Opcode.STATISTICS, [statistics]),
             (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, self._attachments),
             (Opcode.METADATA_INDEX, self._metadata),
         ]
 

@@ -190,9 +190,6 @@ def manifest_of(
 ) -> dict[str, str]:
     """Content of the record `DATASET`: everything that the messages themselves do not say.
 
-    A file without history does not speak of it; a program that knows of none reads the others as
-    the same recording without it.
-
     Raises
     ------
     ValueError
@@ -220,7 +217,7 @@ def manifest_of(
         "channels": json.dumps(entries),
         "topics": json.dumps(clocks),
         "segments": json.dumps([asdict(segment) for segment in recording.segments]),
-        **({"history": json.dumps(before)} if before else {}),
+        "history": json.dumps(before),
         **metadata,
     }
 
@@ -262,7 +259,7 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
         segments = tuple(_segment(entry) for entry in json.loads(metadata["segments"]))
         history = {
             name: (entry["topic"], entry["field"])
-            for name, entry in json.loads(metadata.get("history", "{}")).items()
+            for name, entry in json.loads(metadata["history"]).items()
         }
         manifest = Manifest(
             channels, {path: Clock.from_dict(entry) for path, entry in clocks.items()}, segments,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from math import exp, log, prod
 from typing import Any
 
-from service.core.errors import FieldError, InvalidRequest
+from service.core.errors import FieldError
 from service.jobs.schemas import Axis, JobIn
 from sysid.core.errors import nearest, split_pointer
 
@@ -60,21 +60,6 @@ class Steps(Sequence[Step]):
             labels.update(axis.labels[position] if axis.labels else {})
         cell = Cell({axis.path: values[position] for _, axis, values in self.columns}, labels)
         return Step(_pointer(self.columns[0][0], self.columns[0][1], position), cell)
-
-
-def groups_of(job: JobIn) -> list[list[int]]:
-    """Numbers of the axes that step together; the groups are crossed.
-
-    Raises
-    ------
-    InvalidRequest
-        If a path is not a field of the body, axes of one zip differ in length, or labels in
-        number from values.
-    """
-    errors = list(axis_faults(job))
-    if errors:
-        raise InvalidRequest(errors)
-    return grouped(job.sweep.axes)
 
 
 def grouped(axes: Sequence[Axis]) -> list[list[int]]:

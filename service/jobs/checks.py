@@ -95,7 +95,7 @@ class JobChecker:
         key = repr(reference)
         if key not in self._models:
             try:
-                self._models[key] = models.resolve(self._session, reference, is_new=True)
+                self._models[key] = models.resolve(self._session, reference)
             except SysidError as error:
                 self._models[key] = [fault_in_job(reference, fault) for fault in faults_of(error)]
         return self._models[key]
@@ -108,11 +108,8 @@ class JobChecker:
     def dataset(self, reference: str) -> Dataset | str:
         """The dataset of that identifier or name, or why there is none."""
         if reference not in self._datasets:
-            self._datasets[reference] = self._find(reference)
+            self._datasets[reference] = dataset_of(self._session, reference)
         return self._datasets[reference]
-
-    def _find(self, reference: str) -> Dataset | str:
-        return dataset_of(self._session, reference)
 
     def _all_parameters(self, body: Body, model: Model) -> tuple[Parameter, ...]:
         """The model's parameters, and the initial states to be estimated in each experiment.
@@ -251,6 +248,4 @@ def fault_in_job(reference: Any, fault: FieldError) -> FieldError:
     """A fault of a model at its place in the job that names the model or holds it."""
     if isinstance(reference, Mapping):
         return FieldError("/model" + fault.pointer, fault.detail, fault.column)
-    if fault.pointer == "/model":
-        return fault
-    return FieldError("/model", f"{reference}: {fault.pointer}: {fault.detail}")
+    return fault

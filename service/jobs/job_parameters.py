@@ -34,7 +34,7 @@ def parameters_of_job(
             experiments += experiments_in(repository.get(name))
         except StorageError:
             experiments += 1
-    experiments = max(experiments, experiments_named(body.get("parameters", {})))
+    experiments = max(experiments, experiments_named(body["parameters"]))
     return (*model.parameters, *initial_parameters(model, experiments))
 
 

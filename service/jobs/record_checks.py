@@ -82,7 +82,7 @@ def unit_faults(
     units = SignalUnits(model)
     by_signal = map_channels(model, channels).by_signal
     for pointer, dataset in datasets:
-        found = {channel["name"]: channel.get("unit") for channel in dataset.channels}
+        found = {channel["name"]: channel["unit"] for channel in dataset.channels}
         for signal, channel in by_signal.items():
             fault = units.fault(signal, channel, found.get(channel), f"dataset {dataset.name!r}")
             if fault:
@@ -162,7 +162,7 @@ def conversion_faults(body: Body) -> list[FieldError]:
     found: list[FieldError] = []
     tried(algorithm_of, found, body["algorithm"])
     tried(loss_of, found, body["loss"])
-    if body["prediction"] == "one-step" and body["loss"].get("noise_model") == "ar1":
+    if body["prediction"] == "one-step" and body["loss"]["noise_model"] == "ar1":
         detail = "ar1 is for free runs; predictions one step ahead contain the noise"
         found.append(FieldError("/loss/noise_model", detail))
     return found

@@ -24,7 +24,7 @@ NAMES = ("/model", "/datasets", "/validation", "/warm_start")
 
 def stored_groups(spec: Mapping[str, Any]) -> list[Steps]:
     """The crossed groups of a stored job's axes."""
-    axes = SweepIn.model_validate(spec.get("sweep") or {}).axes
+    axes = SweepIn.model_validate(spec["sweep"]).axes
     return steps_of(axes, grouped(axes))
 
 

@@ -38,21 +38,9 @@ class Checked:
 def submit_to(
     database: Database, body: JobIn, settings: Settings, key: str | None = None
 ) -> JobOut:
-    """Queue a job. SQLite's one write lock is held for its rows only, not while it is checked.
-
-    Raises
-    ------
-    InvalidRequest, KeyReused, TooMuchUnfinished
-        As `submit`.
-    """
-    with database.read() as session:
-        checked = check(session, body, settings)
-    with database.write() as session:
-        return told(store(session, checked, settings, key).job)
-
-
-def submit(session: Session, body: JobIn, settings: Settings, key: str | None = None) -> Submission:
     """Queue a job with its first runs; the dispatcher makes the others as it comes to them.
+
+    SQLite's one write lock is held for its rows only, not while it is checked.
 
     Raises
     ------
@@ -63,7 +51,10 @@ def submit(session: Session, body: JobIn, settings: Settings, key: str | None = 
     TooMuchUnfinished
         If its project has as much queued and running as it may.
     """
-    return store(session, check(session, body, settings), settings, key)
+    with database.read() as session:
+        checked = check(session, body, settings)
+    with database.write() as session:
+        return told(store(session, checked, settings, key).job)
 
 
 def check(

@@ -55,7 +55,7 @@ def add(session: Session, document: Mapping[str, Any]) -> ModelOut:
     InvalidRequest
         If it has faults, or its name is that of a built-in model.
     """
-    model = parse_model(document, is_new=True)
+    model = parse_model(document)
     if model.name in library.catalogue():
         raise InvalidRequest.at(
             "/name", f"{model.name!r} is the name of a built-in model; choose another"
@@ -70,18 +70,18 @@ def check(document: Any) -> CheckOut:
         found = f"a model is an object with 'equations' and more; found {document!r:.60}"
         return CheckOut(valid=False, errors=[FieldProblem(pointer="", detail=found)])
     try:
-        model = parse_model(document, is_new=True)
+        model = parse_model(document)
     except SysidError as error:
         problems = [FieldProblem(**fault.as_dict()) for fault in faults_of(error)]
         return CheckOut(valid=False, errors=problems)
     return CheckOut(valid=True, errors=[], normal_form=dict(model.document))
 
 
-def resolve(session: Session, reference: Any, *, is_new: bool = False) -> tuple[Model, Any]:
+def resolve(session: Session, reference: Any) -> tuple[Model, Any]:
     """The model that a job names, and what to store for it.
 
     A built-in model stays a name; an own one is stored as its document, so that a later version
-    does not change what was submitted. `is_new`: see `sysid.models.parse.parse_model`.
+    does not change what was submitted.
 
     Raises
     ------
@@ -89,15 +89,14 @@ def resolve(session: Session, reference: Any, *, is_new: bool = False) -> tuple[
         If a document has faults, or no model has that name.
     """
     if isinstance(reference, Mapping):
-        model = parse_model(reference, is_new=is_new)
-        return model, dict(reference)
+        return parse_model(reference), dict(reference)
     if reference in library.catalogue():
         return library.load_model(reference), reference
     try:
         row = _own(session, reference)
     except NotFound:
         raise UnknownModel(reference, _names(session)) from None
-    return parse_model(row.document, is_new=is_new), row.document
+    return parse_model(row.document), row.document
 
 
 def load_stored_model(reference: Any) -> Model:

@@ -50,7 +50,7 @@ class GridView:
 
 def grid_of(session: Session, job: Job, chosen: Mapping[str, Any]) -> GridView | None:
     """The grid of a job; None where its runs are few, or differ by nothing but seeds."""
-    paths = [axis["path"] for axis in job.spec.get("sweep", {}).get("axes", [])]
+    paths = [axis["path"] for axis in job.spec["sweep"]["axes"]]
     keys = [path for path in paths if not path.endswith("/seed")]
     if job.n_runs <= LISTED or not keys:
         return None

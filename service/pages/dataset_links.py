@@ -37,14 +37,14 @@ def _of(spec: Document) -> Iterator[tuple[str, str, str]]:
     """Role, label and identifier of each; those of an axis stand for the job's own."""
     axes = [axis for axis in axes_of(spec) if axis["path"] == DATASETS and axis.get("values")]
     for axis in axes:
-        labels = axis.get("labels") or [{}] * len(axis["values"])
+        labels = axis["labels"] or [{}] * len(axis["values"])
         for value, label in zip(axis["values"], labels, strict=True):
             for one in [value] if isinstance(value, str) else value:
                 yield "estimation", format_labels(label), one
     if not axes:
-        for one in spec.get("datasets", []):
+        for one in spec["datasets"]:
             yield "estimation", "", one
-    for one in (spec.get("validation") or {}).get("datasets") or []:
+    for one in (spec["validation"] or {}).get("datasets") or []:
         yield "validation", "", one
 
 

@@ -64,24 +64,24 @@ class Findings:
 
 
 def findings_of(result: Document) -> Findings:
-    """From a result document; results of older versions lack some of its fields."""
-    tested = result.get("residual_tests") or {}
-    tests = tested.get("tests") or []
-    onsets = result.get("onset_delays") or []
-    groups = (result.get("identifiability") or {}).get("groups") or []
+    """From a result document, which is empty as long as the run has none."""
+    tested = result.get("residual_tests", {})
+    tests = tested.get("tests", [])
+    onsets = result.get("onset_delays", [])
+    groups = result.get("identifiability", {}).get("groups", [])
     several = len({one["experiment"] for one in onsets}) > 1
     verdicts = {True: "passed", False: "failed", None: "not tested"}
     return Findings(
-        verdict=verdicts[tested.get("passed")] if tests else "", data=tested.get("data", ""),
+        verdict=verdicts[tested["passed"]] if tests else "", data=tested.get("data", ""),
         tests=[_test(one) for one in tests],
         n_figures=sum(one["experiment"] == 0 and one["outcome"] != "not tested" for one in tests),
         onsets=[_onset(one, several) for one in onsets],
-        groups=[_group(one) for one in groups if isinstance(one, dict)],
-        criteria=result.get("criteria") or {},
+        groups=[_group(one) for one in groups],
+        criteria=result.get("criteria", {}),
         selection=[
             SelectedView(one["term"], format_number(one["err"]),
                          format_number(max(1.0 - one["cumulated"], 0.0)))
-            for one in result.get("selection") or ()
+            for one in result.get("selection", ())
         ],
     )  # fmt: skip
 

@@ -76,7 +76,7 @@ def run_figure(
 def job_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
     """Errors against the noise of a job; empty where σ is no axis of it, or nothing ended yet."""
     job = JobRepository(session).get(job_id)
-    keys = noise_keys(job.spec.get("sweep", {}).get("axes", []))
+    keys = noise_keys(job.spec["sweep"]["axes"])
     if keys is None:
         return figures.empty_figure()
     found = summary(session, job.id, keys, errors_only=True)

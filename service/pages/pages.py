@@ -148,8 +148,7 @@ def dataset_page(session: Session, dataset_id: str) -> str:
               if edge.parent == dataset.id]  # fmt: skip
     return render(
         "dataset.html", dataset=dataset, height=figures_signals.signals_height(dataset.n_channels),
-        has_history=any(one.get("history_samples") for one in dataset.channels),
-        channels=dataset.channels,
+        has_history=any(one["history_samples"] for one in dataset.channels),
         lineage=[
             {"direction": direction, "id": name, "relation": relation, "href": _href(name)}
             for direction, name, relation in edges
@@ -210,7 +209,7 @@ def _comparable(runs: Sequence[Run]) -> str:
 
 def _noise_height(session: Session, job: Job, stored: StoredRun | None) -> int:
     """Height (px) of the figure of a sweep over σ; 0 where it is none."""
-    if job.n_runs == 1 or noise_keys(job.spec.get("sweep", {}).get("axes", [])) is None:
+    if job.n_runs == 1 or noise_keys(job.spec["sweep"]["axes"]) is None:
         return 0
     sought = sought_parameters(session, stored) if stored is not None else []
     return noise_height(1 + len(sought), columns=2)

@@ -136,7 +136,7 @@ def simulate_page(
                 **(TAKEN if is_asked(query) else {}), **query,
                 **_numbers(context.get("result"))},
         faults={f.pointer[1:]: f.detail for f in faults},
-        lines=[_line(one) for one in faults], query=_address(query), label_of=label_of,
+        lines=[_line(one) for one in faults], query=_address(query),
         times=multiplied, bracket=bracket_unit,
         **{"result": None, "free": None, "figure": None, **context},
     )  # fmt: skip

@@ -171,15 +171,14 @@ def run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
 
 def estimate_view(one: Document) -> EstimateView:
     """A line of the table, from an entry of the result's ``parameters``."""
-    stderr = one.get("stderr")
+    stderr = one["stderr"]
     value, error = format_estimate(one["value"], stderr)
-    bounds = [one[name] for name in ("lower", "upper") if one.get(name) is not None]
-    status = one.get("status", "")
+    bounds = [one[name] for name in ("lower", "upper") if one[name] is not None]
     return EstimateView(
-        name=one["name"], unit=one.get("unit", "1"), value_text=value, stderr_text=error,
-        interval_text=format_interval(one.get("interval95"), stderr),
+        name=one["name"], unit=one["unit"], value_text=value, stderr_text=error,
+        interval_text=format_interval(one["interval95"], stderr),
         bounds_text=" … ".join(f"{bound:.6g}".replace("-", "−") for bound in bounds),
-        status=status, reason=one.get("reason") or "",
+        status=one["status"], reason=one["reason"] or "",
     )  # fmt: skip
 
 
@@ -190,7 +189,7 @@ def event_view(event: Event) -> EventView:
         attempt = f", attempt {data['attempt']}" if data.get("attempt") else ""
         error = f": {data['error']}" if data.get("error") else ""
         return EventView(event.created_at, event.kind, f"{data.get('state', '')}{attempt}{error}")
-    text = data.get("message") or data.get("text")
+    text = data.get("message")
     if text is None:
         known = ((name.replace("_", " "), value) for name, value in data.items())
         text = ", ".join(
@@ -201,7 +200,7 @@ def event_view(event: Event) -> EventView:
 
 def axes_of(spec: Document) -> list[Document]:
     """The axes of a job's sweep."""
-    return list((spec.get("sweep") or {}).get("axes") or [])
+    return list(spec["sweep"]["axes"])
 
 
 def cell_text(cell: Document, labels: Document) -> str:

@@ -85,11 +85,11 @@ def _corrected(bench: Bench, record: str) -> Section:
 
 def _printed(bench: Bench, record: str) -> Section:
     found = bench.methods(job(record, SECOND, "as printed, k_b by itself"))
-    groups = (found["improved"].run.get("identifiability") or {}).get("groups") or []
+    groups = found["improved"].run["identifiability"]["groups"]
     told = "; ".join(
         f"{one['expression']} = {format_number(one['value'], 5)}"
         for one in groups
-        if isinstance(one, dict) and one.get("value") is not None
+        if one["value"] is not None
     )
     return Section(
         f"{TITLE}, as printed: k_b sought beside k_a",

@@ -34,22 +34,19 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One part of the study. `skipped` says why there is nothing in it."""
+    """One part of the study."""
 
     title: str
     text: str = ""
     tables: Sequence[Table] = ()
     plots: Sequence[Plot] = ()
     checks: Sequence[Check] = ()
-    skipped: str = ""
     links: Sequence[str] = field(default=())
 
 
 def markdown(section: Section) -> str:
     """The tables and statements of a section for the terminal; figures are in the report."""
     blocks = [f"## {section.title}"]
-    if section.skipped:
-        blocks.append(f"skipped: {section.skipped}")
     if section.text:
         blocks.append(section.text)
     for table in section.tables:

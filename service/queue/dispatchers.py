@@ -6,7 +6,6 @@ from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
 from service.queue.clocks import Clock, clock_of
-from service.queue.leases import LEASE
 from service.storage.columns import Document
 from service.storage.statements import upsert
 from service.storage.tables import Dispatcher
@@ -42,16 +41,12 @@ class DispatcherRepository:
         """Every dispatcher that has not taken leave, by name."""
         return list(self._session.scalars(select(Dispatcher).order_by(Dispatcher.owner)))
 
-    def alive(self, within: timedelta = LEASE) -> list[Dispatcher]:
-        """Dispatchers seen within the length of their leases, by name.
-
-        `within` is that of a dispatcher that has not told its own.
-        """
+    def alive(self) -> list[Dispatcher]:
+        """Dispatchers seen within the length of their leases, by name."""
         now = self._clock()
-        return [one for one in self.all() if one.seen_at >= now - length_of(one, within)]
+        return [one for one in self.all() if one.seen_at >= now - length_of(one)]
 
 
-def length_of(dispatcher: Dispatcher, usual: timedelta) -> timedelta:
-    """How long the leases of a dispatcher are; the usual length if it has not told."""
-    told = dispatcher.details.get(LEASE_SECONDS)
-    return timedelta(seconds=told) if isinstance(told, int | float) else usual
+def length_of(dispatcher: Dispatcher) -> timedelta:
+    """How long the leases of a dispatcher are."""
+    return timedelta(seconds=dispatcher.details[LEASE_SECONDS])

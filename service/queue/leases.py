@@ -101,14 +101,11 @@ class Owners:
         Known to have ended, and known to be there and awake; of others only their leases tell.
     lengths : mapping
         How long the leases of each are.
-    usual : timedelta
-        How long they are of one who has not told.
     """
 
     gone: frozenset[str] = frozenset()
     living: frozenset[str] = frozenset()
     lengths: Mapping[str, timedelta] = field(default_factory=dict)
-    usual: timedelta = LEASE
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,8 +282,7 @@ class Queue:
         """
         now, known = self._now(), owners or Owners()
         ahead = update(Job).where(Job.state == State.RUNNING, _ahead(now, known))
-        ends = _by_owner({one: now + length for one, length in known.lengths.items()},
-                         now + known.usual)  # fmt: skip
+        ends = _by_owner({one: now + length for one, length in known.lengths.items()}, now)
         self._session.execute(ahead.values(lease_until=ends), execution_options=IN_PLACE)
         expired = (
             select(Job)
@@ -375,9 +371,9 @@ def _silent(now: datetime, owners: Owners) -> ColumnElement[bool]:
 
 
 def _ahead(now: datetime, owners: Owners) -> ColumnElement[bool]:
-    """Condition that a job's lease ends later than any that could be given now."""
+    """Condition that a job's lease ends later than any that its owner could be given now."""
     latest = {one: now + LONGEST * length for one, length in owners.lengths.items()}
-    return Job.lease_until > _by_owner(latest, now + LONGEST * owners.usual)
+    return and_(Job.lease_owner.in_(latest), Job.lease_until > _by_owner(latest, now))
 
 
 def _by_owner(times: Mapping[str, datetime], other: datetime) -> ColumnElement[datetime]:

@@ -7,7 +7,6 @@ that is seen to live and to be awake waits for something, and is not reaped for 
 
 import logging
 import threading
-from datetime import timedelta
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -25,7 +24,6 @@ PAUSE_SECONDS = 1.0
 
 def reap(
     database: Database,
-    lease: timedelta,
     clock: Clock | None = None,
     *,
     busy_seconds: float | None = None,
@@ -34,8 +32,6 @@ def reap(
 
     Parameters
     ----------
-    lease : timedelta
-        How long the leases of a dispatcher are that has not told.
     clock : callable, optional
         By default the database's.
     busy_seconds : float, optional
@@ -46,8 +42,7 @@ def reap(
         owners = Owners(
             gone=frozenset(one.owner for one in known if is_gone(one.details)),
             living=frozenset(one.owner for one in known if is_awake(one.details)),
-            lengths={one.owner: length_of(one, lease) for one in known},
-            usual=lease,
+            lengths={one.owner: length_of(one) for one in known},
         )
         if not owners.gone and not Queue(session, clock).has_silent(owners):
             return Reaped()
@@ -81,8 +76,8 @@ def _why(owner: str, owners: Owners) -> str:
 class Reaper:
     """Reaps from a thread of its own until `stopping` is set."""
 
-    def __init__(self, database: Database, lease: timedelta, stopping: threading.Event) -> None:
-        self._database, self._lease, self._stopping = database, lease, stopping
+    def __init__(self, database: Database, stopping: threading.Event) -> None:
+        self._database, self._stopping = database, stopping
         self._thread = threading.Thread(target=self._go_on, name="reaper", daemon=True)
 
     def start(self) -> None:
@@ -97,7 +92,7 @@ class Reaper:
         is_cut_off = False
         while not self._stopping.wait(PAUSE_SECONDS):
             try:
-                reap(self._database, self._lease)
+                reap(self._database)
                 is_cut_off = False
             except SQLAlchemyError as error:  # the database may come back
                 if not is_cut_off:

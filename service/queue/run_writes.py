@@ -219,9 +219,9 @@ def _shallow(cell: Cell) -> dict[str, Any]:
 
 
 def _estimates(result: Document | None) -> Document | None:
-    if result is None or "parameters" not in result:
+    if result is None:
         return None
     return {
-        one["name"]: {"value": one["value"], "stderr": one.get("stderr")}
+        one["name"]: {"value": one["value"], "stderr": one["stderr"]}
         for one in result["parameters"]
     }

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal
 
-from sqlalchemy import delete, func, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from service.storage.columns import Document
@@ -51,18 +51,3 @@ class EventRepository:
         if kinds:
             query = query.where(Event.kind.in_(kinds))
         return list(self._session.scalars(query))[::-1]
-
-    def last_id(self, job_id: str) -> int:
-        """Number of a job's latest event; 0 when there is none."""
-        latest = select(func.max(Event.id)).where(Event.job_id == job_id)
-        return self._session.scalar(latest) or 0
-
-    def prune_progress(self, job_id: str) -> int:
-        """Delete the progress events of a finished job but the last; how many went."""
-        finished = select(Job.id).where(Job.id == job_id, Job.state.not_in(OPEN))
-        if self._session.scalar(finished) is None:
-            return 0
-        progress = (Event.job_id == job_id, Event.kind == "progress")
-        latest = select(func.max(Event.id)).where(*progress).scalar_subquery()
-        gone = delete(Event).where(*progress, Event.id < latest).returning(Event.id)
-        return len(self._session.scalars(gone).all())

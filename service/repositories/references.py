@@ -109,12 +109,6 @@ class ReferenceRepository:
         )  # fmt: skip
         return self._session.scalars(query).all()
 
-    def names_of(self, run_id: str) -> Sequence[str]:
-        """Names under which a run was accepted, now or before."""
-        mine = AcceptedReference.project_id == self._project_id
-        query = select(AcceptedReference.name).where(mine, AcceptedReference.run_id == run_id)
-        return self._session.scalars(query.distinct().order_by(AcceptedReference.name)).all()
-
     def _latest(self, name: str) -> AcceptedReference | None:
         query = select(AcceptedReference).where(*self._named(name))
         return self._session.scalars(

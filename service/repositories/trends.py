@@ -1,6 +1,6 @@
 """What a trend reads of a job's runs: the parts of their results that it needs, no more."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
@@ -40,14 +40,7 @@ def trend_rows(
         .where(Run.job_id == job_id, Run.project_id == project_id, Run.state == State.SUCCEEDED)
         .order_by(Run.number).limit(limit)
     )  # fmt: skip
-    empty: dict[str, Any] = {"agreement": {}, "correlation_times": {}}
-    found = []
-    for row in session.execute(query):
-        values = dict(zip(names, row, strict=True))
-        for name in PARTS:
-            values[name] = values[name] or empty.get(name, [])
-        found.append(TrendRow(**values))
-    return found
+    return [TrendRow(*row) for row in session.execute(query)]
 
 
 def count_succeeded(session: Session, job_id: str, project_id: str = DEFAULT_PROJECT) -> int:

@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
 from service.core.text import plain_estimate, plain_unit
-from service.jobs.results import is_free, read_noise_model
+from service.jobs.results import read_noise_model
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import ComparedParameter, ComparedRun, ComparedValue, ComparisonOut
 from service.storage.errors import NotFound
@@ -107,26 +107,16 @@ def _titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
 
 def _row(one: StoredRun, title: str) -> ComparedRun:
     result = one.result
-    criteria, tests = result.get("criteria") or {}, result.get("residual_tests") or {}
-    fit = result.get("fit_percent") or {}
+    criteria, tests, fit = result["criteria"], result["residual_tests"], result["fit_percent"]
     return ComparedRun(
-        run=one.run.id, job=one.job.id, number=one.run.number, model=one.model.name,
-        title=title, cell=one.run.cell, parameters=criteria.get("parameters", _count_free(result)),
-        samples=criteria.get("samples", _count_samples(result)), rms=result.get("rms"),
-        rms_validation=result.get("rms_validation"), fit_estimation=fit.get("estimation"),
-        fit_validation=fit.get("validation"), aic=criteria.get("aic"), bic=criteria.get("bic"),
+        run=one.run.id, job=one.job.id, number=one.run.number, model=one.model.name, title=title,
+        cell=one.run.cell, parameters=criteria["parameters"],
+        samples=criteria["samples"], rms=result["rms"],
+        rms_validation=result["rms_validation"], fit_estimation=fit["estimation"],
+        fit_validation=fit["validation"], aic=criteria["aic"], bic=criteria["bic"],
         residuals_passed=tests.get("passed"), residuals_data=tests.get("data"),
-        evaluations=result.get("evaluations", 0),
+        evaluations=result["evaluations"],
     )  # fmt: skip
-
-
-def _count_free(result: Document) -> int:
-    return sum(is_free(one) for one in result["parameters"])
-
-
-def _count_samples(result: Document) -> int:
-    agreement = (result.get("agreement") or {}).get("estimation") or []
-    return sum(int(one["samples"]) for one in agreement)
 
 
 def _parameters(
@@ -182,7 +172,7 @@ def _unit(ordered: Sequence[StoredRun]) -> str:
     """Unit of the RMS of all, if it is the same: several outputs are weighted together."""
     units = set()
     for one in ordered:
-        agreement = (one.result.get("agreement") or {}).get("estimation") or []
+        agreement = one.result["agreement"]["estimation"]
         outputs = {entry["output"] for entry in agreement}
         units.add(agreement[0]["unit"] if len(outputs) == 1 else "1")
     return units.pop() if len(units) == 1 else "1"
@@ -198,14 +188,11 @@ def _notes(ordered: Sequence[StoredRun]) -> Iterator[str]:
     losses = ({**one.body["loss"], "noise_model": read_noise_model(one.result)} for one in ordered)
     if len({repr(sorted(loss.items())) for loss in losses}) > 1:
         yield "the runs were fitted with different losses, which favour each its own measure"
-    counts = {(one.result.get("criteria") or {}).get("samples") for one in ordered}
-    if len(counts - {None}) > 1:
+    if len({one.result["criteria"]["samples"] for one in ordered}) > 1:
         yield (
             "the runs scored different numbers of samples: AIC and BIC do not compare "
             "(recursions do not score the samples they start from; the same skip for all helps)"
         )
-    if None in counts:
-        yield "some runs were identified by an older version, which told no AIC and BIC"
 
 
 def _or_infinite(value: float | None) -> float:

@@ -112,8 +112,8 @@ def _identifiability(uncertainty: Uncertainty | None) -> dict[str, Any]:
     }
 
 
-def _criteria(one: Criteria | None) -> dict[str, Any] | None:
-    return None if one is None else _read(one, "aic", "aicc", "bic", "samples", "parameters")
+def _criteria(one: Criteria) -> dict[str, Any]:
+    return _read(one, "aic", "aicc", "bic", "samples", "parameters")
 
 
 def _correlation(uncertainty: Uncertainty | None) -> dict[str, Any] | None:

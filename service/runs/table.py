@@ -60,10 +60,8 @@ def table(database: Database, job_id: str) -> Iterator[str]:
         first = [(one["name"], one["unit"]) for run in best for one in _told(run)]
         parameters = tuple(dict.fromkeys([*first, *runs.estimated(job_id)]))
         units = {**UNITS, "best_rms": unit_of(session, spec)}
-    axes = (spec.get("sweep") or {}).get("axes") or []
-    labels = dict.fromkeys(
-        name for axis in axes for one in axis.get("labels") or [] for name in one
-    )
+    axes = spec["sweep"]["axes"]
+    labels = dict.fromkeys(name for axis in axes for one in axis["labels"] or [] for name in one)
     layout = _Layout(tuple(axis["path"] for axis in axes), tuple(labels), parameters)
     return _parts(database, job_id, layout, units)
 

@@ -52,10 +52,6 @@ class ObjectStore(ABC):
     def __init__(self, backend: Any, temporary: Path) -> None:
         self._backend, self._temporary = backend, temporary
 
-    def put_bytes(self, data: bytes) -> StoredObject:
-        """Store bytes."""
-        return self.put_stream([data])
-
     def put_file(self, path: Path) -> StoredObject:
         """Store a copy of a file."""
         with path.open("rb") as file:

@@ -163,7 +163,7 @@ class Job(Base):
     n_runs: Mapped[int]
     n_done: Mapped[int] = mapped_column(default=0)
     n_failed: Mapped[int] = mapped_column(default=0)
-    n_reused: Mapped[int] = mapped_column(default=0, server_default="0")
+    n_reused: Mapped[int] = mapped_column(default=0)
     best_rms: Mapped[float | None]
     evaluations: Mapped[int] = mapped_column(LargeInteger, default=0)
     generation: Mapped[int] = mapped_column(default=0)
@@ -207,7 +207,7 @@ class Run(Base):
     sigma: Mapped[float | None]
     state: Mapped[State] = mapped_column(default=State.QUEUED)
     attempt: Mapped[int] = mapped_column(default=0)
-    kills: Mapped[int] = mapped_column(default=0, server_default="0")
+    kills: Mapped[int] = mapped_column(default=0)
     valid: Mapped[bool | None]
     best_rms: Mapped[float | None]
     rms_noise_free: Mapped[float | None]

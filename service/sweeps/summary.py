@@ -90,9 +90,9 @@ def _reference(problem: Mapping[str, Any]) -> ReferenceOut:
 
 
 def _keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
-    axes = job.spec.get("sweep", {}).get("axes", [])
+    axes = job.spec["sweep"]["axes"]
     paths = [axis["path"] for axis in axes]
-    labels = {name for axis in axes for one in axis.get("labels") or [] for name in one}
+    labels = {name for axis in axes for one in axis["labels"] or [] for name in one}
     if by is None:
         return [GroupKey("axis", path) for path in paths if not path.endswith("/seed")]
     keys = []
@@ -114,7 +114,7 @@ def _units(session: Session, job: Job) -> dict[str, str]:
     """
     runs = RunRepository(session)
     heads: list[Run] = list(runs.page(job.id, limit=1, states=[State.SUCCEEDED]).items)
-    if any(axis["path"] == "/model" for axis in job.spec.get("sweep", {}).get("axes", [])):
+    if any(axis["path"] == "/model" for axis in job.spec["sweep"]["axes"]):
         for group in groups(session, job.id, [GroupKey("axis", "/model")], [], MOST_GROUPS):
             cell = {"/model": group.key[0]}
             heads += runs.page(job.id, limit=1, states=[State.SUCCEEDED], cell=cell).items

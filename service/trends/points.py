@@ -93,7 +93,7 @@ def quantities(places: Mapping[float, Sequence[TrendRow]], names: Sequence[str])
                 if one["name"] in names or (not names and is_free(one)):
                     entry = _Entry(row.id, one["value"], one["stderr"], one["status"])
                     column = _add(columns, one["name"], one["unit"], "parameter", x, entry)
-                    column.widen(one.get("lower"), one.get("upper"))
+                    column.widen(one["lower"], one["upper"])
             for name, unit, entry in _onsets(row.id, row.onset_delays):
                 _add(columns, name, unit, "onset delay", x, entry).widen(0.0, None)
     order = {name: number for number, name in enumerate(names)}
@@ -178,8 +178,8 @@ def place(
     """All runs of a label; `datasets` of each run, `channels` of the model's signals."""
     spans: dict[str, SpanOut] = {}
     for row in rows:
-        for one in row.agreement.get("estimation") or []:
-            low, high = one.get("span") or (None, None)
+        for one in row.agreement["estimation"]:
+            low, high = one["span"]
             if low is None or high is None:
                 continue
             channel = channels.get(one["output"], one["output"])
@@ -198,5 +198,5 @@ def place(
 
 
 def _unit(known: Channels, datasets: Sequence[str], channel: str, otherwise: str) -> str:
-    units = [known[one][channel].get("unit") for one in datasets if channel in known.get(one, {})]
-    return next((unit for unit in units if unit and unit != "1"), otherwise)
+    units = [known[one][channel]["unit"] for one in datasets if channel in known.get(one, {})]
+    return next((unit for unit in units if unit != "1"), otherwise)

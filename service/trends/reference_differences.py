@@ -11,7 +11,7 @@ from service.models import models
 from service.repositories.datasets import DatasetRepository
 from service.storage.tables import Run
 from service.trends.points import Channels
-from sysid.core.errors import SysidError
+from sysid.core.errors import UnknownModel
 from sysid.models.model import Model
 from sysid.models.parameters import override
 
@@ -52,9 +52,9 @@ def _different(session: Session, bodies: Sequence[Body], known: Channels) -> Ite
     """The facts of a batch, each set of them once."""
     told: set[str] = set()
     for body in bodies:
-        settings = {name: body.get(name) for name in _SETTINGS}
+        settings = {name: body[name] for name in _SETTINGS}
         kinds = [
-            sorted((one["name"], str(one.get("unit")), one.get("hold", "first"))
+            sorted((one["name"], one["unit"], one["hold"])
                    for one in known.get(dataset, {}).values())
             for dataset in body["datasets"]
         ]  # fmt: skip
@@ -73,18 +73,18 @@ def _facts(session: Session, body: Body, known: Channels) -> Facts:
     """What an estimate depends on besides the data, in words."""
     try:
         model, _ = models.resolve(session, body["model"])
-    except SysidError:
-        return {}  # a model that this version cannot read any more
+    except UnknownModel:
+        return {}  # the catalogue does not have it any more
     inputs, outputs = signals_of(model)
     found = {"model": model.name}
     for signal in (*inputs, *outputs):
-        channel = (body.get("channels") or {}).get(signal, signal)
+        channel = body["channels"].get(signal, signal)
         stored = [known[one][channel] for one in body["datasets"] if channel in known.get(one, {})]
         found[signal] = channel
-        found[f"unit of {signal}"] = ", ".join(_each(str(one.get("unit") or 1) for one in stored))
+        found[f"unit of {signal}"] = ", ".join(_each(one["unit"] for one in stored))
         if signal in inputs:
-            given = (body.get("hold") or {}).get(signal)
-            held = [given or one.get("hold", "first") for one in stored]
+            given = body["hold"].get(signal)
+            held = [given or one["hold"] for one in stored]
             found[f"hold of {signal}"] = ", ".join(_each(held))
     return {**found, **dict(_settings(body)), **dict(_given(model, body))}
 
@@ -94,22 +94,22 @@ def _each(words: Any) -> list[str]:
 
 
 def _settings(body: Body) -> Iterator[tuple[str, str]]:
-    loss, weights = body["loss"], body.get("weights")
+    loss, weights = body["loss"], body["weights"]
     scale = "" if loss["kind"] == "squares" else f" of scale {loss['scale']:g}"
     yield "loss", loss["kind"] + scale
     yield "weights", (
         ", ".join(f"{name} {value:g}" for name, value in sorted(weights.items()))
         if weights else "by standard deviation"
     )  # fmt: skip
-    yield "prediction", body.get("prediction", "simulation")
-    yield "skip", f"{body.get('skip', 0):d}"
-    yield "added noise", f"{(body.get('noise') or {}).get('sigma', 0.0):g}"
+    yield "prediction", body["prediction"]
+    yield "skip", f"{body['skip']:d}"
+    yield "added noise", f"{body['noise']['sigma']:g}"
 
 
 def _given(model: Model, body: Body) -> Iterator[tuple[str, str]]:
     """Parameters that are not sought."""
     own = {one.name for one in model.parameters}
-    changes = {name: one for name, one in (body.get("parameters") or {}).items() if name in own}
+    changes = {name: one for name, one in body["parameters"].items() if name in own}
     for one in override(model.parameters, changes):
         if one.fixed is not None:
             yield one.name, f"{one.fixed:g}, fixed"

@@ -32,7 +32,7 @@ MOST_RUNS = 5_000
 
 def has_trend(job: Job) -> bool:
     """Whether a job asks for one."""
-    return bool(job.spec.get("trend"))
+    return job.spec["trend"] is not None
 
 
 def trend(session: Session, job_id: str) -> TrendOut:

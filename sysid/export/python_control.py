@@ -6,7 +6,6 @@ from sysid.export.description import facts, wrapped
 from sysid.export.expressions import number
 from sysid.export.identifiers import in_docstring
 
-PADE_ORDER = 3
 _WIDTH = 96
 
 _CONTINUOUS = '''\
@@ -63,7 +62,7 @@ systems = {names: control.tf(*pair, period) for names, pair in pairs.items()}
 '''
 
 
-def control_source(identified: Identified, pade_order: int = PADE_ORDER) -> str:
+def control_source(identified: Identified, pade_order: int) -> str:
     """A script that makes ``systems``: for (input, output) a transfer function of python-control.
 
     Parameters

@@ -1,7 +1,7 @@
 """What an identification gives: estimates with their uncertainty, and the evidence."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from sysid.core.types import FloatArray
@@ -48,15 +48,15 @@ class Identification:
     agreement: tuple[ChannelMetrics, ...]
     agreement_validation: tuple[ChannelMetrics, ...]
     warnings: tuple[str, ...]
-    selection: tuple[SelectedTerm, ...] = ()
-    criteria: Criteria | None = None
-    residual_tests: ResidualTests | None = None
-    onset_delays: tuple[OnsetDelay, ...] = ()
-    correlation_times: Mapping[str, float] = field(default_factory=dict)
-    holds: Mapping[str, Hold] = field(default_factory=dict)
-    sample_time: float | None = None
-    known_before: tuple[float, ...] = ()
-    known_before_validation: tuple[float, ...] = ()
+    selection: tuple[SelectedTerm, ...]
+    criteria: Criteria
+    residual_tests: ResidualTests | None
+    onset_delays: tuple[OnsetDelay, ...]
+    correlation_times: Mapping[str, float]
+    holds: Mapping[str, Hold]
+    sample_time: float | None
+    known_before: tuple[float, ...]
+    known_before_validation: tuple[float, ...]
 
     @property
     def noise_model(self) -> Literal["white", "ar1"]:

@@ -13,18 +13,17 @@ from time import perf_counter
 from sysid.core.settings import GeneticAlgorithm
 from sysid.identification.conclude import conclude
 from sysid.islands.archipelago import found, plans
-from sysid.islands.evolve import course, ends_of, evolve_all, next_border, rests, step_of
+from sysid.islands.evolve import course, ends_of, evolve_all, next_border, step_of
 from sysid.islands.migration import migrate
 from sysid.islands.state import RunState
 from sysid.islands.stopping import has_ended
 from sysid.search.island import Island, evolve, of_island
-from sysid.search.state import Plan
 from sysid.selection.starts import equation_error_starts
 from sysid.simulation.problem import Problem
 
 __all__ = [
     "RunState", "advance", "advance_island", "begin", "border", "conclude", "exchange",
-    "is_finished", "is_resting",
+    "is_finished",
 ]  # fmt: skip
 
 CALL_SECONDS = 0.1
@@ -59,11 +58,6 @@ def border(algorithm: GeneticAlgorithm, state: RunState) -> int:
     """The generation up to which every island evolves alone."""
     step = step_of(algorithm, is_warm=state.is_warm)
     return next_border(state.generation, step, algorithm.migration.every, algorithm.generations)
-
-
-def is_resting(plan: Plan, island: Island) -> bool:
-    """Whether an island has used up its evaluations or reached the target RMS."""
-    return rests(plan, island.arrays, island.champion_rms)
 
 
 def advance_island(

@@ -95,14 +95,11 @@ class Selection:
         Values of the unknown lags at which the terms explain most.
     samples : int
         Rows of the regression.
-    dropped : frozenset of str
-        Names of the coefficients that the model no longer has.
     """
 
     terms: tuple[SelectedTerm, ...]
     lags: Mapping[str, float] = field(default_factory=dict)
     samples: int = 0
-    dropped: frozenset[str] = frozenset()
 
 
 Form = Literal["difference", "differential", "polynomial"]

@@ -40,16 +40,13 @@ _FIELDS = {
 _MODEL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
-def parse_model(document: object, *, is_new: bool = False) -> Model:
+def parse_model(document: object) -> Model:
     """The model that a document describes.
 
     Parameters
     ----------
     document : object
         A mapping as read from YAML or JSON.
-    is_new : bool
-        Whether what documents were taken with before, and is told wrongly, is a fault: a lag in
-        another unit than that of lags. What is stored can be read with it.
 
     Raises
     ------
@@ -63,8 +60,7 @@ def parse_model(document: object, *, is_new: bool = False) -> Model:
     fields = reader.section(document, "", _FIELDS[form])
     _head(reader, fields)
     model = _polynomial(reader, fields) if form == "polynomial" else _equations(reader, fields)
-    if is_new:
-        check_lag_units(reader, model)
+    check_lag_units(reader, model)
     reader.finish()
     model = replace(model, document=normal_form(fields, model))
     try:

@@ -67,7 +67,7 @@ def selected(
                 coefficients = better.coefficients.tolist()
     resolved = with_terms(model, [model.terms[i].label for i in found.order])
     dropped = frozenset(own - {parameter.name for parameter in resolved.parameters})
-    selection = Selection(_told(model, found, coefficients), lags, samples, dropped)
+    selection = Selection(_told(model, found, coefficients), lags, samples)
     kept = {name: fields for name, fields in given.items() if name not in dropped}
     return replace(resolved, selection=selection), kept
 

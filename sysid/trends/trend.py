@@ -181,11 +181,6 @@ def predictions(
     )
 
 
-def prediction(law: Law, x: FloatArray, stderr: FloatArray, at: float) -> Place:
-    """The same at one new place."""
-    return predictions(law, x, stderr, np.array([at]))[0]
-
-
 def _own(x: FloatArray, stderr: FloatArray, at: FloatArray) -> FloatArray:
     """The stated errors that estimates at some places would have."""
     places, which = np.unique(x, return_inverse=True)
@@ -310,13 +305,6 @@ def drifts_from_law(
         _drift_from(one, place, error, limit)
         for one, place, error in zip(new, told, known, strict=True)
     )
-
-
-def drift_from_law(
-    new: Estimate, law: Law, x: FloatArray, stderr: FloatArray, at: float, comparisons: int = 1
-) -> Drift:
-    """The same for one estimate."""
-    return drifts_from_law([new], law, x, stderr, np.array([at]), comparisons)[0]
 
 
 def _drift_from(new: Estimate, told: Place, known: float, limit: float) -> Drift:

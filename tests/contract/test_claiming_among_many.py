@@ -7,6 +7,7 @@ import pytest
 from sqlalchemy import Connection, Engine, event, insert, text
 
 from service.api.events import _look
+from service.jobs.schemas import JobIn
 from service.queue.admission import Admission
 from service.queue.leases import Owners, Progress, Queue
 from service.queue.notifications import look
@@ -24,9 +25,10 @@ def crowded(database):
     """A database with thousands of ended jobs, hundreds of queued ones, and many that run."""
     states = [State.SUCCEEDED] * N_ENDED + [State.QUEUED] * N_QUEUED + [State.RUNNING] * N_RUNNING
     until = utc_now() + timedelta(hours=1)
+    spec = JobIn.model_validate({"model": "tube", "datasets": ["ds_1"]}).normal_form()
     rows = [
         {"id": f"job_{number:05d}", "project_id": PROJECTS[number % 3], "name": "j",
-         "spec": {"model": "tube"}, "n_runs": 1, "state": state, "priority": 0,
+         "spec": spec, "n_runs": 1, "state": state, "priority": 0,
          "lease_owner": "d1" if state is State.RUNNING else None,
          "lease_until": until if state is State.RUNNING else None}
         for number, state in enumerate(states)

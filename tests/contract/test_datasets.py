@@ -2,11 +2,10 @@
 
 import threading
 from dataclasses import replace
-from datetime import timedelta
 
 import pytest
 
-from service.queue.dispatchers import DispatcherRepository
+from service.queue.dispatchers import LEASE_SECONDS, DispatcherRepository
 from service.repositories.datasets import DatasetRepository
 from service.repositories.lineage import Edge, LineageRepository
 from service.repositories.models import ModelRepository
@@ -160,22 +159,23 @@ def test_models_stored_at_once_get_different_versions(database):
 
 
 def test_a_dispatcher_is_alive_while_it_beats(database):
-    clock, lease = Clock(), timedelta(seconds=30)
+    clock = Clock()
     with database.write() as session:
         dispatchers = DispatcherRepository(session, clock)
-        dispatchers.announce("d1", {"cpus": 2})
+        dispatchers.announce("d1", {LEASE_SECONDS: 30.0})
         clock.advance(20)
-        dispatchers.announce("d2", {"cpus": 4})
-        assert [one.owner for one in dispatchers.alive(lease)] == ["d1", "d2"]
+        dispatchers.announce("d2", {LEASE_SECONDS: 30.0})
+        assert [one.owner for one in dispatchers.alive()] == ["d1", "d2"]
         clock.advance(20)
-        assert [one.owner for one in dispatchers.alive(lease)] == ["d2"]
+        assert [one.owner for one in dispatchers.alive()] == ["d2"]
         dispatchers.beat("d1")
-        assert [one.owner for one in dispatchers.alive(timedelta(seconds=5))] == ["d1"]
+        clock.advance(15)
+        assert [one.owner for one in dispatchers.alive()] == ["d1"]
         dispatchers.leave("d1")
-        dispatchers.announce("d2", {"cpus": 8})
+        dispatchers.announce("d2", {LEASE_SECONDS: 30.0, "cpus": 8})
         (left,) = dispatchers.alive()
     with database.read() as session:
-        assert DispatcherRepository(session, clock).alive()[0].details == {"cpus": 8}
+        assert DispatcherRepository(session, clock).alive()[0].details["cpus"] == 8
     assert left.owner == "d2"
 
 

@@ -187,9 +187,6 @@ def test_a_reader_goes_on_after_the_last_event_it_saw(database):
     rest = events(database, got.job.id, after=first[-1].id)
     assert [event.id for event in first + rest] == ids
     assert [event.data["line"] for event in rest] == [1, 2, 3, 4]
-    with database.read() as session:
-        assert EventRepository(session).last_id(got.job.id) == ids[-1]
-        assert EventRepository(session).last_id("job_none") == 0
 
 
 def test_an_event_is_never_seen_before_one_with_a_smaller_number(database):
@@ -238,17 +235,3 @@ def test_a_reader_who_polls_while_two_writers_write_misses_no_event(database):
     reader.join()
     assert seen == [event.id for event in events(database, got.job.id)]
     assert len(seen) == 32
-
-
-def test_pruning_keeps_the_last_progress_and_every_other_event(database):
-    got, _ = claimed(database)
-    for evaluations in (1, 2, 3):
-        with database.write() as session:
-            Queue(session).report(got.lease, Progress(evaluations))
-    with database.write() as session:
-        assert EventRepository(session).prune_progress(got.job.id) == 0
-        Queue(session).finish(got.lease, State.CANCELLED)
-        assert EventRepository(session).prune_progress(got.job.id) == 2
-    left = events(database, got.job.id)
-    assert [event.data["evaluations"] for event in left if event.kind == "progress"] == [3]
-    assert left[-1].kind == "end"

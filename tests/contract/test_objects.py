@@ -54,7 +54,7 @@ def sha256(data):
 
 @pytest.mark.parametrize("data", [b"", b"x", bytes(range(256)) * 5000])
 def test_bytes_come_back_under_their_hash(store, data):
-    stored = store.put_bytes(data)
+    stored = store.put_stream([data])
     assert (stored.sha256, stored.size) == (sha256(data), len(data))
     assert store.get(stored.sha256) == data
     assert store.size(stored.sha256) == len(data)
@@ -72,9 +72,9 @@ def test_a_stream_and_a_file_give_what_their_bytes_give(store, tmp_path):
 
 
 def test_storing_again_changes_nothing(store):
-    store.put_bytes(b"same")
+    store.put_stream([b"same"])
     (before,) = store.objects()
-    store.put_bytes(b"same")
+    store.put_stream([b"same"])
     (after,) = store.objects()
     assert after == before
 
@@ -82,7 +82,7 @@ def test_storing_again_changes_nothing(store):
 def test_many_writers_of_the_same_bytes_at_once_all_succeed(store):
     results = []
     threads = [
-        threading.Thread(target=lambda: results.append(store.put_bytes(b"y" * 100_000)))
+        threading.Thread(target=lambda: results.append(store.put_stream([b"y" * 100_000])))
         for _ in range(4)
     ]
     for thread in threads:
@@ -98,14 +98,14 @@ def test_many_writers_of_the_same_bytes_at_once_all_succeed(store):
 )
 def test_a_range_is_that_part_of_the_bytes(store, start, length):
     data = os.urandom(1000)
-    name = store.put_bytes(data).sha256
+    name = store.put_stream([data]).sha256
     assert store.get_range(name, start, length) == data[start : start + length]
 
 
 def test_a_stream_gives_the_bytes_in_blocks(store, monkeypatch):
     monkeypatch.setattr(objects, "_BLOCK", 300)
     data = os.urandom(1000)
-    name = store.put_bytes(data).sha256
+    name = store.put_stream([data]).sha256
     blocks = list(store.stream(name))
     assert b"".join(blocks) == data
     assert max(map(len, blocks)) == 300
@@ -126,7 +126,7 @@ def test_what_is_not_there_is_missing(store, name):
 
 
 def test_a_deleted_object_is_gone_and_others_stay(store):
-    one, two = store.put_bytes(b"1").sha256, store.put_bytes(b"2").sha256
+    one, two = store.put_stream([b"1"]).sha256, store.put_stream([b"2"]).sha256
     store.delete(one)
     assert not store.exists(one)
     assert [left.sha256 for left in store.objects()] == [two]
@@ -134,7 +134,7 @@ def test_a_deleted_object_is_gone_and_others_stay(store):
 
 def test_all_objects_are_listed_and_nothing_else(store):
     store.check_writable()
-    wanted = {store.put_bytes(str(i).encode()).sha256: len(str(i)) for i in range(60)}
+    wanted = {store.put_stream([str(i).encode()]).sha256: len(str(i)) for i in range(60)}
     assert {one.sha256: one.size for one in store.objects()} == wanted
 
 
@@ -154,27 +154,27 @@ def test_a_large_object_goes_to_a_bucket_in_parts(bucket, monkeypatch):
     store = open_store(url, **options)
     data = os.urandom(6 << 20)
     for _ in range(2):
-        assert store.get(store.put_bytes(data).sha256) == data
+        assert store.get(store.put_stream([data]).sha256) == data
 
 
 def test_a_bucket_never_replaces_an_object(bucket, s3_endpoint):
     url, options = bucket
     store = open_store(url, **options)
-    name = store.put_bytes(b"first").sha256
+    name = store.put_stream([b"first"]).sha256
     client = boto3.client("s3", endpoint_url=s3_endpoint, region_name="us-east-1", **CREDENTIALS)
     key = f"lagid/sha256/{name[:2]}/{name}.mcap"
     client.put_object(Bucket=url.split("/")[2], Key=key, Body=b"marked")
     client.close()
-    store.put_bytes(b"first")
+    store.put_stream([b"first"])
     assert store.get(name) == b"marked"
 
 
 def test_a_folder_never_replaces_an_object_and_has_the_agreed_layout(tmp_path):
     store = open_store(f"file://{tmp_path}")
-    name = store.put_bytes(b"first").sha256
+    name = store.put_stream([b"first"]).sha256
     path = tmp_path / "sha256" / name[:2] / f"{name}.mcap"
     path.write_bytes(b"marked")
-    store.put_bytes(b"first")
+    store.put_stream([b"first"])
     assert path.read_bytes() == b"marked"
     assert list((tmp_path / "tmp").iterdir()) == []
 
@@ -196,7 +196,7 @@ def test_a_folder_that_cannot_be_made_or_written_is_told_in_one_line(tmp_path):
         open_store(f"file://{tmp_path}/file/objects")
     store = open_store(f"file://{tmp_path}/objects")
     (tmp_path / "objects" / "tmp").rmdir()
-    for act in (store.check_writable, lambda: store.put_bytes(b"x")):
+    for act in (store.check_writable, lambda: store.put_stream([b"x"])):
         with pytest.raises(ObjectStoreFailed, match="cannot write") as caught:
             act()
         assert "\n" not in str(caught.value)
@@ -217,5 +217,5 @@ def test_an_address_of_an_unknown_kind_is_refused(url):
 
 
 def test_spaces_in_a_folders_address_may_be_escaped(tmp_path):
-    open_store(f"file://{tmp_path}/my%20objects").put_bytes(b"x")
+    open_store(f"file://{tmp_path}/my%20objects").put_stream([b"x"])
     assert (tmp_path / "my objects" / "sha256").is_dir()

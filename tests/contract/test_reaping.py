@@ -34,7 +34,8 @@ def clock() -> Clock:
 
 def announce(database, owner: str, details) -> None:
     with database.write() as session:
-        DispatcherRepository(session).announce(owner, details)
+        told = {LEASE_SECONDS: LEASE.total_seconds(), **details}
+        DispatcherRepository(session).announce(owner, told)
 
 
 def of_a_process_that_has_ended():
@@ -53,7 +54,7 @@ def test_jobs_of_a_dispatcher_whose_process_has_ended_are_given_back_at_once(dat
     job = submit(database)
     claim(database, "dead")
     announce(database, "dead", of_a_process_that_has_ended())
-    assert reap(database, LEASE).requeued == (job,)
+    assert reap(database).requeued == (job,)
     assert state_of(database, job) is State.QUEUED
     with database.read() as session:
         assert DispatcherRepository(session).alive() == []
@@ -66,7 +67,7 @@ def test_jobs_of_a_dispatcher_that_lives_or_that_cannot_be_seen_are_left_alone(d
     jobs = {submit(database) for _ in range(3)}
     for owner in ("here", "elsewhere", "unknown"):
         claim(database, owner)
-    assert reap(database, LEASE).requeued == ()
+    assert reap(database).requeued == ()
     assert {state_of(database, job) for job in jobs} == {State.RUNNING}
 
 
@@ -79,26 +80,28 @@ def test_a_process_that_took_over_the_number_of_another_is_not_taken_for_it() ->
 def test_a_lease_written_before_the_clock_was_stepped_back_is_not_waited_for(
     database, clock: Clock
 ) -> None:
+    announce(database, "silent", {})
     job = submit(database)
     claim(database, "silent", clock)
     clock.advance(-3600)
-    assert reap(database, LEASE, clock).requeued == ()  # its owner has one lease to renew it
+    assert reap(database, clock).requeued == ()  # its owner has one lease to renew it
     clock.advance(11)
-    assert reap(database, LEASE, clock).requeued == (job,)
+    assert reap(database, clock).requeued == (job,)
 
 
 def test_a_dispatcher_that_lives_keeps_its_jobs_though_the_clock_is_stepped_back(
     database, clock: Clock
 ) -> None:
+    announce(database, "alive", {})
     submit(database)
     held = claim(database, "alive", clock).lease
     clock.advance(-3600)
-    reap(database, LEASE, clock)
+    reap(database, clock)
     for _ in range(5):
         clock.advance(3)
         with database.write() as session:
             assert [one.lease for one in Queue(session, clock).heartbeat([held], LEASE)] == [held]
-        assert reap(database, LEASE, clock).requeued == ()
+        assert reap(database, clock).requeued == ()
 
 
 def test_leases_lost_while_runs_come_to_their_end_are_not_added_up(database, clock: Clock) -> None:
@@ -111,7 +114,7 @@ def test_leases_lost_while_runs_come_to_their_end_are_not_added_up(database, clo
             run = ledger.pending()[0].id
             ledger.record([RunOutcome(run_id=run, state=State.SUCCEEDED, best_rms=1.0)])
         clock.advance(11)
-        assert reap(database, LEASE, clock).requeued == (job,), number
+        assert reap(database, clock).requeued == (job,), number
     assert job_of(database, job).lost_leases == 1
 
 
@@ -143,7 +146,7 @@ def test_the_web_process_reaps_too(database) -> None:
     claim(database, "dead")
     announce(database, "dead", of_a_process_that_has_ended())
     stopping = threading.Event()
-    reaper = Reaper(database, LEASE, stopping)
+    reaper = Reaper(database, stopping)
     reaper.start()
     try:
         until(lambda: state_of(database, job) is State.QUEUED, "it was queued again")
@@ -168,7 +171,7 @@ def test_a_dispatcher_that_lives_here_is_not_reaped_while_it_waits_for_the_datab
 ) -> None:
     job = expired(database, "here", describe_process(), HUNG.total_seconds() - 10)
     lost = expired(database, "elsewhere", {**describe_process(), "machine": "another"})
-    assert reap(database, LEASE).requeued == (lost,)
+    assert reap(database).requeued == (lost,)
     assert state_of(database, job) is State.RUNNING
     assert job_of(database, job).lost_leases == 0
 
@@ -179,7 +182,7 @@ def test_a_dispatcher_that_lives_but_hangs_is_reaped_at_last_and_not_called_gone
 ) -> None:
     job = expired(database, "here", describe_process(), HUNG.total_seconds() + 1)
     with caplog.at_level(logging.WARNING):
-        assert reap(database, LEASE).requeued == (job,)
+        assert reap(database).requeued == (job,)
     (told,) = caplog.messages
     assert "here lives, but has not renewed its leases" in told
     assert "gone" not in told
@@ -203,7 +206,7 @@ def test_a_dispatcher_that_is_stopped_is_reaped_when_its_lease_ends(database) ->
         assert not is_awake(details)
         assert not is_gone(details)
         job = expired(database, "stopped", details)
-        assert reap(database, LEASE).requeued == (job,)
+        assert reap(database).requeued == (job,)
     finally:
         process.kill()
         process.communicate()
@@ -218,11 +221,11 @@ def test_leases_lost_while_a_run_came_further_are_not_added_up(database, clock: 
             ledger.create([Cell(number=0)])
             ledger.save([(ledger.pending()[0].id, 100 * (number + 1), b"state")])
         clock.advance(11)
-        assert reap(database, LEASE, clock).requeued == (job,), number
+        assert reap(database, clock).requeued == (job,), number
         assert job_of(database, job).lost_leases == 1
     claim(database, "falls", clock)  # and now it does not come further
     clock.advance(11)
-    assert reap(database, LEASE, clock).failed == (job,)
+    assert reap(database, clock).failed == (job,)
 
 
 def test_how_long_a_lease_is_tells_its_dispatcher_and_not_the_one_who_reaps(
@@ -232,15 +235,15 @@ def test_how_long_a_lease_is_tells_its_dispatcher_and_not_the_one_who_reaps(
     announce(database, "slow", {LEASE_SECONDS: 60.0})
     with database.write() as session:
         Queue(session, clock).claim("slow", timedelta(seconds=60))
-    assert reap(database, LEASE, clock).requeued == ()
+    assert reap(database, clock).requeued == ()
     assert job_of(database, job).lease_until == clock.now + timedelta(seconds=60)
     clock.advance(-3600)
-    reap(database, LEASE, clock)
+    reap(database, clock)
     assert job_of(database, job).lease_until == clock.now + timedelta(seconds=60)
     clock.advance(59)
-    assert reap(database, LEASE, clock).requeued == ()
+    assert reap(database, clock).requeued == ()
     clock.advance(2)
-    assert reap(database, LEASE, clock).requeued == (job,)
+    assert reap(database, clock).requeued == (job,)
 
 
 def test_a_dispatcher_with_long_leases_counts_as_alive_as_long(database, clock: Clock) -> None:
@@ -249,7 +252,7 @@ def test_a_dispatcher_with_long_leases_counts_as_alive_as_long(database, clock: 
         repository.announce("slow", {LEASE_SECONDS: 60.0})
         repository.announce("quick", {LEASE_SECONDS: 10.0})
         clock.advance(30)
-        assert [one.owner for one in repository.alive(LEASE)] == ["slow"]
+        assert [one.owner for one in repository.alive()] == ["slow"]
 
 
 @pytest.mark.postgres
@@ -263,7 +266,7 @@ def test_leases_follow_the_clock_of_the_server_not_those_of_its_clients(
         assert clock_of(session)() > wrong + timedelta(seconds=500)
         Queue(session).claim("behind")
     monkeypatch.undo()
-    assert reap(postgres_database, LEASE).requeued == ()
+    assert reap(postgres_database).requeued == ()
     assert state_of(postgres_database, job) is State.RUNNING
 
 
@@ -288,7 +291,7 @@ def test_a_job_that_waits_beside_others_that_come_further_is_not_soon_given_up(
             leases.release_all(lost=True)
         else:
             clock.advance(11)
-            reap(database, LEASE, clock)
+            reap(database, clock)
             for one in got:
                 leases.forget(one.lease)
         assert state_of(database, waits) is State.QUEUED

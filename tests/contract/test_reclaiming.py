@@ -44,7 +44,7 @@ def claim_again(place, lease):
 
 
 def recorder(place, claim):
-    return Recorder(place.database, claim, lambda run, found: None)
+    return Recorder(place.database, claim, lambda run, found: None, lambda run: None)
 
 
 def point(run, number):

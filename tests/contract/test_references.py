@@ -55,7 +55,6 @@ def test_the_same_run_again_is_kept_where_it_is_said_by_another_or_why(database)
         repository = ReferenceRepository(session)
         assert repository.latest("tube").number == 3
         assert [one.note for one in repository.history("tube")] == ["second", "second", "first"]
-        assert repository.names_of(run) == ["tube"]
 
 
 def test_references_are_listed_page_by_page_without_the_results_of_their_runs(database):

@@ -59,7 +59,13 @@ def fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
     """Write everything; the job that runs can be driven on with `progress`."""
     recording = _recording()
     dataset = add_recording(
-        database, store, recording, name="tube 40 m", kind="upload", key="tube", details={}
+        database,
+        store,
+        recording,
+        name="tube 40 m",
+        kind="upload",
+        key="tube",
+        details={"warnings": []},
     ).dataset.id
     finished = _claimed(database, settings, _body(dataset, "tube 40 m, pattern 1"))
     run = _end(database, store, finished, recording)
@@ -77,8 +83,7 @@ def fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
         running_run = _first(session, running)
         RunLedger(session, running.lease).start([running_run])
     progress(database, running, running_run, 60)
-    with database.write() as session:
-        queued = jobs.submit(session, _body(dataset, "tube 5 m, waits"), settings).job.id
+    queued = jobs.submit_to(database, _body(dataset, "tube 5 m, waits"), settings).id
     return Filled(
         dataset, finished.job.id, run, running.job.id, running_run, failed.job.id, queued,
         sweep.job.id, running,
@@ -132,8 +137,8 @@ def _simulated(u: np.ndarray) -> np.ndarray:
 
 
 def _claimed(database: Database, settings: Settings, body: JobIn) -> Claim:
+    jobs.submit_to(database, body, settings)
     with database.write() as session:
-        jobs.submit(session, body, settings)
         claim = Queue(session).claim("test", timedelta(hours=1))
     assert claim is not None
     return claim
@@ -223,7 +228,7 @@ def _end(database: Database, store: ObjectStore, claim: Claim, recording: Record
         outcome = RunOutcome(
             run_id=run, state=State.SUCCEEDED, result=_result(), valid=True, best_rms=SIGMA,
             fit_estimation=99.71, fit_validation=99.68, evaluations=20_000, generations=400,
-            seconds=0.184, signals_sha256=store.put_bytes(target.getvalue()).sha256,
+            seconds=0.184, signals_sha256=store.put_stream([target.getvalue()]).sha256,
         )  # fmt: skip
         ledger = RunLedger(session, claim.lease)
         ledger.record([outcome], _history(run), migrants)

@@ -27,7 +27,7 @@ def garbage(database, store, older_than=AT_ONCE):
 
 
 def test_only_objects_that_no_living_row_names_are_garbage(database, store):
-    raw, fit, stray = (store.put_bytes(name).sha256 for name in (b"raw", b"fit", b"stray"))
+    raw, fit, stray = (store.put_stream([name]).sha256 for name in (b"raw", b"fit", b"stray"))
     got, (run_id,) = claimed(database)
     with database.write() as session:
         datasets = DatasetRepository(session)
@@ -45,12 +45,12 @@ def test_only_objects_that_no_living_row_names_are_garbage(database, store):
 
 
 def test_a_young_object_may_still_be_waiting_for_its_row(database, store):
-    store.put_bytes(b"just written")
+    store.put_stream([b"just written"])
     assert garbage(database, store, timedelta(hours=1)) == set()
 
 
 def test_collecting_deletes_the_garbage_only(database, store):
-    kept, stray = store.put_bytes(b"kept").sha256, store.put_bytes(b"stray").sha256
+    kept, stray = store.put_stream([b"kept"]).sha256, store.put_stream([b"stray"]).sha256
     with database.write() as session:
         DatasetRepository(session).add(new_dataset(sha256=kept))
     with database.read() as session:

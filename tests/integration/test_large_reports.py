@@ -50,8 +50,8 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Large]:
                 {"path": "/seed", "range": [0, N_SEEDS]},
             ]},
         })  # fmt: skip
+        job = jobs.submit_to(parts.database, body, settings).id
         with parts.database.write() as session:
-            job = jobs.submit(session, body, settings).job.id
             claim = Queue(session).claim("test", timedelta(hours=1))
         assert claim is not None
         _end(parts.database, claim)

@@ -1,12 +1,17 @@
 """Migrations: they build the program's tables, undo them, and never race."""
 
 import multiprocessing
+import shutil
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 from sqlalchemy import inspect, text
 
-from service.storage import migrate
+import migrations
+from service.storage import migrate, sessions
 from service.storage.errors import DatabaseNotAtHead
 from service.storage.sessions import Database
 from service.storage.tables import Base, Project
@@ -107,3 +112,99 @@ def test_processes_that_start_at_once_on_a_new_database_do_not_race(empty_databa
     for process in processes:
         process.join()
     assert migrate.differences(empty_database) == []
+
+
+SECOND = """
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0002"
+down_revision = "0001"
+
+
+def upgrade():
+    op.add_column("projects", sa.Column("copy", sa.String(), nullable=True))
+    op.execute("UPDATE projects SET copy = name")
+    {last}
+
+
+def downgrade():
+    op.drop_column("projects", "copy")
+"""
+
+
+@pytest.fixture
+def revisions(tmp_path, monkeypatch):
+    """The revisions of the program in a folder of their own, to which a test adds another."""
+    folder = tmp_path / "migrations"
+    shutil.copytree(Path(migrations.__file__).parent, folder)
+    monkeypatch.setattr(migrations, "__file__", str(folder / "__init__.py"))
+    return folder / "versions"
+
+
+def copies(database):
+    with database.engine.connect() as connection:
+        return list(connection.scalars(text("SELECT copy FROM projects")))
+
+
+def columns(database):
+    return {one["name"] for one in inspect(database.engine).get_columns("projects")}
+
+
+def test_a_second_revision_carries_the_rows_over_and_back(database, revisions):
+    before = columns(database)
+    (revisions / "second.py").write_text(SECOND.format(last=""))
+    with pytest.raises(DatabaseNotAtHead, match="0002"):
+        migrate.check(database)
+    migrate.upgrade(database)
+    assert copies(database) == ["default"]
+    migrate.downgrade(database, "0001")
+    assert columns(database) == before
+    with database.read() as session:
+        assert [one.name for one in session.query(Project)] == ["default"]
+    assert migrate.differences(database) == []
+
+
+def test_a_second_revision_that_fails_leaves_the_database_as_it_was(database, revisions):
+    before = columns(database)
+    (revisions / "second.py").write_text(SECOND.format(last='raise OSError("in the middle")'))
+    with pytest.raises(OSError, match="in the middle"):
+        migrate.upgrade(database)
+    assert columns(database) == before
+    assert migrate.current(database) == "0001"
+
+
+def test_an_upgrade_waits_for_a_writer_that_has_begun_and_carries_over_what_it_wrote(
+    database, revisions
+):
+    (revisions / "second.py").write_text(SECOND.format(last=""))
+    with ThreadPoolExecutor(1) as pool:
+        with database.engine.begin() as writer:
+            writer.execute(text("UPDATE projects SET name = 'early'"))
+            upgraded = pool.submit(migrate.upgrade, database)
+            wait_for_a_lock(database, upgraded)
+            writer.execute(text("UPDATE projects SET name = 'late'"))
+        upgraded.result()
+    assert copies(database) == ["late"]
+
+
+def wait_for_a_lock(database, upgraded):
+    """Until it waits on PostgreSQL; on SQLite nobody else can have begun."""
+    with database.engine.connect() as looking:
+        if looking.dialect.name == "sqlite":
+            return
+        waiting = text("SELECT count(*) FROM pg_locks WHERE NOT granted")
+        while not (looking.scalar(waiting) or upgraded.done()):
+            time.sleep(0.01)
+
+
+def test_an_upgrade_waits_longer_for_its_turn_than_other_writers(database, revisions, monkeypatch):
+    monkeypatch.setattr(sessions, "BUSY_SECONDS", 0.01)
+    (revisions / "second.py").write_text(SECOND.format(last=""))
+    with ThreadPoolExecutor(1) as pool:
+        with database.engine.begin() as writer:
+            writer.execute(text("UPDATE projects SET name = 'late'"))
+            upgraded = pool.submit(migrate.upgrade, database)
+            time.sleep(0.3)
+        upgraded.result()
+    assert copies(database) == ["late"]

@@ -179,7 +179,7 @@ def test_the_recordings_are_listed_page_by_page_with_what_can_be_done(tmp_path: 
             channel = Channel("u", np.array([0.0, 1.0]), np.array([1.0, number]), "V")
             add_recording(
                 parts.database, parts.store, Recording((channel,)), name=f"record {number}",
-                kind="upload", key=f"record {number}", details={},
+                kind="upload", key=f"record {number}", details={"warnings": []},
             )  # fmt: skip
         first = client.get("/datasets").text
         [following] = re.findall(r'rel="next" href="([^"]*)"', first)

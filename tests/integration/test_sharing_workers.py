@@ -151,6 +151,6 @@ def test_a_short_job_passes_a_sweep_on_real_workers(ray_crew) -> None:
     assert len(short.results["one"]) == 1
     assert len(long.results) < 3000
     long.is_stopped = True
-    while len(feeder):
+    while feeder._jobs:
         feeder.step(0.05)
         assert time.monotonic() < limit

@@ -24,9 +24,9 @@ from sysid.identification.run import (  # fmt: skip
     border,
     exchange,
     is_finished,
-    is_resting,
 )
 from sysid.islands.archipelago import found, plans
+from sysid.islands.evolve import rests
 from sysid.islands.state import RunState
 from sysid.islands.stopping import searches
 from sysid.search.island import Island, evolve
@@ -199,7 +199,10 @@ def test_the_target_rms_ends_a_run() -> None:
     state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
     assert state.rms <= 0.05
     plan = plans(problem(), algorithm, 1)
-    assert any(is_resting(p, i) for p, i in zip(plan, state.islands, strict=True))
+    assert any(
+        rests(p, i.fitness, i.counters, i.champion_rms)
+        for p, i in zip(plan, state.islands, strict=True)
+    )
 
 
 def test_seconds_end_a_run() -> None:

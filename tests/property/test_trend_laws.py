@@ -10,21 +10,31 @@ from scipy import stats
 
 from sysid.trends.laws import Law, fit_line, fit_power
 from sysid.trends.trend import (  # fmt: skip
+    Drift,
     Estimate,
+    Place,
     drift,
-    drift_from_law,
     drift_limit,
     drifts_from_law,
     fit_trend,
     half_width,
     pooled,
-    prediction,
     predictions,
 )
 
 X = np.array([5.0, 10.0, 20.0, 40.0, 80.0])
 NUMBER = st.floats(-10, 10).filter(lambda v: v == 0 or abs(v) > 1e-3)
 SCALE = st.floats(1e-6, 1e6)
+
+
+def prediction(law: Law, x: np.ndarray, stderr: np.ndarray, at: float) -> Place:
+    return predictions(law, x, stderr, np.array([at]))[0]
+
+
+def drift_from_law(
+    new: Estimate, law: Law, x: np.ndarray, stderr: np.ndarray, at: float, comparisons: int = 1
+) -> Drift:
+    return drifts_from_law([new], law, x, stderr, np.array([at]), comparisons)[0]
 
 
 def coefficients(law: Law) -> dict[str, tuple[float, float]]:

@@ -88,7 +88,7 @@ def finish(feeder: Feeder) -> list[str]:
     ended: list[str] = []
     for _ in range(1000):
         ended += feeder.step(0.0)
-        if not len(feeder):
+        if not feeder._jobs:
             return ended
     raise AssertionError("the jobs did not end")
 

@@ -38,7 +38,7 @@ DISCRETE: dict[str, Any] = {
 
 def faults(base: dict[str, Any], **changes: Any) -> dict[str, str]:
     with pytest.raises(InvalidModel) as caught:
-        parse_model(base | changes, is_new=True)
+        parse_model(base | changes)
     return {fault.pointer: fault.detail for fault in caught.value.faults}
 
 

@@ -118,10 +118,6 @@ def test_a_table_in_the_terminal_has_one_width_and_keeps_its_marks() -> None:
     assert "does NOT hold: it is so" in text
 
 
-def test_a_part_that_was_skipped_says_why() -> None:
-    assert "skipped: no data" in markdown(Section("S", skipped="no data"))
-
-
 @pytest.mark.parametrize(
     ("low", "high", "marks"),
     [(0.0131, 0.09, [0.01, 0.02, 0.05, 0.1]), (13.1, 85, [10, 20, 50, 100]), (0, 1, [])],

@@ -118,13 +118,13 @@ def test_what_a_project_had_is_forgotten_when_the_others_have_caught_up() -> Non
     shares.enter("short", project="short")
     shares.charge("short", 29.0)
     shares.leave("short")
-    assert len(shares) == 2
+    assert len(shares._projects) == 2
     shares.charge("sweep", 30.0)
     shares.enter("other", project="other")
     shares.leave("other")
-    assert len(shares) == 1
+    assert len(shares._projects) == 1
     shares.leave("sweep")
-    assert len(shares) == 0
+    assert len(shares._projects) == 0
 
 
 def test_accounts_of_projects_without_jobs_are_bounded_in_number() -> None:
@@ -134,7 +134,7 @@ def test_accounts_of_projects_without_jobs_are_bounded_in_number() -> None:
         shares.enter(number, project=f"p{number}")
         shares.charge(number, 1.0 + number % 7)
         shares.leave(number)
-    assert len(shares) == MOST_ABSENT + 1
+    assert len(shares._projects) == MOST_ABSENT + 1
 
 
 def test_a_project_that_asked_for_little_cannot_save_the_rest_for_later() -> None:

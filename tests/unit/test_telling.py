@@ -43,7 +43,7 @@ def told(notebook: Notebook) -> list[str]:
 
 def steps(feeder: Feeder[str], most: int = 1000) -> Iterator[tuple[str, ...]]:
     for _ in range(most):
-        if not len(feeder):
+        if not feeder._jobs:
             return
         yield feeder.step(0.0)
     raise AssertionError("the jobs did not end")

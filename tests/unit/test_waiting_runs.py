@@ -46,7 +46,7 @@ def test_a_job_that_waits_does_not_keep_others_from_the_workers() -> None:
     for _ in range(200):
         feeder.step(0.0)
     assert len(other.failures) == 20
-    assert len(feeder) == 1
+    assert len(feeder._jobs) == 1
 
 
 def test_a_job_that_waits_can_be_cancelled() -> None:

@@ -45,10 +45,10 @@ def load_model(source: str | Mapping[str, Any] | Path) -> Model:
         If the file or the document has faults.
     """
     if isinstance(source, Path):
-        return parse_model(read_document(source), is_new=True)
+        return parse_model(read_document(source))
     if isinstance(source, str):
         return _built_in(source)
-    return parse_model(source, is_new=True)
+    return parse_model(source)
 
 
 def read_document(path: Path) -> Any:

@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from starlette.testclient import TestClient
 
-from service.datasets.datasets import told_again
 from service.formats.mcap import read_recording
-from service.repositories.datasets import Stored
-from service.storage.columns import utc_now
-from service.storage.tables import Dataset
 from tests.rest import CSV, recording, refused
 
 SIMULATION: dict[str, Any] = {
@@ -217,39 +213,6 @@ def test_a_part_without_history_is_another_dataset(server: TestClient, dataset: 
     bad = {"steps": [{"trim": {"start": 1, "history": 1}}]}
     fault = refused(server.post(f"/v1/datasets/{dataset}:derive", json=bad), 422, "invalid")[0]
     assert fault["pointer"] == "/steps/0/trim/history"
-
-
-def test_a_part_that_was_derived_before_parts_kept_their_past_says_so() -> None:
-    steps = [{"offset": {"u": 1}}, {"trim": {"start": 1}}]
-    row = Dataset(
-        id="ds_1", name="part", kind="derive", sha256="", source_key="", size_bytes=1, n_channels=0,
-        n_samples=1, duration=1.0, sample_time=None, channels=[], details={"steps": steps},
-        created_at=utc_now(),
-    )  # fmt: skip
-    [warning] = told_again(Stored(row, is_new=False), None).warnings
-    assert "history: true in trim" in warning
-    row.details = {"steps": steps, "known_before": 0.0}
-    assert told_again(Stored(row, is_new=False), None).warnings == []
-    row.details = {"steps": [{"trim": {"rows": [1, 9]}}]}
-    assert len(told_again(Stored(row, is_new=False), None).warnings) == 1
-
-
-@pytest.mark.parametrize(
-    "step",
-    [
-        {"offset": {"u": 1}},
-        {"trim": {"stop": 9}},
-        {"trim": {"rows": [0, 9]}},
-        {"split": {"fraction": 0.5, "part": "estimation"}},
-    ],
-)
-def test_a_part_from_the_beginning_has_no_past_to_be_derived_anew_for(step: dict[str, Any]) -> None:
-    row = Dataset(
-        id="ds_1", name="part", kind="derive", sha256="", source_key="", size_bytes=1, n_channels=0,
-        n_samples=1, duration=1.0, sample_time=None, channels=[], details={"steps": [step]},
-        created_at=utc_now(),
-    )  # fmt: skip
-    assert told_again(Stored(row, is_new=False), None).warnings == []
 
 
 def test_metrics_count_jobs_by_state(server: TestClient) -> None:
