@@ -4,7 +4,7 @@ N samples of a record, M measured output values that are compared, P individuals
 D free parameters, K all parameters (free and fixed), E experiments, W lanes of a kernel.
 """
 
-from typing import TypeAlias
+from typing import Any, TypeAlias, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,3 +20,14 @@ Interval: TypeAlias = tuple[float, float]
 """Lower and upper end."""
 
 RANK = 1e-7  # of the largest singular value: below, the differences are rounding
+
+
+def make_record_dtype(fields: type) -> np.dtype[Any]:
+    """Data type of records with the annotated fields of a class, each an int or a float.
+
+    Compiled code reads and changes such a record by the names of its fields.
+    """
+    types = {int: np.int64, float: np.float64}
+    return np.dtype(
+        (np.record, [(name, types[kind]) for name, kind in get_type_hints(fields).items()])
+    )

@@ -27,7 +27,7 @@ from sysid.search.operators import (
     unit,
 )
 from sysid.search.slopes import normal_equations, partial_fitness, slope_distance
-from sysid.search.state import SAME, IslandArrays, Plan
+from sysid.search.state import SAME, IslandArrays, Plan, SearchRecord
 from sysid.simulation.evaluator import Evaluator, partial_predictions, population_fitness
 from sysid.simulation.scaling import located
 
@@ -50,7 +50,7 @@ SHORT_GROWTH = 1.5  # doublings: beside the champion the later signs of velociti
 
 @compiled
 def _fresh(
-    evaluator: Evaluator, plan: Plan, shape: tuple[int, int], search: np.record
+    evaluator: Evaluator, plan: Plan, shape: tuple[int, int], search: SearchRecord
 ) -> FloatArray:
     """The best of a population of random places, judged by the record up to the horizon."""
     places, horizon = np.empty(shape), search.horizon
@@ -66,7 +66,7 @@ def _fresh(
 
 
 @compiled
-def scatters(search: np.record) -> bool:
+def scatters(search: SearchRecord) -> bool:
     """Whether the last development spread the population around the champion."""
     return bool(search.local_searches % (TURNS // 2) == SCATTERS)
 
@@ -86,7 +86,7 @@ def _is_lost(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> bool:
 
 
 @compiled
-def _choose_beside(size: int, word: Draws, is_lost: bool, search: np.record) -> int:
+def _choose_beside(size: int, word: Draws, is_lost: bool, search: SearchRecord) -> int:
     """The same where the fitness jumps: there most that is better lies beside the champion.
 
     Of eight developments four are hops, two of them of one parameter, two scatter, one grows from
@@ -122,7 +122,7 @@ def _choose_beside(size: int, word: Draws, is_lost: bool, search: np.record) -> 
 
 
 @compiled
-def _choose(plan: Plan, size: int, is_lost: bool, search: np.record) -> int:
+def _choose(plan: Plan, size: int, is_lost: bool, search: SearchRecord) -> int:
     """What kind of development comes next; gives the individual it begins with, -1: a fresh one."""
     number = search.local_searches
     word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, 0)
@@ -208,7 +208,7 @@ def _scatter(island: IslandArrays, proposals: WordArray, reached: FloatArray, be
 
 
 @compiled
-def _next_part(search: np.record, champion: float) -> None:
+def _next_part(search: SearchRecord, champion: float) -> None:
     """Take in more of the record; at its end, the development ends.
 
     `champion` is the champion's fitness.

@@ -25,7 +25,7 @@ from sysid.core.types import FloatArray
 from sysid.search.levenberg_marquardt import factored, spread
 from sysid.search.operators import DEVELOPMENT, below, decoded, draws, normal, unit
 from sysid.search.slopes import normal_equations, partial_fitness, slope_distance
-from sysid.search.state import IslandArrays, Plan
+from sysid.search.state import IslandArrays, Plan, SearchRecord
 from sysid.simulation.evaluator import Evaluator, partial_predictions, population_fitness
 from sysid.simulation.scaling import located
 
@@ -69,7 +69,7 @@ def _losses(
 @compiled
 def has_cliff(
     evaluator: Evaluator, factor: FloatArray, point: FloatArray, direction: FloatArray,
-    base: float, search: np.record,
+    base: float, search: SearchRecord,
 ) -> bool:  # fmt: skip
     """Whether the loss jumps on a line through a point (D,), in at most `MOST` simulations.
 
@@ -79,7 +79,7 @@ def has_cliff(
         That of the sums of products of slopes (`sysid.search.levenberg_marquardt.factored`).
     direction : FloatArray, shape (D,)
         Standard normal numbers times the fitness `base` at the point: a standard error.
-    search : np.record
+    search : SearchRecord
         The island's: simulations are counted.
     """
     first, width, before, above = -REACH, 2.0 * REACH, 0.0, 0.0
@@ -123,7 +123,7 @@ def hop(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
 
 @compiled
 def _move_one(
-    plan: Plan, search: np.record, matrix: FloatArray, size: float, point: FloatArray
+    plan: Plan, search: SearchRecord, matrix: FloatArray, size: float, point: FloatArray
 ) -> None:
     """Move one parameter by so many of its standard errors with the others held: off the valley.
 
@@ -137,7 +137,7 @@ def _move_one(
 
 
 @compiled
-def _deviation(plan: Plan, search: np.record, line: int, size: float, n: int) -> FloatArray:
+def _deviation(plan: Plan, search: SearchRecord, line: int, size: float, n: int) -> FloatArray:
     """Normal numbers (n,) of that standard deviation."""
     drawn = np.empty(n)
     for d in range(n):

@@ -44,6 +44,7 @@ from sysid.search.state import (
     VALUES,
     IslandArrays,
     Plan,
+    SearchRecord,
 )
 from sysid.simulation.evaluator import Evaluator, population_fitness
 from sysid.simulation.scaling import located
@@ -220,7 +221,7 @@ def _note(
 
 @compiled
 def write_improvement(
-    search: np.record, rms: float, phase: int, values: FloatArray, row: FloatArray
+    search: SearchRecord, rms: float, phase: int, values: FloatArray, row: FloatArray
 ) -> None:
     """Write the row of a better champion with these physical values (D,)."""
     row[AT_GENERATION], row[AT_EVALUATIONS] = search.generation, search.evaluations
@@ -230,7 +231,7 @@ def write_improvement(
 
 
 @compiled
-def reset_evidence(search: np.record, rms: float, before: float) -> None:
+def reset_evidence(search: SearchRecord, rms: float, before: float) -> None:
     """Forget what spoke for the champion before, where the new one is another optimum."""
     if rms < before * (1.0 - SAME):
         search.confirmed_starts, search.champion_discontinuities = 0, 0
@@ -238,7 +239,7 @@ def reset_evidence(search: np.record, rms: float, before: float) -> None:
 
 
 @compiled
-def is_done(plan: Plan, search: np.record, rms: float) -> bool:
+def is_done(plan: Plan, search: SearchRecord, rms: float) -> bool:
     """Whether an island has used up its evaluations or reached the target RMS."""
     return bool(search.evaluations >= plan.evaluations or rms <= plan.rms)
 

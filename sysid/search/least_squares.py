@@ -13,12 +13,12 @@ cancel is heard. What it needs to go on lies in its arrays, so the cuts change n
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from sysid.core.jit import compiled
-from sysid.core.types import FloatArray, IntArray
+from sysid.core.types import FloatArray, IntArray, make_record_dtype
 from sysid.search.levenberg_marquardt import (
     FINE_DIFFERENCE,
     compute_loss,
@@ -38,15 +38,19 @@ _FIRST, _LEAST, _MOST = 1e-3, 1e-11, 1e12
 _STOPPED = 2  # steps in a row that gain next to nothing
 _AT_ONCE = 10_000_000  # steps of integration or recursion in one compiled call: about 0.1 s
 
-_DESCENT_FIELDS = [
-    ("loss", np.float64),  # at the place
-    ("damping", np.float64),
-    ("idle_steps", np.int64),  # in a row, that gained next to nothing
-    ("has_jacobian", np.int64),  # 0 or 1: the slopes are of this place
-    ("evaluations", np.int64),
-    ("has_ended", np.int64),
-]
-_DESCENT_RECORD = np.dtype((np.record, _DESCENT_FIELDS))
+
+class _Progress(Protocol):
+    """How far a search has got. What reads as a statement is 0 or 1."""
+
+    loss: float  # at the place
+    damping: float
+    idle_steps: int  # in a row, that gained next to nothing
+    has_jacobian: int  # the slopes are of this place
+    evaluations: int
+    has_ended: int
+
+
+_PROGRESS = make_record_dtype(_Progress)
 
 
 class Scored(NamedTuple):
@@ -78,14 +82,13 @@ class _Descent(NamedTuple):
         Residuals there.
     columns : FloatArray, shape (D, n)
         Their slopes.
-    progress : np.record
-        A record of `_DESCENT_RECORD`.
+    progress : _Progress
     """
 
     place: FloatArray
     error: FloatArray
     columns: FloatArray
-    progress: np.record
+    progress: _Progress
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +136,7 @@ def solve(
     is_late : callable or None
         Asked after each call: whether to leave it at that.
     """
-    progress = np.zeros((), _DESCENT_RECORD).view(np.recarray)
+    progress: Any = np.zeros((), _PROGRESS).view(np.recarray)
     size, is_cut_short = scored.rows.size, False
     descent = _Descent(np.array(place), np.empty(size), np.empty((place.size, size)), progress[()])
     while steps > 0 and not progress.has_ended and not is_cut_short:

@@ -14,7 +14,7 @@ from sysid.search.levenberg_marquardt import (
     step_aside,
 )
 from sysid.search.operators import DEVELOPMENT, draws, unit
-from sysid.search.state import Plan
+from sysid.search.state import Plan, SearchRecord
 from sysid.simulation.evaluator import Evaluator, partial_predictions
 from sysid.simulation.scaling import located
 
@@ -39,7 +39,7 @@ def partial_fitness(
 
 
 @compiled
-def slope_distance(plan: Plan, search: np.record) -> float:
+def slope_distance(plan: Plan, search: SearchRecord) -> float:
     """Distance (of the range) over which the next slopes are taken.
 
     The first searches take derivatives, the others slopes over a distance that each step draws

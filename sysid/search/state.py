@@ -1,11 +1,9 @@
 """What compiled generations read and change: the plan of an island and its arrays."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
-import numpy as np
-
-from sysid.core.types import FloatArray, IntArray, WordArray
+from sysid.core.types import FloatArray, IntArray, WordArray, make_record_dtype
 
 Phase = Literal["start", "genetic", "sequence", "migration", "refinement"]
 
@@ -48,41 +46,40 @@ class IslandSummary:
 SIMPLE, PAPER, IMPROVED, IMPROVED_PAPER_STEPS = 0, 1, 2, 3
 """Methods: simple GA; with the fixed sequence; improved with adaptive, with fixed sequence."""
 
-_COUNTS = (
-    "generation",
-    "evaluations",
-    "stagnation",  # generations since the last better champion
-    "in_sequence_search",
-    "step_count",  # of this sequence search, or of the generations since the last
-    "failed_steps",  # one after the other
-    "local_searches",  # begun so far
-    "champion_converged",  # a local search of the champion has come to its end
-    "probe_count",
-    "from_random_start",  # this local search
-    "random_starts",  # local searches from random places that have ended
-    "confirmed_starts",  # those of them that led to the champion
-    "hop_kind",  # 0: this local search is none
-    "hop_count",  # hops that have ended
-    "returned_hops",  # those of them that led back to the champion
-    "champion_discontinuities",  # lines beside this champion on which the fitness jumps
-    "is_warm_start",
-    "fitness_discontinuities",  # the same beside any champion, and what neighbours have met
-    "wide_differences",  # slopes are taken over distances that are drawn
-)
-_NUMBERS = (
-    "damping",
-    "horizon",  # part of the record that counts
-    "horizon_growth",  # factor from one part to the next
-    "replaced_fitness",  # of the individual whose place a local search takes
-    "reached_fitness",  # by this local search, over the whole record
-)
-SEARCH_RECORD = np.dtype(
-    (np.record, [(name, np.int64) for name in _COUNTS] + [(name, np.float64) for name in _NUMBERS])
-)
-"""How far the search of an island has got. What reads as a statement is 0 or 1."""
 
-SearchArray: TypeAlias = np.recarray[Any, np.dtype[np.record]]
-"""Records of `SEARCH_RECORD`."""
+class SearchRecord(Protocol):
+    """How far the search of an island has got. What reads as a statement is 0 or 1."""
+
+    generation: int
+    evaluations: int
+    stagnation: int  # generations since the last better champion
+    in_sequence_search: int
+    step_count: int  # of this sequence search, or of the generations since the last
+    failed_steps: int  # one after the other
+    local_searches: int  # begun so far
+    champion_converged: int  # a local search of the champion has come to its end
+    probe_count: int
+    from_random_start: int  # this local search
+    random_starts: int  # local searches from random places that have ended
+    confirmed_starts: int  # those of them that led to the champion
+    hop_kind: int  # 0: this local search is none
+    hop_count: int  # hops that have ended
+    returned_hops: int  # those of them that led back to the champion
+    champion_discontinuities: int  # lines beside this champion on which the fitness jumps
+    is_warm_start: int
+    fitness_discontinuities: int  # the same beside any champion, and what neighbours have met
+    wide_differences: int  # slopes are taken over distances that are drawn
+    damping: float
+    horizon: float  # part of the record that counts
+    horizon_growth: float  # factor from one part to the next
+    replaced_fitness: float  # of the individual whose place a local search takes
+    reached_fitness: float  # by this local search, over the whole record
+
+
+SEARCH_RECORD = make_record_dtype(SearchRecord)
+
+SearchArray: TypeAlias = Any
+"""A `numpy.recarray` of search records; NumPy's own types do not know the fields."""
 
 
 class IslandArrays(NamedTuple):
@@ -96,15 +93,14 @@ class IslandArrays(NamedTuple):
         Fittest first.
     fitness : FloatArray, shape (P,)
         Ascending; ``nan`` is not evaluated yet.
-    search : np.record
-        A record of `SEARCH_RECORD`.
+    search : SearchRecord
     point : FloatArray, shape (D,)
         Where the local search stands, in [0, 1].
     """
 
     chromosomes: WordArray
     fitness: FloatArray
-    search: np.record
+    search: SearchRecord
     point: FloatArray
 
 
