@@ -153,10 +153,10 @@ def test_the_form_is_shown_with_the_values_of_the_run(place: Place) -> None:
 
 def test_of_an_irregular_recording_the_form_suggests_its_own_duration_and_density() -> None:
     oven = Dataset(n_samples=586, duration=3600.0, sample_time=None, channels=[])
-    found = _defaults(load_model("fopdt"), {}, oven)
+    found = _defaults(load_model("fopdt"), {"channels": {}}, oven)
     assert (found["duration"], found["sample_time"]) == ("3600", "6.2")
     single = Dataset(n_samples=1, duration=0.0, sample_time=None, channels=[])
-    assert _defaults(load_model("fopdt"), {}, single)["sample_time"] == "0.01"
+    assert _defaults(load_model("fopdt"), {"channels": {}}, single)["sample_time"] == "0.01"
 
 
 def test_the_form_suggests_a_step_within_what_was_measured(place: Place) -> None:
