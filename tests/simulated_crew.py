@@ -102,7 +102,7 @@ class Theatre:
     def play(self, seconds: float) -> None:
         """Let so much time pass."""
         end = self.crew.now + seconds
-        while self.crew.now < end and len(self.feeder):
+        while self.crew.now < end and self.feeder._jobs:
             self.step()
 
     def until(self, job: str) -> float:

@@ -101,7 +101,7 @@ def test_a_trend_reads_the_runs_that_succeeded_in_order_with_parts_of_their_resu
     ends = [
         {"state": State.SUCCEEDED, "result": RESULT, "best_rms": 0.5, "evaluations": 7},
         {"state": State.FAILED, "error": "diverged"},
-        {"state": State.SUCCEEDED, "result": {"parameters": RESULT["parameters"]}},
+        {"state": State.SUCCEEDED, "result": {**RESULT, "warnings": []}},
     ]
     with database.write() as session:
         RunLedger(session, lease).record(
@@ -113,4 +113,4 @@ def test_a_trend_reads_the_runs_that_succeeded_in_order_with_parts_of_their_resu
         assert [one.id for one in trend_rows(session, lease.job_id, 1)] == runs[:1]
     assert (first.id, first.labels, first.evaluations) == (runs[0], {"length_m": 0.0}, 7)
     assert {name: getattr(first, name) for name in RESULT} == RESULT
-    assert (last.onset_delays, last.agreement, last.warnings) == ([], {}, [])
+    assert (last.id, last.warnings) == (runs[2], [])

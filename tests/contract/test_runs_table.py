@@ -18,7 +18,7 @@ EVIL = '=HYPERLINK("http://x","y")'
 
 def submit(database: Database, n_runs: int) -> str:
     with database.write() as session:
-        new = NewJob(name="many", spec={"model": "silverbox"}, n_runs=n_runs)
+        new = NewJob(name="many", spec={"model": "silverbox", "sweep": {"axes": []}}, n_runs=n_runs)
         return JobRepository(session).submit(new).job.id
 
 

@@ -80,12 +80,11 @@ def test_the_figure_is_json_and_its_numbers_are_csv() -> None:
     assert sum(row.startswith("of y,") for row in rows) == 25 + 51
 
 
-def test_results_of_older_versions_have_no_findings() -> None:
-    found = findings_of({"residual_tests": {}, "identifiability": {"groups": [["T", "L"]]}})
-    assert found.verdict == ""
-    assert list(found.tests) == list(found.onsets) == list(found.groups) == []
-    assert found.criteria == {}
-    assert findings_of({}).n_figures == 0
+def test_a_run_without_a_result_or_a_test_has_no_findings() -> None:
+    for result in ({}, {"residual_tests": {}, "identifiability": {"groups": []}}):
+        found = findings_of(result)
+        assert (found.verdict, found.n_figures, found.criteria) == ("", 0, {})
+        assert list(found.tests) == list(found.onsets) == list(found.groups) == []
 
 
 def test_a_test_that_was_not_made_says_why() -> None:

@@ -86,7 +86,7 @@ def test_a_project_cannot_get_more_by_cutting_its_sweep_into_short_jobs() -> Non
     theatre.add("whole", SWEEP, 0.1, project="whole")
     number = 0
     while theatre.crew.now < 300.0:
-        while len(theatre.feeder) < 6:
+        while len(theatre.feeder._jobs) < 6:
             number += 1
             theatre.add(f"cut{number}", 20, 0.1, project="cut")
         theatre.step()
@@ -103,7 +103,7 @@ def test_a_project_cannot_get_more_by_sending_short_jobs_one_after_another(
     theatre.add("sweep", 5 * SWEEP, 0.1, project="sweep")
     number = 0
     while theatre.crew.now < 600.0 / slots:
-        if len(theatre.feeder) < 2:  # the last one has ended, and its project has no job
+        if len(theatre.feeder._jobs) < 2:  # the last one has ended, and its project has no job
             number += 1
             theatre.add(f"short{number}", int(10 * seconds), 0.1, project="short")
         theatre.step()
@@ -177,7 +177,7 @@ def test_nobody_starves_under_a_stream_of_new_jobs() -> None:
     before, number = theatre.had("sweep"), 0
     begun = theatre.crew.now
     while theatre.crew.now < begun + 160.0:
-        while len(theatre.feeder) < 3:
+        while len(theatre.feeder._jobs) < 3:
             number += 1
             theatre.add(f"new{number}", 1, 1.0)
         theatre.step()
@@ -224,7 +224,7 @@ def test_no_core_is_idle_while_work_waits_and_every_job_ends(
     for number, (priority, project, runs, seconds) in enumerate(sizes):
         theatre.add(f"j{number}", runs, seconds, priority=priority, project=project)
     total = sum(runs * seconds for _, _, runs, seconds in sizes)
-    while len(theatre.feeder):
+    while theatre.feeder._jobs:
         theatre.step()
     assert len(theatre.ended) == len(sizes)
     longest = max(seconds for *_, seconds in sizes)

@@ -13,8 +13,6 @@ from typer.testing import CliRunner
 from service.api.app import create_app
 from service.cli import runs as program
 from service.client.client import Client
-from service.control.schemas import RunSimulateIn
-from service.control.simulate import _request
 from tests.identified import identified
 from tests.integration.rest.test_client import Through
 from tests.rest import refused, settings_of
@@ -237,20 +235,6 @@ def test_a_rule_for_a_recursion_or_without_dead_time_is_refused(served: Served) 
     [fault] = refused(served.server.post(path, json=body), 422, "invalid")
     assert fault["pointer"] == "/control/tuning/closed_loop_time_constant"
     assert "no dead time to take instead" in fault["detail"]
-
-
-def test_a_request_of_before_is_kept_as_it_was_so_that_it_gives_the_same_dataset() -> None:
-    old = {"input": "u", "output": "y", "gain": 0.5, "limit": None,
-           "transport": {"gain": 1.0, "time_constant": 0.3, "delay": 0.1},
-           "reference": {"kind": "step", "amplitude": 1.0, "time": 0.0, "offset": 0.0}}  # fmt: skip
-    body = RunSimulateIn.model_validate({"control": old, "samples": 10, "store": True})
-    assert _request(body) == {
-        "inputs": {}, "control": old, "parameters": {}, "samples": 10, "sample_time": None,
-    }  # fmt: skip
-    new = RunSimulateIn.model_validate(
-        {"control": {**old, "integral_time": 2.0, "lower": 0.0}, "samples": 10}
-    )
-    assert _request(new)["control"] == {**old, "integral_time": 2.0, "lower": 0.0}
 
 
 def test_the_command_line_tells_controller_rule_and_margins(
