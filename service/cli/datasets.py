@@ -46,7 +46,7 @@ def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) ->
     )  # fmt: skip
 
 
-@app.command()
+@app.command("add")
 def add(
     file: Annotated[Path, typer.Argument(help="CSV or MCAP file.")],
     name: Annotated[str | None, typer.Option(help="Name; by default that of the file.")] = None,
@@ -64,7 +64,7 @@ def add(
     _tell(stored, as_json)
 
 
-@app.command()
+@app.command("simulate")
 def simulate(
     file: Annotated[Path | None, typer.Argument(help=DOCUMENT)] = None,
     plant: Annotated[
@@ -102,7 +102,7 @@ def simulate(
     _tell(stored, as_json)
 
 
-@app.command()
+@app.command("derive")
 def derive(
     dataset: Annotated[str, typer.Argument(help="Id or name of the parent.")],
     file: Annotated[Path, typer.Argument(help="YAML or JSON file with the list of steps.")],

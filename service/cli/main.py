@@ -32,29 +32,29 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
-app.command()(serving.serve)
-app.command()(serving.dispatcher)
-app.command()(identify)
-app.command()(paper)
-app.command()(jobs.submit)
-app.command()(jobs.watch)
+app.command("serve")(serving.serve)
+app.command("dispatcher")(serving.dispatcher)
+app.command("identify")(identify)
+app.command("paper")(paper)
+app.command("submit")(jobs.submit)
+app.command("watch")(jobs.watch)
 app.command("jobs")(jobs.listing)
 app.add_typer(runs.app, name="runs")
-app.command()(exporting.export)
-app.command()(jobs.cancel)
-app.command()(jobs.resume)
-app.command()(jobs.report)
+app.command("export")(exporting.export)
+app.command("cancel")(jobs.cancel)
+app.command("resume")(jobs.resume)
+app.command("report")(jobs.report)
 app.command("datasets")(datasets.listing)
 app.add_typer(datasets.app, name="dataset")
 app.add_typer(models.app, name="models")
 app.add_typer(sweeps.app, name="sweep")
-app.command()(reidentify)
+app.command("reidentify")(reidentify)
 app.add_typer(references.app, name="references")
 app.add_typer(upkeep.database, name="db")
-app.command()(upkeep.doctor)
+app.command("doctor")(upkeep.doctor)
 
 
-@app.command()
+@app.command("demo")
 def demo(
     data_dir: Annotated[Path, typer.Option(help="Where to keep its data.")] = Path("lagid-demo"),
 ) -> None:

@@ -57,7 +57,7 @@ def listing(
     )  # fmt: skip
 
 
-@app.command()
+@app.command("show")
 def show(
     name: Annotated[str, typer.Argument(help="Name, or name@version of an own model.")],
     url: Annotated[
@@ -84,7 +84,7 @@ def show(
     out.print(text, markup=False, soft_wrap=True, end="")
 
 
-@app.command()
+@app.command("check")
 def check(
     file: Annotated[Path, typer.Argument(help="Model document, YAML or JSON.")],
     as_json: AsJson = False,
@@ -109,7 +109,7 @@ def check(
         raise typer.Exit(1)
 
 
-@app.command()
+@app.command("add")
 def add(
     file: Annotated[Path, typer.Argument(help="Model document, YAML or JSON.")],
     url: Url = DEFAULT_URL,

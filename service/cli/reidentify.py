@@ -230,7 +230,7 @@ def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) ->
     )
 
 
-@app.command()
+@app.command("show")
 def show(
     name: ReferenceName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
 ) -> None:
@@ -248,7 +248,7 @@ def show(
     print_table(("run", "accepted", "by", "note"), rows, empty="")
 
 
-@app.command()
+@app.command("accept")
 def accept(
     name: ReferenceName,
     run: Annotated[str, typer.Argument(metavar="RUN", help="Id of a run that succeeded.")],

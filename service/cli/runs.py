@@ -59,7 +59,7 @@ app = typer.Typer(
 app.command(LISTING)(listing)
 
 
-@app.command()
+@app.command("residuals")
 def residuals(
     run: RunName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
 ) -> None:
@@ -78,7 +78,7 @@ def residuals(
         out.print(f"note: {found['note']}", markup=False, soft_wrap=True)
 
 
-@app.command()
+@app.command("simulate")
 def simulate(
     run: RunName,
     file: Annotated[Path, typer.Argument(help="YAML or JSON file with the body of the request.")],
@@ -108,7 +108,7 @@ def simulate(
         out.print(f"stored as {found['dataset']['id']}", markup=False)
 
 
-@app.command()
+@app.command("profile")
 def profile(
     run: RunName,
     parameters: Annotated[
@@ -133,7 +133,7 @@ def profile(
     print_table(("parameter", "unit", ">estimate", ">from", ">to"), rows, empty="no parameters")
 
 
-@app.command()
+@app.command("compare")
 def compare(
     runs: Annotated[list[str], typer.Argument(metavar="RUN RUN…", help="Ids of two runs or more.")],
     url: Url = DEFAULT_URL,

@@ -183,7 +183,7 @@ NEEDED = ("numpy", "scipy", "numba", "ray", "fastapi", "sqlalchemy", "obstore", 
 Fix = Annotated[bool, typer.Option("--fix", help="Delete the objects that no row names.")]
 
 
-@database.command()
+@database.command("upgrade")
 def upgrade(data_dir: DataDir = None) -> None:
     """Create the tables, or bring them to this version."""
     from service.storage import migrate
@@ -195,7 +195,7 @@ def upgrade(data_dir: DataDir = None) -> None:
         out.print(f"the database is at revision {migrate.current(found)}", markup=False)
 
 
-@database.command()
+@database.command("check")
 def check(data_dir: DataDir = None, fix: Fix = False) -> None:
     """Compare database and store: the revision, lost objects, objects that no row names."""
     from service.storage import garbage, migrate

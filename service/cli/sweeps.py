@@ -81,7 +81,7 @@ Wait = Annotated[bool, typer.Option("--wait", help="Show progress, then the tabl
 IdempotencyKey = Annotated[str | None, typer.Option(help="The same key again: the same job.")]
 
 
-@app.command()
+@app.command("noise")
 def noise(
     model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
     sigma: Sigma,
