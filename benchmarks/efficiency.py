@@ -21,8 +21,8 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import placed
-from sysid.uncertainty.sensitivities import sensitivities
+from sysid.simulation.scaling import to_unit
+from sysid.uncertainty.sensitivities import compute_sensitivities
 
 STEP, SAMPLES, SD = 0.02, 300, 0.01
 DRAWS, QUICK = 1000, 100
@@ -78,7 +78,7 @@ def drawn(model: Model, truth: dict[str, float], draws: int) -> Draws:
     problem = Problem.build(model, [record(np.zeros(SAMPLES))])
     names = problem.free_names
     theta = np.array([truth[name] for name in names])
-    clean = problem.predictions(theta[None])[0]
+    clean = problem.predict(theta[None])[0]
     found = []
     for draw in range(draws):
         noise = SD * np.random.default_rng([7, draw]).standard_normal(SAMPLES)
@@ -93,8 +93,8 @@ def drawn(model: Model, truth: dict[str, float], draws: int) -> Draws:
 
 def bound(problem: Problem, theta: NDArray[np.float64]) -> NDArray[np.float64]:
     """Cramér-Rao bound of each parameter's standard deviation."""
-    columns = sensitivities(problem, theta).columns
-    place = placed(problem.evaluator, theta[None])[0]
+    columns = compute_sensitivities(problem, theta).columns
+    place = to_unit(problem.evaluator, theta[None])[0]
     assert np.all((place > 0) & (place < 1))
     ranges = problem.evaluator.upper - problem.evaluator.lower
     slopes = columns / ranges

@@ -15,8 +15,8 @@ from sysid import load_model
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold, Record
 from sysid.kernels.abi import LANES
-from sysid.kernels.kernel import kernel_code
-from sysid.kernels.layout import Layout, Variant
+from sysid.kernels.kernel import emit_kernel
+from sysid.kernels.layout import ExperimentLayout, KernelVariant
 from sysid.simulation.problem import Problem
 
 SOURCE = Path(__file__).parent / "c" / "equivalents.c"
@@ -104,10 +104,10 @@ class Compiled:
         self, example: Example, problem: Problem, theta: FloatArray
     ) -> tuple[Callable[[], object], FloatArray]:
         """A call of one model's function, and where it leaves J (P,)."""
-        evaluator, layout = problem.evaluator, Layout.of(problem.model)
+        evaluator, layout = problem.evaluator, ExperimentLayout.from_model(problem.model)
         has_input = bool(problem.model.inputs)
         zero, points = (
-            (int(evaluator.ints[layout.input(0, field)]) if has_input else 0)
+            (int(evaluator.ints[layout.locate_input(0, field)]) if has_input else 0)
             for field in ("zero", "points")
         )
         rows = np.ascontiguousarray(theta.T)
@@ -146,7 +146,7 @@ def operations_of_peak(turns: int) -> float:
 
 def operations_a_step(problem: Problem) -> int:
     """Vector arithmetic in the kernel's code: close to what one step does for one individual."""
-    code = kernel_code(problem.model, Variant())
+    code = emit_kernel(problem.model, KernelVariant())
     single = re.findall(rf"= f(?:add|sub|mul|div)\b.*<{LANES} x double>", code)
     fused = re.findall(rf"= call .*@\"?llvm\.fmuladd\.v{LANES}f64", code)
     return len(single) + len(fused)  # the product that is fused stands among the single ones

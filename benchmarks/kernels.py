@@ -25,12 +25,12 @@ from benchmarks.equivalents import (
     individuals as candidates,
 )
 from benchmarks.table import Row, Skipped, parser, report
-from sysid.core.code_cache import store, stored
+from sysid.core.code_cache import load_code, store_code
 from sysid.data.records import Channel, Record
-from sysid.kernels.build import kernel_key
-from sysid.kernels.kernel import kernel_code
-from sysid.kernels.layout import Variant
-from sysid.kernels.machine_code import object_code
+from sysid.kernels.build import compute_kernel_key
+from sysid.kernels.kernel import emit_kernel
+from sysid.kernels.layout import KernelVariant
+from sysid.kernels.machine_code import compile_assembly
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
@@ -127,7 +127,7 @@ def against_own_c(repeats: int) -> tuple[list[Row], list[Skipped]]:
         built, theta = problem_of(example, 300), candidates(example, 48)
         call, fitness = compiled.call(example, built, theta)
         call()
-        if not np.allclose(fitness, built.fitness(theta), rtol=1e-9):
+        if not np.allclose(fitness, built.evaluate_fitness(theta), rtol=1e-9):
             raise SystemExit(f"{name}: the C code does not compute what the kernel computes")
         ours = c = np.inf
         for _ in range(3):
@@ -168,24 +168,24 @@ def others(repeats: int) -> list[Row]:
     lagged, long = problem(model, 300), problem(duffing("difference"), 20_000)
     few, one_block = individuals(48), individuals(16)
     rows = [
-        Row("duffing-delay (RK4), 48 × 300", microseconds(lambda: lagged.fitness(few), repeats),
+        Row("duffing-delay (RK4), 48 × 300", microseconds(lambda: lagged.evaluate_fitness(few), repeats),
             "µs"),
         Row("duffing-eq16, 16 × 20,000 samples",
-            microseconds(lambda: long.fitness(one_block), max(repeats // 5, 2)) / 1000, "ms"),
+            microseconds(lambda: long.evaluate_fitness(one_block), max(repeats // 5, 2)) / 1000, "ms"),
     ]  # fmt: skip
     start = time.perf_counter()
-    code = kernel_code(model, Variant())
+    code = emit_kernel(model, KernelVariant())
     written = time.perf_counter()
-    compiled = object_code(code)
+    compiled = compile_assembly(code)
     done = time.perf_counter()
     rows.append(Row("write the code of a new model", 1e3 * (written - start), "ms"))
     rows.append(Row("compile it", 1e3 * (done - written), "ms"))
     with TemporaryDirectory() as folder:
         os.environ["LAGID_CACHE_DIR"] = folder
-        key = kernel_key(model, Variant())
-        store(key, compiled)
+        key = compute_kernel_key(model, KernelVariant())
+        store_code(key, compiled)
         start = time.perf_counter()
-        stored(key)
+        load_code(key)
         rows.append(Row("find it again on disk", 1e3 * (time.perf_counter() - start), "ms", 10.0))
     return rows
 

@@ -12,8 +12,8 @@ from tempfile import TemporaryDirectory
 from benchmarks import paper_example
 from benchmarks.table import Row, parser, report
 from service.client.client import Client
-from service.client.embedded import embedded_service
-from sysid.core.code_cache import cache_folder
+from service.client.embedded import run_embedded_service
+from sysid.core.code_cache import find_cache_folder
 
 POLL_SECONDS = 0.004
 """Between two looks at the job; half of it is in every figure."""
@@ -43,7 +43,7 @@ def over_rest(count: int) -> list[Row]:
     waits = []
     with (
         TemporaryDirectory(prefix="lagid-") as folder,
-        embedded_service(Path(folder) / "data") as url,
+        run_embedded_service(Path(folder) / "data") as url,
         Client(url) as client,
     ):
         path = paper_example.write_csv(Path(folder) / "record.csv", seed=1)
@@ -92,7 +92,7 @@ def never_seen(count: int) -> list[Row]:
     for _ in range(count):
         with TemporaryDirectory() as folder:
             environment = {
-                "NUMBA_CACHE_DIR": str(cache_folder()),  # the search is no part of a model
+                "NUMBA_CACHE_DIR": str(find_cache_folder()),  # the search is no part of a model
                 **os.environ, "LAGID_CACHE_DIR": folder,
             }  # fmt: skip
             for found in (cold, cached):

@@ -11,7 +11,7 @@ from benchmarks.family import memory_megabytes
 from benchmarks.table import Row, parser, report
 from service.client import calls
 from service.client.client import Client
-from service.client.embedded import embedded_service
+from service.client.embedded import run_embedded_service
 
 BARS_MB = {"dispatcher": 400.0, "workers": 350.0, "web process": 200.0}
 SMALL = {"method": "simple", "population": 4, "generations": 1, "islands": 1, "refine": False}
@@ -24,7 +24,7 @@ def body(dataset: str, runs: int) -> dict[str, Any]:
     return {**paper_example.job(dataset, 0), "algorithm": SMALL, "sweep": {"axes": axes}}
 
 
-def milliseconds(client: Client, call: calls.Call) -> float:
+def milliseconds(client: Client, call: calls.RestCall) -> float:
     """Time of one request, its answer read."""
     start = time.perf_counter()
     client.send(call)
@@ -39,7 +39,7 @@ def main() -> None:
     waits: dict[str, list[float]] = {"progress": [], "list": []}
     with (
         TemporaryDirectory(prefix="lagid-") as folder,
-        embedded_service(Path(folder) / "data") as url,
+        run_embedded_service(Path(folder) / "data") as url,
         Client(url) as client,
     ):
         path = paper_example.write_csv(Path(folder) / "record.csv", seed=1)

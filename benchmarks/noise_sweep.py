@@ -19,9 +19,9 @@ from benchmarks import paper_example
 from benchmarks.family import cpu_seconds
 from benchmarks.table import Row, parser, report
 from service.client.client import Client
-from service.client.embedded import embedded_service
+from service.client.embedded import run_embedded_service
 from sysid.core.settings import GeneticAlgorithm
-from sysid.data.noise import Noise, with_noise
+from sysid.data.noise import Noise, add_output_noise
 from sysid.identification.identify import identify
 from sysid.islands import evolve as voyage
 from sysid.models.catalogue.load import load_model
@@ -61,7 +61,7 @@ def compiled_seconds(count: int) -> float:
     model, clean, spent = load_model("duffing-eq16"), paper_example.record(1), 0.0
 
     def carried_out(sigma: float, method: str, draw: int) -> None:
-        noisy = with_noise(clean, Noise(sigma, draw))
+        noisy = add_output_noise(clean, Noise(sigma, draw))
         identify(model, noisy, GeneticAlgorithm(method=method), seed=draw)  # type: ignore[arg-type]
 
     def timed(inner: Callable[..., Any]) -> Callable[..., Any]:
@@ -90,7 +90,7 @@ def main() -> None:
     replicates = 5 if options.quick else 100
     with (
         TemporaryDirectory(prefix="lagid-") as folder,
-        embedded_service(Path(folder) / "data") as url,
+        run_embedded_service(Path(folder) / "data") as url,
         Client(url) as client,
     ):
         path = paper_example.write_csv(Path(folder) / "record.csv", seed=1)

@@ -98,7 +98,7 @@ def errors_of(system: System, problem: Problem) -> Errors:
 
     def general(theta: FloatArray) -> tuple[FloatArray, float]:
         with np.errstate(all="ignore"):
-            error = weight * (problem.predictions(theta[None])[0] - y)
+            error = weight * (problem.predict(theta[None])[0] - y)
             error = np.where(np.abs(error) < _CAP, error, _CAP)
             return error, min(float(np.sqrt(np.mean(error**2))), _CAP)
 
@@ -201,8 +201,8 @@ def run_peer(name: str, system: System, seed: int, goal: Goal) -> tuple[int | No
     problem = system.problem(seed)
     errors = errors_of(system, problem)
     errors(system.place(problem))  # compiles, outside the clock
-    lower = np.array([p.lower for p in problem.space])
-    upper = np.array([p.upper for p in problem.space])
+    lower = np.array([p.lower for p in problem.free_parameters])
+    upper = np.array([p.upper for p in problem.free_parameters])
     task = Task(errors, Counter(goal), lower, upper, seed % 2**31 + 1)
     start = time.process_time()
     try:

@@ -29,7 +29,7 @@ from benchmarks.peer_searches import HAS_PYGMO, PEERS, run_peer
 from benchmarks.searches import NEAR, Goal, Search, search
 from benchmarks.systems import OTHERS, PAPER, System
 from benchmarks.table import Row, Skipped, parser, report
-from sysid.core.settings import METHODS
+from sysid.core.settings import SEARCH_METHODS
 
 FIRST_SEED = 95_000
 """No search with these seeds was looked at while the method was made."""
@@ -147,7 +147,7 @@ def paper_rows(first: int, count: int) -> Iterable[Row]:
     for system in PAPER[2:]:
         if system.samples > 300:
             continue
-        for method in METHODS:
+        for method in SEARCH_METHODS:
             found = [search(system, first + i, method)[0] for i in range(count)]
             middle = median(1 + one.distance for one in found)
             yield Row(f"{system.name}: {method}, median RMS", middle, "of the optimum's")

@@ -19,12 +19,12 @@ from benchmarks import paper_example
 from benchmarks.family import cpu_seconds
 from benchmarks.table import Row, Skipped, parser, report
 from service.client.client import Client
-from service.client.embedded import embedded_service
+from service.client.embedded import run_embedded_service
 from sysid.core.settings import GeneticAlgorithm, Stop
-from workers.cluster import ClusterSettings, RayCrew
+from workers.fair_share import HEADSTART_SECONDS
 from workers.packing import PACK_SECONDS
-from workers.ports import Advance, ProblemSpec, RunSpec
-from workers.sharing import HEADSTART_SECONDS
+from workers.protocol import AdvanceRun, ProblemSpec, RunSpec
+from workers.ray_executor import ClusterSettings, RayExecutor
 
 LONG = {"generations": 2500, "stop": {"settled": None}}
 """A run of some tenths of a second; the default one of the paper takes some hundredths."""
@@ -85,7 +85,7 @@ def service(cpus: int) -> Iterator[Service]:
     """A service with so many workers, all of them warm."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="lagid-")))
-        url = stack.enter_context(embedded_service(folder / "data", cpus=cpus))
+        url = stack.enter_context(run_embedded_service(folder / "data", cpus=cpus))
         client = stack.enter_context(Client(url))
         path = paper_example.write_csv(folder / "record.csv", seed=1)
         made = Service(client, client.add_dataset(path, name="example 1")["id"])
@@ -145,20 +145,20 @@ def cost_of_a_task(count: int) -> list[Row]:
         "initial": {"y": 0},
     }
     spec = RunSpec(ProblemSpec(document, "r"), algorithm)
-    crew = RayCrew(ClusterSettings(cpus=2))
+    crew = RayExecutor(ClusterSettings(cpus=2))
     try:
-        crew.warm()
-        shared = crew.share((record,))
+        crew.warm_up_workers()
+        shared = crew.share_records((record,))
 
         def rounds(number: int) -> None:
             sent = fetched = 0
             while fetched < number:
                 while sent < number and sent - fetched < 4:
-                    item = Advance(f"r{sent}", spec, None, PACK_SECONDS)
-                    crew.submit((item,), ("r",), (shared,))
+                    item = AdvanceRun(f"r{sent}", spec, None, PACK_SECONDS)
+                    crew.submit_pack((item,), ("r",), (shared,))
                     sent += 1
-                for handle in crew.finished(1.0):
-                    crew.fetch(handle)
+                for handle in crew.wait_for_packs(1.0):
+                    crew.fetch_results(handle)
                     fetched += 1
 
         rounds(50)

@@ -13,12 +13,12 @@ from benchmarks import paper_example
 from benchmarks.kernels import microseconds, reference
 from benchmarks.table import Row, Skipped, parser, report
 from sysid.core.settings import GeneticAlgorithm
-from sysid.core.threads import one_thread
+from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
-from sysid.identification.run import advance, begin
-from sysid.search.refine import refine
+from sysid.identification.run import advance_run, begin_run
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.analysis import analyse_estimate
 
 GENERATIONS, POPULATION = 400, 50
 C_SHARE = 2.0 / 3.5
@@ -27,9 +27,9 @@ C_SHARE = 2.0 / 3.5
 
 def search_milliseconds(problem: Problem, algorithm: GeneticAlgorithm) -> tuple[float, int]:
     """CPU time and evaluations of one search, without its refinement."""
-    state = begin(problem, algorithm, 1)
+    state = begin_run(problem, algorithm, 1)
     start = time.process_time()
-    state = advance(problem, algorithm, state)
+    state = advance_run(problem, algorithm, state)
     return 1e3 * (time.process_time() - start), state.evaluations
 
 
@@ -52,7 +52,7 @@ def searches(problem: Problem, repeats: int) -> tuple[list[Row], list[Skipped]]:
         for _ in range(repeats):
             once, evaluations = search_milliseconds(problem, algorithm)
             spent = min(spent, once)
-            kernel = min(kernel, microseconds(lambda: problem.fitness(children), 3) / 1e3)
+            kernel = min(kernel, microseconds(lambda: problem.evaluate_fitness(children), 3) / 1e3)
             if timed_c is not None:
                 c = min(c, timed_c(48, paper_example.SAMPLES) / 1e3)
         rows.append(Row(f"{method}: whole search, {evaluations} simulations", spent, "ms"))
@@ -77,9 +77,9 @@ def refinement(problem: Problem, repeats: int) -> Row:
     start = 1.02 * np.array(list(paper_example.TRUTH.values()))
 
     def work() -> object:
-        with one_thread():  # as where a run is concluded
-            found = refine(problem, [start])[0]
-            return analyse(problem, start if found is None else found.theta)
+        with use_one_thread():  # as where a run is concluded
+            found = refine_candidates(problem, [start])[0]
+            return analyse_estimate(problem, start if found is None else found.theta)
 
     work()
     spent = []

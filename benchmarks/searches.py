@@ -9,8 +9,8 @@ from scipy.optimize import least_squares
 from benchmarks.systems import System
 from sysid.core.settings import GeneticAlgorithm, SearchMethod, Stop
 from sysid.core.types import FloatArray
-from sysid.identification.conclude import conclude
-from sysid.identification.run import advance, begin
+from sysid.identification.conclude import conclude_run
+from sysid.identification.run import advance_run, begin_run
 from sysid.islands.state import RunState
 from sysid.search.state import Improvement
 from sysid.simulation.problem import Problem
@@ -79,13 +79,13 @@ class Search:
 
 def optimum(problem: Problem, starts: list[FloatArray]) -> float:
     """Least RMS that SciPy's bounded least squares reaches from the given values."""
-    lower = np.array([p.lower for p in problem.space])
-    upper = np.array([p.upper for p in problem.space])
+    lower = np.array([p.lower for p in problem.free_parameters])
+    upper = np.array([p.upper for p in problem.free_parameters])
     weight, measured = problem.evaluator.weight, problem.evaluator.measured
 
     def residuals(unit: FloatArray) -> FloatArray:
         theta = np.clip(lower + (upper - lower) * unit, lower, upper)
-        error = weight * (problem.predictions(theta[None])[0] - measured)
+        error = weight * (problem.predict(theta[None])[0] - measured)
         return np.nan_to_num(np.clip(error, -1e6, 1e6), nan=1e6)
 
     least = np.inf
@@ -97,7 +97,7 @@ def optimum(problem: Problem, starts: list[FloatArray]) -> float:
                 ftol=1e-14, xtol=1e-14, gtol=1e-15, max_nfev=200,
             )  # fmt: skip
             theta = np.clip(lower + (upper - lower) * np.vstack([place, solved.x]), lower, upper)
-            least = min(least, float(np.min(problem.fitness(theta))))
+            least = min(least, float(np.min(problem.evaluate_fitness(theta))))
     return least
 
 
@@ -118,9 +118,9 @@ def search(system: System, seed: int, method: SearchMethod = "improved") -> tupl
     problem = system.problem(seed)
     algorithm = GeneticAlgorithm(method=method, stop=Stop(evaluations=BUDGET))
     start = time.process_time()
-    state = advance(problem, algorithm, begin(problem, algorithm, seed))
+    state = advance_run(problem, algorithm, begin_run(problem, algorithm, seed))
     searched = time.process_time()
-    found = conclude(problem, algorithm, state)
+    found = conclude_run(problem, algorithm, state)
     seconds, after = searched - start, time.process_time() - searched
     values = {estimate.name: estimate.value for estimate in found.estimates}
     best = np.array([values[name] for name in problem.free_names])
@@ -181,5 +181,5 @@ def _replay(
     """All islands at a generation of the same search, and the CPU seconds up to there."""
     shorter = replace(algorithm, generations=max(generation, 1), refine=algorithm.refine)
     start = time.process_time()
-    state = advance(problem, shorter, begin(problem, shorter, seed))
+    state = advance_run(problem, shorter, begin_run(problem, shorter, seed))
     return state, time.process_time() - start

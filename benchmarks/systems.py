@@ -64,7 +64,7 @@ class System:
         """The output without noise."""
         first = np.full(self.samples, self.start.get("y", 0.0))
         problem = self._posed(first)
-        return problem.predictions(self.place(problem)[None])[0]
+        return problem.predict(self.place(problem)[None])[0]
 
     def place(self, problem: Problem) -> FloatArray:
         """The true values in the order of the free parameters."""

@@ -35,7 +35,7 @@ __all__ = [
     "SysidError", "catalogue", "export_model", "identify", "load_model", "simulate",
 ]  # fmt: skip
 
-_PLACES = {
+_PUBLIC_NAMES = {
     "core.errors": ("SysidError",),
     "core.settings": (
         "GeneticAlgorithm", "IslandChange", "Loss", "Migration", "SequenceSearch", "Stop",
@@ -51,12 +51,12 @@ _PLACES = {
     "simulation.simulate": ("simulate",),
     "uncertainty.estimates": ("Estimate",),
 }  # fmt: skip
-_MODULE_OF = {name: module for module, names in _PLACES.items() for name in names}
+_MODULE_BY_NAME = {name: module for module, names in _PUBLIC_NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _MODULE_OF:
+    if name not in _MODULE_BY_NAME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    value = getattr(import_module(f"{__name__}.{_MODULE_BY_NAME[name]}"), name)
     globals()[name] = value
     return value

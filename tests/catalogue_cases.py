@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sysid.core.settings import Prediction
+from sysid.core.settings import PredictionKind
 from sysid.core.types import FloatArray
-from sysid.data.noise import Noise, with_noise
+from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Channel, Hold, Record
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
@@ -61,7 +61,7 @@ class Case:
     hold: Hold = "first"
     sigma: float = 0.0
     within: float = 1e-3
-    prediction: Prediction = "simulation"
+    prediction: PredictionKind = "simulation"
     initial: Mapping[str, float] = field(default_factory=dict)  # and what the model has fixed
     statuses: Mapping[str, str] = field(default_factory=dict)  # of parameters not identified
 
@@ -125,4 +125,4 @@ def made(model: Model, case: Case) -> Record:
     )
     values = {**case.truth, **case.initial}
     outputs = simulate(model, inputs, values, times=times).channels
-    return with_noise(Record(inputs, outputs), Noise(case.sigma, seed=3))
+    return add_output_noise(Record(inputs, outputs), Noise(case.sigma, seed=3))

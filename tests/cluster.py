@@ -7,24 +7,24 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:  # most tests need no Ray, and its import takes its time
-    from workers.cluster import RayCrew
+    from workers.ray_executor import RayExecutor
 
 CPUS = 2
 FREE_SECONDS = 60.0
 
 
 @pytest.fixture(scope="session")
-def _ray() -> "Iterator[RayCrew]":
-    from workers.cluster import ClusterSettings, RayCrew
+def _ray() -> "Iterator[RayExecutor]":
+    from workers.ray_executor import ClusterSettings, RayExecutor
 
-    crew = RayCrew(ClusterSettings(cpus=CPUS))
-    crew.warm()
+    crew = RayExecutor(ClusterSettings(cpus=CPUS))
+    crew.warm_up_workers()
     yield crew
     crew.close()
 
 
 @pytest.fixture
-def ray_crew(_ray: "RayCrew") -> "Iterator[RayCrew]":
+def ray_crew(_ray: "RayExecutor") -> "Iterator[RayExecutor]":
     """Two workers of a local Ray; each test must leave both free."""
     yield _ray
     limit = time.monotonic() + FREE_SECONDS

@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import NullPool, create_engine, make_url
 
-from service.storage.migrate import upgrade
-from service.storage.sessions import Database, sqlite_url
+from service.storage.migrate import upgrade_database
+from service.storage.sessions import Database, make_sqlite_url
 
 _numbers = count()
 
@@ -38,7 +38,7 @@ def postgres_url() -> str:
 @cache
 def _postgres_template() -> str:
     with empty_postgres("lagid_template", keep=True) as database:
-        upgrade(database)
+        upgrade_database(database)
     return "lagid_template"
 
 
@@ -46,8 +46,8 @@ def _postgres_template() -> str:
 def _sqlite_template() -> Path:
     folder = Path(tempfile.mkdtemp(prefix="lagid-template-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    database = Database(sqlite_url(folder / "template.db"))
-    upgrade(database)
+    database = Database(make_sqlite_url(folder / "template.db"))
+    upgrade_database(database)
     database.dispose()  # the last connection folds the write-ahead log into the file
     return folder / "template.db"
 
@@ -85,7 +85,7 @@ def migrated_sqlite(folder: Path) -> Database:
 
 
 def _sqlite(folder: Path) -> Database:
-    return Database(sqlite_url(folder / "lagid.db"), pool_size=10)
+    return Database(make_sqlite_url(folder / "lagid.db"), pool_size=10)
 
 
 @pytest.fixture

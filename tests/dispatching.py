@@ -12,21 +12,22 @@ from pathlib import Path
 from typing import Any
 
 from service.core.settings import Settings
+from service.core.states import OPEN_STATES, JobState
 from service.datasets.datasets import add_recording
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import Leases
-from service.dispatch.supervisor import clear_family, environment_of
+from service.dispatch.leases import HeldLeases
+from service.dispatch.supervisor import clear_session, to_environment
 from service.jobs.schemas import JobIn
-from service.jobs.submit import submit_to
+from service.jobs.submit import submit_job
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore, open_store
 from service.storage.sessions import Database
-from service.storage.tables import OPEN, Job, Run, State
+from service.storage.tables import Job, Run
 from sysid.data.records import Recording
 from tests.database import migrated_sqlite
 from tests.runs import step_record
-from workers.ports import Crew
+from workers.protocol import Executor
 
 LIMIT_SECONDS = 240.0  # beside other work the search alone is compiled for two minutes
 
@@ -36,9 +37,9 @@ class Place:
 
     def __init__(self, folder: Path, database: Database | None = None) -> None:
         self.settings = Settings(data_dir=folder, cpus=2, lease_seconds=3.0)
-        self.settings.prepare_folder()
+        self.settings.prepare_data_folder()
         self.database = database or migrated_sqlite(folder)
-        self.store: ObjectStore = open_store(self.settings.store)
+        self.store: ObjectStore = open_store(self.settings.resolved_store_url)
         self.dataset = self._dataset()
 
     def submit(self, **body: Any) -> str:
@@ -46,26 +47,26 @@ class Place:
         # A test that compares two runs wants both computed.
         default = {"model": "fopdt", "datasets": [self.dataset], "reuse": False, "parameters":
                    {"T": {"upper": 10.0}, "L": {"upper": 2.0}}}  # fmt: skip
-        return submit_to(self.database, JobIn(**{**default, **body}), self.settings).id
+        return submit_job(self.database, JobIn(**{**default, **body}), self.settings).id
 
     def job(self, job: str) -> Job:
-        with self.database.read() as session:
+        with self.database.read_session() as session:
             return JobRepository(session).get(job)
 
     def runs(self, job: str) -> tuple[Run, ...]:
-        with self.database.read() as session:
-            return RunRepository(session).page(job, limit=1000).items
+        with self.database.read_session() as session:
+            return RunRepository(session).list_page(job, limit=1000).items
 
     def history(self, run: str) -> list[tuple[int, int, float]]:
-        with self.database.read() as session:
-            points = RunRepository(session).history(run)
+        with self.database.read_session() as session:
+            points = RunRepository(session).read_history(run)
             return [(point.island, point.generation, point.rms) for point in points]
 
     def cancel(self, job: str) -> None:
-        with self.database.write() as session:
+        with self.database.write_session() as session:
             JobRepository(session).cancel(job)
 
-    def until(self, job: str, *states: State) -> Job:
+    def until(self, job: str, *states: JobState) -> Job:
         """Wait until the job is in one of the states."""
         until(lambda: self.job(job).state in states, f"{job} in {states}")
         return self.job(job)
@@ -76,7 +77,7 @@ class Place:
         log = (self.settings.data_dir / "dispatcher.log").open("ab")
         child = subprocess.Popen(
             [sys.executable, "-m", "service.dispatch.process"],
-            env={**os.environ, **environment_of(self.settings)},
+            env={**os.environ, **to_environment(self.settings)},
             stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
         )  # fmt: skip
         try:
@@ -84,7 +85,7 @@ class Place:
             child.send_signal(signal.SIGTERM)
             child.wait(LIMIT_SECONDS)
         finally:
-            clear_family(child.pid)
+            clear_session(child.pid)
             child.wait()
             log.close()
 
@@ -98,18 +99,18 @@ class Place:
         return stored.dataset.id
 
 
-def carry_out(place: Place, job: str, crew: Crew) -> None:
+def carry_out(place: Place, job: str, crew: Executor) -> None:
     """Run a dispatcher of this crew until the job has ended."""
-    dispatcher = Dispatcher(place.database, place.store, crew, Leases(place.database, 30))
+    dispatcher = Dispatcher(place.database, place.store, crew, HeldLeases(place.database, 30))
 
     def stop_at_the_end() -> None:
-        while place.job(job).state in OPEN:
+        while place.job(job).state in OPEN_STATES:
             time.sleep(0.01)
         dispatcher.stopping.set()
 
     watcher = threading.Thread(target=stop_at_the_end)
     watcher.start()
-    dispatcher.run()
+    dispatcher.run_until_stopped()
     watcher.join()
 
 

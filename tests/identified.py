@@ -4,39 +4,39 @@ from datetime import timedelta
 from typing import Any
 
 from service.api.dependencies import Parts
-from service.dispatch.cramer_rao import floors_for
+from service.dispatch.cramer_rao import build_bounds_maker
 from service.dispatch.job_runs import JobRuns
-from service.dispatch.recorder import Recorder
+from service.dispatch.recorder import RunRecorder
 from service.jobs import submit as jobs
 from service.jobs.schemas import JobIn
-from service.queue.leases import Queue
+from service.queue.leases import LeaseQueue
 from service.repositories.runs import RunRepository
-from workers.feeding import Feeder
-from workers.inline import InlineCrew
+from workers.inline_executor import InlineExecutor
+from workers.scheduler import Scheduler
 
 
 def identified(parts: Parts, body: dict[str, Any], steps: int = 5000) -> tuple[str, list[str]]:
     """Submit a job and carry it out; gives its id and those of its runs."""
-    job = jobs.submit_to(parts.database, JobIn.model_validate(body), parts.settings).id
+    job = jobs.submit_job(parts.database, JobIn.model_validate(body), parts.settings).id
     return job, carried_out(parts, job, steps)
 
 
 def carried_out(parts: Parts, job: str, steps: int = 5000) -> list[str]:
     """Carry out a job that waits; gives the ids of its runs."""
-    with parts.database.write() as session:
-        claim = Queue(session).claim("test", timedelta(hours=1))
+    with parts.database.write_session() as session:
+        claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
         while claim is not None and claim.job.id != job:  # others that wait are left claimed
-            claim = Queue(session).claim("test", timedelta(hours=1))
+            claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
     assert claim is not None
     source = JobRuns(parts.database, claim, parts.store)
-    floors = floors_for(parts.database, claim, source)
-    recorder = Recorder(parts.database, claim, source.save, source.failed)
-    feeder: Feeder[str] = Feeder(InlineCrew())
-    feeder.add(job, source, recorder)
+    floors = build_bounds_maker(parts.database, claim, source)
+    recorder = RunRecorder(parts.database, claim, source.save_signals, source.note_failure)
+    feeder: Scheduler[str] = Scheduler(InlineExecutor())
+    feeder.add_job(job, source, recorder)
     for _ in range(steps):
-        if feeder.step(0.05):
-            recorder.store()
-            recorder.finish(None if floors is None else list(floors())[-1])
+        if feeder.run_step(0.05):
+            recorder.write_results()
+            recorder.finish_job(None if floors is None else list(floors())[-1])
             break
-    with parts.database.read() as session:
-        return [run.id for run in RunRepository(session).page(job, limit=100).items]
+    with parts.database.read_session() as session:
+        return [run.id for run in RunRepository(session).list_page(job, limit=100).items]

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from sysid.core.types import FloatArray
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 from sysid.models.model import FixedInitial, Model
 
-Read = Callable[[Past, float], float]
+Read = Callable[[PastValue, float], float]
 
 _OPERATORS: Mapping[str, Callable[[Any, Any], Any]] = {
     "+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv,
@@ -34,7 +34,7 @@ def meaning(tree: Expression, values: Mapping[str, float], read: Read) -> Any:
             return value
         case Symbol(name):
             return values[name]
-        case Past(_, _, _, lag):
+        case PastValue(_, _, _, lag):
             return read(tree, 0.0 if lag is None else meaning(lag, values, read))
         case Unary("-", operand):
             return -meaning(operand, values, read)
@@ -42,7 +42,7 @@ def meaning(tree: Expression, values: Mapping[str, float], read: Read) -> Any:
             return not meaning(operand, values, read)
         case Binary(symbol, left, right):
             return _OPERATORS[symbol](meaning(left, values, read), meaning(right, values, read))
-        case Call(function, arguments):
+        case FunctionCall(function, arguments):
             return FUNCTIONS[function](*(meaning(one, values, read) for one in arguments))
 
 
@@ -56,7 +56,7 @@ def simulate(
         signals[state.name] = np.full(n, getattr(start, "value", 0.0))
     for k in range(model.memory, n):
 
-        def read(past: Past, lag: float, k: int = k) -> float:
+        def read(past: PastValue, lag: float, k: int = k) -> float:
             at = max(k - past.offset - lag, 0.0)
             early = math.floor(at)
             part, signal = at - early, signals[past.name]

@@ -73,8 +73,8 @@ def with_output(record_: Record, values: FloatArray, name: str = "y") -> Record:
 
 def individuals(problem: Any, count: int, seed: int = 0) -> FloatArray:
     """Random candidates inside the bounds, the first two at their ends."""
-    lower = np.array([p.lower for p in problem.space])
-    upper = np.array([p.upper for p in problem.space])
+    lower = np.array([p.lower for p in problem.free_parameters])
+    upper = np.array([p.upper for p in problem.free_parameters])
     drawn = np.random.default_rng(seed).random((count, lower.size))
     drawn[:2] = [[0.0], [1.0]][: min(count, 2)]
     return np.asarray(lower + (upper - lower) * drawn)

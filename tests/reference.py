@@ -11,9 +11,9 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.data.interpolation import FineInput
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
-from sysid.models.model import EstimatedInitial, MeasuredInitial, Model, initial_name
-from sysid.simulation.experiments import Experiment
+from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
+from sysid.models.model import EstimatedInitial, MeasuredInitial, Model, name_initial_state
+from sysid.simulation.experiments import GridExperiment
 from sysid.simulation.problem import Problem
 
 _FUNCTIONS = {
@@ -56,7 +56,7 @@ class Twin:
     """One individual in one experiment."""
 
     def __init__(
-        self, model: Model, experiment: Experiment, number: int, values: Mapping[str, float],
+        self, model: Model, experiment: GridExperiment, number: int, values: Mapping[str, float],
         one_step: bool,
     ) -> None:  # fmt: skip
         self.model, self.experiment, self.values = model, experiment, values
@@ -68,9 +68,9 @@ class Twin:
         self.given: dict[str, list[float]] = {}
         for i, start in enumerate(model.initial):
             name = self.names[i]
-            given = experiment.starts[i].given
+            given = experiment.starts[i].first_values
             if isinstance(start, EstimatedInitial):
-                given = np.array([values[initial_name(name, number)]])
+                given = np.array([values[name_initial_state(name, number)]])
             self.past[name] = [float(given[0])]
             later = given[1:] if isinstance(start, MeasuredInitial) else given[:0]
             self.given[name] = [float(v) for v in later]
@@ -82,7 +82,7 @@ class Twin:
     def outputs(self) -> FloatArray:
         """Each output at each grid point."""
         grid, found = self.experiment.grid, []
-        for m in range(grid.last + 1):
+        for m in range(grid.last_step + 1):
             if m % grid.substeps == 0:
                 now = self._now()
                 found.append([
@@ -91,7 +91,7 @@ class Twin:
                 ])  # fmt: skip
                 if self.one_step:
                     self._replace(m // grid.substeps)
-            if m < grid.last:
+            if m < grid.last_step:
                 for name, value in self._next(m).items():
                     self.past[name].append(value)
         return np.array(found).T
@@ -102,8 +102,8 @@ class Twin:
     def _replace(self, n: int) -> None:
         for output, samples in zip(self.model.outputs, self.experiment.outputs, strict=True):
             match output.expression:
-                case Past(name, "state", 0, None):
-                    self.past[name][-1] = float(samples.on_grid[n])
+                case PastValue(name, "state", 0, None):
+                    self.past[name][-1] = float(samples.grid_values[n])
 
     def _next(self, m: int) -> dict[str, float]:
         if not self.difference:
@@ -152,17 +152,17 @@ class Twin:
             return self._value(one, m, c, values, equation)
 
         match e:
-            case Past(_, "input", _, _):
+            case PastValue(_, "input", _, _):
                 return self._input(e, m, c)
-            case Past():
+            case PastValue():
                 return self._state(e, m, c, values, equation)
             case Unary(operator, operand):
                 return -value(operand) if operator == "-" else not value(operand)
             case Binary(operator, left, right):
                 return _OPERATORS[operator](np.float64(value(left)), np.float64(value(right)))
-            case Call("where", (condition, a, b)):
+            case FunctionCall("where", (condition, a, b)):
                 return value(a) if value(condition) else value(b)
-            case Call(function, arguments):
+            case FunctionCall(function, arguments):
                 return _FUNCTIONS[function](*(np.float64(value(a)) for a in arguments))
         return self._leaf(e, m + c)
 
@@ -178,15 +178,15 @@ class Twin:
                 return place
         return place * self.step
 
-    def _lag(self, past: Past) -> float:
-        lag = self._value(past.lag, 0, 0.0, {}, 0) if past.lag is not None else 0.0
+    def _lag(self, past: PastValue) -> float:
+        lag = self._value(past.delay, 0, 0.0, {}, 0) if past.delay is not None else 0.0
         lag = max(lag, 0.0) if self.difference else max(lag, 0.0) / self.step
         return float(floor(lag + 0.5)) if self.model.solver.interpolation == "nearest" else lag
 
     def _state(
-        self, past: Past, m: int, c: float, values: dict[str, float], equation: int
+        self, past: PastValue, m: int, c: float, values: dict[str, float], equation: int
     ) -> float:
-        if past.lag is None and past.offset == 0:
+        if past.delay is None and past.offset == 0:
             return values[past.name]
         semi = not self.difference and self.model.solver.method == "semi-implicit"
         if semi and self.names.index(past.name) < equation:
@@ -213,17 +213,19 @@ class Twin:
         weights = [np.prod([(f - o) / (n - o) for o in nodes if o != n]) for n in nodes]
         return float(sum(w * sample(i + n) for w, n in zip(weights, nodes, strict=True)))
 
-    def _input(self, past: Past, m: int, c: float) -> float:
+    def _input(self, past: PastValue, m: int, c: float) -> float:
         names = [quantity.name for quantity in self.model.inputs]
         fine = self.experiment.inputs[names.index(past.name)]
         start = fine.begin if self.difference else 0
         place = m + c - past.offset
-        if past.lag is None and not self.difference:
-            return float(fine.values[fine.zero + m * fine.points + _inside(fine, c)])
-        at = fine.zero + start + (place - self._lag(past)) * fine.points
+        if past.delay is None and not self.difference:
+            return float(
+                fine.values[fine.start_index + m * fine.points_per_step + _inside(fine, c)]
+            )
+        at = fine.start_index + start + (place - self._lag(past)) * fine.points_per_step
         i = floor(at)
         return float(fine.values[i] + (at - i) * (fine.values[i + 1] - fine.values[i]))
 
 
 def _inside(fine: FineInput, c: float) -> int:
-    return {0.0: fine.begin, 0.5: fine.points // 2, 1.0: fine.end}[c]
+    return {0.0: fine.begin, 0.5: fine.points_per_step // 2, 1.0: fine.end}[c]

@@ -10,18 +10,18 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.result import Identification
 from sysid.islands.state import RunState
-from sysid.models.catalogue.load import document
-from workers.feeding import Feeder
-from workers.ports import (  # fmt: skip
-    Concluded,
-    Crew,
-    Failure,
+from sysid.models.catalogue.load import copy_catalogue_document
+from workers.protocol import (  # fmt: skip
+    Executor,
+    InvalidRun,
     ProblemSpec,
     QueuedRun,
     Records,
-    RefusedRun,
+    RunConclusion,
+    RunFailure,
     RunSpec,
 )
+from workers.scheduler import Scheduler
 
 
 def step_record(n: int = 120, delay: float = 0.7, seed: int = 3) -> Record:
@@ -57,17 +57,17 @@ def spec(
     )
     parameters = {"T": {"upper": 10.0}, "L": {"upper": 2.0}}
     fit = FitSettings(parameters)
-    problem = ProblemSpec(document("fopdt"), records, settings=fit)
+    problem = ProblemSpec(copy_catalogue_document("fopdt"), records, settings=fit)
     return RunSpec(problem, algorithm, seed)
 
 
 class ListedRuns:
-    """A job's runs as a list; implements `workers.ports.JobSource`."""
+    """A job's runs as a list; implements `workers.protocol.JobSource`."""
 
-    def __init__(self, runs: Iterable[QueuedRun | RefusedRun]) -> None:
+    def __init__(self, runs: Iterable[QueuedRun | InvalidRun]) -> None:
         self._runs = list(runs)
 
-    def runs(self) -> Iterator[QueuedRun | RefusedRun]:
+    def runs(self) -> Iterator[QueuedRun | InvalidRun]:
         yield from self._runs
 
     def records(self, key: str) -> Records:
@@ -75,13 +75,13 @@ class ListedRuns:
 
 
 class Notebook:
-    """Keeps what it is told; implements `workers.ports.RunObserver`."""
+    """Keeps what it is told; implements `workers.protocol.RunObserver`."""
 
     def __init__(self) -> None:
         self.begun: list[str] = []
         self.states: dict[str, list[RunState]] = {}
         self.results: dict[str, list[Identification]] = {}
-        self.failures: dict[str, list[Failure]] = {}
+        self.failures: dict[str, list[RunFailure]] = {}
         self.kills: dict[str, list[int]] = {}
         self.is_stopped = False
 
@@ -94,10 +94,10 @@ class Notebook:
     def progress(self, run: str, state: RunState, seconds: float) -> None:
         self.states.setdefault(run, []).append(state)
 
-    def result(self, run: str, concluded: Concluded, seconds: float) -> None:
+    def result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
         self.results.setdefault(run, []).append(concluded.identification)
 
-    def failure(self, run: str, failure: Failure) -> None:
+    def failure(self, run: str, failure: RunFailure) -> None:
         self.failures.setdefault(run, []).append(failure)
 
     def known(self, run: str, source: str) -> None:
@@ -107,13 +107,13 @@ class Notebook:
         return self.is_stopped
 
 
-def carry_out(crew: Crew, specs: Mapping[str, RunSpec]) -> Notebook:
+def carry_out(crew: Executor, specs: Mapping[str, RunSpec]) -> Notebook:
     """Feed one job of these runs to the crew until it has ended."""
-    feeder, notebook = Feeder(crew), Notebook()
-    feeder.add("job", ListedRuns(QueuedRun(run, one) for run, one in specs.items()), notebook)
+    feeder, notebook = Scheduler(crew), Notebook()
+    feeder.add_job("job", ListedRuns(QueuedRun(run, one) for run, one in specs.items()), notebook)
     limit = time.monotonic() + LIMIT_SECONDS
     while time.monotonic() < limit:
-        if feeder.step(0.05):
+        if feeder.run_step(0.05):
             return notebook
     raise AssertionError("the job did not end")
 

@@ -30,8 +30,8 @@ def clean(model: str = "duffing-eq16", n: int = 300) -> FloatArray:
     """The free run of the true model."""
     truth = DUFFING if model == "duffing-eq16" else COULOMB
     problem = Problem.build(load_model(model), [record(np.zeros(n))])
-    theta = np.array([[truth[p.name] for p in problem.space]])
-    return problem.predictions(theta)[0]
+    theta = np.array([[truth[p.name] for p in problem.free_parameters]])
+    return problem.predict(theta)[0]
 
 
 def noisy(model: str = "duffing-eq16", n: int = 300, sd: float = 0.01, seed: int = 0) -> FloatArray:
@@ -48,6 +48,6 @@ def bits(state: RunState | Island) -> tuple[object, ...]:
     """Everything of a run but its clock, so that two of them can be compared bit for bit."""
     if isinstance(state, RunState):
         islands = tuple(bits(island) for island in state.islands)
-        return (state.generation, state.epoch, state.ended, state.migrations, islands)
-    arrays = (state.words, state.fitness, state.search, state.point)
+        return (state.generation, state.epoch, state.has_ended, state.migrations, islands)
+    arrays = (state.chromosomes, state.fitness, state.search, state.point)
     return (state.index, state.history, *(array.tobytes() for array in arrays))

@@ -6,12 +6,20 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
-from sysid.identification.run import begin
+from sysid.identification.run import begin_run
 from sysid.islands.state import RunState
 from tests.runs import RECORDS, ListedRuns, Notebook, spec
-from workers.feeding import Feeder
-from workers.ports import Advance, Advanced, Done, Failure, Item, QueuedRun, Records  # fmt: skip
-from workers.tasks import build
+from workers.protocol import (  # fmt: skip
+    AdvanceRun,
+    ItemResult,
+    QueuedRun,
+    Records,
+    RunFailure,
+    RunProgress,
+    WorkItem,
+)
+from workers.scheduler import Scheduler
+from workers.tasks import build_pack_problems
 
 
 class SimulatedCrew:
@@ -26,13 +34,13 @@ class SimulatedCrew:
         self.most_waiting = 0
         self._waiting: deque[int] = deque()
         self._computing: list[tuple[float, int]] = []
-        self._packs: dict[int, tuple[Item, ...]] = {}
+        self._packs: dict[int, tuple[WorkItem, ...]] = {}
         self._next = 0
 
     def share(self, records: Records) -> Any:
         return records
 
-    def submit(self, pack: Sequence[Item], keys: Sequence[str], shared: Sequence[Any]) -> int:
+    def submit(self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]) -> int:
         self._next += 1
         self._packs[self._next] = tuple(pack)
         self._waiting.append(self._next)
@@ -48,7 +56,7 @@ class SimulatedCrew:
         self._begin()
         return (handle,)
 
-    def fetch(self, handle: int) -> tuple[Done, ...]:
+    def fetch(self, handle: int) -> tuple[ItemResult, ...]:
         return tuple(self._done(item) for item in self._packs.pop(handle))
 
     def cancel(self, handle: int, *, force: bool) -> None:
@@ -66,23 +74,23 @@ class SimulatedCrew:
             seconds = sum(self._seconds(item) for item in self._packs[handle])
             heapq.heappush(self._computing, (self.now + seconds, handle))
 
-    def _seconds(self, item: Item) -> float:
-        assert isinstance(item, Advance)
+    def _seconds(self, item: WorkItem) -> float:
+        assert isinstance(item, AdvanceRun)
         left = float(item.run.split("/")[2]) - self.computed.get(item.run, 0.0)
         return min(item.seconds, left)
 
-    def _done(self, item: Item) -> Done:
+    def _done(self, item: WorkItem) -> ItemResult:
         seconds = self._seconds(item)
         self.computed[item.run] = self.computed.get(item.run, 0.0) + seconds
         if self.computed[item.run] >= float(item.run.split("/")[2]) - 1e-9:
-            return Done(item.run, Failure("as told"), seconds)
-        return Done(item.run, Advanced(_unfinished()), seconds)
+            return ItemResult(item.run, RunFailure("as told"), seconds)
+        return ItemResult(item.run, RunProgress(_unfinished()), seconds)
 
 
 @cache
 def _unfinished() -> RunState:
-    problem, _ = build(spec().problem, RECORDS)
-    return begin(problem, spec().algorithm, 1)
+    problem, _ = build_pack_problems(spec().problem, RECORDS)
+    return begin_run(problem, spec().algorithm, 1)
 
 
 class Theatre:
@@ -90,14 +98,14 @@ class Theatre:
 
     def __init__(self, slots: int, **options: Any) -> None:
         self.crew = SimulatedCrew(slots)
-        self.feeder: Feeder[str] = Feeder(self.crew, **options)
+        self.feeder: Scheduler[str] = Scheduler(self.crew, **options)
         self.ended: dict[str, float] = {}
 
     def add(self, job: str, runs: int, seconds: float, **rights: Any) -> None:
         """A job of equal runs that take `seconds` each."""
         one = spec()
         queued = (QueuedRun(f"{job}/{number}/{seconds}", one) for number in range(runs))
-        self.feeder.add(job, ListedRuns(queued), Notebook(), **rights)
+        self.feeder.add_job(job, ListedRuns(queued), Notebook(), **rights)
 
     def play(self, seconds: float) -> None:
         """Let so much time pass."""
@@ -113,7 +121,7 @@ class Theatre:
         return self.ended[job] - begun
 
     def step(self) -> None:
-        for job in self.feeder.step(0.0):
+        for job in self.feeder.run_step(0.0):
             self.ended[job] = self.crew.now
 
     def had(self, job: str) -> float:

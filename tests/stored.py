@@ -2,13 +2,14 @@
 
 from datetime import UTC, datetime, timedelta
 
-from service.queue.leases import Claim, Queue
-from service.queue.run_writes import Cell, RunLedger
+from service.core.states import JobState
+from service.queue.leases import Claim, LeaseQueue
+from service.queue.run_writes import NewRun, RunWriter
 from service.repositories.datasets import NewDataset
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
-from service.storage.tables import Job, Run, State
+from service.storage.tables import Job, Run
 
 
 class Clock:
@@ -25,38 +26,38 @@ class Clock:
 
 
 def submit(database: Database, name: str = "tube", **values) -> str:
-    with database.write() as session:
+    with database.write_session() as session:
         new = NewJob(name=name, spec={"model": "tube"}, **values)
         return JobRepository(session).submit(new).job.id
 
 
 def claim(database: Database, owner: str = "d1", clock: Clock | None = None) -> Claim | None:
-    with database.write() as session:
-        return Queue(session, *([clock] if clock else [])).claim(owner)
+    with database.write_session() as session:
+        return LeaseQueue(session, *([clock] if clock else [])).claim_job(owner)
 
 
 def claimed(database: Database, n_runs: int = 1, **values) -> tuple[Claim, list[str]]:
     """A submitted and claimed job, and the identifiers of its runs."""
     submit(database, n_runs=n_runs, **values)
     got = claim(database)
-    with database.write() as session:
-        ledger = RunLedger(session, got.lease)
-        ledger.create(Cell(number=i, cell={"/seed": i}, seed=i) for i in range(n_runs))
-        return got, [run.id for run in ledger.pending(limit=10_000)]
+    with database.write_session() as session:
+        ledger = RunWriter(session, got.lease)
+        ledger.create_runs(NewRun(number=i, cell={"/seed": i}, seed=i) for i in range(n_runs))
+        return got, [run.id for run in ledger.list_pending(limit=10_000)]
 
 
 def job_of(database: Database, job_id: str) -> Job:
-    with database.read() as session:
+    with database.read_session() as session:
         return JobRepository(session).get(job_id)
 
 
-def state_of(database: Database, job_id: str) -> State:
+def state_of(database: Database, job_id: str) -> JobState:
     return job_of(database, job_id).state
 
 
 def runs_of(database: Database, job_id: str) -> list[Run]:
-    with database.read() as session:
-        return list(RunRepository(session).page(job_id, limit=10_000).items)
+    with database.read_session() as session:
+        return list(RunRepository(session).list_page(job_id, limit=10_000).items)
 
 
 def new_dataset(**values) -> NewDataset:

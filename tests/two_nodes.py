@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from service.dispatch.supervisor import find_session_processes
-from sysid.core.code_cache import cache_folder
+from sysid.core.code_cache import find_cache_folder
 from workers.ray_folders import kill_processes
 
 
@@ -82,7 +82,9 @@ def _serve(folder: Path, temporary: Path) -> None:
     node = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
     head = {**node, "include_dashboard": False, "temp_dir": str(temporary)}
     cluster = Cluster(initialize_head=True, connect=False, head_node_args=head)
-    loops = os.environ.get("NUMBA_CACHE_DIR") or str(cache_folder())  # half a minute to compile
+    loops = os.environ.get("NUMBA_CACHE_DIR") or str(
+        find_cache_folder()
+    )  # half a minute to compile
     elsewhere = {"LAGID_CACHE_DIR": str(folder / "cache"), "NUMBA_CACHE_DIR": loops}
     second: Any = cluster.add_node(**node, env_vars=elsewhere)
     _answer(json.dumps({"address": cluster.address}))

@@ -13,23 +13,23 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from workers.cluster_address import explain_failure
 from workers.errors import ClusterUnavailable
-from workers.joining import reason
 from workers.ray_folders import clear_dead_dispatchers, get_ray_folder
 
 OBJECT_STORE_BYTES = 200 * 2**20
 """Records are small; the default of Ray, 30 % of the memory, is not."""
-COMMON = {"log_to_driver": False, "logging_level": logging.ERROR}
+INIT_ARGUMENTS = {"log_to_driver": False, "logging_level": logging.ERROR}
 """Arguments of `ray.init`, whichever Ray it is."""
-REFUSALS = (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError)
+INIT_ERRORS = (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError)
 """What `ray.init` raises."""
-ONE_THREAD = {
+ONE_THREAD_ENVIRONMENT = {
     "NUMBA_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-ENVIRONMENT = {
+RAY_ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_task_events_report_interval_ms": "0",  # else the GCS keeps 3-4 kB for each task
     "RAY_memory_monitor_refresh_ms": "0",  # it kills the youngest task, not the largest
@@ -37,7 +37,7 @@ ENVIRONMENT = {
     # Behind the service itself, but not behind everything else on the machine, as its 15 would be.
     "RAY_worker_niceness": "5",
 }
-_NEEDLESS = ("start_monitor", "start_log_monitor", "start_api_server")
+_UNUSED_STARTS = ("start_monitor", "start_log_monitor", "start_api_server")
 """Methods of Ray's `Node` that start the autoscaler, the collector of logs and the dashboard."""
 
 
@@ -66,32 +66,32 @@ class LocalRay:
     def __init__(
         self, cpus: int | None = None, meanwhile: Callable[[], None] | None = None
     ) -> None:
-        self.folder = fresh_folder()
-        os.environ.update(ENVIRONMENT)
+        self.folder = make_folder()
+        os.environ.update(RAY_ENVIRONMENT)
         os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
-        os.environ.update(ONE_THREAD)  # inherited by the workers
+        os.environ.update(ONE_THREAD_ENVIRONMENT)  # inherited by the workers
         import ray
 
         self.module: Any = ray
         if meanwhile is not None:
             meanwhile()
         try:
-            _initialise(ray, cpus, self.folder)
-        except REFUSALS as error:
-            self.forget_folder()
-            raise ClusterUnavailable(reason(None, error)) from error
+            _start_ray(ray, cpus, self.folder)
+        except INIT_ERRORS as error:
+            self.remove_folder()
+            raise ClusterUnavailable(explain_failure(None, error)) from error
 
     def close(self) -> None:
         """End it in order."""
         self.module.shutdown()
-        self.forget_folder()
+        self.remove_folder()
 
-    def forget_folder(self) -> None:
+    def remove_folder(self) -> None:
         """Remove its folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def fresh_folder() -> Path:
+def make_folder() -> Path:
     """Make Ray's folder for this process; what dispatchers that are gone have left is cleared.
 
     Raises
@@ -112,27 +112,27 @@ def fresh_folder() -> Path:
     return folder
 
 
-def _initialise(ray: Any, cpus: int | None, folder: Path) -> None:
-    with _without_needless():
+def _start_ray(ray: Any, cpus: int | None, folder: Path) -> None:
+    with _skip_unused_programs():
         ray.init(
             address="local",  # never a cluster that happens to run on this host
             num_cpus=cpus,
             include_dashboard=False,
             object_store_memory=OBJECT_STORE_BYTES,
             _temp_dir=str(folder),
-            **COMMON,
+            **INIT_ARGUMENTS,
         )
 
 
 @contextmanager
-def _without_needless() -> Iterator[None]:
+def _skip_unused_programs() -> Iterator[None]:
     """Ray starts three programs that nobody here uses, a fifth of what its start costs.
 
     There is no setting for it. A version of Ray that has other methods starts them as before.
     """
     from ray._private.node import Node
 
-    kept = {name: getattr(Node, name) for name in _NEEDLESS if hasattr(Node, name)}
+    kept = {name: getattr(Node, name) for name in _UNUSED_STARTS if hasattr(Node, name)}
     try:
         for name in kept:
             setattr(Node, name, _start_nothing)

@@ -20,27 +20,27 @@ PACKS_PER_CPU = 2
 WORTH_SPREADING_SECONDS = 0.02
 """An island's epoch that takes less is not worth a task of its own."""
 
-ROOM = 1.5
+PACK_TOLERANCE = 1.5
 """A run so many times as long as the mean of its job still fits into a pack that is not cut."""
 
-KEPT = 0.7
+PREVIOUS_WEIGHT = 0.7
 """Weight of what was known when a new cost is measured."""
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
+class MeanCost:
     """Running mean of what one item of a job costs; `seconds` is None before the first."""
 
     seconds: float | None = None
 
-    def observe(self, seconds: float) -> "Cost":
+    def add_measurement(self, seconds: float) -> "MeanCost":
         """The mean after one more item."""
         if self.seconds is None:
-            return Cost(seconds)
-        return Cost(KEPT * self.seconds + (1 - KEPT) * seconds)
+            return MeanCost(seconds)
+        return MeanCost(PREVIOUS_WEIGHT * self.seconds + (1 - PREVIOUS_WEIGHT) * seconds)
 
 
-def pack_size(cost: Cost, waiting: int, slots: int) -> int:
+def choose_pack_size(cost: MeanCost, waiting: int, slots: int) -> int:
     """How many of `waiting` equal items go into the next task.
 
     One while the cost is unknown; never more than an even share of what waits, so that the end of
@@ -53,12 +53,16 @@ def pack_size(cost: Cost, waiting: int, slots: int) -> int:
     return min(max(1, min(by_cost, share)), waiting)
 
 
-def slice_seconds(slices: int, cost: Cost | None = None) -> float:
+def choose_slice_seconds(slices: int, cost: MeanCost | None = None) -> float:
     """Length of a run's next time slice after `slices` of them.
 
     Where `cost` tells that such a run fits into a pack, it is not cut: each cut is a task more.
     """
-    if cost is not None and cost.seconds is not None and cost.seconds <= PACK_SECONDS / ROOM:
+    if (
+        cost is not None
+        and cost.seconds is not None
+        and cost.seconds <= PACK_SECONDS / PACK_TOLERANCE
+    ):
         return PACK_SECONDS
     return min(PACK_SECONDS, FIRST_SLICE_SECONDS * 2.0 ** min(slices, 10))
 
@@ -76,7 +80,7 @@ def is_worth_spreading(epoch_seconds: float, islands: int, idle: int) -> bool:
     return idle > 0 and islands > 1 and epoch_seconds / islands >= WORTH_SPREADING_SECONDS
 
 
-def deal(costs: Sequence[float], bins: int) -> tuple[tuple[int, ...], ...]:
+def balance_packs(costs: Sequence[float], bins: int) -> tuple[tuple[int, ...], ...]:
     """Indices dealt over at most `bins` packs of about equal cost (longest first)."""
     count = min(bins, len(costs))
     packs: list[list[int]] = [[] for _ in range(count)]

@@ -10,9 +10,10 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from benchmarks.breaking.stand import Stand
-from service.repositories.history import history_of, migrants_of
-from service.storage.retry import PASSING
-from service.storage.tables import Event, Job, MigrationLog, Run, RunHistory, State
+from service.core.states import JobState
+from service.repositories.history import unpack_history, unpack_migrants
+from service.storage.retry import TRANSIENT_ERRORS
+from service.storage.tables import Event, Job, MigrationLog, Run, RunHistory
 
 CLOCKED = ("seconds", "job", "run")
 """Fields of a summary that tell of time and place, not of the result."""
@@ -78,11 +79,11 @@ def audit(stand: Stand, job_id: str, *, ends: int = 1) -> Finding:
     ends : int
         How often it may have ended: once more than it was resumed.
     """
-    with stand.database.read() as session:
+    with stand.database.read_session() as session:
         job = session.get_one(Job, job_id)
         runs = list(session.scalars(select(Run).where(Run.job_id == job_id).order_by(Run.number)))
         kinds = session.execute(select(Event.kind, Event.data).where(Event.job_id == job_id))
-        ended = sum(State(data["state"]).is_terminal for kind, data in kinds if kind == "state")
+        ended = sum(JobState(data["state"]).is_terminal for kind, data in kinds if kind == "state")
         paths = _paths(session, job_id)
     numbers = Counter(run.number for run in runs)
     doubled = sum(numbers.values()) - len(numbers) + max(0, job.n_done - job.n_runs)
@@ -95,11 +96,11 @@ def audit(stand: Stand, job_id: str, *, ends: int = 1) -> Finding:
         "histories": [paths.get(run.id) for run in runs],
         "estimates": estimates, "reasons": reasons,
     }  # fmt: skip
-    given_up = job.state is State.FAILED and job.lost_leases >= job.max_attempts
+    given_up = job.state is JobState.FAILED and job.lost_leases >= job.max_attempts
     states = tuple(run.state.value for run in runs)
     killed = tuple((run.error or "").startswith(KILLED) for run in runs)
     unplotted = sum(
-        run.state is State.SUCCEEDED and run.signals_sha256 is None for run in runs
+        run.state is JobState.SUCCEEDED and run.signals_sha256 is None for run in runs
     )  # fmt: skip
     text = json.dumps(figures, sort_keys=True)
     return Finding(states, doubled, given_up, text, killed, unplotted)
@@ -118,7 +119,7 @@ def _paths(session: Session, job_id: str) -> dict[str, str]:
         migrants[run].append(data)
     return {
         run: sha256(
-            repr([history_of("", found), migrants_of("", migrants[run])]).encode()
+            repr([unpack_history("", found), unpack_migrants("", migrants[run])]).encode()
         ).hexdigest()
         for run, found in points.items()
     }
@@ -141,24 +142,26 @@ def without_clock(document: Any) -> Any:
 def is_over(stand: Stand, job_id: str) -> bool:
     """Whether a job has ended; False while the database is away."""
     try:
-        with stand.database.read() as session:
+        with stand.database.read_session() as session:
             return session.get_one(Job, job_id).state.is_terminal
-    except PASSING:
+    except TRANSIENT_ERRORS:
         return False
 
 
 def steps(stand: Stand, jobs: list[str]) -> int | None:
     """A number that grows with the work on jobs; None while the database is away."""
     try:
-        with stand.database.read() as session:
-            ended = select(func.count()).where(Run.job_id.in_(jobs), Run.state == State.SUCCEEDED)
+        with stand.database.read_session() as session:
+            ended = select(func.count()).where(
+                Run.job_id.in_(jobs), Run.state == JobState.SUCCEEDED
+            )
             return int(session.scalar(ended) or 0)
-    except PASSING:
+    except TRANSIENT_ERRORS:
         return None
 
 
 def owners(stand: Stand) -> set[str]:
     """Dispatchers that hold a lease."""
-    with stand.database.read() as session:
-        held = select(Job.lease_owner).where(Job.state == State.RUNNING)
+    with stand.database.read_session() as session:
+        held = select(Job.lease_owner).where(Job.state == JobState.RUNNING)
         return {str(one) for one in session.scalars(held)}

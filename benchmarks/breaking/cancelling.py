@@ -10,8 +10,9 @@ from typing import TypeVar
 from benchmarks.breaking.faults import LIMIT_SECONDS, Bench, goes_on, kill, recovery, renewal
 from benchmarks.breaking.stand import until
 from service.client.calls import ClientError, ProblemError
-from service.storage.retry import PASSING
-from service.storage.tables import Job, State
+from service.core.states import JobState
+from service.storage.retry import TRANSIENT_ERRORS
+from service.storage.tables import Job
 
 T = TypeVar("T")
 CONFLICT = 409
@@ -68,7 +69,7 @@ def _cancel_and_resume(bench: Bench, job: str) -> None:
         bench.stream.watch(job, "cancelled")
         return
     until(lambda: _job(bench, job).state.is_terminal, "it was cancelled", LIMIT_SECONDS)
-    if _job(bench, job).state is not State.CANCELLED:  # it ended before anybody looked
+    if _job(bench, job).state is not JobState.CANCELLED:  # it ended before anybody looked
         bench.stream.counts["cancelled too late"] += 1
         bench.stream.watch(job, "cancelled")
         return
@@ -77,14 +78,14 @@ def _cancel_and_resume(bench: Bench, job: str) -> None:
     try:
         _insist(lambda: bench.stand.client.resume(job))
     except ProblemError:  # the answer to an earlier try was lost
-        if _job(bench, job).state is State.CANCELLED:
+        if _job(bench, job).state is JobState.CANCELLED:
             raise
     bench.stream.watch(job, "cancelled", ends=2)
 
 
 def _has_begun(bench: Bench, job: str) -> bool:
     found = _job(bench, job)
-    return found.state.is_terminal or (found.state is State.RUNNING and found.n_done > 0)
+    return found.state.is_terminal or (found.state is JobState.RUNNING and found.n_done > 0)
 
 
 def _is_finishing(bench: Bench, job: str) -> bool:
@@ -94,7 +95,7 @@ def _is_finishing(bench: Bench, job: str) -> bool:
 
 def _job(bench: Bench, job: str) -> Job:
     def read() -> Job:
-        with bench.stand.database.read() as session:
+        with bench.stand.database.read_session() as session:
             return session.get_one(Job, job)
 
     return _insist(read)
@@ -106,7 +107,7 @@ def _insist(work: Callable[[], T]) -> T:
     while True:
         try:
             return work()
-        except (ClientError, *PASSING) as error:
+        except (ClientError, *TRANSIENT_ERRORS) as error:
             is_answer = isinstance(error, ProblemError) and error.status == CONFLICT
             if is_answer or time.monotonic() > limit:
                 raise

@@ -20,7 +20,7 @@ from sqlalchemy import select
 from benchmarks.breaking.audit import owners, steps
 from benchmarks.breaking.stand import Stand, until
 from benchmarks.breaking.work import Stream
-from service.storage.tables import Dispatcher
+from service.storage.tables import DispatcherHeartbeat
 
 LIMIT_SECONDS = 300.0
 PAUSED_SECONDS = 11.0
@@ -159,8 +159,8 @@ def renewal(bench: Bench, fault: Callable[[], None]) -> float:
 
 def known(bench: Bench) -> set[str]:
     """Dispatchers that were ever heard of."""
-    with bench.stand.database.read() as session:
-        return {*session.scalars(select(Dispatcher.owner)), *owners(bench.stand)}
+    with bench.stand.database.read_session() as session:
+        return {*session.scalars(select(DispatcherHeartbeat.owner)), *owners(bench.stand)}
 
 
 def recovery(

@@ -18,8 +18,8 @@ import httpx
 
 from benchmarks.breaking.processes import MARK, Family
 from service.client.client import Client
-from service.client.embedded import free_port
-from service.storage.sessions import Database, sqlite_url
+from service.client.embedded import find_free_port
+from service.storage.sessions import Database, make_sqlite_url
 
 SHIM = Path(__file__).with_name("shim")
 START_SECONDS = 180.0
@@ -50,7 +50,7 @@ class Stand:
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.temporary = Path(tempfile.mkdtemp(prefix="lb-"))  # short: Ray puts sockets there
-        self.folder, self.port = folder, free_port()
+        self.folder, self.port = folder, find_free_port()
         self.family = Family(mark := secrets.token_hex(8))
         address = {} if database_url is None else {"LAGID_DATABASE_URL": database_url}
         self.environment = {
@@ -61,7 +61,7 @@ class Stand:
             **address, **(environment or {}),
         }  # fmt: skip
         self.url = f"http://127.0.0.1:{self.port}"
-        self.database = Database(database_url or sqlite_url(folder / "lagid.db"))
+        self.database = Database(database_url or make_sqlite_url(folder / "lagid.db"))
         self.client = Client(self.url)
         self.web: subprocess.Popen[bytes] | None = None
         self._before = set(shared_memory())

@@ -14,7 +14,7 @@ from benchmarks import paper_example
 from benchmarks.breaking.audit import Finding, audit, is_over
 from benchmarks.breaking.stand import Stand, until
 from service.client.calls import ClientError
-from service.storage.retry import PASSING
+from service.storage.retry import TRANSIENT_ERRORS
 from service.storage.tables import Checkpoint, Job
 
 STUCK_SECONDS = 180.0
@@ -103,7 +103,7 @@ class Stream:
 
     def _evaluations(self, job: str) -> tuple[int, int]:
         """Those of a job of one run so far, and those in its checkpoint."""
-        with self._stand.database.read() as session:
+        with self._stand.database.read_session() as session:
             told = session.get_one(Job, job).evaluations
             kept = select(Checkpoint.evaluations).where(Checkpoint.job_id == job)
             return told, session.scalar(kept) or 0
@@ -164,7 +164,7 @@ class Stream:
     def _try(work: Any) -> None:
         try:
             work()
-        except (ClientError, *PASSING):
+        except (ClientError, *TRANSIENT_ERRORS):
             return  # a part is away; tried again at the next look
 
     def _compare(self, job: str) -> None:

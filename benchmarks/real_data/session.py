@@ -10,7 +10,7 @@ from typing import Any
 from benchmarks.family import members, pss_bytes
 from benchmarks.table import Row, Skipped, parser, report
 from service.client.client import Client
-from service.client.embedded import embedded_service
+from service.client.embedded import run_embedded_service
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -42,7 +42,7 @@ def service() -> Iterator[tuple[Client, Path]]:
     """Start a service in a temporary folder; give a client and that folder."""
     with (
         tempfile.TemporaryDirectory(prefix="lagid-") as folder,
-        embedded_service(Path(folder)) as url,
+        run_embedded_service(Path(folder)) as url,
         Client(url) as client,
     ):
         yield client, Path(folder)

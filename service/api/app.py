@@ -43,17 +43,17 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         title="lagid",
         version=version("lagid"),
         description=DESCRIPTION,
-        lifespan=_lifespan(chosen),
+        lifespan=_build_lifespan(chosen),
         separate_input_output_schemas=False,
         docs_url=None,  # FastAPI's own page loads its scripts from elsewhere; ours is at /docs
         redoc_url=None,
     )
-    problems.install(app)
+    problems.install_handlers(app)
     app.add_middleware(BodyLimit, limit=chosen.max_body_bytes)
     # Exact REST paths come first: a page's path may have parameters.
     for router in (
-        health.router, datasets.router, models.router, jobs.router, recipes.router,
-        references.router, events.router, runs.comparison_router, runs.router, pages.router,
+        health.router, datasets.router, models.router, jobs.router, recipes.recipe_router,
+        references.reference_router, events.router, runs.comparison_router, runs.router, pages.router,
     ):  # fmt: skip
         app.include_router(router)
     return app
@@ -70,7 +70,7 @@ def open_parts(settings: Settings) -> Parts:
     return Parts(settings, *open_storage(settings))
 
 
-def _lifespan(settings: Settings):  # type: ignore[no-untyped-def]
+def _build_lifespan(settings: Settings):  # type: ignore[no-untyped-def]
     @asynccontextmanager
     async def run(app: FastAPI) -> AsyncIterator[None]:
         app.state.parts = parts = await run_in_threadpool(open_parts, settings)

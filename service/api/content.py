@@ -25,7 +25,7 @@ from service.core.errors import (
     UnsupportedMediaType,
 )
 from service.core.settings import Settings
-from service.datasets.datasets import Format, check_size
+from service.datasets.datasets import FileFormat, check_upload_size
 from service.storage.objects import ObjectStore
 
 MCAP_TYPE = "application/x-mcap"
@@ -34,7 +34,7 @@ CROSS_ORIGIN = {
     "Access-Control-Allow-Origin": "*",
     "Access-Control-Expose-Headers": "Accept-Ranges, Content-Length, Content-Range, ETag",
 }
-_RANGE = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
+_RANGE_PATTERN = re.compile(r"bytes=(\d*)-(\d*)", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class ByteRange:
     stop: int
 
 
-def content_of(
+def content_response(
     request: Request,
     store: ObjectStore,
     sha256: str,
@@ -74,25 +74,25 @@ def content_of(
         "Cache-Control": "private, max-age=31536000, immutable",
         "Content-Disposition": f'attachment; filename="{file_name}"',
     }
-    if "if-match" in request.headers and not _names(request.headers["if-match"], etag):
+    if "if-match" in request.headers and not _matches_etag(request.headers["if-match"], etag):
         raise StaleVersion(f"the content is {etag}; asked for {request.headers['if-match']}")
-    if _names(request.headers.get("if-none-match", ""), etag):
+    if _matches_etag(request.headers.get("if-none-match", ""), etag):
         return Response(status_code=304, headers=headers)
-    whole = ByteRange(0, store.size(sha256))  # asked in any case: it may be missing
+    whole = ByteRange(0, store.get_size(sha256))  # asked in any case: it may be missing
     file = whole if part_of is None else part_of
     size = file.stop - file.start
-    part = _asked(request, size, etag)
+    part = _parse_range(request, size, etag)
     status, wanted = (200, ByteRange(0, size)) if part is None else (206, part)
     if part is not None:
         headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
     headers["Content-Length"] = str(wanted.stop - wanted.start)
     if request.method == "HEAD":
         return Response(status_code=status, headers=headers, media_type=MCAP_TYPE)
-    blocks = store.stream(sha256, file.start + wanted.start, wanted.stop - wanted.start)
+    blocks = store.get_stream(sha256, file.start + wanted.start, wanted.stop - wanted.start)
     return StreamingResponse(blocks, status, headers, MCAP_TYPE)
 
 
-def preflight() -> Response:
+def preflight_response() -> Response:
     """Answer of a browser's question whether a page of another origin may ask for ranges."""
     headers = {
         **CROSS_ORIGIN,
@@ -103,12 +103,12 @@ def preflight() -> Response:
     return Response(status_code=204, headers=headers)
 
 
-def _asked(request: Request, size: int, etag: str) -> ByteRange | None:
+def _parse_range(request: Request, size: int, etag: str) -> ByteRange | None:
     """The range asked for; None for the whole, also where the client holds another version."""
     text = request.headers.get("range")
     if text is None or request.headers.get("if-range", etag) != etag:
         return None
-    found = _RANGE.fullmatch(text.strip())
+    found = _RANGE_PATTERN.fullmatch(text.strip())
     if found is None or found[0] == "bytes=-":
         return None  # several ranges, or another unit: RFC 9110 lets a server send the whole
     first, last = found.groups()
@@ -121,7 +121,7 @@ def _asked(request: Request, size: int, etag: str) -> ByteRange | None:
     return ByteRange(start, stop)
 
 
-def _names(header: str, etag: str) -> bool:
+def _matches_etag(header: str, etag: str) -> bool:
     given = [one.strip().removeprefix("W/") for one in header.split(",")]
     return etag in given or given == ["*"]
 
@@ -129,7 +129,7 @@ def _names(header: str, etag: str) -> bool:
 CSV_TYPES = ("text/csv", "application/csv", "text/plain")
 MCAP_TYPES = ("application/x-mcap", "application/mcap", "application/vnd.mcap")
 MULTIPART = "multipart/form-data"
-PIECE = 1 << 20
+PIECE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,13 +137,13 @@ class Upload:
     """A received file: where it lies, what it is, and the hash of its bytes."""
 
     path: Path
-    form: Format
+    file_format: FileFormat
     sha256: str
     name: str | None
 
 
 @asynccontextmanager
-async def received(request: Request, settings: Settings) -> AsyncIterator[Upload]:
+async def receive_upload(request: Request, settings: Settings) -> AsyncIterator[Upload]:
     """The body as a file that is there for the length of the block.
 
     Raises
@@ -155,48 +155,50 @@ async def received(request: Request, settings: Settings) -> AsyncIterator[Upload
     """
     kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != MULTIPART:
-        _format(kind, None)  # refused before the body is read
+        _detect_format(kind, None)  # refused before the body is read
     announced = request.headers.get("content-length", "")
     if announced.isdecimal():
-        check_size(int(announced), settings)
+        check_upload_size(int(announced), settings)
     elif kind == MULTIPART:
         raise TooLarge("a form needs a Content-Length header, to be known as small enough")
-    with TemporaryDirectory(prefix=temporary.prefix()) as folder:
+    with TemporaryDirectory(prefix=temporary.make_temporary_prefix()) as folder:
         path = Path(folder) / "upload"
         if kind == MULTIPART:
-            yield await _from_form(request, path, settings)
+            yield await _receive_form(request, path, settings)
         else:
-            digest = await _save(request.stream(), path, settings)
-            yield Upload(path, _format(kind, None), digest, None)
+            digest = await _save_body(request.stream(), path, settings)
+            yield Upload(path, _detect_format(kind, None), digest, None)
 
 
-async def _from_form(request: Request, path: Path, settings: Settings) -> Upload:
+async def _receive_form(request: Request, path: Path, settings: Settings) -> Upload:
     async with request.form(max_files=1, max_fields=20) as form:
         file = next((one for one in form.values() if isinstance(one, UploadFile)), None)
         if file is None or not file.filename:
-            raise InvalidRequest.at("/file", "the form has no file; need one CSV or MCAP file")
-        digest = await _save(_pieces(file), path, settings)
-        found = _format((file.content_type or "").partition(";")[0], file.filename)
+            raise InvalidRequest.from_fault(
+                "/file", "the form has no file; need one CSV or MCAP file"
+            )
+        digest = await _save_body(_read_pieces(file), path, settings)
+        found = _detect_format((file.content_type or "").partition(";")[0], file.filename)
         return Upload(path, found, digest, Path(file.filename).stem)
 
 
-async def _pieces(file: UploadFile) -> AsyncIterator[bytes]:
-    while piece := await file.read(PIECE):
+async def _read_pieces(file: UploadFile) -> AsyncIterator[bytes]:
+    while piece := await file.read(PIECE_BYTES):
         yield piece
 
 
-async def _save(pieces: AsyncIterator[bytes], path: Path, settings: Settings) -> str:
+async def _save_body(pieces: AsyncIterator[bytes], path: Path, settings: Settings) -> str:
     digest, size = hashlib.sha256(), 0
     with path.open("wb") as file:
         async for piece in pieces:
             size += len(piece)
-            check_size(size, settings)
+            check_upload_size(size, settings)
             digest.update(piece)
             await run_in_threadpool(file.write, piece)
     return digest.hexdigest()
 
 
-def _format(kind: str, file_name: str | None) -> Format:
+def _detect_format(kind: str, file_name: str | None) -> FileFormat:
     # Browsers do not know MCAP and call CSV many things: a file's suffix says it better.
     suffix = Path(file_name or "").suffix.lower()
     if suffix == ".mcap" or kind in MCAP_TYPES:

@@ -7,20 +7,20 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import StreamingResponse
 
-from service.api.content import CROSS_ORIGIN, content_of, preflight, received
+from service.api.content import CROSS_ORIGIN, content_response, preflight_response, receive_upload
 from service.api.dependencies import Cursor, Limit, MaxPoints, PartsDep, ReadSession
 from service.core.wire import Page
 from service.datasets import datasets
 from service.datasets import datasets as lineage
 from service.datasets import simulated as simulations
-from service.datasets.recordings import recording_of
+from service.datasets.recordings import load_recording
 from service.datasets.schemas import DatasetOut, DeriveIn, LineageOut, SignalsOut, SimulateIn
-from service.formats.csv_recordings import csv_rows
-from service.repositories.datasets import DatasetRepository, Stored
+from service.formats.csv_recordings import generate_csv
+from service.repositories.datasets import DatasetRepository, StoredDataset
 
 router = APIRouter(prefix="/v1", tags=["datasets"])
 
-BODY: dict[str, Any] = {
+UPLOAD_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "content": {
@@ -43,8 +43,8 @@ Segments = Annotated[
 SampleTime = Annotated[float | None, Query(gt=0, description="s, for a CSV without a time column")]
 
 
-@router.post("/datasets", status_code=201, openapi_extra=BODY)
-async def add(
+@router.post("/datasets", status_code=201, openapi_extra=UPLOAD_BODY)
+async def add_dataset(
     request: Request,
     response: Response,
     parts: PartsDep,
@@ -53,80 +53,90 @@ async def add(
     sample_time: SampleTime = None,
 ) -> DatasetOut:
     """Store a recording, CSV or MCAP. The same bytes again give the same dataset (200)."""
-    async with received(request, parts.settings) as upload:
+    async with receive_upload(request, parts.settings) as upload:
         stored = await run_in_threadpool(
-            datasets.add_upload, parts.database, parts.store, upload.path, upload.form,
+            datasets.add_upload, parts.database, parts.store, upload.path, upload.file_format,
             sha256=upload.sha256, name=name or upload.name,
             segments=[one.strip() for one in (segments or "").split(",") if one.strip()],
             sample_time=sample_time,
         )  # fmt: skip
-    return _told(stored, response, name)
+    return _dataset_response(stored, response, name)
 
 
 @router.post("/datasets:simulate", status_code=201)
-def simulate(body: SimulateIn, parts: PartsDep, response: Response) -> DatasetOut:
+def simulate_dataset(body: SimulateIn, parts: PartsDep, response: Response) -> DatasetOut:
     """Make a dataset from a model, its true parameters, inputs and noise."""
-    return _told(simulations.simulate(parts.database, parts.store, body), response, body.name)
+    return _dataset_response(
+        simulations.simulate_dataset(parts.database, parts.store, body), response, body.name
+    )
 
 
 @router.post("/datasets/{dataset_id}:derive", status_code=201)
-def derive(dataset_id: str, body: DeriveIn, parts: PartsDep, response: Response) -> DatasetOut:
+def derive_dataset(
+    dataset_id: str, body: DeriveIn, parts: PartsDep, response: Response
+) -> DatasetOut:
     """Make a dataset from another, by its id or name: noise, resample, trim, select and so on."""
-    stored = datasets.derive(parts.database, parts.store, dataset_id, body)
-    return _told(stored, response, body.name)
+    stored = datasets.derive_dataset(parts.database, parts.store, dataset_id, body)
+    return _dataset_response(stored, response, body.name)
 
 
 @router.get("/datasets")
-def page(session: ReadSession, cursor: Cursor = None, limit: Limit = 50) -> Page[DatasetOut]:
+def list_datasets(
+    session: ReadSession, cursor: Cursor = None, limit: Limit = 50
+) -> Page[DatasetOut]:
     """Datasets, latest first."""
-    return datasets.page(session, cursor, limit)
+    return datasets.list_datasets(session, cursor, limit)
 
 
 @router.get("/datasets/{dataset_id}")
-def read(dataset_id: str, session: ReadSession) -> DatasetOut:
+def read_dataset(dataset_id: str, session: ReadSession) -> DatasetOut:
     """One dataset: channels, sampling, segments, warnings."""
-    return datasets.told(DatasetRepository(session).get(dataset_id))
+    return datasets.to_out(DatasetRepository(session).get(dataset_id))
 
 
 @router.get("/datasets/{dataset_id}/signals")
-def signals(
+def read_signals(
     dataset_id: str, session: ReadSession, parts: PartsDep, max_points: MaxPoints = 1000
 ) -> SignalsOut:
     """The samples, reduced so that extremes stay visible."""
-    return datasets.signals(session, parts.store, dataset_id, max_points)
+    return datasets.read_signals(session, parts.store, dataset_id, max_points)
 
 
 @router.get("/datasets/{dataset_id}/lineage")
-def ancestry(dataset_id: str, session: ReadSession) -> LineageOut:
+def read_lineage(dataset_id: str, session: ReadSession) -> LineageOut:
     """What it was made from, and what was made from it."""
-    return lineage.of_dataset(session, dataset_id)
+    return lineage.read_lineage(session, dataset_id)
 
 
 @router.head("/datasets/{dataset_id}/content", include_in_schema=False)
 @router.get("/datasets/{dataset_id}/content")
-def content(dataset_id: str, request: Request, session: ReadSession, parts: PartsDep) -> Response:
+def read_content(
+    dataset_id: str, request: Request, session: ReadSession, parts: PartsDep
+) -> Response:
     """The recording as MCAP; ranges and ETags are honoured."""
     row = DatasetRepository(session).get(dataset_id)
-    return content_of(request, parts.store, row.sha256, f"{row.id}.mcap")
+    return content_response(request, parts.store, row.sha256, f"{row.id}.mcap")
 
 
 @router.options("/datasets/{dataset_id}/content", include_in_schema=False)
-def may_read(dataset_id: str) -> Response:
+def allow_cross_origin(dataset_id: str) -> Response:
     """Pages of other origins may read content."""
-    return preflight()
+    return preflight_response()
 
 
 @router.get("/datasets/{dataset_id}/content.csv", response_class=StreamingResponse)
-def content_csv(dataset_id: str, session: ReadSession, parts: PartsDep) -> StreamingResponse:
+def read_content_csv(dataset_id: str, session: ReadSession, parts: PartsDep) -> StreamingResponse:
     """The recording as CSV."""
     row = DatasetRepository(session).get(dataset_id)
-    rows: Iterator[str] = csv_rows(recording_of(parts.store, row.sha256))
+    rows: Iterator[str] = generate_csv(load_recording(parts.store, row.sha256))
     headers = {**CROSS_ORIGIN, "Content-Disposition": f'attachment; filename="{row.id}.csv"'}
     return StreamingResponse(rows, media_type="text/csv; charset=utf-8", headers=headers)
 
 
-def _told(stored: Stored, response: Response, name: str | None = None) -> DatasetOut:
+def _dataset_response(
+    stored: StoredDataset, response: Response, name: str | None = None
+) -> DatasetOut:
     response.headers["Location"] = f"/v1/datasets/{stored.dataset.id}"
     if not stored.is_new:
         response.status_code = 200
-    return datasets.told_again(stored, name)
+    return datasets.to_stored_out(stored, name)

@@ -26,29 +26,29 @@ class Parts:
     stopping: Event = field(default_factory=Event)
 
 
-def parts(request: Request) -> Parts:
+def get_parts(request: Request) -> Parts:
     """The parts of this process."""
     found: Parts = request.app.state.parts
     return found
 
 
-PartsDep = Annotated[Parts, Depends(parts)]
+PartsDep = Annotated[Parts, Depends(get_parts)]
 
 
-def _reading(found: PartsDep) -> Iterator[Session]:
-    with found.database.read() as session:
+def _open_read_session(found: PartsDep) -> Iterator[Session]:
+    with found.database.read_session() as session:
         yield session
 
 
-def _writing(found: PartsDep) -> Iterator[Session]:
+def _open_write_session(found: PartsDep) -> Iterator[Session]:
     """One session and one transaction per request: commit if the route returns, else roll back."""
-    with found.database.write() as session:
+    with found.database.write_session() as session:
         yield session
 
 
 # The scope makes the commit happen before the answer is sent: what a client is told is stored.
-ReadSession = Annotated[Session, Depends(_reading, scope="function")]
-WriteSession = Annotated[Session, Depends(_writing, scope="function")]
+ReadSession = Annotated[Session, Depends(_open_read_session, scope="function")]
+WriteSession = Annotated[Session, Depends(_open_write_session, scope="function")]
 
 Cursor = Annotated[str | None, Query(max_length=100, description="`next` of the page before")]
 Limit = Annotated[int, Query(ge=1, le=1000, description="items a page")]

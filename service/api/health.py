@@ -32,16 +32,16 @@ PROBLEM_KINDS = {
 
 
 @router.get("/healthz")
-def alive() -> dict[str, str]:
+def check_alive() -> dict[str, str]:
     """The web process answers."""
     return {"status": "ok"}
 
 
 @router.get("/readyz")
-def ready(parts: PartsDep) -> dict[str, str]:
+def check_ready(parts: PartsDep) -> dict[str, str]:
     """Database at head, store writable, a dispatcher alive; 503 with what is not."""
-    checks = {"database": _database, "store": _store, "dispatcher": _dispatcher}
-    failures = list(_failures(parts, checks))
+    checks = {"database": _check_database, "store": _check_store, "dispatcher": _check_dispatcher}
+    failures = list(_collect_failures(parts, checks))
     if failures:
         detail = "; ".join(one.detail for one in failures)
         raise Unavailable(detail, failures)
@@ -49,11 +49,11 @@ def ready(parts: PartsDep) -> dict[str, str]:
 
 
 @router.get("/metrics", response_class=PlainTextResponse)
-def metrics(session: ReadSession) -> str:
+def read_metrics(session: ReadSession) -> str:
     """Gauges in Prometheus' text format."""
-    alive_now = len(DispatcherRepository(session).alive())
+    alive_now = len(DispatcherRepository(session).list_alive())
     lines = ["# HELP lagid_jobs Jobs by state.", "# TYPE lagid_jobs gauge"]
-    for state, n in JobRepository(session).counts().items():
+    for state, n in JobRepository(session).count_states().items():
         lines.append(f'lagid_jobs{{state="{state.value}"}} {n}')
     lines += ["# HELP lagid_dispatchers Dispatchers that are alive.",
               "# TYPE lagid_dispatchers gauge", f"lagid_dispatchers {alive_now}"]  # fmt: skip
@@ -61,12 +61,14 @@ def metrics(session: ReadSession) -> str:
 
 
 @router.get("/problems/{kind}", response_class=PlainTextResponse, include_in_schema=False)
-def explain(kind: str) -> str:
+def explain_problem(kind: str) -> str:
     """What a problem document's `type` means."""
     return PROBLEM_KINDS.get(kind, "This server gives no problem of that type.")
 
 
-def _failures(parts: Parts, checks: Mapping[str, Callable[[Parts], None]]) -> Iterator[FieldError]:
+def _collect_failures(
+    parts: Parts, checks: Mapping[str, Callable[[Parts], None]]
+) -> Iterator[FieldError]:
     for name, check in checks.items():
         try:
             check(parts)
@@ -74,15 +76,15 @@ def _failures(parts: Parts, checks: Mapping[str, Callable[[Parts], None]]) -> It
             yield FieldError(f"/{name}", str(error).splitlines()[0])
 
 
-def _database(parts: Parts) -> None:
-    migrate.check(parts.database)
+def _check_database(parts: Parts) -> None:
+    migrate.check_revision(parts.database)
 
 
-def _store(parts: Parts) -> None:
+def _check_store(parts: Parts) -> None:
     parts.store.check_writable()
 
 
-def _dispatcher(parts: Parts) -> None:
-    with parts.database.read() as session:
-        if not DispatcherRepository(session).alive():
+def _check_dispatcher(parts: Parts) -> None:
+    with parts.database.read_session() as session:
+        if not DispatcherRepository(session).list_alive():
             raise Unavailable("no dispatcher is alive; jobs are accepted, and wait for one")

@@ -6,9 +6,9 @@ from fastapi import Request
 from fastapi.responses import HTMLResponse
 
 from service.core.errors import FieldError
-from service.pages.render import render
+from service.pages.render import render_template
 
-NO_PAGES = ("/v1/", "/static/", "/pages/", "/healthz", "/readyz", "/metrics", "/openapi.json")
+PROGRAM_PATHS = ("/v1/", "/static/", "/pages/", "/healthz", "/readyz", "/metrics", "/openapi.json")
 """Addresses, or their beginnings, that programs read and scripts load."""
 # Scripts and data come from here only. Plotly styles its own elements, hence the inline styles;
 # it writes pictures for download through blob: and data: addresses.
@@ -24,7 +24,7 @@ PAGE_HEADERS = {
 }
 
 
-class Page(HTMLResponse):
+class HtmlPage(HTMLResponse):
     """A page, with what a browser may load for it."""
 
     def __init__(
@@ -33,16 +33,18 @@ class Page(HTMLResponse):
         super().__init__(content, status, headers={**PAGE_HEADERS, **(headers or {})})
 
 
-def is_for_people(request: Request) -> bool:
+def wants_html(request: Request) -> bool:
     """Whether a browser asked for a page: then an error is told on one."""
     accepted = request.headers.get("accept", "")
-    is_page = request.method in ("GET", "HEAD") and not request.url.path.startswith(NO_PAGES)
+    is_page = request.method in ("GET", "HEAD") and not request.url.path.startswith(PROGRAM_PATHS)
     return is_page and "text/html" in accepted
 
 
 def error_page(
     status: int, title: str, detail: str, errors: Sequence[FieldError], headers: Mapping[str, str]
-) -> Page:
+) -> HtmlPage:
     """An error as a page, in the words of the problem document."""
     lines = [str(one).removeprefix("?") for one in errors] or [detail]
-    return Page(render("error.html", status=status, title=title, lines=lines), status, headers)
+    return HtmlPage(
+        render_template("error.html", status=status, title=title, lines=lines), status, headers
+    )

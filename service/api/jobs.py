@@ -6,8 +6,9 @@ from fastapi import APIRouter, Header, Query, Response, status
 from fastapi.responses import StreamingResponse
 
 from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession, WriteSession
+from service.core.states import JobState
 from service.core.wire import Page
-from service.datasets.rms_unit import unit_of
+from service.datasets.rms_unit import find_rms_unit
 from service.jobs import submit as jobs
 from service.jobs.schemas import JobIn, JobOut
 from service.repositories.jobs import JobRepository
@@ -15,7 +16,6 @@ from service.repositories.runs import RunOrder
 from service.runs import runs
 from service.runs import table as runs_table
 from service.runs.schemas import RunOut
-from service.storage.tables import State
 from service.sweeps import summary as summaries
 from service.sweeps.schemas import SummaryOut
 from service.trends import trend as trends
@@ -23,90 +23,96 @@ from service.trends.schemas import TrendOut
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
-Key = Annotated[str | None, Header(max_length=200, description="same key, same job")]
-States = Annotated[list[State] | None, Query(description="only jobs or runs in these states")]
-Filter = Annotated[
+IdempotencyKeyHeader = Annotated[
+    str | None, Header(max_length=200, description="same key, same job")
+]
+StatesFilter = Annotated[
+    list[JobState] | None, Query(description="only jobs or runs in these states")
+]
+CellFilter = Annotated[
     list[str] | None,
     Query(description="`/noise/sigma=0.1` keeps the cells with that value; may be repeated"),
 ]
 
 
 @router.post("", status_code=status.HTTP_202_ACCEPTED)
-def submit(
+def submit_job(
     body: JobIn,
     parts: PartsDep,
     response: Response,
-    idempotency_key: Key = None,
+    idempotency_key: IdempotencyKeyHeader = None,
 ) -> JobOut:
     """Queue a job. Everything that can be wrong with it is told now.
 
     Of a sweep of more than 2,000 runs the others are made while it runs; until then they count as
     queued, and have no page and no identifier.
     """
-    job = jobs.submit_to(parts.database, body, parts.settings, idempotency_key)
-    return _accepted(job, response)
+    job = jobs.submit_job(parts.database, body, parts.settings, idempotency_key)
+    return _set_location(job, response)
 
 
 @router.get("")
-def page(
-    session: ReadSession, cursor: Cursor = None, limit: Limit = 50, state: States = None
+def list_jobs(
+    session: ReadSession, cursor: Cursor = None, limit: Limit = 50, state: StatesFilter = None
 ) -> Page[JobOut]:
     """Jobs, latest first."""
-    return jobs.page(session, cursor, limit, state or [])
+    return jobs.list_jobs(session, cursor, limit, state or [])
 
 
 @router.get("/{job_id}")
-def read(job_id: str, session: ReadSession) -> JobOut:
+def read_job(job_id: str, session: ReadSession) -> JobOut:
     """One job: state, progress, and the exact request."""
     job = JobRepository(session).get(job_id)
-    return jobs.told(job, with_request=True, rms_unit=unit_of(session, job.spec))
+    return jobs.to_job_out(job, with_request=True, rms_unit=find_rms_unit(session, job.spec))
 
 
 @router.post("/{job_id}:cancel")
-def cancel(job_id: str, session: WriteSession) -> JobOut:
+def cancel_job(job_id: str, session: WriteSession) -> JobOut:
     """Cancel a job: at once if it is queued, within a moment if it runs."""
-    return jobs.told(JobRepository(session).cancel(job_id))
+    return jobs.to_job_out(JobRepository(session).cancel(job_id))
 
 
 @router.post("/{job_id}:resume", status_code=status.HTTP_202_ACCEPTED)
-def resume(job_id: str, parts: PartsDep, session: WriteSession, response: Response) -> JobOut:
+def resume_job(job_id: str, parts: PartsDep, session: WriteSession, response: Response) -> JobOut:
     """Queue a failed or cancelled job again; it goes on from its last checkpoints."""
-    return _accepted(jobs.told(jobs.resume(session, job_id, parts.settings)), response)
+    return _set_location(
+        jobs.to_job_out(jobs.resume_job(session, job_id, parts.settings)), response
+    )
 
 
 @router.post("/{job_id}:clone", status_code=status.HTTP_202_ACCEPTED)
-def clone(job_id: str, parts: PartsDep, response: Response) -> JobOut:
+def clone_job(job_id: str, parts: PartsDep, response: Response) -> JobOut:
     """Queue the same request as a new job."""
-    return _accepted(jobs.clone(parts.database, job_id, parts.settings), response)
+    return _set_location(jobs.clone_job(parts.database, job_id, parts.settings), response)
 
 
 @router.get("/{job_id}/runs.csv", response_class=StreamingResponse)
-def table_of_runs(job_id: str, parts: PartsDep) -> StreamingResponse:
+def export_runs_csv(job_id: str, parts: PartsDep) -> StreamingResponse:
     """All runs of a job as CSV: one row each, with its cell, its estimates and their errors."""
     disposition = {"Content-Disposition": f'attachment; filename="{job_id}.csv"'}
-    rows = runs_table.table(parts.database, job_id)
+    rows = runs_table.stream_table(parts.database, job_id)
     return StreamingResponse(rows, media_type="text/csv", headers=disposition)
 
 
 @router.get("/{job_id}/runs")
-def runs_of(
+def list_runs(
     job_id: str,
     session: ReadSession,
     cursor: Annotated[str | None, Query(max_length=200)] = None,
     limit: Limit = 50,
-    state: States = None,
-    cell: Filter = None,
-    label: Filter = None,
+    state: StatesFilter = None,
+    cell: CellFilter = None,
+    label: CellFilter = None,
     order: RunOrder = "number",
     descending: bool = False,
 ) -> Page[RunOut]:
     """Runs of a job that have been made; filter by axis values, labels or state."""
-    choice = runs.Choice(state or [], cell or [], label or [], order, descending)
-    return runs.page(session, job_id, cursor, limit, choice)
+    choice = runs.RunQuery(state or [], cell or [], label or [], order, descending)
+    return runs.list_runs(session, job_id, cursor, limit, choice)
 
 
 @router.get("/{job_id}/summary")
-def summary(
+def read_summary(
     job_id: str,
     session: ReadSession,
     by: Annotated[
@@ -115,15 +121,15 @@ def summary(
     ] = None,
 ) -> SummaryOut:
     """Quantiles, success rate and mean evaluations for each value of the chosen axes."""
-    return summaries.summary(session, job_id, by)
+    return summaries.summarise_job(session, job_id, by)
 
 
 @router.get("/{job_id}/trend")
-def trend(job_id: str, session: ReadSession) -> TrendOut:
+def read_trend(job_id: str, session: ReadSession) -> TrendOut:
     """Estimates over a label: the law, its band, predictions, outliers and drift."""
-    return trends.trend(session, job_id)
+    return trends.compute_trend(session, job_id)
 
 
-def _accepted(job: JobOut, response: Response) -> JobOut:
+def _set_location(job: JobOut, response: Response) -> JobOut:
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job

@@ -8,7 +8,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.core.errors import TooLarge
 
-UPLOAD = ("POST", "/v1/datasets")
+UPLOAD_ROUTE = ("POST", "/v1/datasets")
 """Goes to a file as it comes (`service.api.content`)."""
 
 
@@ -23,27 +23,27 @@ class BodyLimit:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Hand the request on, its body watched."""
-        if scope["type"] != "http" or (scope["method"], scope["path"]) == UPLOAD:
+        if scope["type"] != "http" or (scope["method"], scope["path"]) == UPLOAD_ROUTE:
             await self._app(scope, receive, send)
         else:
-            await self._app(scope, self._watched(scope, receive), send)
+            await self._app(scope, self._limit_receive(scope, receive), send)
 
-    def _watched(self, scope: Scope, receive: Receive) -> Receive:
+    def _limit_receive(self, scope: Scope, receive: Receive) -> Receive:
         announced = Headers(scope=scope).get("content-length", "")
         size = 0
 
         async def watched() -> Message:
             nonlocal size
             if announced.isdecimal():
-                self._check(int(announced), "")
+                self._check_size(int(announced), "")
             message = await receive()
             size += len(message.get("body", b""))
-            self._check(size, " or more")
+            self._check_size(size, " or more")
             return message
 
         return watched
 
-    def _check(self, size: int, more: str) -> None:
+    def _check_size(self, size: int, more: str) -> None:
         if size > self._limit:
             raise TooLarge(
                 f"the body has {size} bytes{more}; at most {self._limit} (LAGID_MAX_BODY_BYTES)"

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 
 from service.api.dependencies import Cursor, Limit, PartsDep, ReadSession
-from service.core.documents import MAX_DOCUMENT_BYTES, read_json, read_yaml
+from service.core.documents import MAX_DOCUMENT_BYTES, parse_json, parse_yaml
 from service.core.errors import InvalidRequest, TooLarge, UnsupportedMediaType
 from service.core.wire import Page
 from service.models import models
@@ -15,7 +15,7 @@ from service.models.schemas import CheckOut, ModelOut
 router = APIRouter(prefix="/v1", tags=["models"])
 
 YAML_TYPES = ("application/yaml", "application/x-yaml", "text/yaml", "text/x-yaml")
-DOCUMENT: dict[str, Any] = {
+DOCUMENT_BODY: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "description": "A model document: an object as JSON, or the same as YAML.",
@@ -28,44 +28,44 @@ DOCUMENT: dict[str, Any] = {
 
 
 @router.get("/models")
-def page(session: ReadSession, cursor: Cursor = None, limit: Limit = 50) -> Page[ModelOut]:
+def list_models(session: ReadSession, cursor: Cursor = None, limit: Limit = 50) -> Page[ModelOut]:
     """Built-in models, then own ones."""
-    return models.page(session, cursor, limit)
+    return models.list_models(session, cursor, limit)
 
 
 @router.get("/models/{name}")
-def read(name: str, session: ReadSession) -> ModelOut:
+def read_model(name: str, session: ReadSession) -> ModelOut:
     """One model with its document; ``name@version`` for an earlier version of an own one."""
-    return models.one(session, name)
+    return models.get_model(session, name)
 
 
-@router.post("/models", status_code=201, openapi_extra=DOCUMENT)
-async def add(request: Request, parts: PartsDep) -> ModelOut:
+@router.post("/models", status_code=201, openapi_extra=DOCUMENT_BODY)
+async def add_model(request: Request, parts: PartsDep) -> ModelOut:
     """Store an own model; a changed document becomes the next version of its name."""
-    document = await _document(request)
+    document = await _read_document(request)
     if not isinstance(document, dict):
-        raise InvalidRequest.at("", f"a model is an object; found {document!r:.60}")
+        raise InvalidRequest.from_fault("", f"a model is an object; found {document!r:.60}")
 
     def store() -> ModelOut:
-        with parts.database.write() as session:
-            return models.add(session, document)
+        with parts.database.write_session() as session:
+            return models.add_model(session, document)
 
     return await run_in_threadpool(store)
 
 
-@router.post("/models:check", openapi_extra=DOCUMENT)
-async def check(request: Request) -> CheckOut:
+@router.post("/models:check", openapi_extra=DOCUMENT_BODY)
+async def check_model(request: Request) -> CheckOut:
     """Whether a model can be used; every error with its pointer, and its column in equations."""
     try:
-        document = await _document(request)
+        document = await _read_document(request)
     except InvalidRequest as error:
         return CheckOut.model_validate(
-            {"valid": False, "errors": [one.as_dict() for one in error.errors]}
+            {"valid": False, "errors": [one.to_dict() for one in error.errors]}
         )
-    return await run_in_threadpool(models.check, document)
+    return await run_in_threadpool(models.check_model, document)
 
 
-async def _document(request: Request) -> Any:
+async def _read_document(request: Request) -> Any:
     kind = request.headers.get("content-type", "application/json").partition(";")[0].strip()
     if kind not in ("application/json", *YAML_TYPES):
         raise UnsupportedMediaType(f"found {kind!r}; need application/json or application/yaml")
@@ -74,4 +74,4 @@ async def _document(request: Request) -> Any:
         text += piece
         if len(text) > MAX_DOCUMENT_BYTES:
             raise TooLarge(f"a document has at most {MAX_DOCUMENT_BYTES} bytes")
-    return read_yaml(bytes(text)) if kind in YAML_TYPES else read_json(bytes(text))
+    return parse_yaml(bytes(text)) if kind in YAML_TYPES else parse_json(bytes(text))

@@ -6,9 +6,10 @@ from fastapi import APIRouter, Query, Request
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse, PlainTextResponse, Response
 
 from service.api.dependencies import Cursor, PartsDep, ReadSession
-from service.api.html import Page
-from service.api.jobs import Filter
+from service.api.html import HtmlPage
+from service.api.jobs import CellFilter
 from service.core.errors import NotFound
+from service.core.states import JobState
 from service.figures import plotly as figures
 from service.pages import figures as results
 from service.pages import pages, report
@@ -16,105 +17,104 @@ from service.pages import pages as recipe_pages
 from service.pages import render as assets
 from service.pages.figures import FigureChoice, FigureName
 from service.pages.simulate import simulate_page as simulate
-from service.storage.tables import State
 
 router = APIRouter()
 
-FOREVER = "public, max-age=31536000, immutable"
+CACHE_FOREVER = "public, max-age=31536000, immutable"
 
 
-Hidden: dict[str, Any] = {"include_in_schema": False, "response_class": HTMLResponse}
-StateFilter = Annotated[State | None, Query()]
-Choice = Annotated[FigureChoice, Query()]
+HIDDEN: dict[str, Any] = {"include_in_schema": False, "response_class": HTMLResponse}
+StateFilter = Annotated[JobState | None, Query()]
+FigureQuery = Annotated[FigureChoice, Query()]
 ComparedRuns = Annotated[list[str], Query(min_length=2, max_length=50)]
 
 
-@router.get("/docs", **Hidden)
+@router.get("/docs", **HIDDEN)
 def reference_page(request: Request) -> Response:
     """The REST interface for people."""
-    return Page(pages.reference_page(request.app.openapi()))
+    return HtmlPage(pages.reference_page(request.app.openapi()))
 
 
-@router.get("/", **Hidden)
+@router.get("/", **HIDDEN)
 def jobs_page(session: ReadSession, state: StateFilter = None, cursor: Cursor = None) -> Response:
     """The list of jobs, and the form of a new identification."""
-    return Page(pages.jobs_page(session, state, cursor))
+    return HtmlPage(pages.jobs_page(session, state, cursor))
 
 
-@router.get("/new/noise-sweep", **Hidden)
+@router.get("/new/noise-sweep", **HIDDEN)
 def noise_sweep_page(session: ReadSession) -> Response:
     """The form of a noise sweep."""
-    return Page(recipe_pages.noise_sweep_page(session))
+    return HtmlPage(recipe_pages.noise_sweep_page(session))
 
 
-@router.get("/new/reidentify", **Hidden)
+@router.get("/new/reidentify", **HIDDEN)
 def reidentify_page(session: ReadSession) -> Response:
     """The form of a batch re-identification."""
-    return Page(recipe_pages.reidentify_page(session))
+    return HtmlPage(recipe_pages.reidentify_page(session))
 
 
-@router.get("/jobs/{job_id}", **Hidden)
+@router.get("/jobs/{job_id}", **HIDDEN)
 def job_page(
     job_id: str, request: Request, session: ReadSession, cursor: Cursor = None,
-    cell: Filter = None,
+    cell: CellFilter = None,
 ) -> Response:  # fmt: skip
     """One job with its runs, or the grid of its cells and the runs of the chosen one."""
     url = str(request.base_url)
-    return Page(pages.job_page(session, job_id, url, cursor=cursor, cell=cell or []))
+    return HtmlPage(pages.job_page(session, job_id, url, cursor=cursor, cell=cell or []))
 
 
-@router.get("/runs/{run_id}", **Hidden)
+@router.get("/runs/{run_id}", **HIDDEN)
 def run_page(run_id: str, request: Request, session: ReadSession) -> Response:
     """The job of one run, with this run in full."""
-    return Page(pages.run_page(session, run_id, str(request.base_url)))
+    return HtmlPage(pages.run_page(session, run_id, str(request.base_url)))
 
 
-@router.get("/runs/{run_id}/simulate", **Hidden)
+@router.get("/runs/{run_id}/simulate", **HIDDEN)
 def simulate_page(run_id: str, request: Request, parts: PartsDep) -> Response:
     """The model of a run in a closed loop, over a recording, or on a signal; or its form."""
     query = dict(request.query_params)
     found = simulate(parts.database, parts.store, run_id, query, str(request.base_url))
     if found.is_csv:
-        return _as_csv(found.text, "simulation")
-    return Page(found.text, found.status)
+        return _csv_response(found.text, "simulation")
+    return HtmlPage(found.text, found.status)
 
 
-@router.get("/compare", **Hidden)
+@router.get("/compare", **HIDDEN)
 def compare_page(session: ReadSession, run: ComparedRuns) -> Response:
     """Runs of several models on the same data side by side."""
-    return Page(pages.compare_page(session, run))
+    return HtmlPage(pages.compare_page(session, run))
 
 
-@router.get("/datasets", **Hidden)
+@router.get("/datasets", **HIDDEN)
 def datasets_page(session: ReadSession, cursor: Cursor = None) -> Response:
     """The stored recordings."""
-    return Page(pages.datasets_page(session, cursor))
+    return HtmlPage(pages.datasets_page(session, cursor))
 
 
-@router.get("/datasets/{dataset_id}", **Hidden)
+@router.get("/datasets/{dataset_id}", **HIDDEN)
 def dataset_page(dataset_id: str, session: ReadSession) -> Response:
     """One dataset: signals, channels, lineage."""
-    return Page(pages.dataset_page(session, dataset_id))
+    return HtmlPage(pages.dataset_page(session, dataset_id))
 
 
-@router.get("/pages/models/{name}.yaml", **Hidden)
+@router.get("/pages/models/{name}.yaml", **HIDDEN)
 def model_text(name: str, session: ReadSession) -> Response:
     """A model as the text that the form shows."""
     return PlainTextResponse(pages.model_text(session, name))
 
 
-@router.get("/pages/jobs/{job_id}/model.yaml", **Hidden)
+@router.get("/pages/jobs/{job_id}/model.yaml", **HIDDEN)
 def job_model_text(job_id: str, session: ReadSession) -> Response:
     """The model of a job as the text that the form shows for its clone."""
     return PlainTextResponse(pages.job_model_text(session, job_id))
 
 
-@router.get("/static/{name}", **Hidden)
-def static(name: str, request: Request) -> Response:
+@router.get("/static/{name}", **HIDDEN)
+def static_file(name: str, request: Request) -> Response:
     """Our own files, and Plotly out of its installed wheel."""
-    if name == assets.plotly_name():
-        return _plotly(request)
-    found = assets.asset(name)
+    if name == assets.plotly_file_name():
+        return _plotly_response(request)
+    found = assets.load_asset(name)
     if found is None:
         raise NotFound("file", name)
     headers = {"ETag": found.etag, "Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff"}
@@ -125,56 +125,61 @@ def static(name: str, request: Request) -> Response:
 
 @router.get("/v1/runs/{run_id}/figures/{name}", tags=["runs"], response_class=JSONResponse)
 def run_figure(
-    run_id: str, name: FigureName, parts: PartsDep, session: ReadSession, choice: Choice
+    run_id: str, name: FigureName, parts: PartsDep, session: ReadSession, choice: FigureQuery
 ) -> Response:
     """A figure of a run as Plotly JSON, or the numbers it draws as CSV."""
-    return _figure(results.run_figure(session, parts.store, run_id, name, choice), name, choice)
+    return _figure_response(
+        results.load_run_figure(session, parts.store, run_id, name, choice), name, choice
+    )
 
 
 @router.get("/v1/jobs/{job_id}/figures/summary", tags=["jobs"], response_class=JSONResponse)
-def job_figure(job_id: str, session: ReadSession, choice: Choice) -> Response:
+def job_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Response:
     """Errors against the noise (Figure 15) as Plotly JSON, or the numbers drawn as CSV."""
-    return _figure(results.job_figure(session, job_id, choice), "summary", choice)
+    return _figure_response(results.load_noise_figure(session, job_id, choice), "summary", choice)
 
 
 @router.get("/v1/jobs/{job_id}/figures/trend", tags=["jobs"], response_class=JSONResponse)
-def trend_figure(job_id: str, session: ReadSession, choice: Choice) -> Response:
+def trend_figure(job_id: str, session: ReadSession, choice: FigureQuery) -> Response:
     """Estimates over the label of a batch as Plotly JSON, or the numbers drawn as CSV."""
-    return _figure(results.trend_of_job(session, job_id, choice), "trend", choice)
+    return _figure_response(results.load_trend_figure(session, job_id, choice), "trend", choice)
 
 
 @router.get("/v1/datasets/{dataset_id}/figures/signals", tags=["datasets"],
             response_class=JSONResponse)  # fmt: skip
 def dataset_figure(
-    dataset_id: str, parts: PartsDep, session: ReadSession, choice: Choice
+    dataset_id: str, parts: PartsDep, session: ReadSession, choice: FigureQuery
 ) -> Response:
     """The signals of a dataset as Plotly JSON, or the numbers drawn as CSV."""
-    found = results.dataset_figure(session, parts.store, dataset_id, choice)
-    return _figure(found, "signals", choice)
+    found = results.load_dataset_figure(session, parts.store, dataset_id, choice)
+    return _figure_response(found, "signals", choice)
 
 
 @router.get("/v1/jobs/{job_id}/report", tags=["jobs"], response_class=HTMLResponse)
 def job_report(job_id: str, request: Request, parts: PartsDep, session: ReadSession) -> Response:
     """The job as one HTML file that needs no server: tables, figures, the exact request."""
-    made = report.job_report(session, parts.store, job_id, str(request.base_url))
-    policy = {"Content-Security-Policy": report.policy(), "X-Content-Type-Options": "nosniff"}
+    made = report.render_job_report(session, parts.store, job_id, str(request.base_url))
+    policy = {
+        "Content-Security-Policy": report.security_policy(),
+        "X-Content-Type-Options": "nosniff",
+    }
     return HTMLResponse(made, headers=policy)
 
 
-def _figure(figure: figures.Figure, name: str, choice: FigureChoice) -> Response:
+def _figure_response(figure: figures.Figure, name: str, choice: FigureChoice) -> Response:
     if choice.format == "csv":
-        return _as_csv(figures.as_csv(figure), name)
-    return JSONResponse(figures.in_theme(figure, choice.theme))
+        return _csv_response(figures.to_csv(figure), name)
+    return JSONResponse(figures.apply_theme(figure, choice.theme))
 
 
-def _as_csv(text: str, name: str) -> Response:
+def _csv_response(text: str, name: str) -> Response:
     disposition = {"Content-Disposition": f'attachment; filename="{name}.csv"'}
     return Response(text, media_type="text/csv", headers=disposition)
 
 
-def _plotly(request: Request) -> Response:
-    headers = {"Cache-Control": FOREVER, "Vary": "Accept-Encoding"}
+def _plotly_response(request: Request) -> Response:
+    headers = {"Cache-Control": CACHE_FOREVER, "Vary": "Accept-Encoding"}
     if "gzip" not in request.headers.get("accept-encoding", ""):
-        return FileResponse(assets.plotly_file(), media_type="text/javascript", headers=headers)
+        return FileResponse(assets.plotly_path(), media_type="text/javascript", headers=headers)
     headers["Content-Encoding"] = "gzip"
-    return Response(assets.plotly_compressed(), media_type="text/javascript", headers=headers)
+    return Response(assets.compress_plotly(), media_type="text/javascript", headers=headers)

@@ -6,32 +6,37 @@ The route of the noise sweep.
 from fastapi import APIRouter, Response, status
 
 from service.api.dependencies import PartsDep
-from service.api.jobs import Key
+from service.api.jobs import IdempotencyKeyHeader
 from service.jobs.schemas import JobOut
 from service.sweeps import noise, reidentify
 from service.sweeps.schemas import NoiseSweepIn, ReidentifyIn
 
-router = APIRouter(prefix="/v1/recipes", tags=["jobs"])
+recipe_router = APIRouter(prefix="/v1/recipes", tags=["jobs"])
 
 
-@router.post("/noise-sweep", status_code=status.HTTP_202_ACCEPTED)
-def noise_sweep(
-    body: NoiseSweepIn, parts: PartsDep, response: Response, idempotency_key: Key = None
+@recipe_router.post("/noise-sweep", status_code=status.HTTP_202_ACCEPTED)
+def submit_noise_sweep(
+    body: NoiseSweepIn,
+    parts: PartsDep,
+    response: Response,
+    idempotency_key: IdempotencyKeyHeader = None,
 ) -> JobOut:
     """Queue a job of σ × replicates × methods, from true parameters or from a dataset."""
-    job = noise.submit(parts.database, parts.store, parts.settings, body, idempotency_key)
+    job = noise.submit_noise_sweep(
+        parts.database, parts.store, parts.settings, body, idempotency_key
+    )
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
 
 
-@router.post("/reidentify", status_code=status.HTTP_202_ACCEPTED)
-def batch(
+@recipe_router.post("/reidentify", status_code=status.HTTP_202_ACCEPTED)
+def submit_reidentification(
     body: ReidentifyIn,
     parts: PartsDep,
     response: Response,
-    idempotency_key: Key = None,
+    idempotency_key: IdempotencyKeyHeader = None,
 ) -> JobOut:
     """Queue a run for each value of a label, warm-started, with a trend over it."""
-    job = reidentify.submit(parts.database, body, parts.settings, idempotency_key)
+    job = reidentify.submit_reidentification(parts.database, body, parts.settings, idempotency_key)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from service.client.calls import DEFAULT_URL, NotFinite, ProblemError
-from service.core.documents import read_yaml
+from service.core.documents import parse_yaml
 from service.core.errors import FieldError, InvalidRequest
 from service.core.text import DASH, format_value, plain_estimate
 from sysid.core.errors import join_pointer, split_pointer
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 MODEL_SUFFIXES = (".yaml", ".yml", ".json")
 DATA_SUFFIXES = (".csv", ".mcap", ".txt", ".tsv")
-WIDE = 200  # where nobody looks, a line is not folded at 80 columns
-out = Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
+PIPE_WIDTH = 200  # where nobody looks, a line is not folded at 80 columns
+out = Console(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 Url = Annotated[str, typer.Option("--url", envvar="LAGID_URL", help="Address of the server.")]
@@ -45,12 +45,12 @@ SampleTime = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, for machines.")]
 
-__all__ = ["DEFAULT_URL", "AsJson", "Key", "SampleTime", "Segments", "Url", "connected", "fail",
+__all__ = ["DEFAULT_URL", "AsJson", "Key", "SampleTime", "Segments", "Url", "connect_client", "fail",
            "out", "print_json"]  # fmt: skip
 
 
 @contextmanager
-def connected(url: str, key: str | None = None) -> "Iterator[Client]":
+def connect_client(url: str, key: str | None = None) -> "Iterator[Client]":
     """A client for the length of a command."""
     from service.client.client import Client  # commands without a server start sooner
 
@@ -76,27 +76,27 @@ def check_succeeded(job: dict[str, Any]) -> None:
         fail(f"{job['id']} {job['state']}{reason}")
 
 
-def usage(message: str) -> NoReturn:
+def fail_usage(message: str) -> NoReturn:
     """End the command because it was called wrongly."""
     fail(message, 2)
 
 
-def parts_of(change: str) -> list[str]:
+def split_setting_path(change: str) -> list[str]:
     """The parts of the path of a ``--set path=value``; ends the command if it is none."""
     path, equals, _ = change.partition("=")
     if not equals:
-        usage(f"--set {change}: need path=value, as algorithm.population=100")
+        fail_usage(f"--set {change}: need path=value, as algorithm.population=100")
     return [part for part in path.replace("/", ".").split(".") if part]
 
 
-def put(body: dict[str, Any], change: str) -> None:
+def apply_setting(body: dict[str, Any], change: str) -> None:
     """Put the value of a ``--set path=value`` into a body; the value is read as YAML."""
-    parts, here = parts_of(change), body
+    parts, here = split_setting_path(change), body
     for part in parts[:-1]:
         here = here.setdefault(part, {})
         if not isinstance(here, dict):
-            usage(f"--set {change}: {part} has no fields")
-    here[parts[-1] if parts else ""] = read_yaml(change.partition("=")[2].encode())
+            fail_usage(f"--set {change}: {part} has no fields")
+    here[parts[-1] if parts else ""] = parse_yaml(change.partition("=")[2].encode())
 
 
 def print_json(value: Any) -> None:
@@ -123,12 +123,12 @@ def print_table(
     table = Table(title=title or None, box=None, pad_edge=False, title_justify="left")
     for number, heading in enumerate(headings):
         table.add_column(
-            shown(heading.removeprefix(">")),
+            format_cell(heading.removeprefix(">")),
             justify="right" if heading.startswith(">") else "left",
             overflow="fold", no_wrap=number == 0,
         )  # fmt: skip
     for row in rows:
-        table.add_row(*(shown(value) for value in row))
+        table.add_row(*(format_cell(value) for value in row))
     if table.row_count:
         out.print(table)
     else:
@@ -146,19 +146,19 @@ def print_listing(
         print_table(headings, map(row, found), empty=empty)
 
 
-def shown(value: object) -> str:
+def format_cell(value: object) -> str:
     """A value in a cell: a dash for None, six digits for a number."""
     if value is None:
         return DASH
     return format_value(value).replace("[", "\\[")
 
 
-def estimate(one: dict[str, Any]) -> str:
+def format_estimate(one: dict[str, Any]) -> str:
     """``0.1193 ± 0.0004``, from an entry of a run's parameters."""
     return plain_estimate(one["value"], one["stderr"])
 
 
-def status_of(one: dict[str, Any]) -> str:
+def describe_status(one: dict[str, Any]) -> str:
     """The status of an estimate, with its reason where there is one."""
     return f"{one['status']} ({one['reason']})" if one["reason"] else str(one["status"])
 
@@ -174,7 +174,7 @@ def read_file(path: Path) -> bytes:
 def read_document(path: Path) -> Any:
     """What a YAML or JSON file says; ends the command if it cannot be read."""
     try:
-        return read_yaml(read_file(path))
+        return parse_yaml(read_file(path))
     except InvalidRequest as error:
         fail(f"{path}: {error}")
 
@@ -211,7 +211,7 @@ def parse_pairs(option: str, texts: Iterable[str], form: str = "NAME=VALUE") -> 
     for text in texts:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not (equals and name and value):
-            usage(f"{option} {text}: need {form}")
+            fail_usage(f"{option} {text}: need {form}")
         pairs[name] = value
     return pairs
 
@@ -228,7 +228,7 @@ def parse_number(place: str, text: str) -> float:
     except ValueError:
         value = float("nan")
     if not isfinite(value):
-        usage(f"{place}: found {text!r}; need a number")
+        fail_usage(f"{place}: found {text!r}; need a number")
     return value
 
 
@@ -242,11 +242,11 @@ def format_decimals(value: float | None) -> str | None:
     return None if value is None else f"{value:.2f}"
 
 
-INVALID = 422
-INSIDE = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
+INVALID_STATUS = 422
+POINTER_PATTERN = re.compile(r"(?<=; there is )/\S+|^/[^ :]+(?=: )")
 """Pointers in a message: where a field of a name is, and what in a value of an axis is wrong."""
 
-SETTING = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)\}")
+SETTING_PATTERN = re.compile(r"(?<!\bthe model )\b(\w+): \{([^{}:]+): ([^{}:,]+)\}")
 """A field of a job in a note, as a job file has it: ``loss: {noise_model: ar1}``.
 
 What the model is to be given is a field of its document, which no option sets.
@@ -254,7 +254,7 @@ What the model is to be given is a field of its document, which no option sets.
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
+class FieldOrigins:
     """Where the fields of a body were written.
 
     Attributes
@@ -270,65 +270,65 @@ class Places:
     options: Mapping[str, str] = field(default_factory=dict)
     rest: str = "--set {}"
 
-    def of(self, pointer: str) -> str:
+    def locate(self, pointer: str) -> str:
         """The place of a pointer."""
-        for above in _upwards(pointer):
+        for above in _iterate_parents(pointer):
             if above in self.options:
-                return _written(self.options[above], pointer.removeprefix(above))
-        return _written(self.rest, pointer, is_whole=True)
+                return _format_option(self.options[above], pointer.removeprefix(above))
+        return _format_option(self.rest, pointer, is_whole=True)
 
-    def told(self, faults: Iterable[FieldError]) -> str:
+    def describe_faults(self, faults: Iterable[FieldError]) -> str:
         """Faults as one line."""
-        return "; ".join(self._one(fault) for fault in faults)
+        return "; ".join(self._describe_fault(fault) for fault in faults)
 
-    def in_note(self, note: str) -> str:
+    def rewrite_note(self, note: str) -> str:
         """A note of a result, with the options in it that set the fields which it advises."""
-        return SETTING.sub(self._typed, note)
+        return SETTING_PATTERN.sub(self._format_setting, note)
 
-    def _typed(self, found: re.Match[str]) -> str:
+    def _format_setting(self, found: re.Match[str]) -> str:
         part, name, value = found.groups()
-        place = self.of(join_pointer(part, name))
+        place = self.locate(join_pointer(part, name))
         return f"{place}{'=' if place.startswith('--set ') else ' '}{value}"
 
-    def _one(self, fault: FieldError) -> str:
-        place = self.of(fault.pointer) if fault.pointer else ""
+    def _describe_fault(self, fault: FieldError) -> str:
+        place = self.locate(fault.pointer) if fault.pointer else ""
         column = "" if fault.column is None else f", column {fault.column}"
         detail = fault.detail
         if not self.rest.endswith("…"):
-            detail = INSIDE.sub(lambda found: self.of(found[0]), detail)
+            detail = POINTER_PATTERN.sub(lambda found: self.locate(found[0]), detail)
         return f"{place}{column}: {detail}" if place else detail
 
 
-def in_file(name: object) -> Places:
+def file_origins(name: object) -> FieldOrigins:
     """Places of a body that is a file."""
-    return Places(rest=f"{name} …")
+    return FieldOrigins(rest=f"{name} …")
 
 
 @contextmanager
-def told_at(places: Places) -> Iterator[None]:
+def report_faults(places: FieldOrigins) -> Iterator[None]:
     """End the command with the faults that a server finds in a body, at the user's places."""
     try:
         yield
     except NotFinite as error:
-        fail(f"{places.of(error.pointer)}: {error.reason}", 2)
+        fail(f"{places.locate(error.pointer)}: {error.reason}", 2)
     except ProblemError as error:
         entries = error.document.get("errors") or ()
-        if error.status != INVALID or not entries:
+        if error.status != INVALID_STATUS or not entries:
             raise
-        fail(places.told(
+        fail(places.describe_faults(
             FieldError(str(one.get("pointer") or ""), str(one.get("detail")), one.get("column"))
             for one in entries
         ))  # fmt: skip
 
 
-def _upwards(pointer: str) -> Iterator[str]:
+def _iterate_parents(pointer: str) -> Iterator[str]:
     """A pointer and all that hold it, the longest first."""
     while pointer:
         yield pointer
         pointer = pointer.rpartition("/")[0]
 
 
-def _written(option: str, below: str, *, is_whole: bool = False) -> str:
+def _format_option(option: str, below: str, *, is_whole: bool = False) -> str:
     parts = split_pointer(below)
     if option.endswith("…"):
         return option.replace(" …", f": {below}" if below else "")

@@ -7,12 +7,12 @@ import typer
 
 from service.cli.common import (
     AsJson,
+    FieldOrigins,
     Key,
-    Places,
     SampleTime,
     Segments,
     Url,
-    connected,
+    connect_client,
     fail,
     parse_number,
     parse_pairs,
@@ -21,33 +21,33 @@ from service.cli.common import (
     print_listing,
     read_document,
     read_object,
-    told_at,
+    report_faults,
 )
 from service.client.calls import DEFAULT_URL
 from service.core.text import append_unit
 
 app = typer.Typer(help="Add, simulate and derive recordings.", no_args_is_help=True)
 
-UPLOAD = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
-DOCUMENT = "YAML or JSON file with the body of the request."
+UPLOAD_OPTIONS = {"?name": "--name", "?segments": "--segments", "?sample_time": "--sample-time"}
+DOCUMENT_HELP = "YAML or JSON file with the body of the request."
 
 
-def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
+def list_datasets(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
     """List the recordings of the server."""
-    with connected(url, key) as client:
+    with connect_client(url, key) as client:
         found = client.datasets()
     print_listing(
         found,
         as_json,
         ("id", "name", "kind", ">samples", ">duration [s]", "channels"),
         lambda one: (one["id"], one["name"], one["kind"], one["samples"], one["duration"],
-                     _channels(one)),
+                     _format_channels(one)),
         empty="no datasets; add one: lagid dataset add recording.csv",
     )  # fmt: skip
 
 
 @app.command("add")
-def add(
+def add_dataset(
     file: Annotated[Path, typer.Argument(help="CSV or MCAP file.")],
     name: Annotated[str | None, typer.Option(help="Name; by default that of the file.")] = None,
     segments: Segments = None,
@@ -59,14 +59,17 @@ def add(
     """Store a recording."""
     if not file.is_file():
         fail(f"there is no file {file}")
-    with connected(url, key) as client, told_at(Places(UPLOAD, rest=str(file))):
+    with (
+        connect_client(url, key) as client,
+        report_faults(FieldOrigins(UPLOAD_OPTIONS, rest=str(file))),
+    ):
         stored = client.add_dataset(file, name, segments=segments, sample_time=sample_time)
-    _tell(stored, as_json)
+    _print_dataset(stored, as_json)
 
 
 @app.command("simulate")
-def simulate(
-    file: Annotated[Path | None, typer.Argument(help=DOCUMENT)] = None,
+def simulate_dataset(
+    file: Annotated[Path | None, typer.Argument(help=DOCUMENT_HELP)] = None,
     plant: Annotated[
         str | None, typer.Option(help="Reference plant instead of a model: actuator or tube.")
     ] = None,
@@ -97,13 +100,13 @@ def simulate(
             for name, value in parse_pairs("--set", sets).items()
         }
         body["parameters"] = {**(body.get("parameters") or {}), **given}
-    with connected(url, key) as client, told_at(_places(file, sets)):
+    with connect_client(url, key) as client, report_faults(_field_origins(file, sets)):
         stored = client.simulate_dataset(body)
-    _tell(stored, as_json)
+    _print_dataset(stored, as_json)
 
 
 @app.command("derive")
-def derive(
+def derive_dataset(
     dataset: Annotated[str, typer.Argument(help="Id or name of the parent.")],
     file: Annotated[Path, typer.Argument(help="YAML or JSON file with the list of steps.")],
     name: Annotated[str | None, typer.Option(help="Name of the new dataset.")] = None,
@@ -117,20 +120,23 @@ def derive(
         steps = steps.get("steps")
     if not isinstance(steps, list):
         fail(f"{file} has no list of steps, such as - detrend: {{}}")
-    with connected(url, key) as client, told_at(Places({"/name": "--name"}, rest=f"{file} …")):
+    with (
+        connect_client(url, key) as client,
+        report_faults(FieldOrigins({"/name": "--name"}, rest=f"{file} …")),
+    ):
         stored = client.derive(dataset, steps, name)
-    _tell(stored, as_json)
+    _print_dataset(stored, as_json)
 
 
-def _places(file: Path | None, sets: list[str] | None) -> Places:
+def _field_origins(file: Path | None, sets: list[str] | None) -> FieldOrigins:
     """Where the fields of a simulation were given: by options, or all others in the file."""
     given = {f"/parameters/{one.partition('=')[0].strip()}": "--set {}" for one in sets or ()}
     named = {place: option.format(place.rpartition("/")[2]) for place, option in given.items()}
     options = {"/plant": "--plant", "/name": "--name", **named}
-    return Places(options, rest="--set {}" if file is None else f"{file} …")
+    return FieldOrigins(options, rest="--set {}" if file is None else f"{file} …")
 
 
-def _tell(stored: dict[str, Any], as_json: bool) -> None:
+def _print_dataset(stored: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(stored)
         return
@@ -140,11 +146,11 @@ def _tell(stored: dict[str, Any], as_json: bool) -> None:
     known = f"known for {before:.6g} s before, " if before else ""
     print_line(
         f"{stored['id']}  {stored['name']}: {stored['samples']} samples, {sampling}, {known}"
-        f"channels {_channels(stored)}"
+        f"channels {_format_channels(stored)}"
     )
     for warning in stored["warnings"]:
         print_line(f"note: {warning}")
 
 
-def _channels(dataset: dict[str, Any]) -> str:
+def _format_channels(dataset: dict[str, Any]) -> str:
     return ", ".join(append_unit(one["name"], one["unit"]) for one in dataset["channels"])

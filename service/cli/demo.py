@@ -9,17 +9,17 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from service.cli.common import estimate
+from service.cli.common import format_estimate
 from service.client.client import Client
-from service.client.embedded import embedded_service
+from service.client.embedded import run_embedded_service
 
 # Example 1 of the paper: Eq. 13-16 with the parameters and the input of its section 4.
-TRUTH = {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0}
+TRUE_PARAMETERS = {"c": 0.2, "L": 0.5, "b": 5.0, "a": 1.0}
 NOISE_SD = 0.01
-DATASET: dict[str, Any] = {
+DATASET_BODY: dict[str, Any] = {
     "name": "paper example 1",
     "model": "duffing-eq16",
-    "parameters": TRUTH,
+    "parameters": TRUE_PARAMETERS,
     "inputs": {"q": {"kind": "cosine", "amplitude": 10.0, "omega": 5.0}},
     "samples": 300,
     "sample_time": 0.02,
@@ -31,15 +31,15 @@ PAPER_SIMPLE = {"c": 0.143109, "L": 0.393939, "b": 5.171065, "a": 1.018573}
 PAPER_PROPOSED = {"c": 0.195112, "L": 0.497556, "b": 5.004888, "a": 1.012708}
 
 
-def run(data_dir: Path, console: Console) -> None:
+def run_demo(data_dir: Path, console: Console) -> None:
     """Start a service, identify Example 1 with three methods, print the table, stop the service."""
     console.print(
         "[bold]lagid[/] starts: web process, dispatcher, local Ray, SQLite", highlight=False
     )
-    with embedded_service(data_dir, cpus=os.cpu_count()) as url:
+    with run_embedded_service(data_dir, cpus=os.cpu_count()) as url:
         console.print(f"service ready on {url}", highlight=False)
         with Client(url) as client:
-            dataset = client.simulate_dataset(DATASET)
+            dataset = client.simulate_dataset(DATASET_BODY)
             job = client.submit(
                 {
                     "name": "paper example 1",
@@ -48,18 +48,18 @@ def run(data_dir: Path, console: Console) -> None:
                     "sweep": {"axes": [{"path": "/algorithm/method", "values": list(METHODS)}]},
                 }
             )
-            finished = _watch(client, job["id"], console)
+            finished = _watch_job(client, job["id"], console)
             runs = {run["cell"]["/algorithm/method"]: run for run in client.runs(job["id"])}
             if finished["state"] != "succeeded":
                 console.print(f"the job {finished['state']}: {finished.get('error')}")
                 raise typer.Exit(1)
-            _table(console, runs)
+            _print_table(console, runs)
             report = data_dir / "report.html"
             report.write_text(client.report(job["id"]), encoding="utf-8")
-    _say_where(console, data_dir, report)
+    _print_locations(console, data_dir, report)
 
 
-def _watch(client: Client, job: str, console: Console) -> dict[str, Any]:
+def _watch_job(client: Client, job: str, console: Console) -> dict[str, Any]:
     columns = (
         TextColumn("{task.description:>16}"),
         BarColumn(bar_width=40),
@@ -85,14 +85,14 @@ def _watch(client: Client, job: str, console: Console) -> dict[str, Any]:
         return client.wait(job, progress=show)
 
 
-def _table(console: Console, runs: dict[str, dict[str, Any]]) -> None:
+def _print_table(console: Console, runs: dict[str, dict[str, Any]]) -> None:
     table = Table(title="Example 1 (Eq. 13-16): estimates beside the paper's Table 1")
     for heading in ("", "true", "paper, simple GA", "paper, proposed GA"):
         table.add_column(heading, justify="right")
     for method in METHODS:
         table.add_column(f"lagid, {method}", justify="right")
-    for name, true in TRUTH.items():
-        cells = [_estimate(runs[method], name) for method in METHODS]
+    for name, true in TRUE_PARAMETERS.items():
+        cells = [_format_estimate(runs[method], name) for method in METHODS]
         unit = next(p["unit"] for p in runs["improved"]["parameters"] if p["name"] == name)
         table.add_row(
             f"{name} \\[{unit}]", f"{true:g}", f"{PAPER_SIMPLE[name]:.6f}",
@@ -109,11 +109,11 @@ def _table(console: Console, runs: dict[str, dict[str, Any]]) -> None:
     )
 
 
-def _estimate(run: dict[str, Any], name: str) -> str:
-    return estimate(next(p for p in run["parameters"] if p["name"] == name))
+def _format_estimate(run: dict[str, Any], name: str) -> str:
+    return format_estimate(next(p for p in run["parameters"] if p["name"] == name))
 
 
-def _say_where(console: Console, data_dir: Path, report: Path) -> None:
+def _print_locations(console: Console, data_dir: Path, report: Path) -> None:
     folder = data_dir.resolve()
     console.print(f"report    {report.resolve()}", highlight=False, soft_wrap=True)
     console.print(f"MCAP      {folder / 'objects'}", highlight=False, soft_wrap=True)

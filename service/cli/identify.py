@@ -12,26 +12,26 @@ import typer
 
 from service.cli.common import (
     MODEL_SUFFIXES,
-    Places,
+    FieldOrigins,
     SampleTime,
     Segments,
+    apply_setting,
+    describe_status,
     err,
-    estimate,
     fail,
+    fail_usage,
+    format_estimate,
     out,
     parse_channels,
-    parts_of,
     print_json,
     print_table,
-    put,
     read_file,
     split_names,
-    status_of,
-    usage,
+    split_setting_path,
     write_file,
 )
 from service.core.text import plain_unit
-from sysid.core.errors import nearest
+from sysid.core.errors import suggest_name
 from sysid.core.settings import NOISE_MODELS
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 
 # Fields of a job body that mean nothing in one process, and what does their work here.
-ELSEWHERE = {
+SERVER_SETTINGS = {
     "sweep": "a sweep needs a server: lagid submit job.yaml",
     "trend": "a trend needs a server: lagid reidentify",
     "warm_start": "a warm start needs a server: lagid submit job.yaml",
@@ -51,14 +51,14 @@ ELSEWHERE = {
     "model": "use --model",
     "validation.datasets": "use --validation FILE",
 }
-PLACES = Places({
+FIELD_ORIGINS = FieldOrigins({
     "/model": "--model …", "/datasets": "DATA", "/channels": "--channels {}",
     "/loss/noise_model": "--noise-model",
 })  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class CsvOptions:
     """How CSV files are read."""
 
     sample_time: float | None
@@ -100,31 +100,33 @@ def identify(
     changes = list(changes or ())
     if noise_model is not None:
         changes.append(f"loss.noise_model={noise_model}")
-    given = _given(data, model, changes, parse_channels(channels))
-    _refuse_same(data, validation)
-    reading = Reading(sample_time, tuple(split_names(segments)))
-    recording = read(data, reading)
-    body, loaded = checked(given, max(1, len(recording.segments)))
-    records = _records(recording, data, loaded, body)
+    given = _build_body(data, model, changes, parse_channels(channels))
+    _refuse_same_file(data, validation)
+    reading = CsvOptions(sample_time, tuple(split_names(segments)))
+    recording = read_recording(data, reading)
+    body, loaded = check_body(given, max(1, len(recording.segments)))
+    records = _extract_records(recording, data, loaded, body)
     kept = []
     if validation is not None:
-        kept = _records(read(validation, reading), validation, loaded, body)
+        kept = _extract_records(read_recording(validation, reading), validation, loaded, body)
     begun = time.perf_counter()
-    with _told_at_options():
-        found = _identified(loaded, records, kept, body, quiet=json_file == "-")
-    tell(loaded, found, time.perf_counter() - begun, json_file)
+    with _report_core_faults():
+        found = _run_identification(loaded, records, kept, body, quiet=json_file == "-")
+    print_result(loaded, found, time.perf_counter() - begun, json_file)
 
 
-def _given(data: Path, model: str, changes: list[str], channels: dict[str, str]) -> dict[str, Any]:
+def _build_body(
+    data: Path, model: str, changes: list[str], channels: dict[str, str]
+) -> dict[str, Any]:
     """The job body that the options stand for, unchecked."""
     body: dict[str, Any] = {"model": model, "datasets": [str(data)], "channels": channels}
     for change in changes:
-        _refuse_elsewhere(change, parts_of(change))
-        put(body, change)
+        _refuse_server_settings(change, split_setting_path(change))
+        apply_setting(body, change)
     return body
 
 
-def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
+def check_body(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
     """The body as its type, and the model; ends the command with the faults of both.
 
     A body of the wrong type is refused for that alone.
@@ -136,88 +138,90 @@ def checked(body: dict[str, Any], pieces: int) -> "tuple[JobIn, Model]":
     """
     from pydantic import ValidationError
 
-    from service.core.errors import FieldError, faults_of
-    from service.core.validation import explained
+    from service.core.errors import FieldError, to_field_errors
+    from service.core.validation import explain_errors
     from service.jobs.schemas import JobIn
     from sysid.core.errors import SysidError
 
     try:
         job = JobIn.model_validate(body)
     except ValidationError as error:
-        fail(PLACES.told(explained(error.errors(), body, JobIn)), 2)
+        fail(FIELD_ORIGINS.describe_faults(explain_errors(error.errors(), body, JobIn)), 2)
     if job.validation is not None and job.validation.datasets is not None:
-        usage(f"--set validation: {ELSEWHERE['validation.datasets']}")
+        fail_usage(f"--set validation: {SERVER_SETTINGS['validation.datasets']}")
     try:
-        model = _model(body["model"])
+        model = _load_model(body["model"])
     except SysidError as error:
         fail(
-            PLACES.told(
+            FIELD_ORIGINS.describe_faults(
                 FieldError("/model" + one.pointer.removeprefix("/model"), one.detail, one.column)
-                for one in faults_of(error)
+                for one in to_field_errors(error)
             )
         )
-    from service.jobs.record_checks import setting_faults
-    from sysid.models.model import initial_parameters
+    from service.jobs.record_checks import find_setting_faults
+    from sysid.models.model import build_initial_parameters
 
-    parameters = (*model.parameters, *initial_parameters(model, pieces))
-    faults = setting_faults(job.normal_form(), model, parameters)
+    parameters = (*model.parameters, *build_initial_parameters(model, pieces))
+    faults = find_setting_faults(job.to_normal_form(), model, parameters)
     if faults:
-        fail(PLACES.told(faults))
+        fail(FIELD_ORIGINS.describe_faults(faults))
     return job, model
 
 
 @contextmanager
-def _told_at_options() -> Iterator[None]:
+def _report_core_faults() -> Iterator[None]:
     """End the command with what the core refuses, at the user's places."""
-    from service.core.errors import faults_of
+    from service.core.errors import to_field_errors
     from sysid.core.errors import SysidError
 
     try:
         yield
     except SysidError as error:
-        fail(PLACES.told(faults_of(error)))
+        fail(FIELD_ORIGINS.describe_faults(to_field_errors(error)))
 
 
-def _refuse_elsewhere(change: str, parts: list[str]) -> None:
-    for place, instead in ELSEWHERE.items():
+def _refuse_server_settings(change: str, parts: list[str]) -> None:
+    for place, instead in SERVER_SETTINGS.items():
         if ".".join([*parts, ""]).startswith(f"{place}."):
-            usage(f"--set {change}: {instead}")
+            fail_usage(f"--set {change}: {instead}")
 
 
-def _refuse_same(data: Path, validation: Path | None) -> None:
+def _refuse_same_file(data: Path, validation: Path | None) -> None:
     if validation is None or not (data.is_file() and validation.is_file()):
         return
     if read_file(data) == read_file(validation):
-        usage(f"--validation {validation}: this is the recording that is fitted; name another, "
+        fail_usage(f"--validation {validation}: this is the recording that is fitted; name another, "
               "or use --set validation.fraction=0.3")  # fmt: skip
 
 
-def read(path: Path, reading: Reading) -> "Recording":
+def read_recording(path: Path, reading: CsvOptions) -> "Recording":
     """A recording from a file; notes about it go to stderr."""
     from service.formats.csv_recordings import read_csv
-    from sysid.models.units import unknown_units
+    from sysid.models.units import list_unknown_unit_warnings
 
     if not path.is_file():
         fail(f"there is no file {path}")
     if path.suffix.lower() == ".mcap":
         from service.formats.limits import DEFAULT_LIMITS
-        from service.formats.mcap import read_mcap
+        from service.formats.mcap import read_mcap_with_notes
 
-        recording, notes = read_mcap(path, DEFAULT_LIMITS)
+        recording, notes = read_mcap_with_notes(path, DEFAULT_LIMITS)
     else:
         recording, notes = read_csv(
             path, sample_time=reading.sample_time, segments=reading.segments
         )
-    for note in (*notes, *unknown_units(recording.channels)):
+    for note in (*notes, *list_unknown_unit_warnings(recording.channels)):
         err.print(f"note: {note}", markup=False)
     return recording
 
 
-def tell(model: "Model", found: "Identification", seconds: float, json_file: str | None) -> None:
+def print_result(
+    model: "Model", found: "Identification", seconds: float, json_file: str | None
+) -> None:
     """Print the estimates, or write the result as JSON, or both."""
-    from service.runs.result import result_document
+    from service.runs.result import to_result_document
 
-    document = result_document(found, seconds)
+    document = to_result_document(found, seconds)
     if json_file == "-":
         print_json(document)
         return
@@ -228,29 +232,32 @@ def tell(model: "Model", found: "Identification", seconds: float, json_file: str
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "status"),
         (
-            (one["name"], estimate(one), one["unit"], status_of(one))
+            (one["name"], format_estimate(one), one["unit"], describe_status(one))
             for one in document["parameters"]
         ),
         empty="no parameters",
     )
     unit = model.outputs[0].unit if len(model.outputs) == 1 else "standard deviations"
     out.print(
-        f"RMS {found.rms:.6g}{plain_unit(unit)}, fit {_percent(found.fit_percent)}",
+        f"RMS {found.rms:.6g}{plain_unit(unit)}, fit {_format_fit(found.fit_percent)}",
         markup=False,
         end="",
     )
     if found.fit_percent_validation is not None:
-        out.print(f", validation {_percent(found.fit_percent_validation)}", markup=False, end="")
+        out.print(f", validation {_format_fit(found.fit_percent_validation)}", markup=False, end="")
     out.print(f"; {found.evaluations} simulations in {seconds:.2f} s", markup=False)
     if any(found.known_before):
-        out.print(f"inputs known before the record: {_seconds(found.known_before)}", markup=False)
+        out.print(
+            f"inputs known before the record: {_format_history_span(found.known_before)}",
+            markup=False,
+        )
     if found.residual_tests is not None and found.residual_tests.passed is not None:
-        out.print(_verdict(found.residual_tests), markup=False, soft_wrap=True)
+        out.print(_residual_verdict(found.residual_tests), markup=False, soft_wrap=True)
     for warning in found.warnings:
-        err.print(f"note: {PLACES.in_note(warning)}", markup=False)
+        err.print(f"note: {FIELD_ORIGINS.rewrite_note(warning)}", markup=False)
 
 
-def _verdict(tests: "ResidualTests") -> str:
+def _residual_verdict(tests: "ResidualTests") -> str:
     """Whether the residuals pass their tests, and which fail with what chance.
 
     Warnings are for what is clear (p < 0.001), so most of what fails is told here only.
@@ -265,27 +272,27 @@ def _verdict(tests: "ResidualTests") -> str:
     return f"residuals on {tests.data} data: {told}"
 
 
-def _seconds(known: Sequence[float]) -> str:
+def _format_history_span(known: Sequence[float]) -> str:
     least, most = min(known), max(known)
     return f"{least:.4g} s" if least == most else f"{least:.4g} to {most:.4g} s"
 
 
-def _percent(fit: float) -> str:
+def _format_fit(fit: float) -> str:
     return f"{fit:.2f} %" if isfinite(fit) else "none (the output is constant)"
 
 
-def _identified(
+def _run_identification(
     model: "Model", records: "list[Record]", kept: "list[Record]", body: "JobIn", *, quiet: bool
 ) -> "Identification":
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from service.jobs.to_core import algorithm_of, loss_of
+    from service.jobs.to_core import to_algorithm, to_loss
     from sysid.data.noise import Noise
     from sysid.identification.identify import identify as identified
 
-    document = body.normal_form()
-    algorithm = algorithm_of(document["algorithm"])
+    document = body.to_normal_form()
+    algorithm = to_algorithm(document["algorithm"])
     columns = (BarColumn(bar_width=40), TextColumn("{task.percentage:>3.0f} %"),
                TextColumn("RMS {task.fields[rms]}"), TimeElapsedColumn())  # fmt: skip
     console = Console(stderr=True, highlight=False)
@@ -298,7 +305,7 @@ def _identified(
 
         return identified(
             model, records, algorithm, seed=body.seed, parameters=document["parameters"],
-            prediction=body.prediction, loss=loss_of(document["loss"]), weights=body.weights,
+            prediction=body.prediction, loss=to_loss(document["loss"]), weights=body.weights,
             skip=body.skip, validation=kept or None,
             validation_fraction=None if body.validation is None else body.validation.fraction,
             noise=Noise(body.noise.sigma, body.noise.seed) if body.noise.sigma else None,
@@ -306,13 +313,15 @@ def _identified(
         )  # fmt: skip
 
 
-def _model(name: str) -> "Model":
+def _load_model(name: str) -> "Model":
     from sysid.models.catalogue.load import load_model
 
     return load_model(Path(name) if name.endswith(MODEL_SUFFIXES) else name)
 
 
-def _records(recording: "Recording", path: Path, model: "Model", body: "JobIn") -> "list[Record]":
+def _extract_records(
+    recording: "Recording", path: Path, model: "Model", body: "JobIn"
+) -> "list[Record]":
     from service.datasets.signal_channels import map_channels
 
     channels = map_channels(model, body.channels, body.hold)
@@ -320,5 +329,5 @@ def _records(recording: "Recording", path: Path, model: "Model", body: "JobIn") 
         if channel not in recording.names:
             given = f"--channels {signal}" if signal in body.channels else "--channels"
             fail(f"{given}: {path} has no channel {channel!r} for signal {signal!r} of the model"
-                 f"{nearest(channel, recording.names)}")  # fmt: skip
+                 f"{suggest_name(channel, recording.names)}")  # fmt: skip
     return list(channels.cut_records(recording, path.stem))

@@ -1,4 +1,4 @@
-"""`lagid submit`, `watch`, `jobs`, `runs`, `cancel`, `resume`, `report`."""
+"""`lagid submit`, `watch_job`, `jobs`, `list_runs`, `cancel_job`, `resume_job`, `write_report`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,12 +12,12 @@ from service.cli.common import (
     Key,
     Url,
     check_succeeded,
-    connected,
-    estimate,
+    connect_client,
     fail,
+    file_origins,
     format_decimals,
+    format_estimate,
     format_moment,
-    in_file,
     out,
     print_job,
     print_json,
@@ -26,13 +26,19 @@ from service.cli.common import (
     print_table,
     read_document,
     read_object,
-    told_at,
+    report_faults,
     write_file,
 )
-from service.cli.tables import MOST, place_of, print_many, show_run, tell_reused
-from service.cli.watch import follow
+from service.cli.tables import (
+    MAX_PRINTED,
+    print_reuse_note,
+    print_run,
+    print_run_summary,
+    run_coordinates,
+)
+from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
-from service.core.states import State
+from service.core.states import JobState
 from service.core.text import append_unit
 
 if TYPE_CHECKING:
@@ -42,7 +48,7 @@ if TYPE_CHECKING:
 JobName = Annotated[str, typer.Argument(metavar="JOB", help="Id of a job.")]
 
 
-def submit(
+def submit_job(
     file: Annotated[Path, typer.Argument(metavar="JOB.yaml", help="The job, YAML or JSON.")],
     wait: Annotated[bool, typer.Option("--wait", help="Show its progress until its end.")] = False,
     idempotency_key: Annotated[
@@ -53,9 +59,9 @@ def submit(
     as_json: AsJson = False,
 ) -> None:
     """Submit a job."""
-    body = job_of(file)
-    with connected(url, key) as client:
-        with told_at(in_file(file)):
+    body = read_job(file)
+    with connect_client(url, key) as client:
+        with report_faults(file_origins(file)):
             job = client.submit(body, idempotency_key=idempotency_key)
         if not wait:
             if as_json:
@@ -63,38 +69,40 @@ def submit(
             else:
                 print_job(job)
             return
-        _finish(client, follow(client, job["id"], quiet=as_json), as_json)
+        _print_end(client, follow_job(client, job["id"], quiet=as_json), as_json)
 
 
-def watch(job: JobName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
+def watch_job(
+    job: JobName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
+) -> None:
     """Show a job's progress and RMS until it ends, then its estimates."""
-    with connected(url, key) as client:
-        _finish(client, follow(client, job, quiet=as_json), as_json)
+    with connect_client(url, key) as client:
+        _print_end(client, follow_job(client, job, quiet=as_json), as_json)
 
 
-def listing(
+def list_jobs(
     state: Annotated[
-        list[State] | None, typer.Option(help="Only jobs in this state; may be repeated.")
+        list[JobState] | None, typer.Option(help="Only jobs in this state; may be repeated.")
     ] = None,
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
     """List the jobs of the server, latest first."""
-    with connected(url, key) as client:
+    with connect_client(url, key) as client:
         found = client.jobs(state=state or None)
     print_listing(
         found,
         as_json,
         ("id", "name", "state", "model", "runs", ">RMS", "unit", "submitted"),
-        lambda one: (one["id"], one["name"], one["state"], one["model"], _counts(one),
-                     *_rms(one), format_moment(one["created_at"])),
+        lambda one: (one["id"], one["name"], one["state"], one["model"], _format_progress(one),
+                     *_single_run_rms(one), format_moment(one["created_at"])),
         empty=f"no jobs are {' or '.join(state)}" if state
         else "no jobs; submit one: lagid submit job.yaml",
     )  # fmt: skip
 
 
-def runs(
+def list_runs(
     job: Annotated[
         str | None,
         typer.Argument(
@@ -106,11 +114,11 @@ def runs(
     as_json: AsJson = False,
 ) -> None:
     """List the runs of a job with their estimates, or show one run."""
-    with connected(url, key) as client:
+    with connect_client(url, key) as client:
         if job is not None and job.startswith("run_"):
-            show_run(client.run(job), as_json)
+            print_run(client.run(job), as_json)
             return
-        about = client.job(job or _latest(client))
+        about = client.job(job or _find_latest_job(client))
         found = client.runs(about["id"])
     if as_json:
         print_json(found)
@@ -118,22 +126,22 @@ def runs(
         print_runs(found, about["rms_unit"])
 
 
-def cancel(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
+def cancel_job(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
     """Cancel a job; what it has found so far stays."""
-    with connected(url, key) as client:
+    with connect_client(url, key) as client:
         found = client.cancel(job)
     asked = "will be cancelled" if found["state"] == "running" else f"is {found['state']}"
     out.print(f"{found['id']} {asked}", markup=False)
 
 
-def resume(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
+def resume_job(job: JobName, url: Url = DEFAULT_URL, key: Key = None) -> None:
     """Queue a failed or cancelled job again; it goes on from where it stopped."""
-    with connected(url, key) as client:
+    with connect_client(url, key) as client:
         found = client.resume(job)
     out.print(f"{found['id']} is {found['state']}", markup=False)
 
 
-def report(
+def write_report(
     job: JobName,
     file: Annotated[Path, typer.Option("--output", "--out", "-o", help="File to write.")] = Path(
         "report.html"
@@ -142,13 +150,13 @@ def report(
     key: Key = None,
 ) -> None:
     """Write the report of a job as one HTML file."""
-    with connected(url, key) as client:
+    with connect_client(url, key) as client:
         text = client.report(job)
     write_file(file, text)
     out.print(str(file), markup=False)
 
 
-def job_of(file: Path) -> dict[str, Any]:
+def read_job(file: Path) -> dict[str, Any]:
     """The body of a job file; a model named as a file is read, beside the job file."""
     body = read_object(file, "a job (model: …, datasets: […])")
     model = body.get("model")
@@ -163,12 +171,12 @@ def job_of(file: Path) -> dict[str, Any]:
 
 def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
     """Print runs with their cells, fits and estimates; labels stand for the data they tell of."""
-    places = [place_of(run) for run in runs]
+    places = [run_coordinates(run) for run in runs]
     paths = list(dict.fromkeys(path for place in places for path in place))
     units = {one["name"]: one["unit"] for run in runs for one in run["parameters"]}
     rows = []
     for run, place in zip(runs, places, strict=True):
-        found = {one["name"]: estimate(one) for one in run["parameters"]}
+        found = {one["name"]: format_estimate(one) for one in run["parameters"]}
         fit = run.get("fit_percent") or {}
         rows.append(
             [
@@ -186,29 +194,29 @@ def print_runs(runs: list[dict[str, Any]], rms_unit: str | None = None) -> None:
     print_table(headings, rows, empty="no runs")
 
 
-def _finish(client: "Client", job: dict[str, Any], as_json: bool) -> None:
+def _print_end(client: "Client", job: dict[str, Any], as_json: bool) -> None:
     found = client.runs(job["id"])
     if as_json:
         print_json({**job, "runs": found})
-    elif len(found) > MOST:
-        print_many(client, job, found)
+    elif len(found) > MAX_PRINTED:
+        print_run_summary(client, job, found)
     else:
         print_runs(found, job["rms_unit"])
         for warning in dict.fromkeys(w for run in found for w in run.get("warnings", [])):
             print_line(f"note: {warning}")
     if not as_json:
-        tell_reused(job, found, "reuse: false in the job")
+        print_reuse_note(job, found, "reuse: false in the job")
     check_succeeded(job)
 
 
-def _latest(client: "Client") -> str:
+def _find_latest_job(client: "Client") -> str:
     found = client.jobs(limit=1)
     if not found:
         fail("there are no jobs; submit one: lagid submit job.yaml")
     return str(found[0]["id"])
 
 
-def _counts(job: dict[str, Any]) -> str:
+def _format_progress(job: dict[str, Any]) -> str:
     """Runs that are over, of all; of several also how they ended."""
     done = job["progress"]
     told = f"{done['finished']}/{done['runs']}"
@@ -218,7 +226,7 @@ def _counts(job: dict[str, Any]) -> str:
     return f"{told}: {succeeded} succeeded, {done['failed']} failed"
 
 
-def _rms(job: dict[str, Any]) -> tuple[float | None, str | None]:
+def _single_run_rms(job: dict[str, Any]) -> tuple[float | None, str | None]:
     """RMS of a job of one run and its unit; the best of several, on other data, tells nothing."""
     best = job["progress"]["best_rms"]
     if job["progress"]["runs"] != 1 or best is None:

@@ -15,13 +15,13 @@ from service.cli import server as serving
 from service.cli import server as upkeep
 from service.cli.common import out, print_error
 from service.cli.identify import identify
-from service.cli.paper import paper
+from service.cli.paper import reproduce_paper
 from service.cli.reidentify import reidentify
 from service.client.calls import ClientError, NotFinite, ProblemError
 from service.core.errors import ServiceError
 
-SERVER_FAILS = 500
-NO_TEXT = "surrogates not allowed"
+SERVER_ERROR_STATUS = 500
+SURROGATE_REASON = "surrogates not allowed"
 """What Python says of words of a command that were typed, or named a file, in another encoding."""
 app = typer.Typer(
     name="lagid",
@@ -33,35 +33,35 @@ app = typer.Typer(
 )
 
 app.command("serve")(serving.serve)
-app.command("dispatcher")(serving.dispatcher)
+app.command("dispatcher")(serving.run_dispatcher)
 app.command("identify")(identify)
-app.command("paper")(paper)
-app.command("submit")(jobs.submit)
-app.command("watch")(jobs.watch)
-app.command("jobs")(jobs.listing)
+app.command("paper")(reproduce_paper)
+app.command("submit")(jobs.submit_job)
+app.command("watch")(jobs.watch_job)
+app.command("jobs")(jobs.list_jobs)
 app.add_typer(runs.app, name="runs")
-app.command("export")(exporting.export)
-app.command("cancel")(jobs.cancel)
-app.command("resume")(jobs.resume)
-app.command("report")(jobs.report)
-app.command("datasets")(datasets.listing)
+app.command("export")(exporting.export_model)
+app.command("cancel")(jobs.cancel_job)
+app.command("resume")(jobs.resume_job)
+app.command("report")(jobs.write_report)
+app.command("datasets")(datasets.list_datasets)
 app.add_typer(datasets.app, name="dataset")
 app.add_typer(models.app, name="models")
 app.add_typer(sweeps.app, name="sweep")
 app.command("reidentify")(reidentify)
 app.add_typer(references.app, name="references")
-app.add_typer(upkeep.database, name="db")
-app.command("doctor")(upkeep.doctor)
+app.add_typer(upkeep.database_app, name="db")
+app.command("doctor")(upkeep.check_installation)
 
 
 @app.command("demo")
-def demo(
+def run_demo(
     data_dir: Annotated[Path, typer.Option(help="Where to keep its data.")] = Path("lagid-demo"),
 ) -> None:
     """Run the paper's Example 1 through the whole service and print its Table 1."""
     from service.cli import demo as program
 
-    program.run(data_dir, out)
+    program.run_demo(data_dir, out)
 
 
 def main() -> None:
@@ -74,50 +74,50 @@ def main() -> None:
         code = app(prog_name="lagid", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except TyperException as error:
-        _end(_usage(error), error.exit_code)
+        _exit_with_message(_usage_message(error), error.exit_code)
     except ProblemError as error:
-        _end(error.reason if error.status < SERVER_FAILS else str(error))
+        _exit_with_message(error.reason if error.status < SERVER_ERROR_STATUS else str(error))
     except (ServiceError, ClientError) as error:
-        _end(str(error), 2 if isinstance(error, NotFinite) else 1)
+        _exit_with_message(str(error), 2 if isinstance(error, NotFinite) else 1)
     except KeyboardInterrupt:
         sys.exit(130)
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(1)
     except Exception as error:  # the process border; what is no user's mistake goes on as it is
-        sentence = _sentence(error)
+        sentence = _user_message(error)
         if sentence is None:
             raise
-        _end(sentence)
+        _exit_with_message(sentence)
 
 
-def _usage(error: TyperException) -> str:
+def _usage_message(error: TyperException) -> str:
     """What is wrong with the words of a command, in our sentences; empty after a help text."""
     text = error.format_message()
     if not text.strip() or "\n" in text.strip():  # a command without its words: the help is out
         return ""
     cause: Any = error.__cause__
     if hasattr(cause, "errors"):  # Pydantic's, by which the values of options are read
-        from service.core.validation import detail_of
+        from service.core.validation import describe_error
 
-        text = text.replace(error.message, detail_of(cause.errors()[0], ()))
+        text = text.replace(error.message, describe_error(cause.errors()[0], ()))
     context = getattr(error, "ctx", None)
     command = "lagid" if context is None else context.command_path
     return f"{text[:1].lower()}{text[1:].rstrip('.')} ({command} --help)"
 
 
-def _end(message: str, code: int = 1) -> None:
+def _exit_with_message(message: str, code: int = 1) -> None:
     if message:
         print_error(message)
     sys.exit(code)
 
 
-def _sentence(error: Exception) -> str | None:
+def _user_message(error: Exception) -> str | None:
     """What is told of a user's mistake that the core, the storage or a text's encoding finds."""
     from service.storage.errors import StorageError
     from sysid.core.errors import SysidError
 
-    if isinstance(error, UnicodeEncodeError) and error.reason == NO_TEXT:
+    if isinstance(error, UnicodeEncodeError) and error.reason == SURROGATE_REASON:
         return f"{error.object[:200]!r} is not UTF-8 text; write it in UTF-8"
     return str(error) if isinstance(error, SysidError | StorageError) else None
 

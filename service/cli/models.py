@@ -9,32 +9,32 @@ from service.cli.common import (
     AsJson,
     Key,
     Url,
-    connected,
+    connect_client,
     err,
-    in_file,
+    file_origins,
     out,
     print_json,
     print_listing,
     read_file,
     read_object,
-    told_at,
+    report_faults,
 )
 from service.client.calls import DEFAULT_URL
-from service.core.documents import read_yaml
+from service.core.documents import parse_yaml
 from service.core.errors import InvalidRequest
 
 app = typer.Typer(help="Built-in and own models.", invoke_without_command=True)
 
 
 @app.callback()
-def models(context: typer.Context) -> None:
+def list_by_default(context: typer.Context) -> None:
     """Built-in and own models; without a command, a list of the built-in ones."""
     if context.invoked_subcommand is None:
-        listing()
+        list_models()
 
 
 @app.command("list")
-def listing(
+def list_models(
     url: Annotated[
         str | None, typer.Option("--url", envvar="LAGID_URL", help="Also those of a server.")
     ] = None,
@@ -42,9 +42,9 @@ def listing(
     as_json: AsJson = False,
 ) -> None:
     """List the models: built-in ones, and own ones of a server if one is named."""
-    found = _built_in()
+    found = _list_builtin_models()
     if url is not None:
-        with connected(url, key) as client:
+        with connect_client(url, key) as client:
             found = client.models()
     print_listing(
         found,
@@ -58,10 +58,10 @@ def listing(
 
 
 @app.command("show")
-def show(
+def show_model(
     name: Annotated[str, typer.Argument(help="Name, or name@version of an own model.")],
     url: Annotated[
-        str | None, typer.Option("--url", envvar="LAGID_URL", help="Server of own models.")
+        str | None, typer.Option("--url", envvar="LAGID_URL", help="Server of own list_by_default.")
     ] = None,
     key: Key = None,
     as_json: AsJson = False,
@@ -73,9 +73,9 @@ def show(
 
     document: dict[str, Any]
     if url is None or name in library.catalogue():
-        document = dict(library.document(name))
+        document = dict(library.copy_catalogue_document(name))
     else:
-        with connected(url, key) as client:
+        with connect_client(url, key) as client:
             document = client.model(name)["document"]
     if as_json:
         print_json(document)
@@ -85,17 +85,17 @@ def show(
 
 
 @app.command("check")
-def check(
+def check_model(
     file: Annotated[Path, typer.Argument(help="Model document, YAML or JSON.")],
     as_json: AsJson = False,
 ) -> None:
     """Check a model document; each error with its place and, in equations, its column."""
-    from service.models.models import check as checked
+    from service.models.models import check_model as checked
 
     try:
-        answer = checked(read_yaml(read_file(file))).model_dump(mode="json")
+        answer = checked(parse_yaml(read_file(file))).model_dump(mode="json")
     except InvalidRequest as error:
-        answer = {"valid": False, "errors": [one.as_dict() for one in error.errors]}
+        answer = {"valid": False, "errors": [one.to_dict() for one in error.errors]}
     if as_json:
         print_json(answer)
     elif answer["valid"]:
@@ -110,19 +110,19 @@ def check(
 
 
 @app.command("add")
-def add(
+def add_model(
     file: Annotated[Path, typer.Argument(help="Model document, YAML or JSON.")],
     url: Url = DEFAULT_URL,
     key: Key = None,
 ) -> None:
     """Store an own model on a server."""
     document = read_object(file, "a model (name, equations, …)")
-    with connected(url, key) as client, told_at(in_file(file)):
+    with connect_client(url, key) as client, report_faults(file_origins(file)):
         stored = client.add_model(document)
     out.print(f"{stored['name']}@{stored['version']}", markup=False)
 
 
-def _built_in() -> list[dict[str, Any]]:
-    from service.models.models import catalogue
+def _list_builtin_models() -> list[dict[str, Any]]:
+    from service.models.models import list_catalogue
 
-    return [one.model_dump(mode="json") for one in catalogue()]
+    return [one.model_dump(mode="json") for one in list_catalogue()]

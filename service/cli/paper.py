@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from service.client.client import Client
 
 
-def paper(
+def reproduce_paper(
     output: Annotated[Path, typer.Option(help="Where the report goes.")] = Path("paper.html"),
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer replicates; under a minute.")
@@ -33,22 +33,22 @@ def paper(
     key: Key = None,
 ) -> None:  # fmt: skip
     """Reproduce the paper's tables and figures with real jobs; print tables, write a report."""
-    from service.paper.bench import Bench
-    from service.paper.document import markdown
-    from service.paper.report import page
-    from service.paper.study import chosen, conduct
+    from service.paper.bench import StudyBench
+    from service.paper.document import to_markdown
+    from service.paper.report import render_report
+    from service.paper.study import choose_parts, conduct_study
 
-    names = chosen(only)
+    names = choose_parts(only)
     if not output.parent.is_dir():
         fail(f"--output: there is no folder {output.parent}", 2)
     start = time.monotonic()
     sections = []
     with _client(url, key) as client:
-        bench = Bench(client, quick, lambda text: err.print(f"… {text}", markup=False))
-        for section in conduct(bench, names):
+        bench = StudyBench(client, quick, lambda text: err.print(f"… {text}", markup=False))
+        for section in conduct_study(bench, names):
             sections.append(section)
-            out.print(markdown(section), markup=False, soft_wrap=True)
-    output.write_text(page(sections, quick=quick), encoding="utf-8")
+            out.print(to_markdown(section), markup=False, soft_wrap=True)
+    output.write_text(render_report(sections, quick=quick), encoding="utf-8")
     out.print(f"report {output.resolve()} ({time.monotonic() - start:.0f} s)", soft_wrap=True)
 
 
@@ -56,7 +56,7 @@ def paper(
 def _client(url: str | None, key: str | None) -> "Iterator[Client]":
     """A client of the given server, or of one that lives as long as the command."""
     from service.client.client import Client
-    from service.client.embedded import embedded_service
+    from service.client.embedded import run_embedded_service
 
     if url is not None:
         with Client(url, key) as client:
@@ -64,7 +64,7 @@ def _client(url: str | None, key: str | None) -> "Iterator[Client]":
         return
     with (
         TemporaryDirectory(prefix="lagid-paper-") as folder,
-        embedded_service(Path(folder), cpus=os.cpu_count()) as own,
+        run_embedded_service(Path(folder), cpus=os.cpu_count()) as own,
         Client(own) as client,
     ):
         yield client

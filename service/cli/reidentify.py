@@ -12,13 +12,15 @@ import typer
 from service.cli.common import (
     DATA_SUFFIXES,
     AsJson,
+    FieldOrigins,
     Key,
-    Places,
     Url,
+    apply_setting,
     check_succeeded,
-    connected,
-    estimate,
+    connect_client,
     fail,
+    fail_usage,
+    format_estimate,
     format_moment,
     out,
     parse_channels,
@@ -27,15 +29,13 @@ from service.cli.common import (
     print_json,
     print_listing,
     print_table,
-    put,
     read_model,
+    report_faults,
     split_names,
-    told_at,
-    usage,
     write_file,
 )
-from service.cli.tables import print_trend, tell_reused
-from service.cli.watch import follow
+from service.cli.tables import print_reuse_note, print_trend
+from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
 from service.core.text import format_labels
 
@@ -69,7 +69,7 @@ Changes = Annotated[
     list[str] | None,
     typer.Option("--set", help="path=value of the job, as parameters.L.upper=0.5."),
 ]
-Name = Annotated[str | None, typer.Option(help="Name of the job.")]
+JobNameOption = Annotated[str | None, typer.Option(help="Name of the job.")]
 Wait = Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")]
 Accept = Annotated[
     str | None, typer.Option(metavar="NAME", help="Accept a run as this reference at the end.")
@@ -92,7 +92,7 @@ def reidentify(
     warm_start: WarmStart = None,
     channels: Channels = "",
     changes: Changes = None,
-    name: Name = None,
+    name: JobNameOption = None,
     wait: Wait = False,
     accept: Accept = None,
     accept_run: AcceptRun = None,
@@ -104,62 +104,64 @@ def reidentify(
 
     Each run begins at the reference, or at the result of its neighbour.
     """
-    batch = [_experiments(text) for text in experiments]
-    chosen = _chosen([x for x, _ in batch], label, accept, accept_run)
+    batch = [_parse_experiments(text) for text in experiments]
+    chosen = _choose_label_value([x for x, _ in batch], label, accept, accept_run)
     body: dict[str, Any] = {
         "model": read_model(model), "label": label, "look_at": split_names(parameters),
         "predict": [parse_number("--predict", one) for one in split_names(predict)],
         "channels": parse_channels(channels),
-        **_given(reference=reference, warm_start=warm_start, name=name),
+        **_drop_missing(reference=reference, warm_start=warm_start, name=name),
     }  # fmt: skip
     for change in changes or []:
-        put(body, change)
-    with connected(url, key) as client:
-        body["batch"] = _uploaded(client, batch)
-        with told_at(_places(experiments)):
+        apply_setting(body, change)
+    with connect_client(url, key) as client:
+        body["batch"] = _upload_batch(client, batch)
+        with report_faults(_field_origins(experiments)):
             job = client.reidentify(body)
         if not (wait or accept or json_file):
             print_job(job)
             return
-        ended = follow(client, job["id"], quiet=json_file == "-")
-        _tell(client, ended, json_file)
+        ended = follow_job(client, job["id"], quiet=json_file == "-")
+        _print_outcome(client, ended, json_file)
         if accept is not None:
-            _accept(client, ended, accept, label, chosen)
+            _accept_run(client, ended, accept, label, chosen)
 
 
-def _places(experiments: list[str]) -> Places:
+def _field_origins(experiments: list[str]) -> FieldOrigins:
     """Where the fields of the body stand on the command line; entries of the batch as typed."""
     batch = {f"/batch/{number}": text for number, text in enumerate(experiments)}
-    return Places({
+    return FieldOrigins({
         "/model": "--model …", "/label": "--label", "/look_at": "--parameters",
         "/predict": "--predict", "/reference": "--reference", "/warm_start": "--warm-start",
         "/name": "--name", "/channels": "--channels {}", **batch,
     })  # fmt: skip
 
 
-def _tell(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
+def _print_outcome(client: "Client", job: dict[str, Any], json_file: str | None) -> None:
     trend = client.trend(job["id"])
     if json_file == "-":
         print_json(trend)
     else:
-        print_trend(trend, Places())
-        tell_reused(job, (), "--set reuse=false")
+        print_trend(trend, FieldOrigins())
+        print_reuse_note(job, (), "--set reuse=false")
     if json_file not in (None, "-"):
         write_file(Path(str(json_file)), json.dumps(trend, indent=2, ensure_ascii=False))
     check_succeeded(job)
 
 
-def _chosen(given: list[float], label: str, accept: str | None, accept_run: str | None) -> float:
+def _choose_label_value(
+    given: list[float], label: str, accept: str | None, accept_run: str | None
+) -> float:
     """The value of the label whose run is to be accepted: known before anything is computed."""
     there = f"there are {', '.join(f'{x:g}' for x in sorted(set(given)))}"
     if accept is None:
         if accept_run is not None:
-            usage("--accept-run needs --accept NAME, the reference that the run is to be")
+            fail_usage("--accept-run needs --accept NAME, the reference that the run is to be")
         return given[0]
     if accept_run is None and len(set(given)) > 1:
-        usage(f"--accept needs --accept-run, a value of {label}; {there}")
+        fail_usage(f"--accept needs --accept-run, a value of {label}; {there}")
     if accept_run is not None and accept_run.startswith("run_"):
-        usage(
+        fail_usage(
             f"--accept-run {accept_run}: need a value of {label}, since only a run of this batch "
             f"can be meant; {there}. Another run: lagid references accept {accept} {accept_run}"
         )
@@ -167,17 +169,17 @@ def _chosen(given: list[float], label: str, accept: str | None, accept_run: str 
     if given.count(x) != 1:
         found = f"{given.count(x)} experiments have {label} = {x:g}; {there}"
         several = f". Accept one of their runs at the end: lagid references accept {accept} RUN"
-        usage(f"--accept-run {x:g}: {found}{several if x in given else ''}")
+        fail_usage(f"--accept-run {x:g}: {found}{several if x in given else ''}")
     return x
 
 
-def _accept(client: "Client", job: dict[str, Any], name: str, label: str, x: float) -> None:
+def _accept_run(client: "Client", job: dict[str, Any], name: str, label: str, x: float) -> None:
     """Make a run of the batch the reference of a name."""
     (run,) = client.runs(job["id"], label=f"{label}={json.dumps(x)}")
     _print_accepted(client.accept_reference(name, run["id"]))
 
 
-def _uploaded(client: "Client", batch: list[tuple[float, list[str]]]) -> list[dict[str, Any]]:
+def _upload_batch(client: "Client", batch: list[tuple[float, list[str]]]) -> list[dict[str, Any]]:
     """The batch with identifiers of datasets; files are stored first, each once."""
     known: dict[str, str] = {}
     for source in (one for _, sources in batch for one in sources):
@@ -190,29 +192,31 @@ def _uploaded(client: "Client", batch: list[tuple[float, list[str]]]) -> list[di
     return [{"x": x, "datasets": [known[one] for one in sources]} for x, sources in batch]
 
 
-def _experiments(text: str) -> tuple[float, list[str]]:
+def _parse_experiments(text: str) -> tuple[float, list[str]]:
     x, equals, sources = text.partition("=")
     names = split_names(sources)
     if not (equals and names):
-        usage(f"{text}: need X=DATA, the value of the label and a recording, such as 5=a.csv")
+        fail_usage(f"{text}: need X=DATA, the value of the label and a recording, such as 5=a.csv")
     return parse_number(text, x), names
 
 
-def _given(**options: str | None) -> dict[str, str]:
+def _drop_missing(**options: str | None) -> dict[str, str]:
     return {name: value for name, value in options.items() if value is not None}
 
 
 app = typer.Typer(help="List, show and accept references.", no_args_is_help=True)
 
-PLACES = Places({"/run": "RUN", "/by": "--by", "/note": "--note", "{name}": "NAME"})
+REFERENCE_ORIGINS = FieldOrigins(
+    {"/run": "RUN", "/by": "--by", "/note": "--note", "{name}": "NAME"}
+)
 
 ReferenceName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the reference.")]
 
 
 @app.command("list")
-def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
+def list_references(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) -> None:
     """List the references in use."""
-    with connected(url, key) as client:
+    with connect_client(url, key) as client:
         found = client.references()
     print_listing(
         found,
@@ -224,23 +228,23 @@ def listing(url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False) ->
             format_moment(one["at"]),
             one["by"],
             format_labels(one["labels"]),
-            _estimates(one["estimates"]),
+            _format_estimates(one["estimates"]),
         ),
         empty="no references; accept one: lagid references accept NAME RUN",
     )
 
 
 @app.command("show")
-def show(
+def show_reference(
     name: ReferenceName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
 ) -> None:
     """Show a reference with what was accepted before it."""
-    with connected(url, key) as client:
+    with connect_client(url, key) as client:
         found = client.reference(name)
     if as_json:
         print_json(found)
         return
-    out.print(f"{found['name']}: {_estimates(found['estimates'])}", markup=False)
+    out.print(f"{found['name']}: {_format_estimates(found['estimates'])}", markup=False)
     if found["labels"]:
         out.print(format_labels(found["labels"]), markup=False)
     rows = [(one["run"], format_moment(one["at"]), one["by"], one["note"])
@@ -249,7 +253,7 @@ def show(
 
 
 @app.command("accept")
-def accept(
+def accept_reference(
     name: ReferenceName,
     run: Annotated[str, typer.Argument(metavar="RUN", help="Id of a run that succeeded.")],
     by: Annotated[str | None, typer.Option(help="Who accepts it.")] = None,
@@ -259,7 +263,7 @@ def accept(
     as_json: AsJson = False,
 ) -> None:
     """Make a run the reference of a name; the one before stays in the history."""
-    with connected(url, key) as client, told_at(PLACES):
+    with connect_client(url, key) as client, report_faults(REFERENCE_ORIGINS):
         found = client.accept_reference(name, run, by=by, note=note)
     if as_json:
         print_json(found)
@@ -272,5 +276,5 @@ def _print_accepted(reference: dict[str, Any]) -> None:
     out.print(f"{reference['name']}: {reference['run']}{before}", markup=False)
 
 
-def _estimates(estimates: dict[str, Any]) -> str:
-    return ", ".join(f"{name} = {estimate(one)}" for name, one in estimates.items())
+def _format_estimates(estimates: dict[str, Any]) -> str:
+    return ", ".join(f"{name} = {format_estimate(one)}" for name, one in estimates.items())

@@ -11,26 +11,26 @@ from typer.core import TyperGroup
 
 from service.cli.common import (
     AsJson,
+    FieldOrigins,
     Key,
-    Places,
     Url,
-    connected,
-    estimate,
+    connect_client,
     format_decimals,
+    format_estimate,
     out,
     print_json,
     print_table,
     read_object,
-    told_at,
+    report_faults,
     write_file,
 )
-from service.cli.jobs import runs as listing
+from service.cli.jobs import list_runs as listing
 from service.client.calls import DEFAULT_URL
 from service.core.text import format_p_value
-from sysid.core.units import multiplied
+from sysid.core.units import multiply_units
 
-LISTING = "list"
-PROFILE = Places({"/parameters": "PARAMETER", "/points": "--points"})
+LIST_COMMAND = "list"
+PROFILE_ORIGINS = FieldOrigins({"/parameters": "PARAMETER", "/points": "--points"})
 
 _MARGINS = (
     ("gain margin", "gain_margin", ""),
@@ -42,36 +42,36 @@ _MARGINS = (
 RunName = Annotated[str, typer.Argument(metavar="RUN", help="Id of a run.")]
 
 
-class _Listing(TyperGroup):
+class _RunsGroup(TyperGroup):
     """Commands on runs; without the name of one, the runs of a job are listed."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if not args or args[0] not in (*self.commands, "--help"):
-            args = [LISTING, *args]
+            args = [LIST_COMMAND, *args]
         return super().parse_args(ctx, args)
 
 
 app = typer.Typer(
-    cls=_Listing, add_completion=False,
+    cls=_RunsGroup, add_completion=False,
     help="List the runs of a job with their estimates: lagid runs [JOB]; show one: "
     "lagid runs RUN; or ask about it.",
 )  # fmt: skip
-app.command(LISTING)(listing)
+app.command(LIST_COMMAND)(listing)
 
 
 @app.command("residuals")
-def residuals(
+def show_residuals(
     run: RunName, url: Url = DEFAULT_URL, key: Key = None, as_json: AsJson = False
 ) -> None:
     """Tell whether a run's residuals are white and independent of the inputs."""
-    with connected(url, key) as client:
+    with connect_client(url, key) as client:
         found = client.residuals(run)
     if as_json:
         print_json(found)
         return
     headings = ("test", "experiment", "output", "input", ">samples", ">inside 95 %",
                 ">inside 99 %", ">p", "verdict")  # fmt: skip
-    print_table(headings, map(_tested, found["tests"]), empty="no tests")
+    print_table(headings, map(_test_row, found["tests"]), empty="no tests")
     verdict = {True: "passed", False: "failed", None: "not tested"}[found["passed"]]
     out.print(f"residuals on {found['data']} data: {verdict}", markup=False)
     if found["note"]:
@@ -79,7 +79,7 @@ def residuals(
 
 
 @app.command("simulate")
-def simulate(
+def simulate_run(
     run: RunName,
     file: Annotated[Path, typer.Argument(help="YAML or JSON file with the body of the request.")],
     max_points: Annotated[int, typer.Option(min=2, help="Points a line, at most.")] = 1000,
@@ -89,8 +89,8 @@ def simulate(
 ) -> None:
     """Simulate the identified model on a new input or under P, PI or PID control."""
     body = read_object(file)
-    places = Places({"?max_points": "--max-points"}, rest=f"{file} …")
-    with connected(url, key) as client, told_at(places):
+    places = FieldOrigins({"?max_points": "--max-points"}, rest=f"{file} …")
+    with connect_client(url, key) as client, report_faults(places):
         found = client.simulate_run(run, body, max_points)
     if as_json:
         print_json(found)
@@ -109,7 +109,7 @@ def simulate(
 
 
 @app.command("profile")
-def profile(
+def profile_run(
     run: RunName,
     parameters: Annotated[
         list[str] | None, typer.Argument(metavar="PARAMETER…", help="All free ones if none.")
@@ -120,7 +120,7 @@ def profile(
     as_json: AsJson = False,
 ) -> None:
     """Profile likelihood: 95 % intervals with all other parameters estimated anew."""
-    with connected(url, key) as client, told_at(PROFILE):
+    with connect_client(url, key) as client, report_faults(PROFILE_ORIGINS):
         found = client.profile(run, *(parameters or ()), points=points)
     if as_json:
         print_json(found)
@@ -134,14 +134,14 @@ def profile(
 
 
 @app.command("compare")
-def compare(
+def compare_runs(
     runs: Annotated[list[str], typer.Argument(metavar="RUN RUN…", help="Ids of two runs or more.")],
     url: Url = DEFAULT_URL,
     key: Key = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare runs of several models on the same data."""
-    with connected(url, key) as client, told_at(Places({"/runs": "RUN"})):
+    with connect_client(url, key) as client, report_faults(FieldOrigins({"/runs": "RUN"})):
         found = client.compare(*runs)
     if as_json:
         print_json(found)
@@ -149,7 +149,7 @@ def compare(
     headings = ("run", "model", ">parameters", ">samples", f">RMS [{found['unit']}]", ">fit %",
                 ">validation %", ">AIC", ">BIC", "residuals",
                 *(f">{one['name']}" for one in found["parameters"]))  # fmt: skip
-    print_table(headings, [_compared(one, found["parameters"]) for one in found["runs"]],
+    print_table(headings, [_comparison_row(one, found["parameters"]) for one in found["runs"]],
                 empty="no runs")  # fmt: skip
     for note in found["notes"]:
         out.print(f"note: {note}", markup=False, soft_wrap=True)
@@ -171,8 +171,8 @@ def _print_step(metrics: dict[str, Any] | None) -> None:
         ("overshoot of the final value", metrics["overshoot_of_final_percent"], "%"),
         ("settling time (2 %)", metrics["settling_time"], "s"),
         ("steady error", metrics["steady_error"], metrics["unit"]),
-        ("IAE", metrics["iae"], multiplied(metrics["unit"], "s")),
-        ("ITAE", metrics["itae"], multiplied(metrics["unit"], "s²")),
+        ("IAE", metrics["iae"], multiply_units(metrics["unit"], "s")),
+        ("ITAE", metrics["itae"], multiply_units(metrics["unit"], "s²")),
     )
     for name, value, unit in told:
         missing = "not in this record: it has not settled" if "settling" in name else "never"
@@ -207,18 +207,21 @@ def _print_controller(
         out.print(f"without limits: stable, {', '.join(shown)}", markup=False)
 
 
-def _tested(one: dict[str, Any]) -> tuple[object, ...]:
+def _test_row(one: dict[str, Any]) -> tuple[object, ...]:
     reason = f": {one['reason']}" if one["reason"] else ""
     return (
         one["test"], one["experiment"] + 1, one["output"], one["input"], one["samples"],
-        _percent(one["inside95"]), _percent(one["inside99"]), format_p_value(one["p"]),
+        _format_percent(one["inside95"]), _format_percent(one["inside99"]), format_p_value(one["p"]),
         f"{one['outcome']}{reason}",
     )  # fmt: skip
 
 
-def _compared(one: dict[str, Any], parameters: list[dict[str, Any]]) -> tuple[object, ...]:
+def _comparison_row(one: dict[str, Any], parameters: list[dict[str, Any]]) -> tuple[object, ...]:
     values = [
-        next((estimate(value) for value in parameter["values"] if value["run"] == one["run"]), None)
+        next(
+            (format_estimate(value) for value in parameter["values"] if value["run"] == one["run"]),
+            None,
+        )
         for parameter in parameters
     ]
     passed = {True: "passed", False: "failed", None: None}[one["residuals_passed"]]
@@ -233,14 +236,14 @@ def _compared(one: dict[str, Any], parameters: list[dict[str, Any]]) -> tuple[ob
     )
 
 
-def _percent(part: float | None) -> str | None:
+def _format_percent(part: float | None) -> str | None:
     return None if part is None else f"{100 * part:.0f}"
 
 
-PLACES = Places({"?format": "--format", "?pade_order": "--pade-order"})
+EXPORT_ORIGINS = FieldOrigins({"?format": "--format", "?pade_order": "--pade-order"})
 
 
-def export(
+def export_model(
     run: Annotated[str, typer.Argument(metavar="RUN", help="Id of a run.")],
     format: Annotated[
         Literal["json", "python", "c", "control"],
@@ -256,7 +259,7 @@ def export(
     key: Key = None,
 ) -> None:
     """Write the identified model of a run for another program."""
-    with connected(url, key) as client, told_at(PLACES):
+    with connect_client(url, key) as client, report_faults(EXPORT_ORIGINS):
         text = client.export(run, format, pade_order)
     if output is None:
         typer.echo(text, nl=False)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from service.storage.sessions import Database
 
 
-CLOSE_S = 3  # what an open answer may take once the process is asked to end
+SHUTDOWN_SECONDS = 3  # what an open answer may take once the process is asked to end
 
 Host = Annotated[str | None, typer.Option(help="Address to listen on.")]
 Port = Annotated[int | None, typer.Option(min=0, max=65535, help="Port; 0 for any free one.")]
@@ -44,41 +44,43 @@ def serve(
     cpus: Cpus = None,
     with_dispatcher: Annotated[
         bool,
-        typer.Option("--dispatcher/--no-dispatcher", help="Keep a dispatcher running beside it."),
+        typer.Option(
+            "--run_dispatcher/--no-run_dispatcher", help="Keep a run_dispatcher running beside it."
+        ),
     ] = True,
 ) -> None:
     """Serve REST and pages, with a dispatcher beside (defaults from LAGID_… variables)."""
-    settings = settings_of(host=host, port=port, data_dir=data_dir, cpus=cpus)
+    settings = load_settings(host=host, port=port, data_dir=data_dir, cpus=cpus)
     settings.check_exposure()
-    settings.prepare_folder()
-    with listening(settings.host, settings.port) as listener:
-        from service.dispatch.supervisor import supervised_dispatcher
+    settings.prepare_data_folder()
+    with open_listener(settings.host, settings.port) as listener:
+        from service.dispatch.supervisor import supervise_dispatcher
 
-        _end_on_signals()
+        _exit_on_signals()
         child: AbstractContextManager[Supervisor | None] = nullcontext()
         if with_dispatcher:
-            child = supervised_dispatcher(settings)
+            child = supervise_dispatcher(settings)
         with child as supervisor:  # the dispatcher starts beside all that follows
-            _try_storage(settings)
+            _check_storage(settings)
             from service.api.app import create_app
 
             bound = listener.getsockname()[1]
             folder = settings.data_dir.absolute()
             out.print(f"lagid serves http://{settings.host}:{bound}/ (data in {folder}); "
                       "Ctrl-C ends it", soft_wrap=True)  # fmt: skip
-            _run(create_app(settings), listener, supervisor)
+            _run_server(create_app(settings), listener, supervisor)
 
 
-def dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
+def run_dispatcher(data_dir: DataDir = None, cpus: Cpus = None) -> None:
     """Claim jobs and have them computed, until told to end (`serve` starts one by itself)."""
-    settings = settings_of(data_dir=data_dir, cpus=cpus)
-    settings.prepare_folder()
-    from service.dispatch.process import run
+    settings = load_settings(data_dir=data_dir, cpus=cpus)
+    settings.prepare_data_folder()
+    from service.dispatch.process import run_process
 
-    raise typer.Exit(run(settings))
+    raise typer.Exit(run_process(settings))
 
 
-def settings_of(**given: Any) -> "Settings":
+def load_settings(**given: Any) -> "Settings":
     """Settings of the environment, with the options that were given.
 
     Raises
@@ -89,17 +91,17 @@ def settings_of(**given: Any) -> "Settings":
     from pydantic import ValidationError
 
     from service.core.settings import Settings
-    from service.core.validation import detail_of
+    from service.core.validation import describe_error
 
     try:
         return Settings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
         first = error.errors()[0]
         name = "_".join(str(part) for part in first["loc"]).upper()
-        raise Misconfigured(f"LAGID_{name}: {detail_of(first, ())}") from None
+        raise Misconfigured(f"LAGID_{name}: {describe_error(first, ())}") from None
 
 
-def listening(host: str, port: int) -> socket.socket:
+def open_listener(host: str, port: int) -> socket.socket:
     """A socket that listens there.
 
     Raises
@@ -124,7 +126,7 @@ def listening(host: str, port: int) -> socket.socket:
     return listener
 
 
-def _run(app: "FastAPI", listener: socket.socket, supervisor: "Supervisor | None") -> None:
+def _run_server(app: "FastAPI", listener: socket.socket, supervisor: "Supervisor | None") -> None:
     import uvicorn
 
     class Server(uvicorn.Server):
@@ -139,12 +141,12 @@ def _run(app: "FastAPI", listener: socket.socket, supervisor: "Supervisor | None
             super().handle_exit(sig, frame)
 
     config = uvicorn.Config(
-        app, log_level="warning", access_log=False, timeout_graceful_shutdown=CLOSE_S
+        app, log_level="warning", access_log=False, timeout_graceful_shutdown=SHUTDOWN_SECONDS
     )
     Server(config).run(sockets=[listener])
 
 
-def _try_storage(settings: "Settings") -> None:
+def _check_storage(settings: "Settings") -> None:
     """Open database and objects once, so that what cannot be opened is told in one line.
 
     Raises
@@ -167,7 +169,7 @@ def _try_storage(settings: "Settings") -> None:
     database.dispose()
 
 
-def _end_on_signals() -> None:
+def _exit_on_signals() -> None:
     """End by an exception, so that what is open is closed; uvicorn raises the signal again."""
 
     def end(_signal: int, _frame: FrameType | None) -> None:
@@ -177,44 +179,46 @@ def _end_on_signals() -> None:
     signal.signal(signal.SIGINT, end)
 
 
-database = typer.Typer(help="The tables of the database.", no_args_is_help=True)
+database_app = typer.Typer(help="The tables of the database.", no_args_is_help=True)
 
-NEEDED = ("numpy", "scipy", "numba", "ray", "fastapi", "sqlalchemy", "obstore", "mcap")
+REQUIRED_PACKAGES = ("numpy", "scipy", "numba", "ray", "fastapi", "sqlalchemy", "obstore", "mcap")
 Fix = Annotated[bool, typer.Option("--fix", help="Delete the objects that no row names.")]
 
 
-@database.command("upgrade")
-def upgrade(data_dir: DataDir = None) -> None:
+@database_app.command("upgrade")
+def upgrade_database(data_dir: DataDir = None) -> None:
     """Create the tables, or bring them to this version."""
     from service.storage import migrate
 
-    settings = settings_of(data_dir=data_dir)
-    settings.prepare_folder()
-    with opened(settings) as found:
-        migrate.upgrade(found)
-        out.print(f"the database is at revision {migrate.current(found)}", markup=False)
+    settings = load_settings(data_dir=data_dir)
+    settings.prepare_data_folder()
+    with open_database(settings) as found:
+        migrate.upgrade_database(found)
+        out.print(
+            f"the database is at revision {migrate.read_current_revision(found)}", markup=False
+        )
 
 
-@database.command("check")
-def check(data_dir: DataDir = None, fix: Fix = False) -> None:
+@database_app.command("check")
+def check_database(data_dir: DataDir = None, fix: Fix = False) -> None:
     """Compare database and store: the revision, lost objects, objects that no row names."""
     from service.storage import garbage, migrate
     from service.storage.objects import open_store
 
-    settings = settings_of(data_dir=data_dir)
+    settings = load_settings(data_dir=data_dir)
     if settings.database_url is None and not (settings.data_dir / "lagid.db").is_file():
         raise Misconfigured(
             f"there is no database in {settings.data_dir.absolute()}; `lagid serve` or "
             "`lagid db upgrade` makes one, or name another folder with --data-dir"
         )
-    with opened(settings) as found:
-        migrate.check(found)
-        store = open_store(settings.store)
-        with found.read() as session:
-            lost = garbage.lost(session, store)
-            orphans = list(garbage.orphans(session, store))
+    with open_database(settings) as found:
+        migrate.check_revision(found)
+        store = open_store(settings.resolved_store_url)
+        with found.read_session() as session:
+            lost = garbage.find_lost_hashes(session, store)
+            orphans = list(garbage.find_orphans(session, store))
             if fix:
-                freed = garbage.collect(session, store)
+                freed = garbage.delete_orphans(session, store)
                 out.print(f"deleted {len(orphans)} objects, {freed} bytes")
     out.print(f"tables at head; {len(lost)} objects lost; {len(orphans)} objects without a row")
     for sha256 in sorted(lost):
@@ -223,15 +227,15 @@ def check(data_dir: DataDir = None, fix: Fix = False) -> None:
         raise typer.Exit(1)
 
 
-def doctor(data_dir: DataDir = None) -> None:
+def check_installation(data_dir: DataDir = None) -> None:
     """Check the installation: packages, kernels, data folder, port."""
-    settings = settings_of(data_dir=data_dir)
+    settings = load_settings(data_dir=data_dir)
     checks: list[tuple[str, Callable[[], str]]] = [
-        ("Python", _python),
-        ("packages", _packages),
-        ("kernels", _kernels),
-        ("data folder", lambda: _folder(settings)),
-        ("port", lambda: _port(settings)),
+        ("Python", _check_python),
+        ("packages", _check_packages),
+        ("kernels", _check_kernels),
+        ("data folder", lambda: _check_folder(settings)),
+        ("port", lambda: _check_port(settings)),
     ]
     failed = False
     for name, look in checks:
@@ -245,7 +249,7 @@ def doctor(data_dir: DataDir = None) -> None:
 
 
 @contextmanager
-def opened(settings: "Settings") -> Iterator["Database"]:
+def open_database(settings: "Settings") -> Iterator["Database"]:
     """The database, for the length of a command.
 
     Raises
@@ -257,7 +261,7 @@ def opened(settings: "Settings") -> Iterator["Database"]:
 
     from service.storage.sessions import Database
 
-    found = Database(settings.database)
+    found = Database(settings.resolved_database_url)
     try:
         yield found
     except SQLAlchemyError as error:
@@ -267,15 +271,15 @@ def opened(settings: "Settings") -> Iterator["Database"]:
         found.dispose()
 
 
-def _python() -> str:
+def _check_python() -> str:
     return sys.version.split()[0]
 
 
-def _packages() -> str:
-    return ", ".join(f"{name} {version(name)}" for name in NEEDED)
+def _check_packages() -> str:
+    return ", ".join(f"{name} {version(name)}" for name in REQUIRED_PACKAGES)
 
 
-def _kernels() -> str:
+def _check_kernels() -> str:
     """Compile a model and simulate it: the harmonic oscillator without force rests."""
     import numpy as np
 
@@ -293,17 +297,17 @@ def _kernels() -> str:
     return "compiled, and a system at rest stays at rest"
 
 
-def _folder(settings: "Settings") -> str:
+def _check_folder(settings: "Settings") -> str:
     folder = settings.data_dir.absolute()
     if folder.is_dir():
-        settings.prepare_folder()
+        settings.prepare_data_folder()
         return str(folder)
     above = next(parent for parent in folder.parents if parent.is_dir())
-    _probe(above)
+    _check_writable(above)
     return f"{folder} (will be made)"
 
 
-def _probe(folder: Path) -> None:
+def _check_writable(folder: Path) -> None:
     try:
         with TemporaryDirectory(dir=folder):
             return
@@ -311,6 +315,6 @@ def _probe(folder: Path) -> None:
         raise Misconfigured(f"{folder} is not writable ({error.strerror})") from error
 
 
-def _port(settings: "Settings") -> str:
-    with listening(settings.host, settings.port):
+def _check_port(settings: "Settings") -> str:
+    with open_listener(settings.host, settings.port):
         return f"{settings.host}:{settings.port} is free"

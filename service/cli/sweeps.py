@@ -7,11 +7,13 @@ import typer
 
 from service.cli.common import (
     AsJson,
+    FieldOrigins,
     Key,
-    Places,
     Url,
+    apply_setting,
     check_succeeded,
-    connected,
+    connect_client,
+    fail_usage,
     out,
     parse_channels,
     parse_number,
@@ -20,16 +22,14 @@ from service.cli.common import (
     print_json,
     print_line,
     print_table,
-    put,
     read_model,
+    report_faults,
     split_names,
-    told_at,
-    usage,
 )
-from service.cli.watch import follow
+from service.cli.watch import follow_job
 from service.client.calls import DEFAULT_URL
 from service.core.text import append_unit
-from sysid.core.settings import METHODS
+from sysid.core.settings import SEARCH_METHODS
 
 if TYPE_CHECKING:
     from service.client.client import Client
@@ -37,16 +37,20 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Recipes: sweeps made for one purpose.", no_args_is_help=True)
 
-MOST_POINTS = 100_000
-SIGMA, RELATIVE, METHOD = "/noise/sigma", "relative", "/algorithm/method"
+MAX_SIGMA_VALUES = 100_000
+SIGMA_PATH, RELATIVE_KEY, METHOD_PATH = "/noise/sigma", "relative", "/algorithm/method"
 # Of a relative σ the rows tell what was typed beside what it is in the output's unit.
-GROUPS = {False: None, True: [RELATIVE, SIGMA, METHOD]}
-IN_DEVIATIONS = "a relative σ is in standard deviations of the output, the σ beside it in its unit"
-A_TABLE = 4  # parameters beside each other
-LOW, MIDDLE, HIGH = 0, 2, 4  # places of 5, 50 and 95 % among the quantiles of a summary
+GROUP_KEYS = {False: None, True: [RELATIVE_KEY, SIGMA_PATH, METHOD_PATH]}
+RELATIVE_NOTE = "a relative σ is in standard deviations of the output, the σ beside it in its unit"
+PARAMETERS_PER_TABLE = 4  # parameters beside each other
+LOW_INDEX, MEDIAN_INDEX, HIGH_INDEX = (
+    0,
+    2,
+    4,
+)  # places of 5, 50 and 95 % among the quantiles of a summary
 
-Named = list[str] | None
-PLACES = Places({
+NamedValues = list[str] | None
+FIELD_ORIGINS = FieldOrigins({
     "/model": "--model …", "/sigma": "--sigma", "/relative": "--relative",
     "/replicates": "--replicates", "/methods": "--methods", "/seed": "--seed", "/name": "--name",
     "/datasets": "--data", "/channels": "--channels {}", "/truth": "--true",
@@ -61,38 +65,39 @@ Sigma = Annotated[
     list[str],
     typer.Option("--sigma", help="start:stop:step with both ends, or numbers: 0,0.1,0.3."),
 ]
-True_ = Annotated[
-    Named, typer.Option("--true", metavar="NAME=VALUE", help="A true parameter, to simulate.")
+TrueParameters = Annotated[
+    NamedValues, typer.Option("--true", metavar="NAME=VALUE", help="A true parameter, to simulate.")
 ]
 Input = Annotated[
-    Named, typer.Option("--input", metavar="NAME=EXPRESSION", help="Input over t: 'q=10*cos(5*t)'.")
+    NamedValues,
+    typer.Option("--input", metavar="NAME=EXPRESSION", help="Input over t: 'q=10*cos(5*t)'."),
 ]
 Relative = Annotated[
     bool, typer.Option("--relative", help="σ in standard deviations of the output.")
 ]
 Replicates = Annotated[int, typer.Option(help="Draws of noise and of the search for each σ.")]
-Methods = Annotated[str, typer.Option(help=f"Of {', '.join(METHODS)}.")]
+ClientMethods = Annotated[str, typer.Option(help=f"Of {', '.join(SEARCH_METHODS)}.")]
 Seed = Annotated[int, typer.Option(help="Of all draws; each replicate has its own from it.")]
 Channels = Annotated[str | None, typer.Option(help="Which channel is which signal: u=P1,y=P2.")]
 Changes = Annotated[
-    Named, typer.Option("--set", help="path=value of the job, as algorithm.population=100.")
+    NamedValues, typer.Option("--set", help="path=value of the job, as algorithm.population=100.")
 ]
 Wait = Annotated[bool, typer.Option("--wait", help="Show progress, then the table.")]
 IdempotencyKey = Annotated[str | None, typer.Option(help="The same key again: the same job.")]
 
 
 @app.command("noise")
-def noise(
+def sweep_noise(
     model: Annotated[str, typer.Option("--model", help="Name of a model, or a YAML file.")],
     sigma: Sigma,
     data: Data = None,
-    true: True_ = None,
+    true: TrueParameters = None,
     inputs: Input = None,
     samples: Annotated[int | None, typer.Option(help="Samples to simulate.")] = None,
     sample_time: Annotated[float | None, typer.Option(help="Their period in s.")] = None,
     relative: Relative = False,
     replicates: Replicates = 20,
-    methods: Methods = "simple,improved",
+    methods: ClientMethods = "simple,improved",
     seed: Seed = 1,
     channels: Channels = None,
     changes: Changes = None,
@@ -108,58 +113,58 @@ def noise(
     The record is simulated (--true, --input, --samples, --sample-time) or a dataset's (--data).
     With more replicates, or another grid, only the runs that are new are computed.
     """
-    truth = _truth(true, inputs, samples, sample_time)
+    truth = _build_truth(true, inputs, samples, sample_time)
     body: dict[str, Any] = {
-        "model": read_model(model), "sigma": [one for text in sigma for one in grid(text)],
+        "model": read_model(model), "sigma": [one for text in sigma for one in parse_sigma_grid(text)],
         "relative": relative, "replicates": replicates, "methods": split_names(methods),
         "seed": seed, "channels": parse_channels(channels),
-        **_source(data, truth), **({} if name is None else {"name": name}),
+        **_choose_source(data, truth), **({} if name is None else {"name": name}),
     }  # fmt: skip
     for change in changes or []:
-        put(body, change)
-    with connected(url, key) as client:
-        with told_at(PLACES):
+        apply_setting(body, change)
+    with connect_client(url, key) as client:
+        with report_faults(FIELD_ORIGINS):
             job = client.noise_sweep(body, idempotency_key=idempotency_key)
         if wait:
-            job = follow(client, job["id"], quiet=as_json)
-        _tell(client, job, is_relative=relative, wait=wait, as_json=as_json)
+            job = follow_job(client, job["id"], quiet=as_json)
+        _print_sweep(client, job, is_relative=relative, wait=wait, as_json=as_json)
 
 
-def grid(text: str) -> list[float]:
+def parse_sigma_grid(text: str) -> list[float]:
     """Values of σ from ``0:1:0.05``, both ends taken, or from ``0,0.1,0.3``.
 
     Counted in decimals, so that the third of 0:1:0.05 is 0.15 and no number beside it.
     """
     found: list[float] = []
     for part in split_names(text):
-        ends = [_decimal(text, one) for one in part.split(":")]
+        ends = [_parse_decimal(text, one) for one in part.split(":")]
         if len(ends) == 1:
             found.append(float(ends[0]))
         elif len(ends) == 3 and ends[2] > 0 and ends[1] >= ends[0]:
             start, stop, step = ends
             count = int((stop - start) / step) + 1
-            if count > MOST_POINTS:
-                usage(f"--sigma {text}: {count} values; at most {MOST_POINTS}")
+            if count > MAX_SIGMA_VALUES:
+                fail_usage(f"--sigma {text}: {count} values; at most {MAX_SIGMA_VALUES}")
             found += [float(start + step * number) for number in range(count)]
         else:
-            usage(f"--sigma {text}: found {part!r}; need start:stop:step with start ≤ stop and a "
+            fail_usage(f"--sigma {text}: found {part!r}; need start:stop:step with start ≤ stop and a "
                   "positive step, such as 0:1:0.05")  # fmt: skip
     if not found:
-        usage(f"--sigma {text!r}: need numbers, such as 0:1:0.05 or 0,0.1,0.3")
+        fail_usage(f"--sigma {text!r}: need numbers, such as 0:1:0.05 or 0,0.1,0.3")
     return found
 
 
-def tables_of(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
+def build_sweep_tables(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]]:
     """Headings and rows of the tables of a noise sweep, a row for each σ and method.
 
     The first has the runs and the error of the response, the others those of the parameters.
     """
     groups = summary["groups"]
     units = {one["name"]: one["unit"] for group in groups for one in group["parameters"]}
-    others = [key for key in summary["by"] if key not in (SIGMA, RELATIVE)]
-    relative = [f">{RELATIVE} σ"] if RELATIVE in summary["by"] else []
+    others = [key for key in summary["by"] if key not in (SIGMA_PATH, RELATIVE_KEY)]
+    relative = [f">{RELATIVE_KEY} σ"] if RELATIVE_KEY in summary["by"] else []
     cells = [
-        [*(_short(one["key"][RELATIVE], 4) for _ in relative), _short(one["sigma"], 4),
+        [*(_format_short(one["key"][RELATIVE_KEY], 4) for _ in relative), _format_short(one["sigma"], 4),
          *(str(one["key"][key]) for key in others)]
         for one in groups
     ]  # fmt: skip
@@ -173,37 +178,37 @@ def tables_of(summary: dict[str, Any]) -> list[tuple[list[str], list[list[str]]]
     found = [(
         [*keys, ">runs", ">success", ">evaluations",
          f"RMS error{'' if unit in (None, '1') else f' in {unit}'} [5 %, 95 %]", ">floor"],
-        [[*cell, *_whole(one)] for cell, one in zip(cells, groups, strict=True)],
+        [[*cell, *_group_cells(one)] for cell, one in zip(cells, groups, strict=True)],
     )]  # fmt: skip
     names = list(units)
-    for first in range(0, len(names), A_TABLE):
-        some, headings = names[first : first + A_TABLE], list(keys)
+    for first in range(0, len(names), PARAMETERS_PER_TABLE):
+        some, headings = names[first : first + PARAMETERS_PER_TABLE], list(keys)
         for name in some:
             headings += [f"{name}{'' if units[name] == '1' else f' in {units[name]}'}: error "
                          "[5 %, 95 %]", ">floor"]  # fmt: skip
-        rows = [[*cell, *_errors(one, some)] for cell, one in zip(cells, groups, strict=True)]
+        rows = [[*cell, *_error_cells(one, some)] for cell, one in zip(cells, groups, strict=True)]
         found.append((headings, rows))
     return found
 
 
-def _whole(group: dict[str, Any]) -> list[str]:
+def _group_cells(group: dict[str, Any]) -> list[str]:
     ended = group["succeeded"] + group["failed"]
     return [
         f"{ended}" if ended == group["runs"] else f"{ended}/{group['runs']}",
         f"{100 * group['success_rate']:.0f} %" if ended else "–",
         "–" if group["evaluations"] is None else f"{group['evaluations']:.0f}",
-        _band(group["rms_noise_free"]), _short(group["rms_floor"]),
+        _format_band(group["rms_noise_free"]), _format_short(group["rms_floor"]),
     ]  # fmt: skip
 
 
-def _errors(group: dict[str, Any], names: list[str]) -> list[str]:
+def _error_cells(group: dict[str, Any], names: list[str]) -> list[str]:
     known = {one["name"]: one for one in group["parameters"]}
     found = [known.get(name, {"error": None, "floor": None}) for name in names]
     return [text for one in found
-            for text in (_band(one["error"], signed=True), _short(one["floor"]))]  # fmt: skip
+            for text in (_format_band(one["error"], signed=True), _format_short(one["floor"]))]  # fmt: skip
 
 
-def _tell(
+def _print_sweep(
     client: "Client", job: dict[str, Any], *, is_relative: bool, wait: bool, as_json: bool
 ) -> None:
     if not wait:
@@ -212,22 +217,22 @@ def _tell(
         else:
             print_job(job)
         return
-    summary = client.summary(job["id"], GROUPS[is_relative])
+    summary = client.summary(job["id"], GROUP_KEYS[is_relative])
     if as_json:
         print_json({**job, "summary": summary})
     else:
-        for headings, rows in tables_of(summary):
+        for headings, rows in build_sweep_tables(summary):
             print_table(headings, rows, empty="no runs")
             out.print()
-        for note in [*summary["notes"], *([IN_DEVIATIONS] if is_relative else [])]:
+        for note in [*summary["notes"], *([RELATIVE_NOTE] if is_relative else [])]:
             print_line(f"note: {note}")
         out.print(f"{job['id']}: {summary['reused']} of {summary['runs']} runs reused",
                   markup=False)  # fmt: skip
     check_succeeded(job)
 
 
-def _truth(
-    true: Named, inputs: Named, samples: int | None, sample_time: float | None
+def _build_truth(
+    true: NamedValues, inputs: NamedValues, samples: int | None, sample_time: float | None
 ) -> dict[str, Any]:
     return {
         "parameters": {
@@ -242,31 +247,34 @@ def _truth(
     }  # fmt: skip
 
 
-def _source(data: str | None, truth: dict[str, Any]) -> dict[str, Any]:
+def _choose_source(data: str | None, truth: dict[str, Any]) -> dict[str, Any]:
     given = {name: value for name, value in truth.items() if value}
     if (data is None) == (not given):
-        usage("give either --data, or --true, --input, --samples and --sample-time to simulate")
+        fail_usage(
+            "give either --data, or --true, --input, --samples and --sample-time to simulate"
+        )
     return {"truth": given} if data is None else {"datasets": split_names(data)}
 
 
-def _decimal(text: str, part: str) -> Decimal:
+def _parse_decimal(text: str, part: str) -> Decimal:
     try:
         found = Decimal(part)
     except InvalidOperation:
         found = Decimal("NaN")
     if not found.is_finite():
-        usage(f"--sigma {text}: found {part!r}; need a number, or start:stop:step")
+        fail_usage(f"--sigma {text}: found {part!r}; need a number, or start:stop:step")
     return found
 
 
-def _short(value: float | None, digits: int = 2) -> str:
+def _format_short(value: float | None, digits: int = 2) -> str:
     return "–" if value is None else f"{value:.{digits}g}"
 
 
-def _band(quantiles: list[float] | None, *, signed: bool = False) -> str:
+def _format_band(quantiles: list[float] | None, *, signed: bool = False) -> str:
     if quantiles is None:
         return "–"
     low, middle, high = (
-        f"{quantiles[place]:{'+' if signed else ''}.2g}" for place in (LOW, MIDDLE, HIGH)
+        f"{quantiles[place]:{'+' if signed else ''}.2g}"
+        for place in (LOW_INDEX, MEDIAN_INDEX, HIGH_INDEX)
     )
     return f"{middle} [{low}, {high}]"

@@ -11,158 +11,163 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from service.cli.common import (
-    Places,
-    estimate,
+    FieldOrigins,
+    describe_status,
+    format_estimate,
     out,
     print_json,
     print_line,
     print_table,
-    status_of,
 )
 from service.client.calls import ProblemError
 from service.core.text import DASH, append_unit, format_labels, plain_unit
-from service.trends.text import PLAIN, build_tables, notes, reference_text
+from service.trends.text import PLAIN, build_tables, format_reference, list_notes
 
 if TYPE_CHECKING:
     from service.client.client import Client
 
 
-DATA = "/datasets"
-REUSED = "the same run was computed before: the result of {} is shown"
+DATASETS_PATH = "/datasets"
+REUSE_NOTE = "the same run was computed before: the result of {} is shown"
 
 
-def place_of(run: dict[str, Any]) -> dict[str, object]:
+def run_coordinates(run: dict[str, Any]) -> dict[str, object]:
     """Labels and values of axes of a run; where labels tell of the data, their ids are left out."""
     labels = run["labels"]
     cell = {
         path.removeprefix("/").replace("/", "."): value
         for path, value in run["cell"].items()
-        if not (labels and path.startswith(DATA))
+        if not (labels and path.startswith(DATASETS_PATH))
     }
     return {**labels, **cell}
 
 
-def show_run(run: dict[str, Any], as_json: bool) -> None:
+def print_run(run: dict[str, Any], as_json: bool) -> None:
     """Print what `GET /v1/runs/{id}` tells."""
     if as_json:
         print_json(run)
         return
     print_line(f"{run['id']}  run {run['number'] + 1} of {run['job']}: {run['state']}")
-    if place := place_of(run):
+    if place := run_coordinates(run):
         print_line(format_labels(place))
     print_table(
         ("parameter", ">estimate ± standard error", "unit", "95 % interval", "status"),
-        [[one["name"], estimate(one), one["unit"], _interval(one["interval95"]), status_of(one)]
+        [[one["name"], format_estimate(one), one["unit"], _format_interval(one["interval95"]), describe_status(one)]
          for one in run["parameters"]],
         empty="no estimates" if run["finished_at"] else "no estimates yet",
     )  # fmt: skip
     if run["rms"] is not None:
-        print_line(_fit(run))
+        print_line(_format_fit(run))
     if run["error"]:
         print_line(run["error"])
     if run["reused_from"]:
-        print_line(f"note: {REUSED.format(run['reused_from'])}")
+        print_line(f"note: {REUSE_NOTE.format(run['reused_from'])}")
     for warning in run.get("warnings", []):
         print_line(f"note: {warning}")
 
 
-def tell_reused(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: str) -> None:
+def print_reuse_note(job: dict[str, Any], runs: Sequence[dict[str, Any]], cure: str) -> None:
     """Say which results of a job were computed for others before, and how to have them anew."""
     reused, n_runs = job["progress"]["reused"], job["progress"]["runs"]
     if not reused:
         return
     if n_runs == 1 and runs:
-        text = REUSED.format(runs[0]["reused_from"])
+        text = REUSE_NOTE.format(runs[0]["reused_from"])
     else:
         text = f"{reused} of {n_runs} runs were computed before: their results are shown"
     print_line(f"note: {text}; to compute anew: {cure}")
 
 
-def _fit(run: dict[str, Any]) -> str:
+def _format_fit(run: dict[str, Any]) -> str:
     fit = run.get("fit_percent") or {}
-    told = [f"RMS {_with_unit(run, 'rms')}"]
+    told = [f"RMS {_format_rms(run, 'rms')}"]
     told += [
         f"{name} {fit[part]:.2f} %"
         for name, part in (("fit", "estimation"), ("validation fit", "validation"))
         if fit.get(part) is not None
     ]
     if run.get("rms_validation") is not None:
-        told.append(f"validation RMS {_with_unit(run, 'rms_validation')}")
+        told.append(f"validation RMS {_format_rms(run, 'rms_validation')}")
     seconds = "" if run["seconds"] is None else f" in {run['seconds']:.2f} s"
     return f"{', '.join(told)}; {run['evaluations']} simulations{seconds}"
 
 
-def _with_unit(run: dict[str, Any], name: str) -> str:
+def _format_rms(run: dict[str, Any], name: str) -> str:
     unit = "standard deviations" if run["rms_unit"] == "σ" else run["rms_unit"]
     return f"{run[name]:.6g}{plain_unit(unit)}"
 
 
-def _interval(ends: list[float | None] | None) -> str:
+def _format_interval(ends: list[float | None] | None) -> str:
     if ends is None:
         return DASH
     low, high = ("open" if end is None else f"{end:.6g}" for end in ends)
     return f"{low} to {high}"
 
 
-MOST = 50
+MAX_PRINTED = 50
 """Runs, and groups of runs, that are printed one by one."""
-MOST_KINDS = 10
-NUMBER = re.compile(r"\d[\d.,]*(e[-+]?\d+)?")
-LOW, MIDDLE, HIGH = 0.05, 0.5, 0.95
+MAX_WARNING_KINDS = 10
+NUMBER_PATTERN = re.compile(r"\d[\d.,]*(e[-+]?\d+)?")
+LOW_QUANTILE, MEDIAN, HIGH_QUANTILE = 0.05, 0.5, 0.95
 
 
-def print_many(client: "Client", job: dict[str, Any], runs: list[dict[str, Any]]) -> None:
+def print_run_summary(client: "Client", job: dict[str, Any], runs: list[dict[str, Any]]) -> None:
     """Print a summary of a job instead of its runs."""
     states = Counter(run["state"] for run in runs)
     told = ", ".join(f"{count} {state}" for state, count in states.most_common())
     print_line(f"{job['id']}: {len(runs)} runs, {told}")
-    _groups(client, job)
+    _print_groups(client, job)
     print_line(f"single runs: lagid runs {job['id']}")
-    _kinds([warning for run in runs for warning in run.get("warnings", [])])
+    _print_warning_kinds([warning for run in runs for warning in run.get("warnings", [])])
 
 
-def _groups(client: "Client", job: dict[str, Any]) -> None:
+def _print_groups(client: "Client", job: dict[str, Any]) -> None:
     try:
         summary = client.summary(job["id"])
     except ProblemError as error:  # more groups than the server parts runs into
         print_line(f"no groups: {error}")
         return
-    groups, places = summary["groups"], [summary["quantiles"].index(q) for q in (LOW, MIDDLE, HIGH)]
+    groups, places = (
+        summary["groups"],
+        [summary["quantiles"].index(q) for q in (LOW_QUANTILE, MEDIAN, HIGH_QUANTILE)],
+    )
     units = {one["name"]: one["unit"] for group in groups for one in group["parameters"]}
     headings = [*(key.removeprefix("/").replace("/", ".") for key in summary["by"]), ">runs",
                 ">success", f"{append_unit('RMS', summary['rms_unit'])}: median, 5 to 95 %",
                 *(append_unit(*one) for one in units.items())]  # fmt: skip
-    print_table(headings, [_row(one, units, places) for one in groups[:MOST]], empty="no runs")
-    if len(groups) > MOST:
-        print_line(f"… and {len(groups) - MOST} groups more")
+    print_table(
+        headings, [_group_row(one, units, places) for one in groups[:MAX_PRINTED]], empty="no runs"
+    )
+    if len(groups) > MAX_PRINTED:
+        print_line(f"… and {len(groups) - MAX_PRINTED} groups more")
 
 
-def _row(group: dict[str, Any], units: dict[str, str], places: Sequence[int]) -> list[object]:
+def _group_row(group: dict[str, Any], units: dict[str, str], places: Sequence[int]) -> list[object]:
     values = {one["name"]: one["value"] for one in group["parameters"]}
     return [
         *group["key"].values(), group["runs"], f"{100 * group['success_rate']:.0f} %",
-        _band(group["rms"], places), *(_band(values.get(name), places) for name in units),
+        _format_band(group["rms"], places), *(_format_band(values.get(name), places) for name in units),
     ]  # fmt: skip
 
 
-def _band(quantiles: Sequence[float] | None, places: Sequence[int]) -> str | None:
+def _format_band(quantiles: Sequence[float] | None, places: Sequence[int]) -> str | None:
     if quantiles is None:
         return None
     low, middle, high = (f"{quantiles[place]:.4g}" for place in places)
     return f"{middle}, {low} to {high}"
 
 
-def _kinds(warnings: list[str]) -> None:
+def _print_warning_kinds(warnings: list[str]) -> None:
     """Warnings that differ in their numbers only are of one kind, told by its first."""
-    kinds = Counter(NUMBER.sub("…", one) for one in warnings)
-    first = {NUMBER.sub("…", one): one for one in reversed(warnings)}
-    for kind, count in kinds.most_common(MOST_KINDS):
+    kinds = Counter(NUMBER_PATTERN.sub("…", one) for one in warnings)
+    first = {NUMBER_PATTERN.sub("…", one): one for one in reversed(warnings)}
+    for kind, count in kinds.most_common(MAX_WARNING_KINDS):
         print_line(f"note ({count} ×, such as): {first[kind]}")
-    if len(kinds) > MOST_KINDS:
-        print_line(f"… and {len(kinds) - MOST_KINDS} kinds of notes more")
+    if len(kinds) > MAX_WARNING_KINDS:
+        print_line(f"… and {len(kinds) - MAX_WARNING_KINDS} kinds of notes more")
 
 
-def print_trend(trend: dict[str, Any], places: Places) -> None:
+def print_trend(trend: dict[str, Any], places: FieldOrigins) -> None:
     """Print what `GET /v1/jobs/{id}/trend` tells, with notes that name the user's `places`."""
     tables = build_tables(trend, PLAIN)
     headings = [f">{trend['x']}", *(f">{one}" for one in tables.headings), ">measured span",
@@ -186,8 +191,8 @@ def print_trend(trend: dict[str, Any], places: Places) -> None:
         print_table(above, tables.predictions, empty="")
         out.print()
     if trend["reference"] is not None:
-        named = reference_text(trend)
+        named = format_reference(trend)
         text = f"compared with {trend['reference']}{named and ', '}{named}"
         print_line(text)
-    for note in notes(trend):
-        print_line(f"note: {places.in_note(note)}")
+    for note in list_notes(trend):
+        print_line(f"note: {places.rewrite_note(note)}")

@@ -1,8 +1,8 @@
 """Live progress of a job: one bar a run, with its RMS; one bar for all where there are many.
 
 Where nobody looks (a file, a pipe) there are lines instead: at every change of state, and every
-`EVERY_S` at most. Of many runs both tell how many are done and how fast, not the best RMS: on other
-data or under other noise it tells nothing.
+`LOG_INTERVAL_SECONDS` at most. Of many runs both tell how many are done and how fast, not the best
+RMS: on other data or under other noise it tells nothing.
 """
 
 import time
@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from service.client.calls import TERMINAL
+from service.client.calls import TERMINAL_STATES
 from service.core.text import format_duration, format_value, plain_unit
 
 if TYPE_CHECKING:
     from service.client.client import Client
 
 
-MANY = 12
-EVERY_S = 10.0
-LOOK_S = 1.0
+MAX_BARS = 12
+LOG_INTERVAL_SECONDS = 10.0
+RUN_POLL_SECONDS = 1.0
 """The run that ended last is asked for no more often."""
-COLUMNS = (
+BAR_COLUMNS = (
     TextColumn("{task.description:<24.24}", markup=False),
     BarColumn(bar_width=30),
     TextColumn("{task.percentage:>3.0f} %"),
@@ -36,22 +36,22 @@ Document = dict[str, Any]
 Clock = Callable[[], float]
 
 
-def follow(client: "Client", job_id: str, *, quiet: bool = False) -> Document:
+def follow_job(client: "Client", job_id: str, *, quiet: bool = False) -> Document:
     """Show a job until it ends; its last state."""
     if quiet:
         return client.wait(job_id)
     first = client.job(job_id)
     console = Console(stderr=True, highlight=False)
-    many = Many(lambda: _newest(client, job_id), first["rms_unit"])
+    many = RunsProgress(lambda: _find_newest_run(client, job_id), first["rms_unit"])
     if not console.is_terminal:
-        lines = Lines(partial(console.print, markup=False, soft_wrap=True), many)
-        return client.wait(job_id, progress=lines.show)
-    with Progress(*COLUMNS, console=console, refresh_per_second=5) as progress:
-        bars = _Bars(client, progress, many, is_one=first["progress"]["runs"] > MANY)
-        return client.wait(job_id, progress=bars.show)
+        lines = ProgressLog(partial(console.print, markup=False, soft_wrap=True), many)
+        return client.wait(job_id, progress=lines.log_progress)
+    with Progress(*BAR_COLUMNS, console=console, refresh_per_second=5) as progress:
+        bars = _ProgressBars(client, progress, many, is_one=first["progress"]["runs"] > MAX_BARS)
+        return client.wait(job_id, progress=bars.update_bars)
 
 
-class Many:
+class RunsProgress:
     """What is told of the runs of a job: failed and reused, their pace, the one that ended last.
 
     Parameters
@@ -72,23 +72,23 @@ class Many:
         self._begun: tuple[float, int] | None = None
         self._looked, self._seen, self._text = 0.0, 0, ""
 
-    def told(self, job: Document) -> list[str]:
+    def describe_progress(self, job: Document) -> list[str]:
         """The parts of a line about a job of several runs."""
-        done, is_over = job["progress"], job["state"] in TERMINAL
+        done, is_over = job["progress"], job["state"] in TERMINAL_STATES
         parts = [f"{done[what]} {what}" for what in ("failed", "reused") if done[what]]
         if is_over:
             return parts
-        pace = self._pace(done["finished"]) if job["state"] == "running" else 0.0
+        pace = self._runs_per_second(done["finished"]) if job["state"] == "running" else 0.0
         parts += [f"{pace:.3g} runs/s"] if pace > 0 else []
         if done["seconds_left"] is not None:
             parts.append(f"{format_duration(done['seconds_left'])} left".replace("\u202f", " "))
-        return [*parts, *([text] if (text := self._last(done["finished"])) else [])]
+        return [*parts, *([text] if (text := self._describe_last_run(done["finished"])) else [])]
 
-    def rms(self, value: float | None) -> str:
+    def format_rms(self, value: float | None) -> str:
         """An RMS with its unit."""
         return "RMS –" if value is None else f"RMS {value:.6g}{plain_unit(self.unit)}"
 
-    def _pace(self, finished: int) -> float:
+    def _runs_per_second(self, finished: int) -> float:
         """Runs a second since the first look at the running job."""
         now = self.clock()
         if self._begun is None:
@@ -96,72 +96,76 @@ class Many:
         since, before = self._begun
         return (finished - before) / (now - since) if now > since else 0.0
 
-    def _last(self, finished: int) -> str:
+    def _describe_last_run(self, finished: int) -> str:
         now = self.clock()
-        if finished != self._seen and (not self._seen or now - self._looked >= LOOK_S):
+        if finished != self._seen and (not self._seen or now - self._looked >= RUN_POLL_SECONDS):
             self._looked, self._seen = now, finished
             run = self._newest()
-            self._text = "" if run is None else f"last {self._run(run)}"
+            self._text = "" if run is None else f"last {self._describe_run(run)}"
         return self._text
 
-    def _run(self, run: Document) -> str:
-        cell = _values(run)
-        found = self.rms(run["rms"]) if run["state"] == "succeeded" else run["state"]
+    def _describe_run(self, run: Document) -> str:
+        cell = _describe_cell(run)
+        found = self.format_rms(run["rms"]) if run["state"] == "succeeded" else run["state"]
         return f"run {run['number'] + 1}{f' ({cell})' if cell else ''}: {found}"
 
 
-class Lines:
+class ProgressLog:
     """Lines of one job for a log; `tell` takes a line."""
 
-    def __init__(self, tell: Callable[[str], object], many: Many) -> None:
+    def __init__(self, tell: Callable[[str], object], many: RunsProgress) -> None:
         self._tell, self._many = tell, many
         self._state, self._last, self._text = "", 0.0, ""
 
-    def show(self, job: Document) -> None:
+    def log_progress(self, job: Document) -> None:
         """Tell what is new, if its state changed or the last line is old enough."""
         now = self._many.clock()
-        if job["state"] == self._state and now - self._last < EVERY_S:
+        if job["state"] == self._state and now - self._last < LOG_INTERVAL_SECONDS:
             return
-        text = self._line(job)
+        text = self._format_line(job)
         if job["state"] == self._state and text == self._text:
             return
         self._state, self._last, self._text = job["state"], now, text
         self._tell(text)
 
-    def _line(self, job: Document) -> str:
+    def _format_line(self, job: Document) -> str:
         done = job["progress"]
         told = [f"{job['id']} {job['state']}", f"{done['finished']}/{done['runs']} runs"]
         if done["runs"] > 1:
-            return ", ".join([*told, *self._many.told(job)])
+            return ", ".join([*told, *self._many.describe_progress(job)])
         if done["generation"]:
             told.append(f"generation {done['generation']}")
         if done["best_rms"] is not None:
-            told.append(self._many.rms(done["best_rms"]))
+            told.append(self._many.format_rms(done["best_rms"]))
         return ", ".join(told)
 
 
-class _Bars:
+class _ProgressBars:
     """The bars of one job, one for all its runs or one each, brought up to date at every look."""
 
-    def __init__(self, client: "Client", progress: Progress, many: Many, *, is_one: bool) -> None:
+    def __init__(
+        self, client: "Client", progress: Progress, many: RunsProgress, *, is_one: bool
+    ) -> None:
         self._client, self._progress, self._many = client, progress, many
         self._is_one = is_one
         self._bars: dict[str, TaskID] = {}
 
-    def show(self, job: Document) -> None:
+    def update_bars(self, job: Document) -> None:
         done = job["progress"]
         if self._is_one:
             part = done["finished"] / done["runs"]
             label = f"{done['finished']}/{done['runs']} runs"
-            self._update(job["id"], label, part, ", ".join(self._many.told(job)), job["state"])
+            self._update_bar(
+                job["id"], label, part, ", ".join(self._many.describe_progress(job)), job["state"]
+            )
             return
         for run in self._client.runs(job["id"]):
-            label = _values(run) or str(job["name"])
-            self._update(
-                run["id"], label, run["progress"], self._many.rms(run["rms"]), run["state"]
+            label = _describe_cell(run) or str(job["name"])
+            self._update_bar(
+                run["id"], label, run["progress"], self._many.format_rms(run["rms"]), run["state"]
             )
 
-    def _update(self, key: str, label: str, part: float, told: str, state: str) -> None:
+    def _update_bar(self, key: str, label: str, part: float, told: str, state: str) -> None:
         if key not in self._bars:
             self._bars[key] = self._progress.add_task(label, total=1.0, told=told, state=state)
         self._progress.update(
@@ -169,14 +173,14 @@ class _Bars:
         )
 
 
-def _newest(client: "Client", job_id: str) -> Document | None:
+def _find_newest_run(client: "Client", job_id: str) -> Document | None:
     """The run with the highest number of those that have ended: they begin in that order."""
     ended = ["succeeded", "failed"]
     found = client.runs(job_id, at_most=1, state=ended, order="number", descending=True)
     return found[0] if found else None
 
 
-def _values(run: Document) -> str:
+def _describe_cell(run: Document) -> str:
     """Labels and values of axes of a run, without those that are data or models."""
     values = [*run["labels"].values(), *run["cell"].values()]
     return ", ".join(format_value(one) for one in values if not isinstance(one, dict | list))

@@ -9,7 +9,7 @@ from typing import Any, Self
 import httpx
 
 from service.client import calls
-from service.client.calls import Call, Document, ServerUnreachable
+from service.client.calls import Document, RestCall, ServerUnreachable
 
 BLOCK_BYTES = 1 << 20
 """Bytes of a file that are read at once."""
@@ -27,14 +27,14 @@ class AsyncClient:
         url: str = calls.DEFAULT_URL,
         key: str | None = None,
         *,
-        retries: int = calls.RETRIES,
+        retries: int = calls.DEFAULT_RETRIES,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         self.url, self._retries = url.rstrip("/"), retries
         self._http = httpx.AsyncClient(
             base_url=self.url,
             headers=calls.make_auth_header(key),
-            timeout=calls.TIMEOUT_S,
+            timeout=calls.TIMEOUT_SECONDS,
             transport=transport,
         )
 
@@ -48,17 +48,17 @@ class AsyncClient:
         """Close the connections."""
         await self._http.aclose()
 
-    async def send(self, call: Call, *, stream: bool = False) -> httpx.Response:
+    async def send(self, call: RestCall, *, stream: bool = False) -> httpx.Response:
         """Send one call; errors are raised. A stream is read and closed by the caller."""
-        left = calls.pauses(call, self._retries)
+        left = calls.plan_pauses(call, self._retries)
         while True:
             answer = await self._send_once(call, stream)
-            pause = calls.pause_after(answer, left)
+            pause = calls.choose_pause(answer, left)
             if pause is None:
-                return calls.checked(answer)
+                return calls.raise_for_problem(answer)
             await asyncio.sleep(pause)
 
-    async def _send_once(self, call: Call, stream: bool) -> httpx.Response:
+    async def _send_once(self, call: RestCall, stream: bool) -> httpx.Response:
         content = _read_blocks(call.content) if isinstance(call.content, Path) else call.content
         request = self._http.build_request(**call.request(content, stream=stream))
         try:
@@ -69,19 +69,19 @@ class AsyncClient:
             raise ServerUnreachable(self.url, error) from error
         return answer
 
-    async def _fetch_document(self, call: Call) -> Document:
+    async def _fetch_document(self, call: RestCall) -> Document:
         document: Document = (await self.send(call)).json()
         return document
 
     async def _iterate_items(
-        self, call: Call, at_most: int | None = None
+        self, call: RestCall, at_most: int | None = None
     ) -> AsyncIterator[Document]:
-        pages = calls.Pages(call, at_most)
-        while (page := pages.next()) is not None:
-            for item in pages.take(await self._fetch_document(page)):
+        pages = calls.Paginator(call, at_most)
+        while (page := pages.next_call()) is not None:
+            for item in pages.take_items(await self._fetch_document(page)):
                 yield item
 
-    async def _fetch_list(self, call: Call, at_most: int | None = None) -> list[Document]:
+    async def _fetch_list(self, call: RestCall, at_most: int | None = None) -> list[Document]:
         return [item async for item in self._iterate_items(call, at_most)]
 
     # ---- datasets
@@ -94,7 +94,7 @@ class AsyncClient:
         sample_time: float | None = None,
     ) -> Document:
         """Store a recording, CSV or MCAP, from a file or from bytes."""
-        return await self._fetch_document(calls.upload(source, name, segments, sample_time))
+        return await self._fetch_document(calls.build_upload(source, name, segments, sample_time))
 
     async def simulate_dataset(self, body: Mapping[str, Any]) -> Document:
         """Make a dataset from a model, its true parameters, inputs and noise."""
@@ -149,19 +149,25 @@ class AsyncClient:
         self, job: Mapping[str, Any], *, idempotency_key: str | None = None
     ) -> Document:
         """Queue a job."""
-        return await self._fetch_document(calls.queue(calls.SUBMIT, job, idempotency_key))
+        return await self._fetch_document(
+            calls.build_submission(calls.SUBMIT, job, idempotency_key)
+        )
 
     async def noise_sweep(
         self, body: Mapping[str, Any], *, idempotency_key: str | None = None
     ) -> Document:
         """Queue a noise sweep: σ × replicates × methods as one job."""
-        return await self._fetch_document(calls.queue(calls.NOISE_SWEEP, body, idempotency_key))
+        return await self._fetch_document(
+            calls.build_submission(calls.NOISE_SWEEP, body, idempotency_key)
+        )
 
     async def reidentify(
         self, body: Mapping[str, Any], *, idempotency_key: str | None = None
     ) -> Document:
         """Queue a batch re-identification: a run for each value of a label, with a trend."""
-        return await self._fetch_document(calls.queue(calls.REIDENTIFY, body, idempotency_key))
+        return await self._fetch_document(
+            calls.build_submission(calls.REIDENTIFY, body, idempotency_key)
+        )
 
     async def jobs(
         self, limit: int | None = None, state: Sequence[str] | None = None
@@ -194,24 +200,24 @@ class AsyncClient:
         job: str,
         progress: Callable[[Document], object] | None = None,
         *,
-        poll: float = calls.POLL_S,
+        poll: float = calls.POLL_SECONDS,
     ) -> Document:
         """Wait until a job has ended; `progress` hears its state at every look."""
         while True:
             state = await self.job(job)
             if progress is not None:
                 progress(state)
-            if state["state"] in calls.TERMINAL:
+            if state["state"] in calls.TERMINAL_STATES:
                 return state
             await asyncio.sleep(poll)
 
     async def events(self, job: str, after: str | None = None) -> AsyncIterator[Document]:
         """Events of a job as they come, until its end; `after` is the id of the last one known."""
         parser = calls.EventParser()
-        stream = await self.send(calls.events(job, after), stream=True)
+        stream = await self.send(calls.build_event_stream(job, after), stream=True)
         async with aclosing(stream):
             async for line in stream.aiter_lines():
-                for event in parser.feed(line):
+                for event in parser.feed_line(line):
                     yield event
 
     # ---- runs
@@ -235,7 +241,7 @@ class AsyncClient:
 
     async def history(self, run: str) -> Document:
         """Improvements of each island's champion."""
-        return await self._fetch_document(calls.HISTORY(run))
+        return await self._fetch_document(calls.HISTORY_KEY(run))
 
     async def response(self, run: str, max_points: int = 1000) -> Document:
         """Measured and simulated outputs."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import quote
 from uuid import uuid4
 
-from service.core.states import State
+from service.core.states import JobState
 
 if TYPE_CHECKING:
     import httpx
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 Document: TypeAlias = dict[str, Any]
 
 DEFAULT_URL = "http://127.0.0.1:8000"
-TERMINAL = frozenset(state.value for state in State if state.is_terminal)
+TERMINAL_STATES = frozenset(state.value for state in JobState if state.is_terminal)
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 MEDIA_TYPES = {".csv": "text/csv", ".txt": "text/csv", ".mcap": "application/x-mcap"}
-IDEMPOTENCY = "Idempotency-Key"
+IDEMPOTENCY_HEADER = "Idempotency-Key"
 
-POLL_S = 0.3
-TIMEOUT_S = 60.0
-PAGE = 500
+POLL_SECONDS = 0.3
+TIMEOUT_SECONDS = 60.0
+PAGE_SIZE = 500
 
 
 def make_auth_header(key: str | None) -> dict[str, str]:
@@ -60,7 +60,7 @@ class ProblemError(ClientError):
 
     def __init__(self, status: int, document: Document) -> None:
         self.status, self.document = status, document
-        faults = [_fault(entry) for entry in document.get("errors", [])]
+        faults = [_describe_fault(entry) for entry in document.get("errors", [])]
         self.reason = "; ".join(faults) or str(document.get("detail", ""))
         super().__init__(f"{document.get('title', 'error')} ({status}): {self.reason}")
 
@@ -93,7 +93,7 @@ class NotFinite(ClientError):
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class RestCall:
     """One request, not yet sent.
 
     Raises
@@ -138,11 +138,11 @@ class Endpoint:
     method: str
     path: str
 
-    def __call__(self, *names: str, json: Any = None, **params: Any) -> Call:
+    def __call__(self, *names: str, json: Any = None, **params: Any) -> RestCall:
         """The call on the things with these names; parameters that are None are left out."""
         path = self.path.format(*(quote(name, safe="") for name in names))
         query = {key: _to_query(value) for key, value in params.items() if value is not None}
-        return Call(self.method, f"/v1/{path}", query, json)
+        return RestCall(self.method, f"/v1/{path}", query, json)
 
 
 def _to_query(value: Any) -> Any:
@@ -179,7 +179,7 @@ SUMMARY = Endpoint("GET", "jobs/{}/summary")
 TREND = Endpoint("GET", "jobs/{}/trend")
 
 RUN = Endpoint("GET", "runs/{}")
-HISTORY = Endpoint("GET", "runs/{}/history")
+HISTORY_KEY = Endpoint("GET", "runs/{}/history")
 RESPONSE = Endpoint("GET", "runs/{}/response")
 SIMULATE_RUN = Endpoint("POST", "runs/{}:simulate")
 VALIDATE_RUN = Endpoint("POST", "runs/{}:validate")
@@ -194,22 +194,22 @@ REFERENCE = Endpoint("GET", "references/{}")
 ACCEPT_REFERENCE = Endpoint("PUT", "references/{}")
 
 
-def queue(endpoint: Endpoint, body: Mapping[str, Any], key: str | None) -> Call:
+def build_submission(endpoint: Endpoint, body: Mapping[str, Any], key: str | None) -> RestCall:
     """A call that queues a job; the same idempotency key again gives the same job.
 
     Without a key it has one of its own, so that it can be sent again where no answer came.
     """
-    return replace(endpoint(json=body), headers={IDEMPOTENCY: key or uuid4().hex})
+    return replace(endpoint(json=body), headers={IDEMPOTENCY_HEADER: key or uuid4().hex})
 
 
-def events(job: str, after: str | None) -> Call:
+def build_event_stream(job: str, after: str | None) -> RestCall:
     """The call for a job's events, or for those after a known one."""
     return replace(EVENTS(job), headers={"Last-Event-ID": after} if after else {})
 
 
-def upload(
+def build_upload(
     source: str | Path | bytes, name: str | None, segments: str | None, sample_time: float | None
-) -> Call:
+) -> RestCall:
     """The call that stores a file or bytes; the kind follows from the suffix or the content."""
     content: bytes | Path
     if isinstance(source, bytes):
@@ -223,15 +223,15 @@ def upload(
     return replace(call, content=content, headers={"content-type": kind})
 
 
-class Pages:
+class Paginator:
     """What a call lists, page by page: `at_most` items, or all."""
 
-    def __init__(self, call: Call, at_most: int | None) -> None:
-        self._call, self._left, self._limit = call, at_most, min(at_most or PAGE, PAGE)
+    def __init__(self, call: RestCall, at_most: int | None) -> None:
+        self._call, self._left, self._limit = call, at_most, min(at_most or PAGE_SIZE, PAGE_SIZE)
         self._cursor: str | None = None
         self._is_over = False
 
-    def next(self) -> Call | None:
+    def next_call(self) -> RestCall | None:
         """The call of the next page, until there is none."""
         if self._is_over:
             return None
@@ -239,7 +239,7 @@ class Pages:
         params = {**self._call.params, "limit": self._limit, **position}
         return replace(self._call, params=params)
 
-    def take(self, page: Document) -> list[Document]:
+    def take_items(self, page: Document) -> list[Document]:
         """The items of a page that answers the call."""
         found: list[Document] = page["items"][: self._left]
         if self._left is not None:
@@ -249,7 +249,7 @@ class Pages:
         return found
 
 
-def checked(answer: "httpx.Response") -> "httpx.Response":
+def raise_for_problem(answer: "httpx.Response") -> "httpx.Response":
     """The answer, unless it is an error.
 
     Raises
@@ -275,7 +275,7 @@ class EventParser:
     def __init__(self) -> None:
         self._fields: dict[str, str] = {}
 
-    def feed(self, line: str) -> Iterator[Document]:
+    def feed_line(self, line: str) -> Iterator[Document]:
         """Take one line; yield the event it completes, with its data decoded from JSON."""
         if line:
             key, _, value = line.partition(":")
@@ -291,30 +291,30 @@ class EventParser:
             }
 
 
-def _fault(entry: Mapping[str, Any]) -> str:
+def _describe_fault(entry: Mapping[str, Any]) -> str:
     column = f", column {entry['column']}" if entry.get("column") is not None else ""
     return f"{entry.get('pointer') or 'body'}{column}: {entry.get('detail')}"
 
 
-RETRIES = 4
-FIRST_S = 0.5
+DEFAULT_RETRIES = 4
+FIRST_PAUSE_SECONDS = 0.5
 """Pause before the second try, where the server names none; each one after is twice as long."""
-LONGEST_S = 30.0
+LONGEST_PAUSE_SECONDS = 30.0
 """No pause is longer: a server that asks for more is away for longer than a call should hang."""
-REPEATABLE = frozenset({"GET", "HEAD", "PUT"})
+REPEATABLE_METHODS = frozenset({"GET", "HEAD", "PUT"})
 
 
-def pauses(call: Call, retries: int) -> "Iterator[float]":
+def plan_pauses(call: RestCall, retries: int) -> "Iterator[float]":
     """Seconds to wait before each further try of a call, where the server names none.
 
     There are none for a request that might be carried out twice: a POST without idempotency key.
     """
-    if call.method in REPEATABLE or IDEMPOTENCY in call.headers:
+    if call.method in REPEATABLE_METHODS or IDEMPOTENCY_HEADER in call.headers:
         for number in range(retries):
-            yield FIRST_S * 2**number
+            yield FIRST_PAUSE_SECONDS * 2**number
 
 
-def pause_after(answer: "httpx.Response", left: "Iterator[float]") -> float | None:
+def choose_pause(answer: "httpx.Response", left: "Iterator[float]") -> float | None:
     """Seconds until a call is sent again; None if its answer stands.
 
     Parameters
@@ -330,12 +330,12 @@ def pause_after(answer: "httpx.Response", left: "Iterator[float]") -> float | No
     pause = next(left, None)
     if pause is None:
         return None
-    asked = _asked(answer.headers.get("Retry-After"))
+    asked = _parse_retry_after(answer.headers.get("Retry-After"))
     pause = pause if asked is None else asked
-    return pause if pause <= LONGEST_S else None
+    return pause if pause <= LONGEST_PAUSE_SECONDS else None
 
 
-def _asked(header: str | None) -> float | None:
+def _parse_retry_after(header: str | None) -> float | None:
     """Seconds that a ``Retry-After`` asks for; None if it is missing or neither of its forms."""
     if header is None:
         return None

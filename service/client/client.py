@@ -12,7 +12,7 @@ from typing import Any, BinaryIO, Self
 import httpx
 
 from service.client import calls
-from service.client.calls import Call, Document, ServerUnreachable
+from service.client.calls import Document, RestCall, ServerUnreachable
 
 
 class Client:
@@ -47,14 +47,14 @@ class Client:
         url: str = calls.DEFAULT_URL,
         key: str | None = None,
         *,
-        retries: int = calls.RETRIES,
+        retries: int = calls.DEFAULT_RETRIES,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         self.url, self._retries = url.rstrip("/"), retries
         self._http = httpx.Client(
             base_url=self.url,
             headers=calls.make_auth_header(key),
-            timeout=calls.TIMEOUT_S,
+            timeout=calls.TIMEOUT_SECONDS,
             transport=transport,
         )
 
@@ -68,17 +68,17 @@ class Client:
         """Close the connections."""
         self._http.close()
 
-    def send(self, call: Call, *, stream: bool = False) -> httpx.Response:
+    def send(self, call: RestCall, *, stream: bool = False) -> httpx.Response:
         """Send one call; errors are raised. A stream is read and closed by the caller."""
-        left = calls.pauses(call, self._retries)
+        left = calls.plan_pauses(call, self._retries)
         while True:
             answer = self._send_once(call, stream)
-            pause = calls.pause_after(answer, left)
+            pause = calls.choose_pause(answer, left)
             if pause is None:
-                return calls.checked(answer)
+                return calls.raise_for_problem(answer)
             time.sleep(pause)
 
-    def _send_once(self, call: Call, stream: bool) -> httpx.Response:
+    def _send_once(self, call: RestCall, stream: bool) -> httpx.Response:
         source = call.content
         file: AbstractContextManager[BinaryIO | bytes | None]
         file = source.open("rb") if isinstance(source, Path) else nullcontext(source)
@@ -92,14 +92,14 @@ class Client:
                 raise ServerUnreachable(self.url, error) from error
         return answer
 
-    def _fetch_document(self, call: Call) -> Document:
+    def _fetch_document(self, call: RestCall) -> Document:
         document: Document = self.send(call).json()
         return document
 
-    def _fetch_list(self, call: Call, at_most: int | None = None) -> list[Document]:
-        pages, items = calls.Pages(call, at_most), []
-        while (page := pages.next()) is not None:
-            items += pages.take(self._fetch_document(page))
+    def _fetch_list(self, call: RestCall, at_most: int | None = None) -> list[Document]:
+        pages, items = calls.Paginator(call, at_most), []
+        while (page := pages.next_call()) is not None:
+            items += pages.take_items(self._fetch_document(page))
         return items
 
     # ---- datasets
@@ -112,7 +112,7 @@ class Client:
         sample_time: float | None = None,
     ) -> Document:
         """Store a recording, CSV or MCAP, from a file or from bytes."""
-        return self._fetch_document(calls.upload(source, name, segments, sample_time))
+        return self._fetch_document(calls.build_upload(source, name, segments, sample_time))
 
     def simulate_dataset(self, body: Mapping[str, Any]) -> Document:
         """Make a dataset from a model, its true parameters, inputs and noise."""
@@ -163,19 +163,21 @@ class Client:
     # ---- jobs
     def submit(self, job: Mapping[str, Any], *, idempotency_key: str | None = None) -> Document:
         """Queue a job."""
-        return self._fetch_document(calls.queue(calls.SUBMIT, job, idempotency_key))
+        return self._fetch_document(calls.build_submission(calls.SUBMIT, job, idempotency_key))
 
     def noise_sweep(
         self, body: Mapping[str, Any], *, idempotency_key: str | None = None
     ) -> Document:
         """Queue a noise sweep: σ × replicates × methods as one job."""
-        return self._fetch_document(calls.queue(calls.NOISE_SWEEP, body, idempotency_key))
+        return self._fetch_document(
+            calls.build_submission(calls.NOISE_SWEEP, body, idempotency_key)
+        )
 
     def reidentify(
         self, body: Mapping[str, Any], *, idempotency_key: str | None = None
     ) -> Document:
         """Queue a batch re-identification: a run for each value of a label, with a trend."""
-        return self._fetch_document(calls.queue(calls.REIDENTIFY, body, idempotency_key))
+        return self._fetch_document(calls.build_submission(calls.REIDENTIFY, body, idempotency_key))
 
     def jobs(self, limit: int | None = None, state: Sequence[str] | None = None) -> list[Document]:
         """Jobs, newest first: all, or at most `limit`, or those in some states."""
@@ -206,23 +208,23 @@ class Client:
         job: str,
         progress: Callable[[Document], object] | None = None,
         *,
-        poll: float = calls.POLL_S,
+        poll: float = calls.POLL_SECONDS,
     ) -> Document:
         """Wait until a job has ended; `progress` hears its state at every look."""
         while True:
             state = self.job(job)
             if progress is not None:
                 progress(state)
-            if state["state"] in calls.TERMINAL:
+            if state["state"] in calls.TERMINAL_STATES:
                 return state
             time.sleep(poll)
 
     def events(self, job: str, after: str | None = None) -> Iterator[Document]:
         """Events of a job as they come, until its end; `after` is the id of the last one known."""
         parser = calls.EventParser()
-        with closing(self.send(calls.events(job, after), stream=True)) as stream:
+        with closing(self.send(calls.build_event_stream(job, after), stream=True)) as stream:
             for line in stream.iter_lines():
-                yield from parser.feed(line)
+                yield from parser.feed_line(line)
 
     # ---- runs
     def runs(self, job: str, *, at_most: int | None = None, **filters: Any) -> list[Document]:
@@ -243,7 +245,7 @@ class Client:
 
     def history(self, run: str) -> Document:
         """Improvements of each island's champion."""
-        return self._fetch_document(calls.HISTORY(run))
+        return self._fetch_document(calls.HISTORY_KEY(run))
 
     def response(self, run: str, max_points: int = 1000) -> Document:
         """Measured and simulated outputs."""

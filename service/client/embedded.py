@@ -14,13 +14,13 @@ import httpx
 
 from service.core.errors import ServiceDidNotStart
 
-START_LIMIT_S = 240.0
+START_LIMIT_SECONDS = 240.0
 """A first start compiles the loops, which takes minutes beside other work."""
-STOP_LIMIT_S = 20.0
+STOP_LIMIT_SECONDS = 20.0
 
 
 @contextmanager
-def embedded_service(
+def run_embedded_service(
     data_dir: Path, *, port: int | None = None, cpus: int | None = None
 ) -> Iterator[str]:
     """Start `lagid serve` as a child, wait until it is ready, and stop it at the end.
@@ -45,7 +45,7 @@ def embedded_service(
         If it ended or was not ready in time; the message holds the end of its log.
     """
     data_dir.mkdir(parents=True, exist_ok=True)
-    chosen = port or free_port()
+    chosen = port or find_free_port()
     url = f"http://127.0.0.1:{chosen}"
     command = [sys.executable, "-m", "service.cli.main", "serve", "--data-dir", str(data_dir)]
     command += ["--host", "127.0.0.1", "--port", str(chosen)]
@@ -57,10 +57,10 @@ def embedded_service(
         _wait_until_ready(url, child, log)
         yield url
     finally:
-        _stop(child)
+        _stop_child(child)
 
 
-def free_port() -> int:
+def find_free_port() -> int:
     """Return a port of loopback that nobody listens on at this moment."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -68,29 +68,33 @@ def free_port() -> int:
 
 
 def _wait_until_ready(url: str, child: "subprocess.Popen[bytes]", log: Path) -> None:
-    limit = time.monotonic() + START_LIMIT_S
+    limit = time.monotonic() + START_LIMIT_SECONDS
     while time.monotonic() < limit:
         if child.poll() is not None:
-            raise ServiceDidNotStart(f"it ended with exit code {child.returncode}", _tail(log))
+            raise ServiceDidNotStart(
+                f"it ended with exit code {child.returncode}", _read_log_tail(log)
+            )
         try:
             if httpx.get(f"{url}/readyz", timeout=2.0).status_code == httpx.codes.OK:
                 return
         except httpx.TransportError:
             pass  # not listening yet
         time.sleep(0.1)
-    raise ServiceDidNotStart(f"it was not ready after {START_LIMIT_S:g} s", _tail(log))
+    raise ServiceDidNotStart(
+        f"it was not ready after {START_LIMIT_SECONDS:g} s", _read_log_tail(log)
+    )
 
 
-def _tail(log: Path) -> str:
+def _read_log_tail(log: Path) -> str:
     return "\n".join(log.read_text(errors="replace").splitlines()[-8:])
 
 
-def _stop(child: "subprocess.Popen[bytes]") -> None:
+def _stop_child(child: "subprocess.Popen[bytes]") -> None:
     if child.poll() is not None:
         return
     child.send_signal(signal.SIGTERM)
     try:
-        child.wait(timeout=STOP_LIMIT_S)
+        child.wait(timeout=STOP_LIMIT_SECONDS)
     except subprocess.TimeoutExpired:
         os.kill(child.pid, signal.SIGKILL)
         child.wait()

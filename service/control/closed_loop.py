@@ -17,31 +17,31 @@ from service.control.schemas import (
 from service.core.errors import FieldError, InvalidRequest
 from service.core.text import plain_unit
 from service.datasets.schemas import StepInput
-from service.datasets.simulated import check_finite
-from sysid.core.errors import InvalidSettings, nearest
+from service.datasets.simulated import check_finite_outputs
+from sysid.core.errors import InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel
 from sysid.models.model import Model
 
 if TYPE_CHECKING:  # the compiler comes with these, and most requests never need it
     from sysid.control.controllers import PidControl, Transport
-    from sysid.control.linear_form import Identified
+    from sysid.control.linear_form import IdentifiedModel
 
 
-_SMALL = 0.02  # of a step: what moves or differs by less is at rest
-_AT_LIMIT = 1e-9  # of the limit
-_MORE = (
+_REST_TOLERANCE = 0.02  # of a step: what moves or differs by less is at rest
+_LIMIT_TOLERANCE = 1e-9  # of the limit
+_START_ADVICE = (
     "the measures tell of how it settles too, not of the step alone; give the states' starts, "
     "such as x(0), or a later step"
 )
 
 
 @dataclass(frozen=True, slots=True)
-class Loop:
+class LoopResponse:
     """What a closed loop does: outputs, what enters the plant, what the controller gives."""
 
     outputs: list[Channel]
-    entered: Channel
+    plant_input: Channel
     command: Channel
     notes: list[str]
     metrics: StepMetricsOut | None
@@ -50,10 +50,10 @@ class Loop:
     margins: MarginsOut | None
 
 
-def closed(
+def simulate_closed_loop(
     model: Model, values: Mapping[str, float], times: FloatArray, reference: Channel,
     inputs: Sequence[Channel], control: ControlIn,
-) -> Loop:  # fmt: skip
+) -> LoopResponse:  # fmt: skip
     """The model in the loop.
 
     Parameters
@@ -74,37 +74,42 @@ def closed(
 
     solver = model.solver
     step = (solver.step or float(times[1] - times[0])) / solver.substeps
-    identified = _identified(model, values)
+    identified = _build_identified(model, values)
     try:
-        used, tuning = _controller(identified, control)
+        used, tuning = _build_controller(identified, control)
         loop = close_loop(model, used, step)
     except InvalidSettings as error:
-        raise InvalidRequest.at(f"/control{error.pointer}", error.detail) from None
+        raise InvalidRequest.from_fault(f"/control{error.pointer}", error.detail) from None
     found = loop.simulate([replace(reference, name=loop.reference), *inputs], values, times=times)
-    margins = _margins(identified, used)
+    margins = _compute_margins(identified, used)
     outputs = [found.channel(one.name) for one in model.outputs]
-    _check_finite(outputs, times, used.gain, step, margins, is_tuned=tuning is not None)
+    _check_loop_finite(outputs, times, used.gain, step, margins, is_tuned=tuning is not None)
     command = found.channel(loop.command)
-    metrics = _metrics(times, outputs, control)
-    notes = [] if tuning is None or used.differentiates else list(_tuning_notes(tuning))
-    if loop.steps_late:
+    metrics = _compute_step_metrics(times, outputs, control)
+    notes = [] if tuning is None or used.has_derivative_action else list(_describe_tuning(tuning))
+    if loop.controller_delay_steps:
         notes.append(
             f"the output answers at once, so the controller acts {step:.4g} s late, as a sampled "
             "one does"
         )
-    told = _controller_told(used, command.values)
-    notes += [*_start_notes(times, outputs, control), *_stability_notes(metrics, margins, told)]
-    return Loop(outputs, found.channel(loop.input), command, notes, metrics, told, tuning, margins)
+    told = _to_controller_out(used, command.values)
+    notes += [
+        *_describe_start(times, outputs, control),
+        *_describe_stability(metrics, margins, told),
+    ]
+    return LoopResponse(
+        outputs, found.channel(loop.input), command, notes, metrics, told, tuning, margins
+    )
 
 
-def control_faults(model: Model, control: ControlIn) -> Iterator[FieldError]:
+def find_control_faults(model: Model, control: ControlIn) -> Iterator[FieldError]:
     """Signals that the model has not, and a controller by hand and by a rule at once."""
     for role, name, signals in (
         ("input", control.input, [one.name for one in model.inputs]),
         ("output", control.output, [one.name for one in model.outputs]),
     ):
         if name not in signals:
-            detail = f"the model has no {role} {name!r}{nearest(name, signals)}"
+            detail = f"the model has no {role} {name!r}{suggest_name(name, signals)}"
             yield FieldError(f"/control/{role}", detail)
     if control.tuning is None:
         if control.gain is None:
@@ -116,28 +121,30 @@ def control_faults(model: Model, control: ControlIn) -> Iterator[FieldError]:
             yield FieldError(f"/control/{name}", detail)
 
 
-def check_transport(control: ControlIn | None, duration: float) -> None:
+def check_transport_delay(control: ControlIn | None, duration: float) -> None:
     """Refuse a dead time that is longer than the simulation."""
     if control is not None and control.transport is not None:
         delay = control.transport.delay
         if delay >= duration:
-            raise InvalidRequest.at(
+            raise InvalidRequest.from_fault(
                 "/control/transport/delay",
                 f"found {delay:g} s; the simulation lasts {duration:g} s, give more samples or a "
                 "shorter delay",
             )
 
 
-def _identified(model: Model, values: Mapping[str, float]) -> "Identified":
-    from sysid.control.linear_form import Identified, Value
-    from sysid.simulation.simulate import completed
+def _build_identified(model: Model, values: Mapping[str, float]) -> "IdentifiedModel":
+    from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+    from sysid.simulation.simulate import complete_values
 
-    known = completed(model, values)
-    return Identified(model, tuple(Value(name, value) for name, value in known.items()))
+    known = complete_values(model, values)
+    return IdentifiedModel(
+        model, tuple(IdentifiedValue(name, value) for name, value in known.items())
+    )
 
 
-def _controller(
-    identified: "Identified", control: ControlIn
+def _build_controller(
+    identified: "IdentifiedModel", control: ControlIn
 ) -> tuple["PidControl", TuningOut | None]:
     """The controller, its numbers given or by a rule."""
     from sysid.control.controllers import PidControl, Transport
@@ -148,7 +155,7 @@ def _controller(
     )  # fmt: skip
     told = None
     if control.tuning is not None:
-        gain, integral_time, derivative_time, told = _tuned(
+        gain, integral_time, derivative_time, told = _tune_controller(
             identified, control, control.tuning, transport
         )
     assert gain is not None
@@ -161,12 +168,15 @@ def _controller(
     ), told  # fmt: skip
 
 
-def _tuned(
-    identified: "Identified", control: ControlIn, tuning: TuningIn, transport: "Transport | None"
+def _tune_controller(
+    identified: "IdentifiedModel",
+    control: ControlIn,
+    tuning: TuningIn,
+    transport: "Transport | None",
 ) -> tuple[float, float, float, TuningOut]:
-    from sysid.control.tuning import tuned
+    from sysid.control.tuning import tune_controller
 
-    found = tuned(
+    found = tune_controller(
         identified, control.input, control.output, rule=tuning.rule, controller=tuning.controller,
         closed_loop_time_constant=tuning.closed_loop_time_constant, transport=transport,
     )  # fmt: skip
@@ -181,63 +191,63 @@ def _tuned(
     return found.gain, found.integral_time, found.derivative_time, told
 
 
-def _margins(identified: "Identified", control: "PidControl") -> MarginsOut | None:
+def _compute_margins(identified: "IdentifiedModel", control: "PidControl") -> MarginsOut | None:
     """Margins, where the model has a transfer function in s."""
     from sysid.control.linear_form import NotLinear
-    from sysid.control.margins import margins
+    from sysid.control.margins import compute_margins
 
     try:
-        return MarginsOut.from_source(margins(identified, control))
+        return MarginsOut.from_source(compute_margins(identified, control))
     except NotLinear:
         return None
 
 
-def _controller_told(used: "PidControl", command: FloatArray) -> ControllerOut:
-    low, high = used.range
+def _to_controller_out(used: "PidControl", command: FloatArray) -> ControllerOut:
+    low, high = used.output_limits
     at_limit = np.zeros(command.size, dtype=np.bool_)
     for limit, sign in ((low, -1.0), (high, 1.0)):
         if limit is not None:
-            at_limit |= sign * command >= sign * limit - _AT_LIMIT * abs(limit)
+            at_limit |= sign * command >= sign * limit - _LIMIT_TOLERANCE * abs(limit)
     return ControllerOut.from_source(
         used,
-        integral_time=used.integral_time if used.integrates else None,
+        integral_time=used.integral_time if used.has_integral_action else None,
         lower=low,
         upper=high,
-        tracking_time=used.tracking,
+        tracking_time=used.active_tracking_time,
         command_min=float(np.min(command)),
         command_max=float(np.max(command)),
         saturated_percent=100.0 * float(np.mean(at_limit)),
     )
 
 
-def _check_finite(
+def _check_loop_finite(
     outputs: Sequence[Channel], times: FloatArray, gain: float, step: float,
     margins: MarginsOut | None, *, is_tuned: bool,
 ) -> None:  # fmt: skip
     """Refuse a loop that diverges: its gain is to blame, or steps (s) too long for a stable one."""
     try:
-        check_finite(outputs, times)
+        check_finite_outputs(outputs, times)
     except InvalidRequest as error:
         [fault] = error.errors
         detail = fault.detail.removeprefix("with these values ").partition("; ")[0]
         if margins is not None and margins.is_stable:
-            raise InvalidRequest.at(
+            raise InvalidRequest.from_fault(
                 "/sample_time",
                 f"{detail}: the loop is stable, but steps of {step:.4g} s are too long to simulate "
                 "it; give a smaller sample_time",
             ) from None
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "/control/tuning" if is_tuned else "/control/gain",
             f"found {gain:g}; with it the loop runs away: {detail}; choose a smaller "
             "gain, a longer integral_time, a limit, or another sign",
         ) from None
 
 
-def _metrics(
+def _compute_step_metrics(
     times: FloatArray, outputs: Sequence[Channel], control: ControlIn
 ) -> StepMetricsOut | None:
     """Judge the controlled output, if the reference is a step."""
-    from sysid.control.step_response import step_metrics
+    from sysid.control.step_response import measure_step_response
 
     if not isinstance(control.reference, StepInput):
         return None
@@ -245,18 +255,18 @@ def _metrics(
     if step.amplitude == 0 or np.count_nonzero(times >= step.time) < 2:
         return None
     [output] = [one for one in outputs if one.name == control.output]
-    found = step_metrics(
+    found = measure_step_response(
         times, output.values, at=step.time, before=step.offset, after=step.offset + step.amplitude
     )
     return StepMetricsOut.from_source(found, output=output.name, unit=output.unit)
 
 
-def _tuning_notes(tuning: TuningOut) -> Iterator[str]:
+def _describe_tuning(tuning: TuningOut) -> Iterator[str]:
     if tuning.controller == "PID":
         yield "the model has no second time constant, so the rule gives a PI controller"
 
 
-def _start_notes(
+def _describe_start(
     times: FloatArray, outputs: Sequence[Channel], control: ControlIn
 ) -> Iterator[str]:
     """What to mind where the loop may not be at rest when its reference steps."""
@@ -264,10 +274,10 @@ def _start_notes(
         return
     step = control.reference
     [output] = [one for one in outputs if one.name == control.output]
-    band, earlier = _SMALL * abs(step.amplitude), output.values[times < step.time]
+    band, earlier = _REST_TOLERANCE * abs(step.amplitude), output.values[times < step.time]
     if earlier.size:
         if np.ptp(earlier[-max(earlier.size // 4, 2) :]) > band:
-            yield f"{output.name} still moves when the reference steps: {_MORE}"
+            yield f"{output.name} still moves when the reference steps: {_START_ADVICE}"
         return
     start = float(output.values[0])
     if abs(start - step.offset) <= band:
@@ -275,11 +285,11 @@ def _start_notes(
     unit = plain_unit(output.unit)
     yield (
         f"{output.name} starts at {start:.4g}{unit} with a reference of {step.offset:.4g}{unit} "
-        f"before the step: unless the loop rests there, {_MORE}"
+        f"before the step: unless the loop rests there, {_START_ADVICE}"
     )
 
 
-def _stability_notes(
+def _describe_stability(
     metrics: StepMetricsOut | None, margins: MarginsOut | None, controller: ControllerOut
 ) -> Iterator[str]:
     """That a loop is unstable or keeps swinging, said plainly."""

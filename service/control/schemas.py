@@ -3,9 +3,15 @@
 from pydantic import Field
 
 from service.core.wire import Answer, Body, Finite
-from service.datasets.schemas import MAX_SIMULATED, DatasetOut, RunInputIn, SampleTime, Series
+from service.datasets.schemas import (
+    MAX_SERIES_SAMPLES,
+    DatasetOut,
+    RunInputIn,
+    SampleTime,
+    SeriesOut,
+)
 from sysid.control.controllers import AntiWindup, DerivativeOn
-from sysid.control.tuning import Kind, Rule
+from sysid.control.tuning import ControllerKind, TuningRule
 
 
 class TransportIn(Body):
@@ -23,8 +29,8 @@ class TuningIn(Body):
     given: longer is slower and more robust.
     """
 
-    rule: Rule = "simc"
-    controller: Kind = "PI"
+    rule: TuningRule = "simc"
+    controller: ControllerKind = "PI"
     closed_loop_time_constant: float | None = Field(default=None, gt=0, examples=[0.5])
 
 
@@ -59,7 +65,7 @@ class ControlIn(Body):
     reference: RunInputIn
 
 
-_PI_CONTROL = {
+_EXAMPLE_CONTROL = {
     "input": "u", "output": "y", "gain": 0.5, "integral_time": 1.0, "lower": 0, "upper": 0.7,
     "reference": {"kind": "step", "amplitude": 1},
 }  # fmt: skip
@@ -74,9 +80,9 @@ class RunSimulateIn(Body):
     """
 
     inputs: dict[str, RunInputIn] = Field(default={})
-    control: ControlIn | None = Field(default=None, examples=[_PI_CONTROL])
+    control: ControlIn | None = Field(default=None, examples=[_EXAMPLE_CONTROL])
     parameters: dict[str, float] = Field(default={})
-    samples: int = Field(ge=2, le=MAX_SIMULATED)
+    samples: int = Field(ge=2, le=MAX_SERIES_SAMPLES)
     sample_time: SampleTime | None = None
     store: bool = False
     name: str | None = Field(default=None, max_length=200)
@@ -172,10 +178,10 @@ class RunSimulationOut(Answer):
 
     id: str
     parameters: dict[str, float]
-    outputs: list[Series]
-    inputs: list[Series]
-    reference: Series | None = None
-    command: Series | None = None
+    outputs: list[SeriesOut]
+    inputs: list[SeriesOut]
+    reference: SeriesOut | None = None
+    command: SeriesOut | None = None
     metrics: StepMetricsOut | None = None
     controller: ControllerOut | None = None
     tuning: TuningOut | None = None

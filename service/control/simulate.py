@@ -6,27 +6,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.control.closed_loop import Loop, check_transport, closed, control_faults
+from service.control.closed_loop import (
+    LoopResponse,
+    check_transport_delay,
+    find_control_faults,
+    simulate_closed_loop,
+)
 from service.control.schemas import ControlIn, RunSimulateIn, RunSimulationOut
-from service.core.concurrency import simulating
+from service.core.concurrency import simulation_limit
 from service.core.errors import FieldError, InvalidRequest
-from service.datasets.datasets import add_recording, key_of, series, told
+from service.datasets.datasets import add_recording, hash_source, to_out, to_series
 from service.datasets.schemas import DatasetOut
-from service.datasets.simulated import check_finite, check_lags_at
-from service.datasets.waveforms import Signals, sampled
+from service.datasets.simulated import check_finite_outputs, check_given_delays
+from service.datasets.waveforms import InputSignals, interpolate_channel
 from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.repositories.datasets import DatasetRepository
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from sysid.core.errors import nearest
+from sysid.core.errors import suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
 from sysid.models.model import FixedInitial, Model
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
+class _SimulationRequest:
     """What a request asks of a run, looked up."""
 
     model: Model
@@ -39,7 +44,7 @@ class _Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class _Simulated:
+class _SimulationResult:
     """What the model does, and what is to be said of it."""
 
     outputs: list[Channel]
@@ -47,8 +52,8 @@ class _Simulated:
     notes: list[str]
 
 
-@simulating.one()
-def simulate(
+@simulation_limit.acquire()
+def simulate_run(
     database: Database, store: ObjectStore, run_id: str, body: RunSimulateIn, max_points: int
 ) -> RunSimulationOut:
     """Simulate a run's model; with `store`, what comes out becomes a dataset.
@@ -62,44 +67,49 @@ def simulate(
     InvalidRequest
         With every fault of the inputs and parameters, or where the simulation diverges.
     """
-    with database.read() as session:
-        asked = _asked(session, store, run_id, body)
-    loop = _closed(asked, body.control) if body.control else None
-    found = _Simulated(
-        outputs=_open(asked) if loop is None else loop.outputs,
-        inputs=[_sampled(one, asked.times) for one in asked.inputs] + _entered(loop),
+    with database.read_session() as session:
+        asked = _read_request(session, store, run_id, body)
+    loop = _simulate_loop(asked, body.control) if body.control else None
+    found = _SimulationResult(
+        outputs=_simulate_open_loop(asked) if loop is None else loop.outputs,
+        inputs=[_sample_channel(one, asked.times) for one in asked.inputs]
+        + _list_plant_inputs(loop),
         notes=[*asked.notes, *(loop.notes if loop else ())],
     )
-    reference = None if asked.reference is None else _sampled(asked.reference, asked.times)
+    reference = None if asked.reference is None else _sample_channel(asked.reference, asked.times)
     dataset = (
-        _stored(database, store, run_id, body, asked, found, reference) if body.store else None
+        _store_simulation(database, store, run_id, body, asked, found, reference)
+        if body.store
+        else None
     )
     return RunSimulationOut.from_source(
         loop,
         id=run_id,
         parameters=asked.values,
-        outputs=[series(one, max_points) for one in found.outputs],
-        inputs=[series(one, max_points) for one in found.inputs],
-        reference=None if reference is None else series(reference, max_points),
-        command=series(loop.command, max_points) if loop else None,
+        outputs=[to_series(one, max_points) for one in found.outputs],
+        inputs=[to_series(one, max_points) for one in found.inputs],
+        reference=None if reference is None else to_series(reference, max_points),
+        command=to_series(loop.command, max_points) if loop else None,
         notes=found.notes,
         dataset=dataset,
     )
 
 
-def _asked(session: Session, store: ObjectStore, run_id: str, body: RunSimulateIn) -> _Asked:
+def _read_request(
+    session: Session, store: ObjectStore, run_id: str, body: RunSimulateIn
+) -> _SimulationRequest:
     stored = load_estimated_run(session, run_id, "simulate with")
     model = stored.model
-    faults = [*_parameter_faults(model, body.parameters), *_input_faults(model, body)]
+    faults = [*_find_parameter_faults(model, body.parameters), *_find_input_faults(model, body)]
     if faults:
         raise InvalidRequest(faults)
-    check_lags_at(model, body.parameters)
-    period, notes = _period(session, stored, body)
+    check_given_delays(model, body.parameters)
+    period, notes = _choose_sample_time(session, stored, body)
     times = np.arange(body.samples, dtype=np.float64) * period
-    check_transport(body.control, float(times[-1]))
-    signals = Signals(session, store, times)
+    check_transport_delay(body.control, float(times[-1]))
+    signals = InputSignals(session, store, times)
     inputs = [
-        signals.channel(f"/inputs/{one.name}", one.name, one.unit, body.inputs[one.name])
+        signals.build_channel(f"/inputs/{one.name}", one.name, one.unit, body.inputs[one.name])
         for one in model.inputs
         if one.name in body.inputs
     ]
@@ -107,14 +117,14 @@ def _asked(session: Session, store: ObjectStore, run_id: str, body: RunSimulateI
     if body.control is not None:
         unit = next((o.unit for o in model.outputs if o.name == body.control.output), "1")
         at = "/control/reference"
-        reference = signals.channel(at, "reference", unit, body.control.reference)
-    values = _values(stored, body.parameters)
+        reference = signals.build_channel(at, "reference", unit, body.control.reference)
+    values = _collect_values(stored, body.parameters)
     given = inputs if reference is None else [*inputs, reference]
-    notes = [*notes, *_early_notes(model, given, period)]
-    return _Asked(model, values, times, inputs, reference, signals.parents, notes)
+    notes = [*notes, *_describe_early_inputs(model, given, period)]
+    return _SimulationRequest(model, values, times, inputs, reference, signals.parents, notes)
 
 
-def _early_notes(model: Model, given: Sequence[Channel], period: float) -> list[str]:
+def _describe_early_inputs(model: Model, given: Sequence[Channel], period: float) -> list[str]:
     """What to say of signals from before t = 0: the solver begins where the first of them does."""
     first = min(given, key=lambda one: float(one.times[0]), default=None)
     if first is None or model.form != "differential" or first.times[0] > -0.5 * period:
@@ -125,7 +135,9 @@ def _early_notes(model: Model, given: Sequence[Channel], period: float) -> list[
     ]
 
 
-def _period(session: Session, stored: StoredRun, body: RunSimulateIn) -> tuple[float, list[str]]:
+def _choose_sample_time(
+    session: Session, stored: StoredRun, body: RunSimulateIn
+) -> tuple[float, list[str]]:
     """The sampling period in s, and what is to be said of it."""
     try:
         known = DatasetRepository(session).get(stored.body["datasets"][0]).sample_time
@@ -133,14 +145,14 @@ def _period(session: Session, stored: StoredRun, body: RunSimulateIn) -> tuple[f
         known = None
     period = body.sample_time or known
     if period is None:
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "/sample_time", "is missing, and the run's data do not tell one; give it in s"
         )
     form = stored.model.form
     if form == "differential" or known is None or abs(period / known - 1) < 1e-3:
         return period, []
     if form == "polynomial":
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "/sample_time",
             f"found {period:g} s; the terms of this polynomial are samples of {known:g} s: "
             "leave it out",
@@ -151,7 +163,7 @@ def _period(session: Session, stored: StoredRun, body: RunSimulateIn) -> tuple[f
     ]
 
 
-def _values(stored: StoredRun, given: Mapping[str, float]) -> dict[str, float]:
+def _collect_values(stored: StoredRun, given: Mapping[str, float]) -> dict[str, float]:
     """Value of every parameter and of every start that the model does not fix."""
     model = stored.model
     rest = {
@@ -168,39 +180,41 @@ def _values(stored: StoredRun, given: Mapping[str, float]) -> dict[str, float]:
     return {**rest, **kept, **given}
 
 
-def _open(asked: _Asked) -> list[Channel]:
+def _simulate_open_loop(asked: _SimulationRequest) -> list[Channel]:
     # The compiler comes with this import, and most requests never need it.
     from sysid.simulation.simulate import simulate as simulated
 
     found = simulated(asked.model, asked.inputs, asked.values, times=asked.times).channels
-    check_finite(found, asked.times)
+    check_finite_outputs(found, asked.times)
     return list(found)
 
 
-def _closed(asked: _Asked, control: ControlIn) -> Loop:
+def _simulate_loop(asked: _SimulationRequest, control: ControlIn) -> LoopResponse:
     assert asked.reference is not None
-    return closed(asked.model, asked.values, asked.times, asked.reference, asked.inputs, control)
+    return simulate_closed_loop(
+        asked.model, asked.values, asked.times, asked.reference, asked.inputs, control
+    )
 
 
-def _entered(loop: Loop | None) -> list[Channel]:
-    return [] if loop is None else [loop.entered]
+def _list_plant_inputs(loop: LoopResponse | None) -> list[Channel]:
+    return [] if loop is None else [loop.plant_input]
 
 
-def _sampled(channel: Channel, times: FloatArray) -> Channel:
-    return replace(channel, times=times, values=sampled(channel, times), history=None)
+def _sample_channel(channel: Channel, times: FloatArray) -> Channel:
+    return replace(channel, times=times, values=interpolate_channel(channel, times), history=None)
 
 
-def _stored(
-    database: Database, store: ObjectStore, run_id: str, body: RunSimulateIn, asked: _Asked,
-    found: _Simulated, reference: Channel | None,
+def _store_simulation(
+    database: Database, store: ObjectStore, run_id: str, body: RunSimulateIn, asked: _SimulationRequest,
+    found: _SimulationResult, reference: Channel | None,
 ) -> DatasetOut:  # fmt: skip
     """The simulation as a dataset that knows its run; the same request gives the same one."""
     request = body.model_dump(mode="json", exclude={"name", "store"})
-    key = key_of({"run": run_id, "simulation": request, "values": asked.values})
-    with database.read() as session:
-        known = DatasetRepository(session).by_source(key)
+    key = hash_source({"run": run_id, "simulation": request, "values": asked.values})
+    with database.read_session() as session:
+        known = DatasetRepository(session).find_by_source(key)
     if known is not None:
-        return told(known)
+        return to_out(known)
     channels = [*found.inputs, *found.outputs]
     taken = {channel.name for channel in channels}
     if reference is not None and reference.name not in taken:
@@ -212,28 +226,28 @@ def _stored(
         name=body.name or f"{asked.model.name}, simulated with {run_id}", kind="simulate",
         key=key, details=details, parents=[run_id, *asked.parents], relation="simulated",
     )  # fmt: skip
-    return told(stored.dataset)
+    return to_out(stored.dataset)
 
 
-def _parameter_faults(model: Model, values: Mapping[str, float]) -> Iterator[FieldError]:
+def _find_parameter_faults(model: Model, values: Mapping[str, float]) -> Iterator[FieldError]:
     known = [*(p.name for p in model.parameters), *(f"{one.name}(0)" for one in model.states)]
     for name in values:
         if name not in known:
-            detail = f"the model has no parameter {name!r}{nearest(name, known)}"
+            detail = f"the model has no parameter {name!r}{suggest_name(name, known)}"
             yield FieldError(f"/parameters/{name}", detail)
 
 
-def _input_faults(model: Model, body: RunSimulateIn) -> Iterator[FieldError]:
+def _find_input_faults(model: Model, body: RunSimulateIn) -> Iterator[FieldError]:
     known = [one.name for one in model.inputs]
     controlled = body.control.input if body.control else None
     if body.control is not None:
-        found = list(control_faults(model, body.control))
+        found = list(find_control_faults(model, body.control))
         yield from found
         if found:  # which inputs are still to be given is not known then
             return
     for name in body.inputs:
         if name not in known:
-            detail = f"the model has no input {name!r}{nearest(name, known)}"
+            detail = f"the model has no input {name!r}{suggest_name(name, known)}"
             yield FieldError(f"/inputs/{name}", detail)
         elif name == controlled:
             yield FieldError(f"/inputs/{name}", "the controller gives this input; leave it out")

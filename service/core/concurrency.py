@@ -8,24 +8,27 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import BoundedSemaphore
 
-from service.core.errors import Busy
+from service.core.errors import ServiceBusy
 
-AT_ONCE = 2
-WAITING = 16
-LONGEST_SECONDS = 20.0
+MAX_RUNNING = 2
+MAX_WAITING = 16
+MAX_WAIT_SECONDS = 20.0
 
 
-class Turns:
+class ConcurrencyLimit:
     """At most `at_once` go on, `waiting` others wait, `seconds` at most."""
 
     def __init__(
-        self, at_once: int = AT_ONCE, waiting: int = WAITING, seconds: float = LONGEST_SECONDS
+        self,
+        at_once: int = MAX_RUNNING,
+        waiting: int = MAX_WAITING,
+        seconds: float = MAX_WAIT_SECONDS,
     ) -> None:
         self._going, self._seconds = BoundedSemaphore(at_once), seconds
         self._here = BoundedSemaphore(at_once + waiting)
 
     @contextmanager
-    def one(self) -> Iterator[None]:
+    def acquire(self) -> Iterator[None]:
         """A turn, for the length of a block or of a function.
 
         Raises
@@ -34,10 +37,10 @@ class Turns:
             If too many wait already, or it did not come in time.
         """
         if not self._here.acquire(blocking=False):
-            raise Busy("too many simulations are waiting; ask again in a while")
+            raise ServiceBusy("too many simulations are waiting; ask again in a while")
         try:
             if not self._going.acquire(timeout=self._seconds):
-                raise Busy(f"other simulations took {self._seconds:g} s and more; ask again")
+                raise ServiceBusy(f"other simulations took {self._seconds:g} s and more; ask again")
             try:
                 yield
             finally:
@@ -46,5 +49,5 @@ class Turns:
             self._here.release()
 
 
-simulating = Turns()
+simulation_limit = ConcurrencyLimit()
 """Those of this process."""

@@ -5,14 +5,14 @@ from math import isfinite
 from typing import Any
 
 from service.core.errors import FieldError, InvalidRequest, TooLarge
-from service.core.text_checks import fault_in_json
+from service.core.text_checks import find_json_fault
 from sysid.core.errors import InvalidModel
 from sysid.models import documents
 
 MAX_DOCUMENT_BYTES = 4 * 1024**2
 
 
-def read_yaml(text: bytes) -> Any:
+def parse_yaml(text: bytes) -> Any:
     """What a YAML text says; JSON is YAML too.
 
     Raises
@@ -24,14 +24,16 @@ def read_yaml(text: bytes) -> Any:
     """
     _check_size(text)
     try:
-        return _storable(documents.read_yaml(text.decode("utf-8-sig")))
+        return _check_storable(documents.parse_yaml(text.decode("utf-8-sig")))
     except UnicodeDecodeError as error:
-        raise InvalidRequest.at("", f"not UTF-8 text: byte {error.start} does not fit") from None
+        raise InvalidRequest.from_fault(
+            "", f"not UTF-8 text: byte {error.start} does not fit"
+        ) from None
     except InvalidModel as error:
         raise InvalidRequest(FieldError(one.pointer, one.detail) for one in error.faults) from None
 
 
-def read_json(text: bytes) -> Any:
+def parse_json(text: bytes) -> Any:
     """What a JSON text says.
 
     Raises
@@ -46,10 +48,10 @@ def read_json(text: bytes) -> Any:
         found = json.loads(text, parse_constant=_refuse_constant)
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
-        raise InvalidRequest.at("", f"the body is not JSON: {place}: {error.msg}") from None
+        raise InvalidRequest.from_fault("", f"the body is not JSON: {place}: {error.msg}") from None
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise InvalidRequest.at("", f"the body is not JSON: {error}") from None
-    return _storable(found)
+        raise InvalidRequest.from_fault("", f"the body is not JSON: {error}") from None
+    return _check_storable(found)
 
 
 def to_finite(value: float | None) -> float | None:
@@ -57,12 +59,12 @@ def to_finite(value: float | None) -> float | None:
     return None if value is None or not isfinite(value) else float(value)
 
 
-def _storable(document: Any) -> Any:
+def _check_storable(document: Any) -> Any:
     """The document, whose texts a database can keep: escapes can stand for what is no text."""
     written = json.dumps(document, ensure_ascii=False, default=repr, skipkeys=True)
-    fault = fault_in_json(written)
+    fault = find_json_fault(written)
     if fault is not None:
-        raise InvalidRequest.at("", fault)
+        raise InvalidRequest.from_fault("", fault)
     return document
 
 

@@ -47,7 +47,7 @@ class FieldError:
     def __str__(self) -> str:
         return f"{self.pointer}: {self.detail}" if self.pointer else self.detail
 
-    def as_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """The entry of a problem document's ``errors``."""
         entry: dict[str, Any] = {"pointer": self.pointer, "detail": self.detail}
         return entry if self.column is None else {**entry, "column": self.column}
@@ -81,7 +81,7 @@ class NotFound(ServiceError):
         self.what, self.name = what, name
 
 
-class NoSuchDataset(ServiceError):
+class DatasetNotFound(ServiceError):
     """No dataset has that identifier or name, or several have the name; the text says which."""
 
     status, kind, title = 404, "not-found", "There is no such thing"
@@ -136,12 +136,12 @@ class InvalidRequest(ServiceError):
         super().__init__("; ".join(map(str, found)), found)
 
     @classmethod
-    def at(cls, pointer: str, detail: str) -> "InvalidRequest":
+    def from_fault(cls, pointer: str, detail: str) -> "InvalidRequest":
         """A request with one fault."""
         return cls((FieldError(pointer, detail),))
 
 
-class TooMuchUnfinished(ServiceError):
+class QuotaExceeded(ServiceError):
     """The project has as much queued and running as it may."""
 
     status, kind, title = 429, "too-much-unfinished", "The project has too much unfinished work"
@@ -158,7 +158,7 @@ class Unavailable(ServiceError):
     status, kind, title = 503, "unavailable", "A part of the service is down"
 
 
-class Busy(Unavailable):
+class ServiceBusy(Unavailable):
     """Too many requests of a heavy kind at once."""
 
     title = "The service has too much to do"
@@ -185,7 +185,7 @@ class ServiceDidNotStart(ServiceError):
         self.reason, self.log = reason, log
 
 
-def faults_of(error: SysidError) -> list[FieldError]:
+def to_field_errors(error: SysidError) -> list[FieldError]:
     """What an error of the numerical core says of a job or model document, with its places."""
     match error:
         case InvalidModel():

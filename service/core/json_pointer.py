@@ -7,7 +7,7 @@ from typing import Any
 from sysid.core.errors import split_pointer
 
 
-def body_of(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+def build_run_body(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
     """Body of one run: the job's normal form with the cell's values put in.
 
     What no value changes is the document's own: neither is to be changed.
@@ -28,7 +28,7 @@ def body_of(document: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str,
     return body
 
 
-def value_at(document: Mapping[str, Any], path: str) -> Any:
+def get_value(document: Mapping[str, Any], path: str) -> Any:
     """The value of a field that is there."""
     here: Any = document
     for part in split_pointer(path):

@@ -68,22 +68,22 @@ class Settings(BaseSettings):
     data: Path | None = None
 
     @property
-    def database(self) -> str:
+    def resolved_database_url(self) -> str:
         """SQLAlchemy address of the database."""
         folder = self.data_dir.absolute()
         return self.database_url or f"sqlite:///{folder / 'lagid.db'}"
 
     @property
-    def worker_memory(self) -> int | None:
+    def worker_memory_bytes(self) -> int | None:
         """The same in bytes."""
         return None if self.worker_memory_mb is None else self.worker_memory_mb * 2**20
 
     @property
-    def store(self) -> str:
+    def resolved_store_url(self) -> str:
         """Address of the object store."""
         return self.store_url or (self.data_dir.absolute() / "objects").as_uri()
 
-    def prepare_folder(self) -> None:
+    def prepare_data_folder(self) -> None:
         """Make the data folder if it is not there.
 
         Raises

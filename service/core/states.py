@@ -6,7 +6,7 @@ from typing import Literal
 StateName = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 
 
-class State(StrEnum):
+class JobState(StrEnum):
     """How far a job or a run has come."""
 
     QUEUED = "queued"
@@ -18,7 +18,7 @@ class State(StrEnum):
     @property
     def is_terminal(self) -> bool:
         """Whether no dispatcher will ever change it again."""
-        return self not in OPEN
+        return self not in OPEN_STATES
 
 
-OPEN = (State.QUEUED, State.RUNNING)
+OPEN_STATES = (JobState.QUEUED, JobState.RUNNING)

@@ -18,20 +18,20 @@ STALE_SECONDS = 24 * 3600
 """After so long a file is nobody's, whichever machine it came from."""
 
 
-def prefix() -> str:
+def make_temporary_prefix() -> str:
     """What the names of this process's temporary files begin with."""
     return f"lagid-tmp-{make_machine_tag()}-{os.getpid()}-{read_start(os.getpid()) or 0}-"
 
 
-def clear(folder: Path, pattern: str = "lagid-tmp-*") -> None:
+def remove_leftovers(folder: Path, pattern: str = "lagid-tmp-*") -> None:
     """Remove files and folders of processes of this machine that are gone, and stale ones."""
     for path in folder.glob(pattern):
         with suppress(FileNotFoundError):  # its owner, or another that clears, was faster
-            if _is_of_the_dead(path.name) or _is_stale(path):
+            if _has_dead_owner(path.name) or _is_stale(path):
                 shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def _is_of_the_dead(name: str) -> bool:
+def _has_dead_owner(name: str) -> bool:
     found = re.match(rf"lagid-tmp-{make_machine_tag()}-(\d+)-(\d+)-", name)
     return found is not None and has_process_ended(int(found[1]), int(found[2]) or None)
 

@@ -15,18 +15,18 @@ from pydantic import BaseModel
 from pydantic_core.core_schema import ErrorType
 
 from service.core.errors import FieldError
-from sysid.core.errors import join_pointer, nearest
+from sysid.core.errors import join_pointer, suggest_name
 
-SHOWN = 80
-NOT_AN_OBJECT = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
-OWN_KINDS = frozenset(get_args(ErrorType))
+MAX_SHOWN_CHARACTERS = 80
+NOT_AN_OBJECT_KINDS = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
+PYDANTIC_KINDS = frozenset(get_args(ErrorType))
 """Kinds of errors that are Pydantic's own."""
 
-_NEEDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
-    "greater_than": lambda c: f"a number above {_number(c['gt'])}",
-    "greater_than_equal": lambda c: f"{_number(c['ge'])} or more",
-    "less_than": lambda c: f"a number below {_number(c['lt'])}",
-    "less_than_equal": lambda c: f"{_number(c['le'])} or less",
+_EXPECTATIONS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "greater_than": lambda c: f"a number above {_format_number(c['gt'])}",
+    "greater_than_equal": lambda c: f"{_format_number(c['ge'])} or more",
+    "less_than": lambda c: f"a number below {_format_number(c['lt'])}",
+    "less_than_equal": lambda c: f"{_format_number(c['le'])} or less",
     "finite_number": lambda _: "a finite number",
     "int_type": lambda _: "a whole number",
     "int_parsing": lambda _: "a whole number",
@@ -40,14 +40,14 @@ _NEEDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "string_sub_type": lambda _: "text",
     "string_unicode": lambda _: "text in UTF-8",
     "string_too_long": lambda c: f"at most {c['max_length']} characters",
-    "string_too_short": lambda c: f"at least {_counted(c['min_length'], 'character')}",
+    "string_too_short": lambda c: f"at least {_format_count(c['min_length'], 'character')}",
     "string_pattern_mismatch": lambda c: f"text of the form {c['pattern']}",
     "literal_error": lambda c: str(c["expected"]),
     "enum": lambda c: str(c["expected"]),
     "list_type": lambda _: "a list",
     "tuple_type": lambda _: "a list",
-    "too_short": lambda c: f"at least {_counted(c['min_length'], 'entry')}",
-    "too_long": lambda c: f"at most {_counted(c['max_length'], 'entry')}",
+    "too_short": lambda c: f"at least {_format_count(c['min_length'], 'entry')}",
+    "too_long": lambda c: f"at most {_format_count(c['max_length'], 'entry')}",
     "invalid_key": lambda _: "text as the name of a field",
     "none_required": lambda _: "null",
     "union_tag_invalid": lambda c: f"{c['discriminator']} to be one of {c['expected_tags']}",
@@ -58,7 +58,9 @@ _NEEDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
 }
 
 
-def detail_of(entry: Mapping[str, Any], known: Sequence[str], elsewhere: Sequence[str] = ()) -> str:
+def describe_error(
+    entry: Mapping[str, Any], known: Sequence[str], elsewhere: Sequence[str] = ()
+) -> str:
     """What was wrong, what was found, what would be right.
 
     Parameters
@@ -68,12 +70,12 @@ def detail_of(entry: Mapping[str, Any], known: Sequence[str], elsewhere: Sequenc
     known : sequence of str
         Fields that are known at its place; `elsewhere` are pointers to fields of its name.
     """
-    kind, found = entry["type"], _found(entry.get("input"))
+    kind, found = entry["type"], _format_value(entry.get("input"))
     if kind == "extra_forbidden":
-        return f"unknown field {entry['loc'][-1]!r}{_hint(str(entry['loc'][-1]), known, elsewhere)}"
+        return f"unknown field {entry['loc'][-1]!r}{_suggest_field(str(entry['loc'][-1]), known, elsewhere)}"
     if kind == "missing":
         return "this field is required"
-    if kind in NOT_AN_OBJECT:
+    if kind in NOT_AN_OBJECT_KINDS:
         some = f" with fields such as {', '.join(known)}" if known else " (name: value)"
         return f"found {found}; need an object{some}"
     if kind == "string_pattern_mismatch" and entry["loc"][-1] == "path":
@@ -81,26 +83,26 @@ def detail_of(entry: Mapping[str, Any], known: Sequence[str], elsewhere: Sequenc
     if kind == "list_type":
         one = f", such as [{found}]" if isinstance(entry.get("input"), str) else ""
         return f"found {found}; need a list{one}"
-    if kind in _NEEDS:
-        return f"found {found}{_size(kind, entry)}; need {_NEEDS[kind](entry.get('ctx', {}))}"
-    return _raised(entry, found)
+    if kind in _EXPECTATIONS:
+        return f"found {found}{_format_size(kind, entry)}; need {_EXPECTATIONS[kind](entry.get('ctx', {}))}"
+    return _describe_raised_error(entry, found)
 
 
-def _raised(entry: Mapping[str, Any], found: str) -> str:
+def _describe_raised_error(entry: Mapping[str, Any], found: str) -> str:
     """The sentence that a validator raised; of the other kinds what was found."""
     if entry["type"] in ("value_error", "assertion_error") and "error" in entry.get("ctx", {}):
         return str(entry["ctx"]["error"])
-    if entry["type"] in OWN_KINDS:
+    if entry["type"] in PYDANTIC_KINDS:
         return f"found {found}; this cannot be used here"
     return f"{entry['msg']}; found {found}"
 
 
-def _hint(name: str, known: Sequence[str], elsewhere: Sequence[str]) -> str:
+def _suggest_field(name: str, known: Sequence[str], elsewhere: Sequence[str]) -> str:
     """Where a field of this very name is, else the nearest of those that are here."""
-    return f"; there is {' and '.join(elsewhere[:2])}" if elsewhere else nearest(name, known)
+    return f"; there is {' and '.join(elsewhere[:2])}" if elsewhere else suggest_name(name, known)
 
 
-def _found(value: Any) -> str:
+def _format_value(value: Any) -> str:
     """A value as it is written in JSON where Python has another word for it."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
@@ -108,32 +110,34 @@ def _found(value: Any) -> str:
         text = repr(value)
     except RecursionError:
         return "lists or objects nested too deeply"
-    return text if len(text) <= SHOWN else text[:SHOWN] + "…"
+    return text if len(text) <= MAX_SHOWN_CHARACTERS else text[:MAX_SHOWN_CHARACTERS] + "…"
 
 
-def _size(kind: str, entry: Mapping[str, Any]) -> str:
+def _format_size(kind: str, entry: Mapping[str, Any]) -> str:
     """How much was found, where it is too much or too little."""
     if kind == "too_long" and (length := entry.get("ctx", {}).get("actual_length")):
-        return f" ({_counted(length, 'entry')})"
+        return f" ({_format_count(length, 'entry')})"
     if kind == "string_too_long" and isinstance(entry.get("input"), str):
-        return f" ({_counted(len(entry['input']), 'character')})"
+        return f" ({_format_count(len(entry['input']), 'character')})"
     return ""
 
 
-def _number(value: Any) -> str:
+def _format_number(value: Any) -> str:
     """A bound as it is written by hand: 9223372036854775808 stays, 0.0 is 0."""
     return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
-def _counted(count: int, what: str) -> str:
+def _format_count(count: int, what: str) -> str:
     plural = f"{what[:-1]}ies" if what.endswith("y") else f"{what}s"
     return f"1 {what}" if count == 1 else f"{count} {plural}"
 
 
-Location = Sequence[str | int]
+ErrorLocation = Sequence[str | int]
 
 
-def explained(entries: Iterable[Mapping[str, Any]], body: Any, kind: Any) -> Iterator[FieldError]:
+def explain_errors(
+    entries: Iterable[Mapping[str, Any]], body: Any, kind: Any
+) -> Iterator[FieldError]:
     """Pydantic's errors of a body as faults with JSON pointers.
 
     Parameters
@@ -145,16 +149,16 @@ def explained(entries: Iterable[Mapping[str, Any]], body: Any, kind: Any) -> Ite
     """
     seen: set[str] = set()
     for entry in entries:
-        pointer = pointer_into(body, entry["loc"], is_missing=entry["type"] == "missing")
+        pointer = to_pointer(body, entry["loc"], is_missing=entry["type"] == "missing")
         # A union gives one entry per member; the first is about the member most often meant.
         if pointer not in seen:
             seen.add(pointer)
-            at = entry["loc"] if entry["type"] in NOT_AN_OBJECT else entry["loc"][:-1]
-            elsewhere = places_of(kind, entry["loc"][-1]) if entry["loc"] else []
-            yield FieldError(pointer, detail_of(entry, known_fields(kind, at), elsewhere))
+            at = entry["loc"] if entry["type"] in NOT_AN_OBJECT_KINDS else entry["loc"][:-1]
+            elsewhere = find_field_pointers(kind, entry["loc"][-1]) if entry["loc"] else []
+            yield FieldError(pointer, describe_error(entry, list_fields(kind, at), elsewhere))
 
 
-def pointer_into(body: Any, loc: Location, *, is_missing: bool = False) -> str:
+def to_pointer(body: Any, loc: ErrorLocation, *, is_missing: bool = False) -> str:
     """JSON pointer of a Pydantic location, without the names that unions put into it.
 
     `is_missing`: the last part is not in the body, and should be.
@@ -162,7 +166,7 @@ def pointer_into(body: Any, loc: Location, *, is_missing: bool = False) -> str:
     parts: list[str | int] = []
     here = body
     for position, part in enumerate(loc):
-        if _is_in(here, part):
+        if _contains_part(here, part):
             here = here[part]
             parts.append(part)
         elif is_missing and position == len(loc) - 1:
@@ -170,42 +174,42 @@ def pointer_into(body: Any, loc: Location, *, is_missing: bool = False) -> str:
     return join_pointer(*parts)
 
 
-def body_type(endpoint: Callable[..., Any] | None) -> Any:
+def find_body_type(endpoint: Callable[..., Any] | None) -> Any:
     """Wire type of an endpoint's body."""
     return get_annotations(endpoint, eval_str=True).get("body") if endpoint else None
 
 
-def known_fields(kind: Any, loc: Location) -> list[str]:
+def list_fields(kind: Any, loc: ErrorLocation) -> list[str]:
     """Fields that a wire type knows at a location."""
-    types = list(_models(kind))
+    types = list(_iterate_models(kind))
     for part in loc:
         fields = [t.model_fields[part] for t in types if part in t.model_fields]
         # A list index, a key of a mapping or a union's own name leaves the types as they are.
         if fields:
-            types = [model for field in fields for model in _models(field.annotation)]
+            types = [model for field in fields for model in _iterate_models(field.annotation)]
     return sorted({name for model in types for name in model.model_fields})
 
 
-def places_of(kind: Any, name: str | int, above: str = "") -> list[str]:
+def find_field_pointers(kind: Any, name: str | int, above: str = "") -> list[str]:
     """Pointers of the fields of a name that can be reached by names alone, the shortest first."""
     found = []
-    for model in _models(kind):
+    for model in _iterate_models(kind):
         for own, field in model.model_fields.items():
             if own == name:
                 found.append(f"{above}/{own}")
             if get_origin(field.annotation) not in (dict, list):
-                found += places_of(field.annotation, name, f"{above}/{own}")
+                found += find_field_pointers(field.annotation, name, f"{above}/{own}")
     return sorted(dict.fromkeys(found), key=lambda place: place.count("/"))
 
 
-def _is_in(value: Any, part: str | int) -> bool:
+def _contains_part(value: Any, part: str | int) -> bool:
     if isinstance(value, dict):
         return part in value
     return isinstance(value, list) and isinstance(part, int) and part < len(value)
 
 
-def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+def _iterate_models(annotation: Any) -> Iterator[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inner in get_args(annotation):
-        yield from _models(inner)
+        yield from _iterate_models(inner)

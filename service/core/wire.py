@@ -14,24 +14,26 @@ Pointer = Annotated[str, Field(pattern=r"^(/[^/]+)+$", examples=["/noise/sigma"]
 """A JSON pointer into a job body."""
 
 
-DEEPEST = 50
+MAX_DEPTH = 50
 """Levels of lists and objects within one another in a body; a model document has five."""
 
 
-def not_too_deep(value: Any) -> Any:
+def check_depth(value: Any) -> Any:
     """The value itself; what is nested too deeply cannot be copied or written again."""
     level, depth = [value], 0
-    while level := [inner for one in level if isinstance(one, dict | list) for inner in _in(one)]:
+    while level := [
+        inner for one in level if isinstance(one, dict | list) for inner in _iterate_children(one)
+    ]:
         depth += 1
-        if depth > DEEPEST:
+        if depth > MAX_DEPTH:
             raise PydanticCustomError(
                 "nesting", "need lists and objects at most {most} levels within one another",
-                {"most": DEEPEST},
+                {"most": MAX_DEPTH},
             )  # fmt: skip
     return value
 
 
-def _in(value: dict[Any, Any] | list[Any]) -> Iterable[Any]:
+def _iterate_children(value: dict[Any, Any] | list[Any]) -> Iterable[Any]:
     return value.values() if isinstance(value, dict) else value
 
 

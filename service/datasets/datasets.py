@@ -16,72 +16,77 @@ import numpy as np
 from sqlalchemy.orm import Session
 
 from service.core import temporary_files as temporary
-from service.core.errors import NoSuchDataset, TooLarge
+from service.core.errors import DatasetNotFound, TooLarge
 from service.core.settings import Settings
 from service.core.wire import Page
-from service.datasets.recordings import recording_of
+from service.datasets.recordings import load_recording
 from service.datasets.schemas import (
     DatasetOut,
     DeriveIn,
-    Edge,
+    LineageEdgeOut,
     LineageOut,
-    Series,
+    SeriesOut,
     SignalsOut,
 )
 from service.formats.decimate import decimate
 from service.formats.mcap import write_recording
 from service.formats.sandbox import read_untrusted
-from service.repositories.datasets import DatasetRepository, NewDataset, Stored
-from service.repositories.lineage import LineageRepository, Relation, dataset_names, datasets_named
-from service.storage.errors import NotFound
+from service.repositories.datasets import DatasetRepository, NewDataset, StoredDataset
+from service.repositories.lineage import (
+    LineageRepository,
+    Relation,
+    find_datasets_by_name,
+    list_dataset_names,
+)
+from service.storage.errors import RowNotFound
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
-from sysid.core.errors import nearest
+from sysid.core.errors import suggest_name
 from sysid.data.records import Channel, Recording
-from sysid.models.units import unknown_units
+from sysid.models.units import list_unknown_unit_warnings
 
 
-def of_dataset(session: Session, dataset_id: str) -> LineageOut:
+def read_lineage(session: Session, dataset_id: str) -> LineageOut:
     """Every edge on the ways to and from a dataset, from raw file to job."""
     row = DatasetRepository(session).get(dataset_id)
     repository = LineageRepository(session)
-    edges = {*repository.ancestors(row.id), *repository.descendants(row.id)}
-    return LineageOut(id=row.id, edges=[Edge.from_source(edge) for edge in sorted(edges)])
+    edges = {*repository.list_ancestors(row.id), *repository.list_descendants(row.id)}
+    return LineageOut(id=row.id, edges=[LineageEdgeOut.from_source(edge) for edge in sorted(edges)])
 
 
-def dataset_of(session: Session, reference: str) -> Dataset | str:
+def resolve_dataset(session: Session, reference: str) -> Dataset | str:
     """The dataset of that identifier or name, or why there is none."""
     try:
         return DatasetRepository(session).get(reference)
-    except NotFound:
-        named = datasets_named(session, reference)
+    except RowNotFound:
+        named = find_datasets_by_name(session, reference)
     if len(named) == 1:
         return named[0]
     if named:
         ids = ", ".join(one.id for one in named)
         return f"{len(named)} datasets are named {reference!r}; give one of the ids {ids}"
-    hint = nearest(reference, set(dataset_names(session)))
+    hint = suggest_name(reference, set(list_dataset_names(session)))
     if "/" in reference or reference.endswith((".csv", ".mcap")):
         hint = "; a path of a file is not read here, add the file first: `lagid dataset add`"
     return f"there is no dataset {reference!r}{hint}"
 
 
-Kind = Literal["upload", "simulate", "derive"]
-Format = Literal["csv", "mcap"]
+DatasetKind = Literal["upload", "simulate", "derive"]
+FileFormat = Literal["csv", "mcap"]
 
 
 def add_upload(
     database: Database,
     store: ObjectStore,
     path: Path,
-    form: Format,
+    form: FileFormat,
     *,
     sha256: str,
     name: str | None = None,
     segments: Sequence[str] = (),
     sample_time: float | None = None,
-) -> Stored:
+) -> StoredDataset:
     """Store an uploaded file, or give the dataset that the same bytes made before.
 
     Raises
@@ -91,11 +96,11 @@ def add_upload(
     """
     read_as = {"sha256": sha256, "format": form, "segments": list(segments),
                "sample_time": sample_time}  # fmt: skip
-    key = key_of(read_as)
-    with database.read() as session:
-        known = DatasetRepository(session).by_source(key)
+    key = hash_source(read_as)
+    with database.read_session() as session:
+        known = DatasetRepository(session).find_by_source(key)
     if known is not None:
-        return Stored(known, is_new=False)
+        return StoredDataset(known, is_new=False)
     # Reading takes time: no transaction is open meanwhile, which on SQLite would hold up all.
     read = read_untrusted(path, form, segments=segments, sample_time=sample_time)
     details = {"source": read_as, "warnings": list(read.notes)}
@@ -105,7 +110,9 @@ def add_upload(
     )  # fmt: skip
 
 
-def derive(database: Database, store: ObjectStore, parent_id: str, body: DeriveIn) -> Stored:
+def derive_dataset(
+    database: Database, store: ObjectStore, parent_id: str, body: DeriveIn
+) -> StoredDataset:
     """Make a dataset from another by steps; the same steps again give the same dataset.
 
     Raises
@@ -115,21 +122,23 @@ def derive(database: Database, store: ObjectStore, parent_id: str, body: DeriveI
     InvalidRecord, InvalidSettings
         If a step cannot be done.
     """
-    with database.read() as session:
-        parent = dataset_of(session, parent_id)
+    with database.read_session() as session:
+        parent = resolve_dataset(session, parent_id)
         if isinstance(parent, str):
-            raise NoSuchDataset(parent)
-        known = DatasetRepository(session).by_source(_derivation_key(parent, body))
+            raise DatasetNotFound(parent)
+        known = DatasetRepository(session).find_by_source(_hash_derivation(parent, body))
     if known is not None:
-        return Stored(known, is_new=False)
-    from sysid.data.derivations import derive as derived  # brings SciPy's signal processing
+        return StoredDataset(known, is_new=False)
+    from sysid.data.derivations import (
+        derive_recording as derived,  # brings SciPy's signal processing
+    )
 
-    recording = derived(recording_of(store, parent.sha256), body.steps)
+    recording = derived(load_recording(store, parent.sha256), body.steps)
     steps = ", ".join(next(iter(step), "?") for step in body.steps)
     return add_recording(
         database, store, recording, name=body.name or f"{parent.name} ({steps})", kind="derive",
-        key=_derivation_key(parent, body),
-        details={"steps": body.steps, "warnings": [], "known_before": _known_before(recording)},
+        key=_hash_derivation(parent, body),
+        details={"steps": body.steps, "warnings": [], "known_before": _measure_history(recording)},
         parents=[parent.id],
     )  # fmt: skip
 
@@ -140,33 +149,35 @@ def add_recording(
     recording: Recording,
     *,
     name: str,
-    kind: Kind,
+    kind: DatasetKind,
     key: str,
     details: Mapping[str, Any],
     parents: Sequence[str] = (),
     relation: Relation = "derived",
-) -> Stored:
+) -> StoredDataset:
     """Store a recording: its object first, then the row that names it."""
     metadata = {"source": key, "parents": " ".join(parents), "name": name}
-    content = _written(store, recording, metadata)
-    new = described(recording, name=name, kind=kind, key=key, details=details, content=content)
-    with database.write() as session:
+    content = _store_file(store, recording, metadata)
+    new = describe_recording(
+        recording, name=name, kind=kind, key=key, details=details, content=content
+    )
+    with database.write_session() as session:
         return DatasetRepository(session).add(new, parents=parents, relation=relation)
 
 
-def described(
-    recording: Recording, *, name: str, kind: Kind, key: str, details: Mapping[str, Any],
+def describe_recording(
+    recording: Recording, *, name: str, kind: DatasetKind, key: str, details: Mapping[str, Any],
     content: StoredObject,
 ) -> NewDataset:  # fmt: skip
     """What the row of a recording says."""
     return NewDataset(
         name=name, kind=kind, sha256=content.sha256, source_key=key, size_bytes=content.size,
         n_samples=recording.samples, duration=recording.duration,
-        sample_time=_common_period(recording) if recording.sampling.is_regular else None,
-        channels=[_summary(channel) for channel in recording.channels],
+        sample_time=_find_common_period(recording) if recording.sampling.is_regular else None,
+        channels=[_describe_channel(channel) for channel in recording.channels],
         details={
             **details,
-            "warnings": [*details["warnings"], *unknown_units(recording.channels)],
+            "warnings": [*details["warnings"], *list_unknown_unit_warnings(recording.channels)],
             "segments": [
                 {"start": s.start, "stop": s.stop, "origin": s.origin, "labels": dict(s.labels)}
                 for s in recording.segments
@@ -175,7 +186,7 @@ def described(
     )  # fmt: skip
 
 
-def told(row: Dataset) -> DatasetOut:
+def to_out(row: Dataset) -> DatasetOut:
     """A dataset as it is told."""
     details = dict(row.details)
     return DatasetOut.from_source(
@@ -187,9 +198,9 @@ def told(row: Dataset) -> DatasetOut:
     )
 
 
-def told_again(stored: Stored, name: str | None) -> DatasetOut:
+def to_stored_out(stored: StoredDataset, name: str | None) -> DatasetOut:
     """A dataset that was just sent; warned of if it is there already under another name."""
-    answer, row = told(stored.dataset), stored.dataset
+    answer, row = to_out(stored.dataset), stored.dataset
     if stored.is_new:
         return answer
     if name in (None, row.name):
@@ -198,33 +209,37 @@ def told_again(stored: Stored, name: str | None) -> DatasetOut:
     return answer.model_copy(update={"warnings": [*answer.warnings, warning]})
 
 
-def _known_before(recording: Recording) -> float:
+def _measure_history(recording: Recording) -> float:
     """For how long (s) before the start something is known."""
-    return recording.start - min(float(one.whole.times[0]) for one in recording.channels)
-
-
-def page(session: Session, cursor: str | None, limit: int) -> Page[DatasetOut]:
-    """Datasets, latest first."""
-    found = DatasetRepository(session).page(cursor=cursor, limit=limit)
-    return Page(items=[told(row) for row in found.items], next=found.next)
-
-
-def signals(session: Session, store: ObjectStore, dataset_id: str, max_points: int) -> SignalsOut:
-    """Channels of a dataset, reduced so that extremes stay visible."""
-    row = DatasetRepository(session).get(dataset_id)
-    channels = recording_of(store, row.sha256).channels
-    before = [Channel(c.name, *c.history, c.unit) for c in channels if c.history is not None]
-    return SignalsOut(
-        id=row.id,
-        channels=[series(channel, max_points) for channel in channels],
-        history=[series(channel, max_points) for channel in before],
+    return recording.start - min(
+        float(one.history_and_samples.times[0]) for one in recording.channels
     )
 
 
-def series(channel: Channel, max_points: int) -> Series:
+def list_datasets(session: Session, cursor: str | None, limit: int) -> Page[DatasetOut]:
+    """Datasets, latest first."""
+    found = DatasetRepository(session).list_page(cursor=cursor, limit=limit)
+    return Page(items=[to_out(row) for row in found.items], next=found.next)
+
+
+def read_signals(
+    session: Session, store: ObjectStore, dataset_id: str, max_points: int
+) -> SignalsOut:
+    """Channels of a dataset, reduced so that extremes stay visible."""
+    row = DatasetRepository(session).get(dataset_id)
+    channels = load_recording(store, row.sha256).channels
+    before = [Channel(c.name, *c.history, c.unit) for c in channels if c.history is not None]
+    return SignalsOut(
+        id=row.id,
+        channels=[to_series(channel, max_points) for channel in channels],
+        history=[to_series(channel, max_points) for channel in before],
+    )
+
+
+def to_series(channel: Channel, max_points: int) -> SeriesOut:
     """A channel as one line of a plot."""
     times, values = decimate(channel.times, channel.values, max_points)
-    return Series(
+    return SeriesOut(
         name=channel.name,
         unit=channel.unit,
         times=times.tolist(),
@@ -233,12 +248,12 @@ def series(channel: Channel, max_points: int) -> Series:
     )
 
 
-def key_of(source: Mapping[str, Any]) -> str:
+def hash_source(source: Mapping[str, Any]) -> str:
     """Hash of what a dataset is made from."""
     return hashlib.sha256(json.dumps(source, sort_keys=True).encode()).hexdigest()
 
 
-def check_size(size: int, settings: Settings) -> None:
+def check_upload_size(size: int, settings: Settings) -> None:
     """Refuse a body that is larger than the limit.
 
     Raises
@@ -252,18 +267,20 @@ def check_size(size: int, settings: Settings) -> None:
         )
 
 
-def _derivation_key(parent: Dataset, body: DeriveIn) -> str:
-    return key_of({"parent": parent.id, "steps": body.steps})
+def _hash_derivation(parent: Dataset, body: DeriveIn) -> str:
+    return hash_source({"parent": parent.id, "steps": body.steps})
 
 
-def _written(store: ObjectStore, recording: Recording, metadata: Mapping[str, str]) -> StoredObject:
-    with tempfile.TemporaryDirectory(prefix=temporary.prefix()) as folder:
+def _store_file(
+    store: ObjectStore, recording: Recording, metadata: Mapping[str, str]
+) -> StoredObject:
+    with tempfile.TemporaryDirectory(prefix=temporary.make_temporary_prefix()) as folder:
         path = Path(folder) / "recording.mcap"
         write_recording(recording, path, metadata=metadata)
         return store.put_file(path)
 
 
-def _summary(channel: Channel) -> dict[str, Any]:
+def _describe_channel(channel: Channel) -> dict[str, Any]:
     sampling, history = channel.sampling, channel.history
     return {
         "name": channel.name, "unit": channel.unit, "hold": channel.hold,
@@ -276,7 +293,7 @@ def _summary(channel: Channel) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _common_period(recording: Recording) -> float | None:
+def _find_common_period(recording: Recording) -> float | None:
     periods = [channel.sampling for channel in recording.channels]
     if not all(one.is_regular for one in periods):
         return None

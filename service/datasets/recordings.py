@@ -10,11 +10,11 @@ from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
 from sysid.data.records import Record, Recording
 
-KEPT = 4
-LARGEST_KEPT = 2_000_000  # samples over all channels: 32 MB
+CACHE_SIZE = 4
+MAX_CACHED_SAMPLES = 2_000_000  # samples over all channels: 32 MB
 
 
-class _Kept:
+class _RecordingCache:
     """The recordings read last, by hash: an object never changes."""
 
     def __init__(self) -> None:
@@ -28,18 +28,18 @@ class _Kept:
             return self._found.get(sha256)
 
     def put(self, sha256: str, recording: Recording) -> None:
-        if sum(channel.known_samples for channel in recording.channels) > LARGEST_KEPT:
+        if sum(channel.total_samples for channel in recording.channels) > MAX_CACHED_SAMPLES:
             return
         with self._lock:
             self._found[sha256] = recording
-            while len(self._found) > KEPT:
+            while len(self._found) > CACHE_SIZE:
                 self._found.popitem(last=False)
 
 
-_kept = _Kept()
+_recording_cache = _RecordingCache()
 
 
-def recording_of(store: ObjectStore, sha256: str) -> Recording:
+def load_recording(store: ObjectStore, sha256: str) -> Recording:
     """The recording that an object holds.
 
     Raises
@@ -47,10 +47,10 @@ def recording_of(store: ObjectStore, sha256: str) -> Recording:
     ObjectMissing
         If the store has lost it.
     """
-    found = _kept.get(sha256)
+    found = _recording_cache.get(sha256)
     if found is None:
-        found = read_recording(store.get(sha256))
-        _kept.put(sha256, found)
+        found = read_recording(store.get_bytes(sha256))
+        _recording_cache.put(sha256, found)
     return found
 
 
@@ -69,5 +69,5 @@ def read_records(
     return tuple(
         record
         for row in rows
-        for record in channels.cut_records(recording_of(store, row.sha256), row.name)
+        for record in channels.cut_records(load_recording(store, row.sha256), row.name)
     )

@@ -7,12 +7,12 @@ from sqlalchemy.orm import Session
 
 from service.models.models import load_stored_model
 from service.repositories.datasets import DatasetRepository
-from service.storage.errors import NotFound
+from service.storage.errors import RowNotFound
 
-Body = Mapping[str, Any]
+JobBody = Mapping[str, Any]
 
 
-def unit_of(session: Session, body: Body) -> str:
+def find_rms_unit(session: Session, body: JobBody) -> str:
     """Unit of the RMS: the output's, or standard deviations of several outputs together.
 
     A model that fits any unit says "1"; then the unit is that of the recorded channel.
@@ -23,12 +23,14 @@ def unit_of(session: Session, body: Body) -> str:
     output = model.outputs[0]
     if output.unit != "1":
         return output.unit
-    return _recorded_unit(session, body, body.get("channels", {}).get(output.name, output.name))
+    return _find_recorded_unit(
+        session, body, body.get("channels", {}).get(output.name, output.name)
+    )
 
 
-def _recorded_unit(session: Session, body: Body, channel: str) -> str:
+def _find_recorded_unit(session: Session, body: JobBody, channel: str) -> str:
     try:
         channels = DatasetRepository(session).get(body["datasets"][0]).channels
-    except NotFound:
+    except RowNotFound:
         return "1"
     return next((str(one["unit"]) for one in channels if one["name"] == channel), "1")

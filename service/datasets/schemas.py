@@ -15,7 +15,7 @@ SampleTime = Annotated[float, Field(ge=1e-9, le=1e9)]
 """In s; the longest record then lasts a finite time, and no two of its samples share one."""
 
 
-class Wave(Body):
+class WaveInput(Body):
     """offset + amplitude · cos(omega·t + phase); `omega` in rad/s or `frequency` in Hz."""
 
     kind: Literal["cosine", "sine"]
@@ -26,7 +26,7 @@ class Wave(Body):
     offset: float = 0.0
 
     @model_validator(mode="after")
-    def _one_of_two(self) -> Self:
+    def _check_frequency(self) -> Self:
         if (self.omega is None) == (self.frequency is None):
             raise PydanticCustomError("one_of", "give either 'omega' (rad/s) or 'frequency' (Hz)")
         return self
@@ -67,7 +67,8 @@ class DatasetInput(Body):
 
 
 InputIn = Annotated[
-    Wave | StepInput | BinaryInput | ExpressionInput | DatasetInput, Field(discriminator="kind")
+    WaveInput | StepInput | BinaryInput | ExpressionInput | DatasetInput,
+    Field(discriminator="kind"),
 ]
 
 
@@ -94,7 +95,7 @@ class SimulateIn(Body):
     noise: NoiseIn = NoiseIn()
 
     @model_validator(mode="after")
-    def _one_source(self) -> Self:
+    def _check_source(self) -> Self:
         if (self.model is None) == (self.plant is None):
             raise PydanticCustomError("one_of", "give either 'model' or 'plant'")
         return self
@@ -143,7 +144,7 @@ class DatasetOut(Answer):
     created_at: datetime
 
 
-class Series(Answer):
+class SeriesOut(Answer):
     """One line of a plot: at most as many points as were asked for."""
 
     name: str
@@ -160,11 +161,11 @@ class SignalsOut(Answer):
     """
 
     id: str
-    channels: list[Series]
-    history: list[Series] = Field(default=[])
+    channels: list[SeriesOut]
+    history: list[SeriesOut] = Field(default=[])
 
 
-class Edge(Answer):
+class LineageEdgeOut(Answer):
     """`child` was made from `parent`."""
 
     parent: str
@@ -176,18 +177,18 @@ class LineageOut(Answer):
     """Everything a dataset was made from and everything made from it."""
 
     id: str
-    edges: list[Edge]
+    edges: list[LineageEdgeOut]
 
 
-MAX_SIMULATED = 1_000_000
+MAX_SERIES_SAMPLES = 1_000_000
 
 
 class SeriesInput(Body):
     """Samples given in the request; before the first and after the last they keep their values."""
 
     kind: Literal["series"]
-    times: list[float] = Field(min_length=1, max_length=MAX_SIMULATED)
-    values: list[float] = Field(min_length=1, max_length=MAX_SIMULATED)
+    times: list[float] = Field(min_length=1, max_length=MAX_SERIES_SAMPLES)
+    values: list[float] = Field(min_length=1, max_length=MAX_SERIES_SAMPLES)
     hold: Hold = "first"
 
     @model_validator(mode="after")
@@ -202,6 +203,6 @@ class SeriesInput(Body):
 
 
 RunInputIn = Annotated[
-    Wave | StepInput | BinaryInput | ExpressionInput | DatasetInput | SeriesInput,
+    WaveInput | StepInput | BinaryInput | ExpressionInput | DatasetInput | SeriesInput,
     Field(discriminator="kind"),
 ]

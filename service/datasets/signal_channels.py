@@ -36,8 +36,8 @@ class SignalChannels:
         InvalidRecord
             If a channel is not there, or cannot be that signal.
         """
-        held = recording.held(dict(self.holds))
-        return tuple(held.records(dict(self.inputs), dict(self.outputs), name))
+        held = recording.replace_holds(dict(self.holds))
+        return tuple(held.to_records(dict(self.inputs), dict(self.outputs), name))
 
 
 def map_channels(

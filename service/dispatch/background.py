@@ -16,19 +16,19 @@ STOP_SECONDS = 2.0
 """Longest wait for the step in progress when the dispatcher stops."""
 
 Key = TypeVar("Key", bound=Hashable)
-Steps = Iterator[Document | None]
+DocumentSteps = Iterator[Document | None]
 """The making of a document, step by step: the last thing it gives is the document."""
-Make = Callable[[], Steps]
+DocumentMaker = Callable[[], DocumentSteps]
 
 
 @dataclass(slots=True, eq=False)
-class _Making:
-    steps: Steps
-    made: "Future[Document | None]" = field(default_factory=Future)
+class _BackgroundJob:
+    steps: DocumentSteps
+    future: "Future[Document | None]" = field(default_factory=Future)
     latest: Document | None = None
 
 
-class Aside(Generic[Key]):
+class BackgroundJobs(Generic[Key]):
     """One thread for all jobs: each has a step in turn, so that a short one is not held up.
 
     Compiling a model takes a tenth of a second and simulating a long record more; the workers must
@@ -36,8 +36,8 @@ class Aside(Generic[Key]):
     """
 
     def __init__(self) -> None:
-        self._making: dict[Key, _Making] = {}
-        self._queue: SimpleQueue[_Making | None] = SimpleQueue()
+        self._making: dict[Key, _BackgroundJob] = {}
+        self._queue: SimpleQueue[_BackgroundJob | None] = SimpleQueue()
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -45,31 +45,31 @@ class Aside(Generic[Key]):
         return key in self._making
 
     @property
-    def keys(self) -> tuple[Key, ...]:
+    def pending_keys(self) -> tuple[Key, ...]:
         """Keys whose documents were begun, and neither taken nor dropped."""
         return tuple(self._making)
 
-    def begin(self, key: Key, make: Make) -> None:
+    def start_job(self, key: Key, make: DocumentMaker) -> None:
         """Make a document for that key."""
         if self._thread is None:
-            self._thread = threading.Thread(target=self._work, name="aside", daemon=True)
+            self._thread = threading.Thread(target=self._run_jobs, name="aside", daemon=True)
             self._thread.start()
-        self._making[key] = one = _Making(make())
+        self._making[key] = one = _BackgroundJob(make())
         self._queue.put(one)
 
-    def ended(self) -> tuple[Key, ...]:
+    def list_done(self) -> tuple[Key, ...]:
         """Keys whose documents are there to be taken."""
-        return tuple(key for key, one in self._making.items() if one.made.done())
+        return tuple(key for key, one in self._making.items() if one.future.done())
 
-    def take(self, key: Key) -> Document | None:
+    def take_result(self, key: Key) -> Document | None:
         """The document that was made; whatever its making raised is raised here."""
-        return self._making.pop(key).made.result()
+        return self._making.pop(key).future.result()
 
-    def drop(self, key: Key) -> None:
+    def cancel_job(self, key: Key) -> None:
         """The document is no longer wanted."""
         one = self._making.pop(key, None)
         if one is not None:
-            one.made.cancel()
+            one.future.cancel()
 
     def stop(self) -> None:
         """Make nothing more."""
@@ -78,24 +78,24 @@ class Aside(Generic[Key]):
         if self._thread is not None:
             self._thread.join(STOP_SECONDS)
 
-    def _work(self) -> None:
+    def _run_jobs(self) -> None:
         while (one := self._queue.get()) is not None and not self._ending.is_set():
-            if one.made.cancelled():
+            if one.future.cancelled():
                 continue
             try:
                 one.latest = next(one.steps)
             except StopIteration:
-                _settle(one, None)
+                _set_outcome(one, None)
             except Exception as error:  # noqa: BLE001 - the thread's border: raised where it is taken
-                _settle(one, error)
+                _set_outcome(one, error)
             else:
                 self._queue.put(one)
 
 
-def _settle(one: _Making, error: Exception | None) -> None:
-    if not one.made.set_running_or_notify_cancel():
+def _set_outcome(one: _BackgroundJob, error: Exception | None) -> None:
+    if not one.future.set_running_or_notify_cancel():
         return
     if error is None:
-        one.made.set_result(one.latest)
+        one.future.set_result(one.latest)
     else:
-        one.made.set_exception(error)
+        one.future.set_exception(error)

@@ -19,35 +19,43 @@ from sqlalchemy.orm import Session
 
 from service.core.documents import to_finite
 from service.core.errors import ServiceError
-from service.core.json_pointer import body_of
-from service.dispatch.background import Make
+from service.core.json_pointer import build_run_body
+from service.dispatch.background import DocumentMaker
 from service.dispatch.job_runs import JobRuns
 from service.queue.leases import Claim
 from service.repositories.datasets import DatasetRepository
-from service.repositories.summaries import Group, GroupKey, groups, quietest_run
+from service.repositories.summaries import GroupKey, RunGroup, find_quietest_run, read_groups
 from service.storage.columns import Document
 from service.storage.errors import StorageError
-from service.storage.retry import patiently
+from service.storage.retry import retry_transient
 from service.storage.sessions import Database
 from service.storage.tables import Job, Run
-from service.sweeps.true_parameters import truth_of
+from service.sweeps.true_parameters import find_true_parameters
 from sysid.core.errors import SysidError
-from sysid.core.threads import one_thread
+from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
 from sysid.data.noise import Noise
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.cramer_rao import Floor, floor
+from sysid.uncertainty.cramer_rao import CramerRaoBound, cramer_rao_bound
 from workers.errors import RecordsUnavailable
-from workers.ports import ProblemSpec
-from workers.tasks import prepared
+from workers.protocol import ProblemSpec
+from workers.tasks import prepare_run_records
 
 _log = logging.getLogger(__name__)
 
 # Fields of a run that do not change what its parameters are measured by.
-SETTINGS = ("/noise", "/seed", "/algorithm", "/loss", "/weights", "/prediction", "/warm_start")
+IRRELEVANT_FIELDS = (
+    "/noise",
+    "/seed",
+    "/algorithm",
+    "/loss",
+    "/weights",
+    "/prediction",
+    "/warm_start",
+)
 MOST_PROBLEMS = 64
-LEFT_OUT = (
+LEFT_OUT_NOTE = (
     f"the sweep poses more than {MOST_PROBLEMS} problems: the first {MOST_PROBLEMS} have floors "
     "and values to tell errors from, the others none"
 )
@@ -55,7 +63,7 @@ MOST_WORK = 10_000_000
 """Samples to simulate for the floors of one job: below a second in most models."""
 
 
-def floors_for(database: Database, claim: Claim, source: JobRuns) -> Make | None:
+def build_bounds_maker(database: Database, claim: Claim, source: JobRuns) -> DocumentMaker | None:
     """Makes the document of a job's floors, a problem a step; None for a job without noise.
 
     All runs of the job must be over, and their results written. The document has ``axes``, the
@@ -73,46 +81,46 @@ def floors_for(database: Database, claim: Claim, source: JobRuns) -> Make | None
     axes = spec["sweep"]["axes"]
     if not spec["noise"]["sigma"] and not any(axis["path"].startswith("/noise") for axis in axes):
         return None
-    return _Floors(database, claim.job, source).steps
+    return _BoundsMaker(database, claim.job, source).iterate_steps
 
 
-class _Floors:
+class _BoundsMaker:
     """Collects the floors of one job; `left` is the work that may still be done."""
 
     def __init__(self, database: Database, job: Job, source: JobRuns) -> None:
         self._database, self._job, self._source = database, job, source
         self._left = MOST_WORK
 
-    def steps(self) -> Iterator[Document | None]:
+    def iterate_steps(self) -> Iterator[Document | None]:
         """Nothing after each problem, and then the document."""
         axes = [
             axis["path"] for axis in self._job.spec["sweep"]["axes"]
-            if not axis["path"].startswith(SETTINGS)
+            if not axis["path"].startswith(IRRELEVANT_FIELDS)
         ]  # fmt: skip
-        found = patiently(partial(self._groups, axes))
+        found = retry_transient(partial(self._group_runs, axes))
         cells = [dict(zip(axes, one.key, strict=True)) for one in found[:MOST_PROBLEMS]]
         problems = []
         for cell in cells:
-            problems.append(self._problem(cell))
+            problems.append(self._describe_problem(cell))
             yield None
         left_out = len(found) > MOST_PROBLEMS
-        yield {"axes": axes, "problems": problems, "note": LEFT_OUT if left_out else ""}
+        yield {"axes": axes, "problems": problems, "note": LEFT_OUT_NOTE if left_out else ""}
 
-    def _groups(self, axes: list[str]) -> list[Group]:
+    def _group_runs(self, axes: list[str]) -> list[RunGroup]:
         keys = [GroupKey("axis", path) for path in axes]
-        with self._database.read() as session:
-            return groups(session, self._job.id, keys, [], MOST_PROBLEMS, self._job.project_id)
+        with self._database.read_session() as session:
+            return read_groups(session, self._job.id, keys, [], MOST_PROBLEMS, self._job.project_id)
 
-    def _problem(self, cell: Mapping[str, Any]) -> Document:
+    def _describe_problem(self, cell: Mapping[str, Any]) -> Document:
         entry: Document = {
             "cell": dict(cell), "reference": None, "stderr": {}, "rms": None, "note": "",
         }  # fmt: skip
         try:
-            entry["reference"] = patiently(partial(self._reference, cell))
+            entry["reference"] = retry_transient(partial(self._read_reference, cell))
             if entry["reference"] is None:
                 return {**entry, "note": "no run succeeded whose values errors could be told from"}
-            spec = self._source.specification(cell).problem
-            return {**entry, **self._floor(spec, entry["reference"]["values"])}
+            spec = self._source.build_specification(cell).problem
+            return {**entry, **self._compute_bounds(spec, entry["reference"]["values"])}
         except (SysidError, ServiceError, StorageError, RecordsUnavailable) as error:
             _log.warning("%s: no floor: %s", self._job.id, error)
             return {**entry, "note": f"there is no floor: {error}"}
@@ -120,57 +128,57 @@ class _Floors:
             _log.exception("%s: no floor", self._job.id)
             return {**entry, "note": f"there is no floor: internal error: {type(error).__name__}"}
 
-    def _reference(self, cell: Mapping[str, Any]) -> Document | None:
-        with self._database.read() as session:
-            return self._reference_in(session, cell)
+    def _read_reference(self, cell: Mapping[str, Any]) -> Document | None:
+        with self._database.read_session() as session:
+            return self._find_reference(session, cell)
 
-    def _reference_in(self, session: Session, cell: Mapping[str, Any]) -> Document | None:
-        body = body_of(self._job.spec, cell)
+    def _find_reference(self, session: Session, cell: Mapping[str, Any]) -> Document | None:
+        body = build_run_body(self._job.spec, cell)
         rows = DatasetRepository(session, self._job.project_id).get_all(body["datasets"])
-        true = truth_of(session, body["model"], rows)
+        true = find_true_parameters(session, body["model"], rows)
         if true is not None:
             return {"kind": "truth", "run": None, "sigma": None, "values": true}
-        run: Run | None = quietest_run(session, self._job.id, cell, self._job.project_id)
+        run: Run | None = find_quietest_run(session, self._job.id, cell, self._job.project_id)
         if run is None:
             return None
         values = {name: one["value"] for name, one in (run.estimates or {}).items()}
         return {"kind": "estimate", "run": run.id, "sigma": run.sigma, "values": values}
 
-    def _floor(self, spec: ProblemSpec, values: Mapping[str, float]) -> Document:
+    def _compute_bounds(self, spec: ProblemSpec, values: Mapping[str, float]) -> Document:
         model = parse_model(spec.model)
         if model.rule is not None:
             return {"note": "there is no floor: the model selects its terms by the data"}
-        records = {key: self._source.records(key) for key in spec.needs}
+        records = {key: self._source.load_records(key) for key in spec.record_keys}
         problem = Problem.build(
             model,
-            prepared(replace(spec, noise=Noise()), records).estimation,
-            parameters=dict(_widened(spec, values)),
+            prepare_run_records(replace(spec, noise=Noise()), records).estimation,
+            parameters=dict(_widen_bounds(spec, values)),
             skip=spec.settings.skip,
             weights={output.name: 1.0 for output in model.outputs},
         )
         unknown = [name for name in problem.free_names if name not in values]
         if unknown:
             return {"note": f"there is no floor: no value of {', '.join(unknown)} is known"}
-        work = problem.n_scored * (2 * len(problem.space) + 1)
+        work = problem.n_scored * (2 * len(problem.free_parameters) + 1)
         if work > self._left:
             return {"note": "there is no floor: the records are too long to compute it here"}
         self._left -= work
         theta: FloatArray = np.array([values[name] for name in problem.free_names])
-        with one_thread():
-            return _told(floor(problem, theta))
+        with use_one_thread():
+            return _to_bounds_document(cramer_rao_bound(problem, theta))
 
 
-def _told(found: Floor) -> Document:
+def _to_bounds_document(found: CramerRaoBound) -> Document:
     stderr = {
         name: to_finite(value)
         for name, value in zip(found.names, found.stderr.tolist(), strict=True)
     }
     untold = [name for name, value in stderr.items() if value is None]
     note = f"the data tell nothing of {', '.join(untold)} alone: no floor" if untold else ""
-    return {"stderr": stderr, "rms": to_finite(found.response), "note": note}
+    return {"stderr": stderr, "rms": to_finite(found.response_rms), "note": note}
 
 
-def _widened(
+def _widen_bounds(
     spec: ProblemSpec, values: Mapping[str, float]
 ) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """The changes of the parameters, with bounds between which the known values lie."""

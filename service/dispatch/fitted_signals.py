@@ -6,23 +6,23 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 from weakref import WeakSet
 
-from service.formats.mcap import FitRole, FittedOutput, write_fit
+from service.formats.mcap import FitRole, FittedOutput, write_fitted_outputs
 from service.storage.errors import ObjectStoreFailed
 from service.storage.objects import ObjectStore
 from sysid.core.types import FloatArray
 from sysid.data.records import Record
-from workers.ports import Records
+from workers.protocol import Records
 
-PARCEL_BYTES = 4 << 20
+UPLOAD_BYTES = 4 << 20
 """Bytes that are kept in memory until they are stored with those of other runs."""
-PATIENCE_SECONDS = 15.0
+RETRY_SECONDS = 15.0
 """How long a store that takes nothing, such as a full disk, is waited for."""
-PAUSE_SECONDS = 0.3
-_lost: "WeakSet[ObjectStore]" = WeakSet()
+RETRY_PAUSE_SECONDS = 0.3
+_unavailable_stores: "WeakSet[ObjectStore]" = WeakSet()
 """Stores that have not come back in time."""
 
 
-class Place(NamedTuple):
+class SignalsLocation(NamedTuple):
     """Where a run's file is stored; `start` is None where it is the whole object."""
 
     sha256: str
@@ -34,7 +34,7 @@ FittedPart = tuple[FitRole, Records, tuple[tuple[FloatArray, ...], ...]]
 """What the records are for, the records, and the simulated outputs of each."""
 
 
-class _PatientStore:
+class _RetryingStore:
     """Puts objects into a store that may be full or away for a while.
 
     A store that has not come back in time is not waited for again until it has taken something,
@@ -50,19 +50,19 @@ class _PatientStore:
             try:
                 sha256 = self._store.put_stream(blocks).sha256
             except ObjectStoreFailed:
-                if self._store in _lost or time.monotonic() - begun > PATIENCE_SECONDS:
-                    _lost.add(self._store)
+                if self._store in _unavailable_stores or time.monotonic() - begun > RETRY_SECONDS:
+                    _unavailable_stores.add(self._store)
                     raise
-                time.sleep(PAUSE_SECONDS)
+                time.sleep(RETRY_PAUSE_SECONDS)
             else:
-                _lost.discard(self._store)
+                _unavailable_stores.discard(self._store)
                 return sha256
 
 
-class _Parcel:
+class _Upload:
     """Files behind one another, which become one object. What made that fail is told to all."""
 
-    def __init__(self, store: _PatientStore) -> None:
+    def __init__(self, store: _RetryingStore) -> None:
         self._store = store
         self._files: list[bytes] = []
         self._sha256: str | None = None
@@ -74,14 +74,14 @@ class _Parcel:
         """Whether another file would come too late."""
         return self._sha256 is not None or self._failed is not None
 
-    def add(self, file: bytes) -> int:
+    def add_file(self, file: bytes) -> int:
         start = self.size
         self._files.append(file)
         self._n_files += 1
         self.size += len(file)
         return start
 
-    def stored(self) -> str:
+    def store_files(self) -> str:
         if self._failed is not None:
             raise self._failed
         if self._sha256 is None:
@@ -94,19 +94,21 @@ class _Parcel:
                 self._files = []
         return self._sha256
 
-    def place(self, start: int, size: int) -> Place:
-        sha256 = self.stored()
-        return Place(sha256, start, size) if self._n_files > 1 else Place(sha256)
+    def locate_file(self, start: int, size: int) -> SignalsLocation:
+        sha256 = self.store_files()
+        return (
+            SignalsLocation(sha256, start, size) if self._n_files > 1 else SignalsLocation(sha256)
+        )
 
 
-class Shelved(NamedTuple):
+class StoredSignals(NamedTuple):
     """A run's file that waits to be stored."""
 
-    parcel: _Parcel
+    upload: _Upload
     start: int
     size: int
 
-    def place(self) -> Place:
+    def store_file(self) -> SignalsLocation:
         """Store it, with the others of its parcel.
 
         Raises
@@ -114,17 +116,17 @@ class Shelved(NamedTuple):
         ObjectStoreFailed
             If it cannot be written, now or before.
         """
-        return self.parcel.place(self.start, self.size)
+        return self.upload.locate_file(self.start, self.size)
 
 
-class Shelf:
+class SignalsBatch:
     """Collects the files of runs: an object of each would cost more than the file itself."""
 
     def __init__(self, store: ObjectStore) -> None:
-        self._store = _PatientStore(store)
-        self._parcel = _Parcel(self._store)
+        self._store = _RetryingStore(store)
+        self._parcel = _Upload(self._store)
 
-    def add(self, file: bytes) -> Shelved:
+    def add_file(self, file: bytes) -> StoredSignals:
         """Put a file to those that are stored next; a full parcel is stored at once.
 
         Raises
@@ -134,18 +136,18 @@ class Shelf:
         """
         parcel = self._parcel
         if parcel.is_closed:
-            parcel = self._parcel = _Parcel(self._store)
-        start = parcel.add(file)
-        if parcel.size >= PARCEL_BYTES:
-            parcel.stored()
-        return Shelved(parcel, start, len(file))
+            parcel = self._parcel = _Upload(self._store)
+        start = parcel.add_file(file)
+        if parcel.size >= UPLOAD_BYTES:
+            parcel.store_files()
+        return StoredSignals(parcel, start, len(file))
 
 
-def save_fit(
-    shelf: Shelf,
+def add_fitted_signals(
+    shelf: SignalsBatch,
     run: str,
     parts: Sequence[FittedPart],
-) -> Shelved:
+) -> StoredSignals:
     """What a run's model gives beside what was measured, as a file on the shelf.
 
     Parameters
@@ -154,12 +156,16 @@ def save_fit(
         `role` is ``estimation`` or ``validation``.
     """
     target = io.BytesIO()
-    fits = [fit for role, records, simulated in parts for fit in _fits(role, records, simulated)]
-    write_fit(run, fits, target)
-    return shelf.add(target.getvalue())
+    fits = [
+        fit
+        for role, records, simulated in parts
+        for fit in _list_fitted_outputs(role, records, simulated)
+    ]
+    write_fitted_outputs(run, fits, target)
+    return shelf.add_file(target.getvalue())
 
 
-def _fits(
+def _list_fitted_outputs(
     role: FitRole, records: Sequence[Record], simulated: tuple[tuple[FloatArray, ...], ...]
 ) -> Iterator[FittedOutput]:
     for number, (record, outputs) in enumerate(zip(records, simulated, strict=True), 1):

@@ -15,22 +15,22 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.core.processes import describe_process
 from service.queue.admission import Admission
 from service.queue.clocks import Clock
-from service.queue.dispatchers import LEASE_SECONDS, DispatcherRepository
-from service.queue.leases import Claim, Lease, Queue
-from service.queue.notifications import Signals, look
-from service.queue.orphaned_jobs import reap
+from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
+from service.queue.leases import Claim, Lease, LeaseQueue
+from service.queue.notifications import QueueStatus, read_queue_status
+from service.queue.orphaned_jobs import reap_jobs
 from service.storage.columns import Document
 from service.storage.errors import LeaseLost
-from service.storage.retry import patiently
+from service.storage.retry import retry_transient
 from service.storage.sessions import Database
 
 _log = logging.getLogger(__name__)
 
-AGAIN_SECONDS = 0.5
+RETRY_SECONDS = 0.5
 """After a heartbeat that could not be written, until the next."""
 
 
-class Leases:
+class HeldLeases:
     """The jobs this dispatcher may write for.
 
     A thread renews all leases with one statement, three times within their length, and reaps the
@@ -63,42 +63,42 @@ class Leases:
         self._is_cut_off = False  # the last heartbeat did not reach the database
         self._lock = threading.Lock()
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
+        self._thread = threading.Thread(target=self._run_heartbeat, name="heartbeat", daemon=True)
 
-    def start(self, details: dict[str, object]) -> None:
+    def start_heartbeat(self, details: dict[str, object]) -> None:
         """Announce the dispatcher and begin to beat."""
-        told = {LEASE_SECONDS: self._length.total_seconds(), **describe_process(), **details}
-        patiently(partial(self._announce, told))
+        told = {LEASE_SECONDS_KEY: self._length.total_seconds(), **describe_process(), **details}
+        retry_transient(partial(self._announce_dispatcher, told))
         self._thread.start()
 
-    def _announce(self, details: Document) -> None:
-        with self._database.write() as session:
-            DispatcherRepository(session, self._clock).announce(self.owner, details)
-        reap(self._database, self._clock)
+    def _announce_dispatcher(self, details: Document) -> None:
+        with self._database.write_session() as session:
+            DispatcherRepository(session, self._clock).add_dispatcher(self.owner, details)
+        reap_jobs(self._database, self._clock)
 
-    def claim(self, admission: Admission | None = None) -> Claim | None:
+    def claim_job(self, admission: Admission | None = None) -> Claim | None:
         """Take the next job that `admission` lets in, if one waits."""
         begun = self._stopwatch()
         claim, had_asked = None, self._has_asked
         self._has_asked = True  # a claim whose answer is lost may have been made
-        with self._database.write() as session:
-            queue = Queue(session, self._clock)
+        with self._database.write_session() as session:
+            queue = LeaseQueue(session, self._clock)
             if had_asked:
-                claim = queue.regain(self.owner, self._jobs())
+                claim = queue.recover_claim(self.owner, self._list_held_jobs())
             if claim is None:
-                claim = queue.claim(self.owner, self._length, admission)
+                claim = queue.claim_job(self.owner, self._length, admission)
         self._has_asked = False
         if claim is not None:
             with self._lock:
                 self._held[claim.lease] = begun
         return claim
 
-    def look(self, admission: Admission | None = None) -> Signals:
+    def check_queue(self, admission: Admission | None = None) -> QueueStatus:
         """Whether a job waits that `admission` lets in, and which of ours are to be cancelled."""
-        with self._database.read() as session:
-            return look(session, self.owner, admission)
+        with self._database.read_session() as session:
+            return read_queue_status(session, self.owner, admission)
 
-    def _jobs(self) -> list[str]:
+    def _list_held_jobs(self) -> list[str]:
         with self._lock:
             return [lease.job_id for lease in self._held]
 
@@ -107,13 +107,13 @@ class Leases:
         with self._lock:
             return lease not in self._held
 
-    def is_sure(self, lease: Lease) -> bool:
+    def is_held(self, lease: Lease) -> bool:
         """Whether the lease is ours: it was renewed within its length."""
         with self._lock:
             renewed = self._held.get(lease)
         return renewed is not None and self._stopwatch() - renewed <= self._length.total_seconds()
 
-    def forget(self, lease: Lease) -> None:
+    def forget_lease(self, lease: Lease) -> None:
         """The job has ended, or was dropped: renew its lease no longer."""
         with self._lock:
             self._held.pop(lease, None)
@@ -128,37 +128,41 @@ class Leases:
         """
         with self._lock:
             held = tuple(self._held)
-        worked = lost and patiently(self._worked)
+        worked = lost and retry_transient(self._has_worked)
         for lease in held:
             try:
-                patiently(partial(self._release, lease, lost=lost, beside_others=worked))
+                retry_transient(
+                    partial(self._release_lease, lease, lost=lost, beside_others=worked)
+                )
             except LeaseLost:
                 _log.info("%s was no longer ours", lease.job_id)
-            self.forget(lease)
+            self.forget_lease(lease)
 
-    def _release(self, lease: Lease, *, lost: bool, beside_others: bool) -> None:
-        with self._database.write() as session:
-            Queue(session, self._clock).release(lease, lost=lost, beside_others=beside_others)
+    def _release_lease(self, lease: Lease, *, lost: bool, beside_others: bool) -> None:
+        with self._database.write_session() as session:
+            LeaseQueue(session, self._clock).release_job(
+                lease, lost=lost, beside_others=beside_others
+            )
 
-    def _worked(self) -> bool:
-        with self._database.read() as session:
-            return Queue(session, self._clock).worked(self.owner)
+    def _has_worked(self) -> bool:
+        with self._database.read_session() as session:
+            return LeaseQueue(session, self._clock).has_progressed(self.owner)
 
-    def stop(self) -> None:
+    def stop_heartbeat(self) -> None:
         """Stop beating and take leave."""
         self._ending.set()
         self._thread.join(5.0)
-        with self._database.write() as session:
-            DispatcherRepository(session).leave(self.owner)
+        with self._database.write_session() as session:
+            DispatcherRepository(session).remove_dispatcher(self.owner)
 
-    def renew(self) -> None:
+    def renew_leases(self) -> None:
         """One heartbeat: renew what is held, and reap what has expired."""
         begun = self._stopwatch()
         with self._lock:
             before = tuple(self._held)
-        with self._database.write(self._third) as session:
-            DispatcherRepository(session, self._clock).beat(self.owner)
-            held = Queue(session, self._clock).heartbeat(before, self._length)
+        with self._database.write_session(self._heartbeat_seconds) as session:
+            DispatcherRepository(session, self._clock).record_heartbeat(self.owner)
+            held = LeaseQueue(session, self._clock).renew_leases(before, self._length)
         renewed = {one.lease for one in held}
         with self._lock:
             for lease in before:
@@ -166,20 +170,20 @@ class Leases:
                     self._held.pop(lease, None)
                 elif lease in self._held:
                     self._held[lease] = begun
-        reap(self._database, self._clock, busy_seconds=self._third)
+        reap_jobs(self._database, self._clock, busy_seconds=self._heartbeat_seconds)
 
     @property
-    def _third(self) -> float:
+    def _heartbeat_seconds(self) -> float:
         return self._length.total_seconds() / 3
 
-    def _beat(self) -> None:
-        third = self._third
+    def _run_heartbeat(self) -> None:
+        third = self._heartbeat_seconds
         pause = third
         while not self._ending.wait(pause):
             try:
-                self.renew()
+                self.renew_leases()
                 pause, self._is_cut_off = third, False
             except SQLAlchemyError as error:  # it may come back before the leases end
                 if not self._is_cut_off:
                     _log.warning("no heartbeat could be written: %s", str(error).splitlines()[0])
-                pause, self._is_cut_off = min(third, AGAIN_SECONDS), True
+                pause, self._is_cut_off = min(third, RETRY_SECONDS), True

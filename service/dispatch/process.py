@@ -15,11 +15,11 @@ from workers.local_ray import LocalRay
 _log = logging.getLogger("lagid.dispatcher")
 
 
-def run(settings: Settings) -> int:
+def run_process(settings: Settings) -> int:
     """Run a dispatcher until it is told to stop; gives the exit code."""
     local = None
     if settings.ray_address is None:
-        reading = threading.Thread(target=_read, name="reading")
+        reading = threading.Thread(target=_import_dispatcher, name="reading")
         try:
             local = LocalRay(settings.cpus, meanwhile=reading.start)
         except ClusterUnavailable as error:
@@ -27,18 +27,18 @@ def run(settings: Settings) -> int:
             _log.error("%s", error)
             return 1
         reading.join()
-    from service.dispatch.dispatcher import run_to_the_end
+    from service.dispatch.dispatcher import run_dispatcher
 
-    return run_to_the_end(settings, local)
+    return run_dispatcher(settings, local)
 
 
-def _read() -> None:
+def _import_dispatcher() -> None:
     """Import the dispatcher and load the loops; what fails here, fails again for whoever waits."""
     import service.dispatch.dispatcher  # noqa: F401
-    from workers.warming import warm
+    from workers.warmup import warm_up_worker
 
-    warm()
+    warm_up_worker()
 
 
 if __name__ == "__main__":
-    sys.exit(run(Settings()))
+    sys.exit(run_process(Settings()))

@@ -4,21 +4,21 @@ import math
 from collections.abc import Iterator, Mapping
 
 from service.core.documents import to_finite
+from service.core.states import JobState
 from service.queue.run_writes import RunOutcome
 from service.repositories.history import HistoryPoint, MigrantPoint
-from service.runs.result import result_document
-from service.storage.tables import State
+from service.runs.result import to_result_document
 from sysid.search.state import Improvement, Migrant
-from workers.ports import Concluded
+from workers.protocol import RunConclusion
 
 
-def outcome_of(run: str, concluded: Concluded, seconds: float) -> RunOutcome:
+def to_run_outcome(run: str, concluded: RunConclusion, seconds: float) -> RunOutcome:
     """The row of a run that succeeded, its signals left out."""
     found, without = concluded.identification, to_finite(concluded.rms_noise_free)
     return RunOutcome(
         run_id=run,
-        state=State.SUCCEEDED,
-        result={**result_document(found, seconds), "rms_noise_free": without},
+        state=JobState.SUCCEEDED,
+        result={**to_result_document(found, seconds), "rms_noise_free": without},
         valid=found.valid,
         best_rms=to_finite(found.rms),
         rms_noise_free=without,
@@ -30,7 +30,7 @@ def outcome_of(run: str, concluded: Concluded, seconds: float) -> RunOutcome:
     )
 
 
-def history_points(
+def to_history_points(
     run: str, history: tuple[tuple[Improvement, ...], ...], written: Mapping[int, int]
 ) -> Iterator[HistoryPoint]:
     """Improvements beyond the first `written` of each island."""
@@ -44,7 +44,9 @@ def history_points(
                 )  # fmt: skip
 
 
-def migrant_points(run: str, migrants: tuple[Migrant, ...], written: int) -> Iterator[MigrantPoint]:
+def to_migrant_points(
+    run: str, migrants: tuple[Migrant, ...], written: int
+) -> Iterator[MigrantPoint]:
     """Migrants beyond the first `written`."""
     for number, one in enumerate(migrants[written:], start=written):
         if math.isfinite(one.fitness):

@@ -26,14 +26,14 @@ STEADY_SECONDS = 60.0
 """A child that lived so long is restarted after the first pause again."""
 LIVED_SECONDS = 5.0
 """So is one that was killed, or lost its workers, after so long: it did not fail to start."""
-AGAIN = 75
+RESTART_EXIT_CODE = 75
 """Exit code of a child that should be started again at once (EX_TEMPFAIL of sysexits)."""
 STOP_SECONDS = 2.0
-LOOK_SECONDS = 1.0
+POLL_SECONDS = 1.0
 STOPPED_SECONDS = 12.0
 """A child that was stopped (SIGSTOP) past its lease is killed: it may hold SQLite's write lock."""
 
-SUPERVISED = "LAGID_SUPERVISED"
+SUPERVISED_VARIABLE = "LAGID_SUPERVISED"
 """Set for the child: it ends when its standard input does, that is, when this process dies."""
 
 
@@ -65,9 +65,9 @@ class Supervisor:
         """
         with self._one_stop:
             if not self._stopping.is_set():
-                self._stop()
+                self._stop_child()
 
-    def _stop(self) -> None:
+    def _stop_child(self) -> None:
         with self._lock:
             self._stopping.set()
             child = self._child
@@ -79,7 +79,7 @@ class Supervisor:
             child.wait(STOP_SECONDS)
         child.kill()
         child.wait()
-        clear_family(child.pid)
+        clear_session(child.pid)
         self._thread.join()
 
     @property
@@ -92,24 +92,24 @@ class Supervisor:
         pause = FIRST_PAUSE_SECONDS
         while not self._stopping.is_set():
             begun = time.monotonic()
-            child = self._spawn()
+            child = self._spawn_child()
             if child is None:
                 return
-            code = _end_of(child)
-            clear_family(child.pid)
+            code = _wait_for_end(child)
+            clear_session(child.pid)
             assert child.stdin is not None
             child.stdin.close()
             if self._stopping.is_set():
                 return
             lived = time.monotonic() - begun
             was_well = lived > STEADY_SECONDS or (
-                lived > LIVED_SECONDS and (code < 0 or code == AGAIN)
+                lived > LIVED_SECONDS and (code < 0 or code == RESTART_EXIT_CODE)
             )
             pause = FIRST_PAUSE_SECONDS if was_well else min(2 * pause, LONGEST_PAUSE_SECONDS)
             _log.warning("the dispatcher ended with %d; a new one in %.1f s", code, pause)
             self._stopping.wait(pause)
 
-    def _spawn(self) -> "subprocess.Popen[bytes] | None":
+    def _spawn_child(self) -> "subprocess.Popen[bytes] | None":
         with self._lock, contextlib.ExitStack() as stack:
             if self._stopping.is_set():
                 return None
@@ -119,7 +119,7 @@ class Supervisor:
                 sink = stack.enter_context(self._log_path.open("ab"))
             self._child = subprocess.Popen(
                 self._command,
-                env={**os.environ, **self._environment, SUPERVISED: "1"},
+                env={**os.environ, **self._environment, SUPERVISED_VARIABLE: "1"},
                 stdin=subprocess.PIPE,  # never written to: its end tells the child of our death
                 stdout=sink,
                 stderr=sink,
@@ -129,11 +129,11 @@ class Supervisor:
 
 
 @contextmanager
-def supervised_dispatcher(settings: Settings) -> Iterator[Supervisor]:
+def supervise_dispatcher(settings: Settings) -> Iterator[Supervisor]:
     """Keep a dispatcher with these settings running for the length of the block."""
     supervisor = Supervisor(
         [sys.executable, "-m", "service.dispatch.process"],
-        environment_of(settings),
+        to_environment(settings),
         settings.data_dir.absolute() / "logs" / "dispatcher.log",
     )
     supervisor.start()
@@ -143,19 +143,19 @@ def supervised_dispatcher(settings: Settings) -> Iterator[Supervisor]:
         supervisor.stop()
 
 
-def environment_of(settings: Settings) -> dict[str, str]:
+def to_environment(settings: Settings) -> dict[str, str]:
     """The settings as environment variables, so that a child has the same."""
     values = settings.model_dump(mode="json", exclude_none=True)
     values["data_dir"] = str(settings.data_dir.absolute())
     return {f"LAGID_{name.upper()}": str(value) for name, value in values.items()}
 
 
-def _end_of(child: "subprocess.Popen[bytes]") -> int:
+def _wait_for_end(child: "subprocess.Popen[bytes]") -> int:
     """Wait for the end of a child; gives its exit code."""
     awake = time.monotonic()
     while True:
         try:
-            return child.wait(LOOK_SECONDS)
+            return child.wait(POLL_SECONDS)
         except subprocess.TimeoutExpired:
             pass
         if not is_stopped(child.pid):
@@ -165,7 +165,7 @@ def _end_of(child: "subprocess.Popen[bytes]") -> int:
             child.kill()
 
 
-def clear_family(leader: int) -> None:
+def clear_session(leader: int) -> None:
     """Kill every process of the session of a child that has ended; clear what its Ray left."""
     kill_processes(find_session_processes(leader))
     clear_ray_remains(leader)

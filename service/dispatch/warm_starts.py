@@ -14,30 +14,31 @@ from typing import Any
 
 from sqlalchemy import select
 
-from service.jobs.axes import positions_of
+from service.core.states import OPEN_STATES, JobState
+from service.jobs.axes import locate_cell
 from service.jobs.schemas import PREVIOUS, SweepIn
-from service.jobs.stored_cells import stored_groups
-from service.jobs.warm_start_order import Chain
+from service.jobs.stored_cells import read_axis_groups
+from service.jobs.warm_start_order import ChainLayout
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
-from service.storage.tables import OPEN, Job, Run, State
+from service.storage.tables import Job, Run
 from sysid.identification.result import Identification
-from workers.ports import Warm
+from workers.protocol import WarmStartValues
 
-MOST_OPEN = 1_000
+MOST_OPEN_CHAINS = 1_000
 """Chains under way at a time: more cores than that hardly work on one job."""
 
 
 @dataclass(slots=True)
-class _Open:
+class _OpenChain:
     """A chain under way."""
 
     numbers: range
-    at: int = 0  # position of its next run
-    flying: set[int] = field(default_factory=set)
+    position: int = 0  # position of its next run
+    running: set[int] = field(default_factory=set)
     values: Mapping[str, float] | None = None  # of the last run that succeeded
-    last: int = -1  # the number of that run
-    has_gap: bool = False  # runs were passed over that an earlier attempt ended
+    last_success: int = -1  # the number of that run
+    has_skipped: bool = False  # runs were passed over that an earlier attempt ended
 
 
 class OpenChains:
@@ -59,101 +60,101 @@ class OpenChains:
 
     def __init__(
         self,
-        chain: Chain,
+        chain: ChainLayout,
         n_runs: int,
         waits: Callable[[int], bool],
         ended: Container[int] = frozenset(),
     ) -> None:
         self._chain, self._waits, self._ended = chain, waits, ended
         self._n_chains, self._opened = n_runs // chain.length, 0
-        self._open: dict[int, _Open] = {}
+        self._open: dict[int, _OpenChain] = {}
         self._n_unfinished = 0  # open chains of which not every run was given
         self._free: deque[int] = deque()  # chains whose next run may begin
 
     @property
-    def is_empty(self) -> bool:
+    def is_exhausted(self) -> bool:
         """Whether every run was given."""
         return self._opened == self._n_chains and self._n_unfinished == 0
 
     @property
-    def has_free(self) -> bool:
+    def has_ready(self) -> bool:
         """Whether a run may begin: one that `ready` did not give has not been made."""
         return bool(self._free)
 
-    def ready(self, limit: int, made: int) -> list[int]:
+    def take_ready(self, limit: int, made: int) -> list[int]:
         """At most `limit` numbers below `made` of runs that may begin; each is given once."""
-        self._open_more(limit)
+        self._open_chains(limit)
         found: list[int] = []
         for _ in range(len(self._free)):
             key = self._free.popleft()
             one = self._open[key]
-            if len(found) < limit and one.numbers[one.at] < made:
-                found.append(self._taken(one))
-            if self._is_free(one):
+            if len(found) < limit and one.numbers[one.position] < made:
+                found.append(self._take_next(one))
+            if self._is_ready(one):
                 self._free.append(key)
         return found
 
-    def over(self, number: int, values: Mapping[str, float] | None = None) -> None:
+    def end_run(self, number: int, values: Mapping[str, float] | None = None) -> None:
         """A run has ended; `values` are its estimates if it succeeded. To be told again is fine."""
-        key = self._chain.of(number)
+        key = self._chain.find_chain(number)
         one = self._open.get(key)
-        if one is None or number not in one.flying:
+        if one is None or number not in one.running:
             return
-        was_free = self._is_free(one)
-        one.flying.discard(number)
-        if values is not None and number > one.last:
-            one.values, one.last = values, number
-        if one.at == len(one.numbers) and not one.flying:
+        was_free = self._is_ready(one)
+        one.running.discard(number)
+        if values is not None and number > one.last_success:
+            one.values, one.last_success = values, number
+        if one.position == len(one.numbers) and not one.running:
             del self._open[key]
-        elif self._is_free(one) and not was_free:
+        elif self._is_ready(one) and not was_free:
             self._free.append(key)
 
-    def before(
+    def find_previous_values(
         self, number: int, stored: Callable[[range], tuple[int, Mapping[str, float]] | None]
     ) -> Mapping[str, float] | None:
         """Estimates of the last run before that one in its chain that succeeded, if one did.
 
         `stored` finds it, with its number, among those that an earlier attempt has ended.
         """
-        one = self._open[self._chain.of(number)]
-        if one.has_gap:
+        one = self._open[self._chain.find_chain(number)]
+        if one.has_skipped:
             found = stored(one.numbers[: one.numbers.index(number)])
-            if found is not None and found[0] > one.last:
-                one.last, one.values = found
-            one.has_gap = False
+            if found is not None and found[0] > one.last_success:
+                one.last_success, one.values = found
+            one.has_skipped = False
         return one.values
 
-    def _open_more(self, wanted: int) -> None:
-        room = MOST_OPEN - len(self._open)
+    def _open_chains(self, wanted: int) -> None:
+        room = MOST_OPEN_CHAINS - len(self._open)
         while len(self._free) < wanted and room > 0 and self._opened < self._n_chains:
             key, self._opened = self._opened, self._opened + 1
-            one = _Open(self._chain.numbers(key))
-            self._pass_over(one)
-            if one.at < len(one.numbers):
+            one = _OpenChain(self._chain.list_runs(key))
+            self._skip_ended(one)
+            if one.position < len(one.numbers):
                 self._open[key] = one
                 self._n_unfinished += 1
                 self._free.append(key)
                 room -= 1
 
-    def _taken(self, one: _Open) -> int:
-        number = one.numbers[one.at]
-        one.flying.add(number)
-        one.at += 1
-        self._pass_over(one)
-        self._n_unfinished -= one.at == len(one.numbers)
+    def _take_next(self, one: _OpenChain) -> int:
+        number = one.numbers[one.position]
+        one.running.add(number)
+        one.position += 1
+        self._skip_ended(one)
+        self._n_unfinished -= one.position == len(one.numbers)
         return number
 
-    def _pass_over(self, one: _Open) -> None:
-        while one.at < len(one.numbers) and one.numbers[one.at] in self._ended:
-            one.at, one.has_gap = one.at + 1, True
+    def _skip_ended(self, one: _OpenChain) -> None:
+        while one.position < len(one.numbers) and one.numbers[one.position] in self._ended:
+            one.position, one.has_skipped = one.position + 1, True
 
-    def _is_free(self, one: _Open) -> bool:
-        if one.at == len(one.numbers):
+    def _is_ready(self, one: _OpenChain) -> bool:
+        if one.position == len(one.numbers):
             return False
-        return not one.flying or not self._waits(one.numbers[one.at])
+        return not one.running or not self._waits(one.numbers[one.position])
 
 
-PATH = "/warm_start"
+WARM_START_PATH = "/warm_start"
 
 
 class WarmStarts:
@@ -165,26 +166,27 @@ class WarmStarts:
         self._numbers: dict[str, int] = {}
         self._earlier: dict[str, Mapping[str, float]] = {}
 
-    def chains(self) -> OpenChains | None:
+    def open_chains(self) -> OpenChains | None:
         """The chains of the job, begun where it was left; None if no run waits for another."""
-        waits = _Waits(self._job)
+        waits = _WaitRule(self._job)
         axes = SweepIn.model_validate(self._job.spec["sweep"]).axes
-        chain = Chain.along(axes)
+        chain = ChainLayout.from_axes(axes)
         if chain is None or not waits.any:
             return None
-        with self._database.read() as session:
+        with self._database.read_session() as session:
             query = select(Run.number).where(
-                Run.job_id == self._job.id, Run.state.in_([one for one in State if one not in OPEN])
+                Run.job_id == self._job.id,
+                Run.state.in_([one for one in JobState if one not in OPEN_STATES]),
             )
             ended = set(session.scalars(query))
         self._chains = OpenChains(chain, self._job.n_runs, waits, ended)
         return self._chains
 
-    def given(self, row: Run) -> None:
+    def register_run(self, row: Run) -> None:
         """A run of a chain is given to the workers: others wait until it is over."""
         self._numbers[row.id] = row.number
 
-    def of(self, row: Run, body: Mapping[str, Any]) -> Warm:
+    def find_values(self, row: Run, body: Mapping[str, Any]) -> WarmStartValues:
         """Values for a run to begin with; those before it in its chain are over.
 
         Raises
@@ -196,59 +198,59 @@ class WarmStarts:
         if reference is None:
             return ()
         if reference != PREVIOUS:
-            return (self._estimates(reference),)
+            return (self._read_estimates(reference),)
         assert self._chains is not None  # a job without axes is refused
-        values = self._chains.before(row.number, self._stored)
+        values = self._chains.find_previous_values(row.number, self._read_last_success)
         return () if values is None else (values,)
 
-    def note(self, run: str, found: Identification) -> None:
+    def record_success(self, run: str, found: Identification) -> None:
         """A run of the job has succeeded."""
-        self._over(run, {one.name: float(one.value) for one in found.estimates})
+        self._end_run(run, {one.name: float(one.value) for one in found.estimates})
 
-    def note_known(self, run: str, source: str) -> None:
+    def record_reuse(self, run: str, source: str) -> None:
         """A run of the job is what another was."""
         if run in self._numbers:
-            self._over(run, self._estimates(source))
+            self._end_run(run, self._read_estimates(source))
 
-    def note_failed(self, run: str) -> None:
+    def record_failure(self, run: str) -> None:
         """A run of the job has failed."""
-        self._over(run, None)
+        self._end_run(run, None)
 
-    def _over(self, run: str, values: Mapping[str, float] | None) -> None:
+    def _end_run(self, run: str, values: Mapping[str, float] | None) -> None:
         number = self._numbers.pop(run, None)
         if number is not None and self._chains is not None:
-            self._chains.over(number, values)
+            self._chains.end_run(number, values)
 
-    def _stored(self, before: range) -> tuple[int, Mapping[str, float]] | None:
+    def _read_last_success(self, before: range) -> tuple[int, Mapping[str, float]] | None:
         """Number and estimates of the last of these runs that succeeded."""
         query = select(Run.number, Run.estimates).where(
-            Run.job_id == self._job.id, Run.state == State.SUCCEEDED,
+            Run.job_id == self._job.id, Run.state == JobState.SUCCEEDED,
             Run.number >= before.start, Run.number < before.stop,
             (Run.number - before.start) % before.step == 0,
         )  # fmt: skip
-        with self._database.read() as session:
+        with self._database.read_session() as session:
             found = session.execute(query.order_by(Run.number.desc()).limit(1)).one_or_none()
-        return None if found is None else (found[0], _values(found[1]))
+        return None if found is None else (found[0], _to_values(found[1]))
 
-    def _estimates(self, run: str) -> Mapping[str, float]:
+    def _read_estimates(self, run: str) -> Mapping[str, float]:
         if run not in self._earlier:
-            with self._database.read() as session:
+            with self._database.read_session() as session:
                 row = RunRepository(session, self._job.project_id).get(run)
-                self._earlier[run] = _values(row.estimates)
+                self._earlier[run] = _to_values(row.estimates)
         return self._earlier[run]
 
 
-class _Waits:
+class _WaitRule:
     """Which runs of a job wait for their neighbour: all, none, or those that an axis tells to."""
 
     def __init__(self, job: Job) -> None:
-        groups = stored_groups(job.spec)
+        groups = read_axis_groups(job.spec)
         self._lengths = [len(steps) for steps in groups]
         swept = [
             (place, values)
             for place, steps in enumerate(groups)
             for _, axis, values in steps.columns
-            if axis.path == PATH
+            if axis.path == WARM_START_PATH
         ]
         self._swept = swept[0] if swept else None
         if self._swept is None:
@@ -260,9 +262,9 @@ class _Waits:
         if self._swept is None:
             return self.any
         place, values = self._swept
-        waits: bool = values[positions_of(number, self._lengths)[place]] == PREVIOUS
+        waits: bool = values[locate_cell(number, self._lengths)[place]] == PREVIOUS
         return waits
 
 
-def _values(estimates: Mapping[str, Any] | None) -> Mapping[str, float]:
+def _to_values(estimates: Mapping[str, Any] | None) -> Mapping[str, float]:
     return {name: float(one["value"]) for name, one in (estimates or {}).items()}

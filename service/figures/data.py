@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Improvement:
+class IslandImprovement:
     """A better champion of one island; `parameters` in the order of the free parameters."""
 
     generation: int
@@ -22,7 +22,7 @@ class Improvement:
 
 
 @dataclass(frozen=True, slots=True)
-class SoughtParameter:
+class FreeParameter:
     """A free parameter: its bounds, and its estimate once there is one."""
 
     name: str
@@ -35,7 +35,7 @@ class SoughtParameter:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trace:
+class SignalTrace:
     """One signal on its own times (s); `is_held` if it keeps its value until the next sample.
 
     `history` is the same signal up to its first sample, as far back as it is known.
@@ -46,19 +46,19 @@ class Trace:
     times: Floats
     values: Floats
     is_held: bool = False
-    history: "Trace | None" = None
+    history: "SignalTrace | None" = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OutputTraces:
     """A measured output and what the identified model gives at the same times."""
 
-    measured: Trace
+    measured: SignalTrace
     identified: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Experiment:
+class ExperimentTraces:
     """One record as fitted or as kept for validation.
 
     `validation_from` is the time (s) from which on the samples were not used for the estimate;
@@ -67,7 +67,7 @@ class Experiment:
 
     name: str
     outputs: tuple[OutputTraces, ...]
-    inputs: tuple[Trace, ...]
+    inputs: tuple[SignalTrace, ...]
     validation_from: float | None = None
 
 
@@ -88,7 +88,7 @@ class CorrelationTrace:
 
 
 @dataclass(frozen=True, slots=True)
-class RunEvidence:
+class RunFigureData:
     """All that is known of one run's search and result.
 
     Attributes
@@ -111,11 +111,11 @@ class RunEvidence:
 
     id: str
     unit: str
-    fitness: str = "RMS"
+    fitness_label: str = "RMS"
     generations: int = 0
     evaluations: int = 0
-    parameters: Sequence[SoughtParameter] = ()
-    history: Sequence[Sequence[Improvement]] = ()
+    parameters: Sequence[FreeParameter] = ()
+    history: Sequence[Sequence[IslandImprovement]] = ()
     epoch: int = 0
     migrations: Sequence[int] = ()
     islands: Sequence[tuple[float, float | None]] = ()

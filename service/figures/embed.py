@@ -5,21 +5,21 @@ import json
 from markupsafe import Markup
 
 from service.figures.plotly import Figure
-from service.figures.theme import template
+from service.figures.theme import plotly_template
 
 
-def bare(figure: Figure) -> Figure:
+def strip_template(figure: Figure) -> Figure:
     """Without the template, which the report holds once for all its figures."""
     kept = {name: value for name, value in figure["layout"].items() if name != "template"}
     return {"data": figure["data"], "layout": kept}
 
 
-def as_json(value: object) -> Markup:
+def to_script_json(value: object) -> Markup:
     """JSON inside a script element: no text in it can end the element."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
-def templates() -> Markup:
+def templates_json() -> Markup:
     """Both papers, held once for all figures of a page."""
-    return as_json({"light": template("light"), "dark": template("dark")})
+    return to_script_json({"light": plotly_template("light"), "dark": plotly_template("dark")})

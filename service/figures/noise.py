@@ -7,21 +7,21 @@ from typing import Any
 from service.core.text import append_unit, bracket_unit, format_value
 from service.figures import theme
 from service.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
-from service.figures.plotly import Figure, finite, layout
+from service.figures.plotly import Figure, base_layout, to_json_numbers
 from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
 
-SIGMA = "/noise/sigma"
-METHOD = "/algorithm/method"
-MOST_SERIES = 12
+SIGMA_PATH = "/noise/sigma"
+METHOD_PATH = "/algorithm/method"
+MAX_SERIES = 12
 NORMAL_95 = 1.6449  # standard deviations from the median to the 95 % quantile
 
-_STYLES: Mapping[str, dict[str, Any]] = {
+_METHOD_STYLES: Mapping[str, dict[str, Any]] = {
     "simple": {"color": theme.VERMILLION, "dash": "dashdot", "width": 1.6},
     "improved-paper": {"color": theme.PURPLE, "dash": "dot", "width": 1.8},
     "improved": {"color": theme.BLUE, "dash": "solid", "width": 2},
 }
-_OTHERS = ((theme.GREEN, "solid"), (theme.OCHRE, "dashdot"), (theme.PURPLE, "solid"))
-_FLOOR = {"color": theme.GREY, "dash": "dash", "width": 1.6}
+_OTHER_STYLES = ((theme.GREEN, "solid"), (theme.OCHRE, "dashdot"), (theme.PURPLE, "solid"))
+_FLOOR_STYLE = {"color": theme.GREY, "dash": "dash", "width": 1.6}
 
 
 @dataclass(slots=True)
@@ -33,7 +33,7 @@ class _Band:
     middle: list[float] = field(default_factory=list)
     high: list[float] = field(default_factory=list)
 
-    def add(self, sigma: float, quantiles: Sequence[float]) -> None:
+    def add_quantiles(self, sigma: float, quantiles: Sequence[float]) -> None:
         self.x.append(sigma)
         for values, place in ((self.low, 0), (self.middle, 2), (self.high, 4)):
             values.append(quantiles[place])
@@ -50,92 +50,94 @@ class _Panel:
     floor: dict[float, float] = field(default_factory=dict)
 
 
-def noise_keys(axes: Sequence[Mapping[str, Any]]) -> list[str] | None:
+def noise_group_keys(axes: Sequence[Mapping[str, Any]]) -> list[str] | None:
     """Keys to group by for this figure: σ and all axes but seeds; None without an axis of σ."""
     paths = [axis["path"] for axis in axes]
-    return [path for path in paths if not path.endswith("/seed")] if SIGMA in paths else None
+    return [path for path in paths if not path.endswith("/seed")] if SIGMA_PATH in paths else None
 
 
-def noise_sweep(summary: SummaryOut, unit: str, columns: int = 2) -> Figure:
+def plot_noise_sweep(summary: SummaryOut, unit: str, columns: int = 2) -> Figure:
     """Medians and 5 to 95 % bands over σ, one line a method, and the Cramér–Rao floor.
 
     The first plot has the RMS between the identified response and the record without noise, the
     others each parameter's estimate minus its reference. Quantiles are those of the runs that
     succeeded.
     """
-    panels = _panels(summary, unit)
+    panels = _build_panels(summary, unit)
     grid = wide_grid(len(panels), columns)
     figure: Figure = {
         "data": [],
-        "layout": layout(grid.height(WIDE_MARGIN), annotations=[], margin=WIDE_MARGIN),
+        "layout": base_layout(grid.height(WIDE_MARGIN), annotations=[], margin=WIDE_MARGIN),
     }
     told: set[str] = set()
     for number, panel in enumerate(panels):
-        _add(figure, number, panel, grid.place(number), unit, told)
+        _add_panel(figure, number, panel, grid.place(number), unit, told)
     return figure
 
 
-def noise_height(n_panels: int, columns: int = 2) -> int:
+def noise_sweep_height(n_panels: int, columns: int = 2) -> int:
     """Height (px) of the figure, so that a page can leave room for it."""
     return wide_grid(n_panels, columns).height(WIDE_MARGIN)
 
 
-def _panels(summary: SummaryOut, unit: str) -> list[_Panel]:
+def _build_panels(summary: SummaryOut, unit: str) -> list[_Panel]:
     suffix = bracket_unit(unit)
     response = _Panel("<b>RMS error</b> of the response", f"RMS error{suffix}", is_signed=False)
     panels = {"": response}
     for group in summary.groups:
-        name = _series(group)
+        name = _series_name(group)
         if group.sigma is None or not _is_shown(name, response):
             continue
         if group.rms_noise_free is not None:
-            _band(response, name).add(group.sigma, group.rms_noise_free)
+            _get_band(response, name).add_quantiles(group.sigma, group.rms_noise_free)
         if group.rms_floor is not None:
             response.floor[group.sigma] = group.rms_floor
         for one in group.parameters:
-            _add_error(panels.setdefault(one.name, _panel_of(one)), name, group.sigma, one)
+            _add_parameter_error(
+                panels.setdefault(one.name, _parameter_panel(one)), name, group.sigma, one
+            )
     return [one for one in panels.values() if one.bands]
 
 
-def _add_error(panel: _Panel, name: str, sigma: float, one: ParameterSummaryOut) -> None:
+def _add_parameter_error(panel: _Panel, name: str, sigma: float, one: ParameterSummaryOut) -> None:
     if one.error is not None:
-        _band(panel, name).add(sigma, one.error)
+        _get_band(panel, name).add_quantiles(sigma, one.error)
     if one.floor is not None:
         panel.floor[sigma] = one.floor
 
 
-def _panel_of(one: ParameterSummaryOut) -> _Panel:
+def _parameter_panel(one: ParameterSummaryOut) -> _Panel:
     suffix = bracket_unit(one.unit)
     known = "" if one.reference is None else f" − {one.reference:.6g}".replace("−-", "+")
     return _Panel(f"<b>{one.name}</b>{known}", f"error of {one.name}{suffix}", is_signed=True)
 
 
-def _band(panel: _Panel, name: str) -> _Band:
+def _get_band(panel: _Panel, name: str) -> _Band:
     return panel.bands.setdefault(name, _Band())
 
 
 def _is_shown(name: str, panel: _Panel) -> bool:
-    return name in panel.bands or len(panel.bands) < MOST_SERIES
+    return name in panel.bands or len(panel.bands) < MAX_SERIES
 
 
-def _series(group: GroupOut) -> str:
+def _series_name(group: GroupOut) -> str:
     """What the runs of a group have in common besides σ."""
-    rest = {key: value for key, value in group.key.items() if key != SIGMA}
-    if list(rest) == [METHOD]:
-        return str(rest[METHOD])
+    rest = {key: value for key, value in group.key.items() if key != SIGMA_PATH}
+    if list(rest) == [METHOD_PATH]:
+        return str(rest[METHOD_PATH])
     return ", ".join(map(format_value, rest.values())) or "all runs"
 
 
-def _look(name: str, number: int) -> dict[str, Any]:
-    if name in _STYLES:
-        return dict(_STYLES[name])
-    if number >= len(_OTHERS):
+def _line_style(name: str, number: int) -> dict[str, Any]:
+    if name in _METHOD_STYLES:
+        return dict(_METHOD_STYLES[name])
+    if number >= len(_OTHER_STYLES):
         return theme.series_style(number)
-    colour, dash = _OTHERS[number]
+    colour, dash = _OTHER_STYLES[number]
     return {"color": colour, "dash": dash, "width": 1.6}
 
 
-def _add(
+def _add_panel(
     figure: Figure, number: int, panel: _Panel, place: Place, unit: str, told: set[str]
 ) -> None:
     small = {"size": 11}
@@ -160,19 +162,21 @@ def _add(
         first = name not in told
         told.add(name)
         label = name if number == 0 else f"{panel.title}: {name}"
-        figure["data"] += _drawn(band, label, name, _look(name, place_in_order), at, first)
-    figure["data"] += _floors(panel, at, told)
+        figure["data"] += _band_traces(
+            band, label, name, _line_style(name, place_in_order), at, first
+        )
+    figure["data"] += _floor_traces(panel, at, told)
     add_caption(figure, panel.caption, place)
 
 
-def _drawn(
+def _band_traces(
     band: _Band, label: str, group: str, line: dict[str, Any], at: dict[str, str], first: bool
 ) -> list[dict[str, Any]]:
     """The band between its two edges, and the median over it."""
     order = sorted(range(len(band.x)), key=band.x.__getitem__)
-    x = finite(band.x[i] for i in order)
+    x = to_json_numbers(band.x[i] for i in order)
     low, middle, high = (
-        finite(values[i] for i in order) for values in (band.low, band.middle, band.high)
+        to_json_numbers(values[i] for i in order) for values in (band.low, band.middle, band.high)
     )
     shared = {"type": "scatter", "x": x, "legendgroup": group, **at}
     edge = {**shared, "mode": "lines", "line": {"width": 0}, "showlegend": False,
@@ -187,7 +191,7 @@ def _drawn(
     ]  # fmt: skip
 
 
-def _floors(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dict[str, Any]]:
+def _floor_traces(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dict[str, Any]]:
     """The floor: of the response its value, of a parameter the 5 and 95 % that it stands for."""
     x = sorted(panel.floor)
     if not x:
@@ -198,8 +202,8 @@ def _floors(panel: _Panel, at: dict[str, str], told: set[str]) -> list[dict[str,
     for sign in signs:
         lines.append({
             "type": "scatter", "mode": "lines", "name": name, "legendgroup": name,
-            "showlegend": name not in told, "x": finite(x),
-            "y": finite(sign * panel.floor[one] for one in x), "line": dict(_FLOOR), **at,
+            "showlegend": name not in told, "x": to_json_numbers(x),
+            "y": to_json_numbers(sign * panel.floor[one] for one in x), "line": dict(_FLOOR_STYLE), **at,
             "hovertemplate": "floor, σ %{x:.4g}: %{y:.4g}<extra></extra>",
         })  # fmt: skip
         told.add(name)

@@ -13,31 +13,31 @@ import numpy as np
 
 from service.core.text import append_unit, bracket_unit, join_estimate, plain_unit
 from service.figures import theme
-from service.figures.data import Floats, Improvement, RunEvidence, SoughtParameter
+from service.figures.data import Floats, FreeParameter, IslandImprovement, RunFigureData
 from service.figures.grid import Place, PlotGrid, add_axes, add_caption
-from service.figures.theme import strided
+from service.figures.theme import stride_indices
 
 Figure = dict[str, Any]
 Abscissa = Literal["generations", "evaluations"]
 
 MARGIN = {"l": 64, "r": 16, "t": 28, "b": 44}
 WATERFALL_HEIGHT = 280
-_EPOCHS_MARKED = 80
-_CROWDED = 8.0
+_MAX_MARKED_EPOCHS = 80
+_CROWDED_RATIO = 8.0
 """Ratio of the largest to the smallest value from which on digits of a log axis stand too close."""
-_PHASES = {
+_PHASE_MARKERS = {
     "sequence": ("sequence", "diamond-open"),
     "migration": ("migration", "triangle-up-open"),
     "refinement": ("refinement", "star"),
 }
 
 
-def finite(values: Iterable[float]) -> list[float | None]:
+def to_json_numbers(values: Iterable[float]) -> list[float | None]:
     """Numbers as JSON takes them, seven digits long; what is not finite is a gap."""
     return [float(f"{v:.7g}") if np.isfinite(v) else None for v in values]
 
 
-def layout(height: int, **more: Any) -> dict[str, Any]:
+def base_layout(height: int, **more: Any) -> dict[str, Any]:
     """The layout that all figures share; `uirevision` keeps a zoom through live updates."""
     shared: dict[str, Any] = {
         "height": height,
@@ -45,24 +45,24 @@ def layout(height: int, **more: Any) -> dict[str, Any]:
         "uirevision": "keep",
         "hovermode": "closest",
         "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0, "xanchor": "left"},
-        "template": theme.template("light"),
+        "template": theme.plotly_template("light"),
     }
     return {**shared, **more}
 
 
 def empty_figure() -> Figure:
     """A figure with nothing to show yet."""
-    return {"data": [], "layout": layout(200)}
+    return {"data": [], "layout": base_layout(200)}
 
 
-def in_theme(figure: Figure, paper: theme.Theme) -> Figure:
+def apply_theme(figure: Figure, paper: theme.Theme) -> Figure:
     """The same figure on light or dark paper."""
-    return {**figure, "layout": {**figure["layout"], "template": theme.template(paper)}}
+    return {**figure, "layout": {**figure["layout"], "template": theme.plotly_template(paper)}}
 
 
-def history(run: RunEvidence, abscissa: Abscissa = "generations") -> Figure:
+def plot_history(run: RunFigureData, abscissa: Abscissa = "generations") -> Figure:
     """Fitness of every island's champion over generations or evaluations, phases marked."""
-    end = _end(run, abscissa)
+    end = _last_abscissa(run, abscissa)
     lines = [
         _island_line(number, points, abscissa, end)
         for number, points in enumerate(run.history)
@@ -72,23 +72,23 @@ def history(run: RunEvidence, abscissa: Abscissa = "generations") -> Figure:
     epochs = run.migrations if abscissa == "generations" and run.epoch else ()
     return {
         "data": data,
-        "layout": layout(
+        "layout": base_layout(
             360,
             xaxis={"title": {"text": abscissa}, "rangemode": "tozero"},
             yaxis=_fitness_axis(run, data),
-            shapes=[_upright(epoch * run.epoch) for epoch in _some(epochs)],
+            shapes=[_vertical_line(epoch * run.epoch) for epoch in _distinct_epochs(epochs)],
             uirevision=abscissa,
         ),
     }
 
 
-def convergence(run: RunEvidence, columns: int = 3) -> Figure:
+def plot_convergence(run: RunFigureData, columns: int = 3) -> Figure:
     """Every free parameter of the islands' champions over generations, between its bounds."""
     parameters = run.parameters
     grid = _parameter_grid(len(parameters), columns)
     figure: Figure = {
         "data": [],
-        "layout": layout(
+        "layout": base_layout(
             convergence_height(len(parameters), columns),
             showlegend=False,
             shapes=[],
@@ -97,7 +97,7 @@ def convergence(run: RunEvidence, columns: int = 3) -> Figure:
     }
     figure["layout"]["margin"] = {**MARGIN, "b": 36}
     for number, parameter in enumerate(parameters):
-        _small_plot(figure, run, number, parameter, grid.place(number))
+        _add_parameter_plot(figure, run, number, parameter, grid.place(number))
     return figure
 
 
@@ -119,10 +119,10 @@ def correlation_height(n_parameters: int) -> int:
     return min(130 + max(n_parameters, 3) * (46 if n_parameters <= 12 else 24), 760)
 
 
-def correlation(run: RunEvidence) -> Figure:
+def plot_correlation(run: RunFigureData) -> Figure:
     """Correlation matrix of the estimates, from −1 to 1."""
     names = list((run.correlation or {}).get("names", ()))
-    rows = [finite(row) for row in (run.correlation or {}).get("matrix", ())]
+    rows = [to_json_numbers(row) for row in (run.correlation or {}).get("matrix", ())]
     few = len(names) <= 12
     matrix = {
         "type": "heatmap", "x": names, "y": names, "z": rows, "zmin": -1, "zmax": 1,
@@ -134,7 +134,7 @@ def correlation(run: RunEvidence) -> Figure:
         matrix["texttemplate"] = "%{z:.2f}"
     return {
         "data": [matrix] if names else [],
-        "layout": layout(
+        "layout": base_layout(
             correlation_height(len(names)),
             xaxis={"showgrid": False, "type": "category", "showline": False, "ticks": ""},
             yaxis={
@@ -145,9 +145,9 @@ def correlation(run: RunEvidence) -> Figure:
     }  # fmt: skip
 
 
-def waterfall(run: RunEvidence) -> Figure:
+def plot_waterfall(run: RunFigureData) -> Figure:
     """Fitness that each island found, best first, before and after refinement."""
-    order = sorted(range(len(run.islands)), key=lambda i: _last(run.islands[i]))
+    order = sorted(range(len(run.islands)), key=lambda i: _final_fitness(run.islands[i]))
     rank = list(range(1, len(order) + 1))
     islands = [f"island {i + 1}" for i in order]
     series = [("after the search", theme.GREY, "circle-open", 0)]
@@ -156,7 +156,7 @@ def waterfall(run: RunEvidence) -> Figure:
     data = [
         {
             "type": "scatter", "mode": "lines+markers", "name": name, "x": rank,
-            "y": finite(np.nan if (v := run.islands[i][part]) is None else v for i in order),
+            "y": to_json_numbers(np.nan if (v := run.islands[i][part]) is None else v for i in order),
             "text": islands, "line": {"color": colour, "width": 1, "dash": "dot"},
             "marker": {"color": colour, "symbol": symbol, "size": 9},
             "hovertemplate": "%{text}: %{y:.5g} " + run.unit + "<extra></extra>",
@@ -165,7 +165,7 @@ def waterfall(run: RunEvidence) -> Figure:
     ]  # fmt: skip
     return {
         "data": data if order else [],
-        "layout": layout(
+        "layout": base_layout(
             WATERFALL_HEIGHT,
             xaxis={"title": {"text": "islands, best first"}, "dtick": max(1, len(order) // 12),
                    "range": [0.5, len(order) + 0.5]},
@@ -174,7 +174,7 @@ def waterfall(run: RunEvidence) -> Figure:
     }  # fmt: skip
 
 
-def as_csv(figure: Figure) -> str:
+def to_csv(figure: Figure) -> str:
     """The numbers drawn, one a row: series, x, y (and z of a matrix)."""
     sink = io.StringIO()
     rows = csv.writer(sink, lineterminator="\n")
@@ -190,37 +190,42 @@ def as_csv(figure: Figure) -> str:
     return sink.getvalue()
 
 
-def _at(point: Improvement, abscissa: Abscissa) -> int:
+def _abscissa_value(point: IslandImprovement, abscissa: Abscissa) -> int:
     return point.generation if abscissa == "generations" else point.evaluations
 
 
-def _end(run: RunEvidence, abscissa: Abscissa) -> int:
-    last = [_at(points[-1], abscissa) for points in run.history if points]
+def _last_abscissa(run: RunFigureData, abscissa: Abscissa) -> int:
+    last = [_abscissa_value(points[-1], abscissa) for points in run.history if points]
     # Evaluations of a run are those of all its islands, which count their own.
     return max([*last, run.generations if abscissa == "generations" else 0])
 
 
-def _steps(points: Sequence[Improvement], abscissa: Abscissa, end: int) -> tuple[list[int], Any]:
-    kept = [points[i] for i in strided(len(points), 990)]
-    ahead = [end] if _at(kept[-1], abscissa) < end else []
-    return [*(_at(p, abscissa) for p in kept), *ahead], [*kept, *([kept[-1]] if ahead else [])]
+def _step_points(
+    points: Sequence[IslandImprovement], abscissa: Abscissa, end: int
+) -> tuple[list[int], Any]:
+    kept = [points[i] for i in stride_indices(len(points), 990)]
+    ahead = [end] if _abscissa_value(kept[-1], abscissa) < end else []
+    return [*(_abscissa_value(p, abscissa) for p in kept), *ahead], [
+        *kept,
+        *([kept[-1]] if ahead else []),
+    ]
 
 
 def _island_line(
-    number: int, points: Sequence[Improvement], abscissa: Abscissa, end: int
+    number: int, points: Sequence[IslandImprovement], abscissa: Abscissa, end: int
 ) -> dict[str, Any]:
-    x, kept = _steps(points, abscissa, end)
+    x, kept = _step_points(points, abscissa, end)
     return {
         "type": "scatter", "mode": "lines", "name": f"island {number + 1}",
-        "x": x, "y": finite(p.rms for p in kept),
+        "x": x, "y": to_json_numbers(p.rms for p in kept),
         "line": {**theme.series_style(number), "shape": "hv"},
         "hovertemplate": f"island {number + 1}<br>%{{x}} {abscissa}: %{{y:.5g}}<extra></extra>",
     }  # fmt: skip
 
 
-def _phase_markers(run: RunEvidence, abscissa: Abscissa) -> list[dict[str, Any]]:
+def _phase_markers(run: RunFigureData, abscissa: Abscissa) -> list[dict[str, Any]]:
     markers = []
-    for phase, (name, symbol) in _PHASES.items():
+    for phase, (name, symbol) in _PHASE_MARKERS.items():
         found = [
             (number, point)
             for number, points in enumerate(run.history)
@@ -229,10 +234,10 @@ def _phase_markers(run: RunEvidence, abscissa: Abscissa) -> list[dict[str, Any]]
         ]
         if not found:
             continue
-        found = [found[i] for i in strided(len(found))]
+        found = [found[i] for i in stride_indices(len(found))]
         markers.append({
             "type": "scatter", "mode": "markers", "name": name,
-            "x": [_at(p, abscissa) for _, p in found], "y": finite(p.rms for _, p in found),
+            "x": [_abscissa_value(p, abscissa) for _, p in found], "y": to_json_numbers(p.rms for _, p in found),
             "marker": {
                 "symbol": symbol, "size": 10 if phase == "refinement" else 6,
                 "color": [theme.series_style(i)["color"] for i, _ in found],
@@ -243,36 +248,36 @@ def _phase_markers(run: RunEvidence, abscissa: Abscissa) -> list[dict[str, Any]]
     return markers
 
 
-def _some(epochs: Sequence[int]) -> list[int]:
+def _distinct_epochs(epochs: Sequence[int]) -> list[int]:
     distinct = sorted(set(epochs))
-    return distinct if len(distinct) <= _EPOCHS_MARKED else []
+    return distinct if len(distinct) <= _MAX_MARKED_EPOCHS else []
 
 
-def _fitness_axis(run: RunEvidence, data: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _fitness_axis(run: RunFigureData, data: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """The axis of the fitness; `data` are the traces upon it."""
-    title = {"text": run.fitness + bracket_unit(run.unit)}
+    title = {"text": run.fitness_label + bracket_unit(run.unit)}
     # Over less than a decade the digits between its powers would stand alone, without any power.
     axis = {"title": title, "type": "log", "exponentformat": "e", "minorloglabels": "complete"}
     positive = [y for trace in data for y in trace["y"] if y is not None and y > 0]
-    if positive and _CROWDED <= max(positive) / min(positive) < 1000 * _CROWDED:
+    if positive and _CROWDED_RATIO <= max(positive) / min(positive) < 1000 * _CROWDED_RATIO:
         axis["dtick"] = "D2"  # 1, 2, 5: all nine digits of a decade lie upon each other
     return axis
 
 
-def _upright(x: float) -> dict[str, Any]:
+def _vertical_line(x: float) -> dict[str, Any]:
     return {
         "type": "line", "x0": x, "x1": x, "y0": 0, "y1": 1, "yref": "paper", "layer": "below",
         "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dot"},
     }  # fmt: skip
 
 
-def _last(island: tuple[float, float | None]) -> float:
+def _final_fitness(island: tuple[float, float | None]) -> float:
     champion, refined = island
     return champion if refined is None else refined
 
 
-def _small_plot(
-    figure: Figure, run: RunEvidence, number: int, parameter: SoughtParameter, place: Place
+def _add_parameter_plot(
+    figure: Figure, run: RunFigureData, number: int, parameter: FreeParameter, place: Place
 ) -> None:
     at = add_axes(
         figure,
@@ -283,27 +288,27 @@ def _small_plot(
             "nticks": 5,
             **({} if number == 0 else {"matches": "x"}),
         },
-        {"nticks": 5, **_between_bounds(parameter)},
+        {"nticks": 5, **_bounds_axis(parameter)},
     )
-    end = _end(run, "generations")
+    end = _last_abscissa(run, "generations")
     for island, points in enumerate(run.history):
         if points:
-            x, kept = _steps(points, "generations", end)
+            x, kept = _step_points(points, "generations", end)
             y: Floats = np.array([p.parameters[number] for p in kept], dtype=np.float64)
             figure["data"].append({
                 "type": "scatter", "mode": "lines",
                 "name": f"{parameter.name}, island {island + 1}",
-                "x": x, "y": finite(y), "xaxis": at["xaxis"], "yaxis": at["yaxis"],
+                "x": x, "y": to_json_numbers(y), "xaxis": at["xaxis"], "yaxis": at["yaxis"],
                 "line": {**theme.series_style(island), "shape": "hv"},
                 "hovertemplate": f"island {island + 1}<br>%{{x}}: %{{y:.6g}}<extra></extra>",
             })  # fmt: skip
     figure["layout"]["shapes"] += [
-        _level(bound, at) for bound in (parameter.lower, parameter.upper)
+        _bound_line(bound, at) for bound in (parameter.lower, parameter.upper)
     ]
-    add_caption(figure, _caption(parameter), place)
+    add_caption(figure, _parameter_caption(parameter), place)
 
 
-def _between_bounds(parameter: SoughtParameter) -> dict[str, Any]:
+def _bounds_axis(parameter: FreeParameter) -> dict[str, Any]:
     lower, upper = parameter.lower, parameter.upper
     if parameter.scale == "log":
         lower, upper = float(np.log10(lower)), float(np.log10(upper))
@@ -311,7 +316,7 @@ def _between_bounds(parameter: SoughtParameter) -> dict[str, Any]:
     return {"range": [lower - room, upper + room], "type": parameter.scale}
 
 
-def _level(y: float, at: dict[str, str]) -> dict[str, Any]:
+def _bound_line(y: float, at: dict[str, str]) -> dict[str, Any]:
     return {
         "type": "line", "xref": f"{at['xaxis']} domain", "x0": 0, "x1": 1, "yref": at["yaxis"],
         "y0": y, "y1": y, "layer": "below",
@@ -319,7 +324,7 @@ def _level(y: float, at: dict[str, str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _caption(parameter: SoughtParameter) -> str:
+def _parameter_caption(parameter: FreeParameter) -> str:
     if parameter.value is None:
         return append_unit(f"<b>{parameter.name}</b>", parameter.unit)
     estimate = join_estimate(parameter.value, parameter.stderr)

@@ -6,21 +6,21 @@ from typing import Any
 from service.core.text import append_unit
 from service.figures import theme
 from service.figures.grid import PlotGrid, add_axes
-from service.figures.plotly import MARGIN, Figure, layout
+from service.figures.plotly import MARGIN, Figure, base_layout
 from service.runs.schemas import ProfileOut
 
 _ROW_PX, _GAP = 230, 0.08
-_MOST = 3.0  # thresholds that are drawn: the walls of a steep profile would hide its foot
+_MAX_THRESHOLDS = 3.0  # thresholds that are drawn: the walls of a steep profile would hide its foot
 
 
-def profile(profiles: Sequence[ProfileOut], threshold: float, columns: int = 2) -> Figure:
+def plot_profiles(profiles: Sequence[ProfileOut], threshold: float, columns: int = 2) -> Figure:
     """Likelihood ratio of each parameter over its values, with the threshold and the interval."""
     grid = PlotGrid(
         len(profiles), columns, caption=0, plot=1, axis=0.35, gap=_GAP, has_last_axis=False
     )
     figure: Figure = {
         "data": [],
-        "layout": layout(
+        "layout": base_layout(
             grid.n_rows * _ROW_PX, showlegend=False, shapes=[], margin={**MARGIN, "b": 44}
         ),
     }
@@ -33,16 +33,16 @@ def profile(profiles: Sequence[ProfileOut], threshold: float, columns: int = 2) 
             {"title": {"text": append_unit(one.name, one.unit)}, "nticks": 6},
             {
                 "nticks": 5,
-                "range": [0, _MOST * threshold],
+                "range": [0, _MAX_THRESHOLDS * threshold],
                 **({"title": {"text": "likelihood ratio"}} if is_first else {}),
             },
         )
-        figure["data"].append(_line(one, at))
-        figure["layout"]["shapes"] += _marks(one, at, threshold)
+        figure["data"].append(_profile_trace(one, at))
+        figure["layout"]["shapes"] += _threshold_shapes(one, at, threshold)
     return figure
 
 
-def _line(one: ProfileOut, at: dict[str, str]) -> dict[str, Any]:
+def _profile_trace(one: ProfileOut, at: dict[str, str]) -> dict[str, Any]:
     return {
         "type": "scatter", "mode": "lines+markers", "name": one.name,
         "x": one.values, "y": one.ratio, **at,
@@ -51,7 +51,9 @@ def _line(one: ProfileOut, at: dict[str, str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _marks(one: ProfileOut, at: dict[str, str], threshold: float) -> list[dict[str, Any]]:
+def _threshold_shapes(
+    one: ProfileOut, at: dict[str, str], threshold: float
+) -> list[dict[str, Any]]:
     """The threshold, and an upright at each end of the interval that is not open."""
     style = {"color": theme.GREY, "width": 1, "dash": "dot"}
     level = {

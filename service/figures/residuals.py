@@ -8,13 +8,13 @@ import numpy as np
 from service.figures import theme
 from service.figures.data import CorrelationTrace, Floats
 from service.figures.grid import Place, PlotGrid, add_axes, add_caption
-from service.figures.plotly import MARGIN, Figure, finite, layout
+from service.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
 
 _MARGIN = {**MARGIN, "t": 34, "b": 6}
 _BAND95 = "rgba(138,146,155,0.22)"
 
 
-def residuals(
+def plot_residuals(
     functions: Sequence[CorrelationTrace], columns: int = 2, names: Sequence[str] = ()
 ) -> Figure:
     """Correlation functions of one experiment, each over its bands.
@@ -25,7 +25,7 @@ def residuals(
     grid = _grid(len(functions), columns)
     figure: Figure = {
         "data": [],
-        "layout": layout(
+        "layout": base_layout(
             grid.height(_MARGIN),
             annotations=[],
             bargap=0.45,
@@ -34,7 +34,7 @@ def residuals(
         ),
     }
     for number, one in enumerate(functions):
-        _add(figure, number, one, grid.place(number))
+        _add_correlation(figure, number, one, grid.place(number))
     return figure
 
 
@@ -47,7 +47,7 @@ def residuals_height(n_functions: int, columns: int = 2) -> int:
     return _grid(n_functions, columns).height(_MARGIN)
 
 
-def _add(figure: Figure, number: int, one: CorrelationTrace, place: Place) -> None:
+def _add_correlation(figure: Figure, number: int, one: CorrelationTrace, place: Place) -> None:
     shown = one.lags != 0 if one.is_auto else np.ones(one.lags.size, dtype=bool)
     lags, values = one.lags[shown], one.values[shown]
     bands = one.band95[shown], one.band99[shown]
@@ -66,8 +66,8 @@ def _add(figure: Figure, number: int, one: CorrelationTrace, place: Place) -> No
         },
         {"nticks": 5, "range": [-reach, reach]},
     )
-    figure["data"] += _bands(lags, bands, at, first=number == 0)
-    figure["data"].append(_bars(one, lags, values, bands[1], at))
+    figure["data"] += _band_traces(lags, bands, at, first=number == 0)
+    figure["data"].append(_correlation_bars(one, lags, values, bands[1], at))
     add_caption(figure, one.title, place, shift=3)
 
 
@@ -77,12 +77,12 @@ def _lag_title(one: CorrelationTrace) -> str:
     return f"lag [samples of {one.period:.4g} s]"
 
 
-def _bands(
+def _band_traces(
     lags: Floats, bands: tuple[Floats, Floats], at: dict[str, str], *, first: bool
 ) -> list[dict[str, Any]]:
     """The 95 % band as an area, the 99 % band as dashed lines about it."""
     # Half a lag further at each end, so that the first and the last bar stand on the band.
-    x = finite(np.concatenate([[lags[0] - 0.5], lags, [lags[-1] + 0.5]]))
+    x = to_json_numbers(np.concatenate([[lags[0] - 0.5], lags, [lags[-1] + 0.5]]))
     shared = {
         "type": "scatter", "mode": "lines", "x": x, **at,
         "hoverinfo": "skip",
@@ -95,21 +95,21 @@ def _bands(
         ends = np.concatenate([band[:1], band, band[-1:]])
         area = {"fill": "tonexty", "fillcolor": _BAND95} if look["line"]["width"] == 0 else {}
         drawn += [
-            {**shared, **look, "name": name, "y": finite(-ends), "legendgroup": name,
+            {**shared, **look, "name": name, "y": to_json_numbers(-ends), "legendgroup": name,
              "showlegend": first and not area},
-            {**shared, **look, **area, "name": name, "y": finite(ends), "legendgroup": name,
+            {**shared, **look, **area, "name": name, "y": to_json_numbers(ends), "legendgroup": name,
              "showlegend": first and bool(area)},
         ]  # fmt: skip
     return drawn
 
 
-def _bars(
+def _correlation_bars(
     one: CorrelationTrace, lags: Floats, values: Floats, band99: Floats, at: dict[str, str]
 ) -> dict[str, Any]:
     outside = np.abs(values) > band99
     return {
-        "type": "bar", "name": one.title.partition("<br>")[0], "x": finite(lags),
-        "y": finite(values), **at, "showlegend": False,
+        "type": "bar", "name": one.title.partition("<br>")[0], "x": to_json_numbers(lags),
+        "y": to_json_numbers(values), **at, "showlegend": False,
         "marker": {"color": [theme.VERMILLION if out else theme.BLUE for out in outside]},
         "hovertemplate": "lag %{x}: %{y:.3f}<extra></extra>",
     }  # fmt: skip

@@ -8,17 +8,17 @@ import numpy as np
 
 from service.core.text import bracket_unit
 from service.figures import theme
-from service.figures.data import Experiment, Floats, OutputTraces, Trace
-from service.figures.plotly import MARGIN, Figure, finite, layout
-from service.figures.theme import MAX_POINTS, thinned, window
+from service.figures.data import ExperimentTraces, Floats, OutputTraces, SignalTrace
+from service.figures.plotly import MARGIN, Figure, base_layout, to_json_numbers
+from service.figures.theme import MAX_POINTS, thin_indices, window_slice
 
 _GAP_PX = 20
-_SHOWN_BEFORE = 0.1  # of a record's duration, of what its inputs were before it
+_HISTORY_FRACTION = 0.1  # of a record's duration, of what its inputs were before it
 _OUTPUT_PX, _RESIDUAL_PX, _INPUT_PX, _SIGNAL_PX = 240, 84, 110, 120
 
 
-def response(
-    experiment: Experiment, start: float | None = None, stop: float | None = None
+def plot_response(
+    experiment: ExperimentTraces, start: float | None = None, stop: float | None = None
 ) -> Figure:
     """Measured against identified outputs, residuals under each, inputs below, one time axis.
 
@@ -27,21 +27,21 @@ def response(
     start, stop : float, optional
         Only this stretch (s), so that a zoom shows more of the samples.
     """
-    figure = stack(_response_rows(len(experiment.outputs), len(experiment.inputs)))
+    figure = stack_plots(_response_heights(len(experiment.outputs), len(experiment.inputs)))
     for number, output in enumerate(experiment.outputs):
-        span = window(output.measured.times, start, stop)
+        span = window_slice(output.measured.times, start, stop)
         figure["data"] += _output_traces(output, span, f"y{2 * number + 1}", number == 0)
-        figure["data"].append(_residual(output, span, f"y{2 * number + 2}", number == 0))
+        figure["data"].append(_residual_trace(output, span, f"y{2 * number + 2}", number == 0))
         unit = bracket_unit(output.measured.unit)
         name_axis(figure, 2 * number + 1, f"{output.measured.name}{unit}")
         name_axis(figure, 2 * number + 2, f"residual<br>{unit}")
     for number, signal in enumerate(experiment.inputs, 2 * len(experiment.outputs) + 1):
-        span = window(signal.times, start, stop)
-        figure["data"].append(line(signal, span, f"y{number}", theme.GREEN, legend=True))
-        known = _near(signal, _SHOWN_BEFORE * _duration(experiment))
-        figure["data"] += _before(known, start, stop, f"y{number}", theme.GREEN)
+        span = window_slice(signal.times, start, stop)
+        figure["data"].append(signal_line(signal, span, f"y{number}", theme.GREEN, legend=True))
+        known = _recent_history(signal, _HISTORY_FRACTION * _record_duration(experiment))
+        figure["data"] += _history_traces(known, start, stop, f"y{number}", theme.GREEN)
         name_axis(figure, number, f"{signal.name}{bracket_unit(signal.unit)}")
-    figure["layout"].update(_shading(experiment), uirevision=experiment.name)
+    figure["layout"].update(_validation_shading(experiment), uirevision=experiment.name)
     traces = [output.measured for output in experiment.outputs] + list(experiment.inputs)
     figure["layout"]["meta"] = {"thinned": _is_thinned(traces)}
     return figure
@@ -49,47 +49,47 @@ def response(
 
 def response_height(n_outputs: int, n_inputs: int) -> int:
     """Height (px) of a response, so that a page can leave room for it."""
-    return _height(_response_rows(n_outputs, n_inputs))
+    return _stack_height(_response_heights(n_outputs, n_inputs))
 
 
 def signals_height(n_channels: int) -> int:
     """Height (px) of the channels of a dataset."""
-    return _height([_SIGNAL_PX] * n_channels)
+    return _stack_height([_SIGNAL_PX] * n_channels)
 
 
-def signals(
-    channels: Sequence[Trace], start: float | None = None, stop: float | None = None
+def plot_signals(
+    channels: Sequence[SignalTrace], start: float | None = None, stop: float | None = None
 ) -> Figure:
     """The channels of a dataset, one under the other."""
-    figure = stack([_SIGNAL_PX] * len(channels))
+    figure = stack_plots([_SIGNAL_PX] * len(channels))
     for number, signal in enumerate(channels, 1):
-        span = window(signal.times, start, stop)
-        colour = theme.SERIES[(number - 1) % len(theme.SERIES)]
-        figure["data"].append(line(signal, span, f"y{number}", colour, legend=False))
-        figure["data"] += _before(signal.history, start, stop, f"y{number}", colour)
+        span = window_slice(signal.times, start, stop)
+        colour = theme.SERIES_COLOURS[(number - 1) % len(theme.SERIES_COLOURS)]
+        figure["data"].append(signal_line(signal, span, f"y{number}", colour, legend=False))
+        figure["data"] += _history_traces(signal.history, start, stop, f"y{number}", colour)
         name_axis(figure, number, f"{signal.name}{bracket_unit(signal.unit)}")
     figure["layout"]["meta"] = {"thinned": _is_thinned(channels)}
     return figure
 
 
-def _response_rows(n_outputs: int, n_inputs: int) -> list[int]:
+def _response_heights(n_outputs: int, n_inputs: int) -> list[int]:
     return [_OUTPUT_PX, _RESIDUAL_PX] * n_outputs + [_INPUT_PX] * n_inputs
 
 
-def _height(rows: Sequence[int]) -> int:
+def _stack_height(rows: Sequence[int]) -> int:
     return sum(rows) + _GAP_PX * max(len(rows) - 1, 0) + MARGIN["t"] + MARGIN["b"]
 
 
-def _is_thinned(traces: Sequence[Trace]) -> bool:
+def _is_thinned(traces: Sequence[SignalTrace]) -> bool:
     """Whether a zoom would show samples that the whole does not."""
     return any(trace.times.size > MAX_POINTS for trace in traces)
 
 
-def stack(heights: Sequence[int]) -> Figure:
+def stack_plots(heights: Sequence[int]) -> Figure:
     """Empty plots of these heights (px), one under the other over one time axis."""
     total = sum(heights) + _GAP_PX * max(len(heights) - 1, 0)
-    shared: dict[str, Any] = layout(
-        _height(heights),
+    shared: dict[str, Any] = base_layout(
+        _stack_height(heights),
         xaxis={"title": {"text": "time [s]"}, "anchor": f"y{max(len(heights), 1)}"},
         hovermode="x",
     )
@@ -119,26 +119,26 @@ def _output_traces(
     output: OutputTraces, span: slice, axis: str, in_legend: bool
 ) -> list[dict[str, Any]]:
     times, values = output.measured.times[span], output.measured.values[span]
-    kept = thinned(values, MAX_POINTS)
+    kept = thin_indices(values, MAX_POINTS)
     identified = output.identified[span]
-    also = thinned(identified, MAX_POINTS)
+    also = thin_indices(identified, MAX_POINTS)
     shared = {"type": "scatter", "yaxis": axis_id(axis), "showlegend": in_legend}
     return [
         {
-            **shared, "name": "measured", "x": finite(times[kept]), "y": finite(values[kept]),
-            **_measured_look(times, kept.size),
+            **shared, "name": "measured", "x": to_json_numbers(times[kept]), "y": to_json_numbers(values[kept]),
+            **_measured_style(times, kept.size),
             "hovertemplate": "%{y:.6g}<extra>measured</extra>",
         },
         {
             **shared, "name": "identified", "mode": "lines",
-            "x": finite(times[also]), "y": finite(identified[also]),
+            "x": to_json_numbers(times[also]), "y": to_json_numbers(identified[also]),
             "line": {"color": theme.BLUE, "width": 1.6},
             "hovertemplate": "%{y:.6g}<extra>identified</extra>",
         },
     ]  # fmt: skip
 
 
-def _measured_look(times: Floats, drawn: int) -> dict[str, Any]:
+def _measured_style(times: Floats, drawn: int) -> dict[str, Any]:
     """Points where single samples can be told apart or share a time, else a line."""
     pooled = bool(np.any(np.diff(times) <= 0))
     if pooled or drawn <= 400:
@@ -146,35 +146,39 @@ def _measured_look(times: Floats, drawn: int) -> dict[str, Any]:
     return {"mode": "lines", "line": {"color": theme.GREY, "width": 2.4}}
 
 
-def _residual(output: OutputTraces, span: slice, axis: str, in_legend: bool) -> dict[str, Any]:
+def _residual_trace(
+    output: OutputTraces, span: slice, axis: str, in_legend: bool
+) -> dict[str, Any]:
     times = output.measured.times[span]
     values = output.measured.values[span] - output.identified[span]
-    kept = thinned(values, MAX_POINTS)
+    kept = thin_indices(values, MAX_POINTS)
     return {
         "type": "scatter", "mode": "lines", "name": "residual", "yaxis": axis_id(axis),
-        "showlegend": in_legend, "x": finite(times[kept]), "y": finite(values[kept]),
+        "showlegend": in_legend, "x": to_json_numbers(times[kept]), "y": to_json_numbers(values[kept]),
         "line": {"color": theme.VERMILLION, "width": 1},
         "hovertemplate": "%{y:.4g}<extra>residual</extra>",
     }  # fmt: skip
 
 
-def line(signal: Trace, span: slice, axis: str, colour: str, *, legend: bool) -> dict[str, Any]:
+def signal_line(
+    signal: SignalTrace, span: slice, axis: str, colour: str, *, legend: bool
+) -> dict[str, Any]:
     """A signal as one line of a stack, thinned to what a screen shows."""
     times, values = signal.times[span], signal.values[span]
-    kept = thinned(values, MAX_POINTS)
+    kept = thin_indices(values, MAX_POINTS)
     return {
         "type": "scatter", "mode": "lines", "name": signal.name, "yaxis": axis_id(axis),
-        "showlegend": legend, "x": finite(times[kept]), "y": finite(values[kept]),
+        "showlegend": legend, "x": to_json_numbers(times[kept]), "y": to_json_numbers(values[kept]),
         "line": {"color": colour, "width": 1.2, "shape": "hv" if signal.is_held else "linear"},
         "hovertemplate": f"%{{y:.6g}}<extra>{signal.name}</extra>",
     }  # fmt: skip
 
 
-def _duration(experiment: Experiment) -> float:
+def _record_duration(experiment: ExperimentTraces) -> float:
     return max((float(np.ptp(one.measured.times)) for one in experiment.outputs), default=0.0)
 
 
-def _near(signal: Trace, seconds: float) -> Trace | None:
+def _recent_history(signal: SignalTrace, seconds: float) -> SignalTrace | None:
     """The end of a signal's history; all of it could take half of the plot from the record."""
     if signal.history is None:
         return None
@@ -183,20 +187,22 @@ def _near(signal: Trace, seconds: float) -> Trace | None:
     return replace(signal.history, times=times, values=values)
 
 
-def _before(
-    history: Trace | None, start: float | None, stop: float | None, axis: str, colour: str
+def _history_traces(
+    history: SignalTrace | None, start: float | None, stop: float | None, axis: str, colour: str
 ) -> list[dict[str, Any]]:
     """What is known of a signal from before its first sample: dotted, in the same row."""
     if history is None or not history.times.size:
         return []
-    drawn = line(history, window(history.times, start, stop), axis, colour, legend=False)
+    drawn = signal_line(
+        history, window_slice(history.times, start, stop), axis, colour, legend=False
+    )
     label = f"{history.name}, before the record"
     look = {**drawn["line"], "dash": "dot"}
     told = f"%{{y:.6g}}<extra>{label}</extra>"
     return [{**drawn, "name": label, "line": look, "hovertemplate": told}]
 
 
-def _shading(experiment: Experiment) -> dict[str, Any]:
+def _validation_shading(experiment: ExperimentTraces) -> dict[str, Any]:
     """Shade what was kept for validation, and say so."""
     since = experiment.validation_from
     if since is None or not experiment.outputs:

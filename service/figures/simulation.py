@@ -7,18 +7,18 @@ import numpy as np
 
 from service.control.schemas import ControllerOut, RunSimulationOut, StepMetricsOut
 from service.core.text import bracket_unit
-from service.datasets.schemas import Series
+from service.datasets.schemas import SeriesOut
 from service.figures import theme
-from service.figures.data import Trace
+from service.figures.data import SignalTrace
 from service.figures.plotly import Figure
-from service.figures.signals import axis_id, line, name_axis, stack
+from service.figures.signals import axis_id, name_axis, signal_line, stack_plots
 
 _OUTPUT_PX, _INPUT_PX = 260, 120
-_WHOLE = slice(None)
-_LOOK = {"layer": "below", "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dot"}}
+_WHOLE_SPAN = slice(None)
+_LINE_STYLE = {"layer": "below", "line": {"color": theme.HAIRLINE, "width": 1, "dash": "dot"}}
 
 
-def simulation(found: RunSimulationOut, step_time: float | None = None) -> Figure:
+def plot_simulation(found: RunSimulationOut, step_time: float | None = None) -> Figure:
     """Outputs over time with the reference and the band that they settle in, then the inputs.
 
     Parameters
@@ -27,32 +27,34 @@ def simulation(found: RunSimulationOut, step_time: float | None = None) -> Figur
         When the reference steps (s): settling is counted from there.
     """
     below = list(found.inputs)
-    if found.command is not None and _tells_more(found, found.command):
+    if found.command is not None and _command_differs(found, found.command):
         below.append(found.command)
-    figure = stack([_OUTPUT_PX] * len(found.outputs) + [_INPUT_PX] * len(below))
+    figure = stack_plots([_OUTPUT_PX] * len(found.outputs) + [_INPUT_PX] * len(below))
     controlled = found.metrics.output if found.metrics else None
     for number, output in enumerate(found.outputs, 1):
         if found.reference is not None and controlled in (None, output.name):
-            figure["data"].append(_drawn(found.reference, number, theme.GREY, dash="dash"))
-        figure["data"].append(_drawn(output, number, theme.BLUE))
+            figure["data"].append(_signal_trace(found.reference, number, theme.GREY, dash="dash"))
+        figure["data"].append(_signal_trace(output, number, theme.BLUE))
         name_axis(figure, number, f"{output.name}{bracket_unit(output.unit)}")
         if found.metrics is not None and output.name == controlled:
-            figure["layout"]["shapes"] = [*_settling(found.metrics, number, step_time or 0.0)]
+            figure["layout"]["shapes"] = [
+                *_settling_shapes(found.metrics, number, step_time or 0.0)
+            ]
     for number, signal in enumerate(below, len(found.outputs) + 1):
         is_command = signal is found.command
         colour = theme.VERMILLION if is_command else theme.GREEN
-        figure["data"].append(_drawn(signal, number, colour))
+        figure["data"].append(_signal_trace(signal, number, colour))
         if found.command is not None and signal.values == found.command.values:
-            figure["layout"].setdefault("shapes", []).extend(_limits(found.controller, number))
+            figure["layout"].setdefault("shapes", []).extend(_limit_lines(found.controller, number))
         name = "command" if is_command else signal.name
         name_axis(figure, number, f"{name}{bracket_unit(signal.unit)}")
     return figure
 
 
-def in_units(found: RunSimulationOut, units: Mapping[str, str]) -> RunSimulationOut:
+def apply_units(found: RunSimulationOut, units: Mapping[str, str]) -> RunSimulationOut:
     """The same with the units of signals that the model leaves open."""
 
-    def told(one: Series) -> Series:
+    def told(one: SeriesOut) -> SeriesOut:
         return one.model_copy(update={"unit": units.get(one.name, one.unit)})
 
     changes: dict[str, Any] = {
@@ -65,41 +67,45 @@ def in_units(found: RunSimulationOut, units: Mapping[str, str]) -> RunSimulation
     return found.model_copy(update=changes)
 
 
-def _tells_more(found: RunSimulationOut, command: Series) -> bool:
+def _command_differs(found: RunSimulationOut, command: SeriesOut) -> bool:
     """Whether the command is not just the input: something lies between the two."""
     return all(one.values != command.values or one.times != command.times for one in found.inputs)
 
 
-def _drawn(signal: Series, number: int, colour: str, dash: str = "solid") -> dict[str, Any]:
+def _signal_trace(
+    signal: SeriesOut, number: int, colour: str, dash: str = "solid"
+) -> dict[str, Any]:
     values = np.array([np.nan if v is None else v for v in signal.values], dtype=np.float64)
-    trace = Trace(signal.name, signal.unit, np.array(signal.times, dtype=np.float64), values)
-    drawn = line(trace, _WHOLE, axis_id(f"y{number}"), colour, legend=True)
+    trace = SignalTrace(signal.name, signal.unit, np.array(signal.times, dtype=np.float64), values)
+    drawn = signal_line(trace, _WHOLE_SPAN, axis_id(f"y{number}"), colour, legend=True)
     drawn["line"] = {**drawn["line"], "width": 1.6, "dash": dash}
     return drawn
 
 
-def _limits(controller: ControllerOut | None, number: int) -> Iterator[dict[str, Any]]:
+def _limit_lines(controller: ControllerOut | None, number: int) -> Iterator[dict[str, Any]]:
     """Least and largest value that the controller may give."""
     if controller is None:
         return
     for limit in (controller.lower, controller.upper):
         if limit is not None:
-            yield _level(axis_id(f"y{number}"), limit)
+            yield _horizontal_line(axis_id(f"y{number}"), limit)
 
 
-def _level(axis: str, height: float) -> dict[str, Any]:
+def _horizontal_line(axis: str, height: float) -> dict[str, Any]:
     """A dotted line at a height, all over the width."""
     return {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "yref": axis, "y0": height,
-            "y1": height, **_LOOK}  # fmt: skip
+            "y1": height, **_LINE_STYLE}  # fmt: skip
 
 
-def _settling(metrics: StepMetricsOut, number: int, since: float) -> Sequence[dict[str, Any]]:
+def _settling_shapes(
+    metrics: StepMetricsOut, number: int, since: float
+) -> Sequence[dict[str, Any]]:
     """The band of 2 % about the final value, and the time from which on it is kept."""
     if metrics.final_value is None or metrics.settling_time is None:
         return []
     axis = axis_id(f"y{number}")
     edges = (metrics.final_value - metrics.band, metrics.final_value + metrics.band)
-    band = [_level(axis, y) for y in edges]
+    band = [_horizontal_line(axis, y) for y in edges]
     settled = since + metrics.settling_time
     return [*band, {"type": "line", "x0": settled, "x1": settled, "yref": f"{axis} domain",
-                    "y0": 0, "y1": 1, **_LOOK}]  # fmt: skip
+                    "y0": 0, "y1": 1, **_LINE_STYLE}]  # fmt: skip

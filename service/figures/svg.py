@@ -1,6 +1,6 @@
 """Figures as drawings (SVG): the same definitions, for a report that runs no script at all.
 
-They follow the paper by the sheet's colours, and hold at most `POINTS` points a line.
+They follow the paper by the sheet's colours, and hold at most `MAX_LINE_POINTS` points a line.
 
 Axes of a figure that is drawn without a script: ranges, ticks, places in px.
 
@@ -18,54 +18,52 @@ from markupsafe import Markup, escape
 
 from service.core.text import format_number
 from service.figures.plotly import Figure
-from service.figures.theme import strided, thinned
+from service.figures.theme import stride_indices, thin_indices
 
-_Path = Callable[[float, float, float], str]
+_MarkerPath = Callable[[float, float, float], str]
 
 
-def symbol(name: str, x: float, y: float, radius: float, colour: str) -> str:
+def draw_marker(name: str, x: float, y: float, radius: float, colour: str) -> str:
     """A symbol about a place (px); a name that ends with ``-open`` is only an outline."""
     shape, is_open = name.removesuffix("-open"), name.endswith("-open")
-    is_thin = shape in _THIN
+    is_thin = shape in _LINE_MARKERS
     paint = f'fill="none" stroke="{colour}"' if is_open or is_thin else f'fill="{colour}"'
-    if shape in _PATHS:
-        return f'<path d="{_PATHS[shape](x, y, radius)}" {paint}/>'
+    if shape in _MARKER_PATHS:
+        return f'<path d="{_MARKER_PATHS[shape](x, y, radius)}" {paint}/>'
     return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.1f}" {paint}/>'
 
 
-def _diamond(x: float, y: float, r: float) -> str:
+def _diamond_path(x: float, y: float, r: float) -> str:
     return f"M{x:.1f} {y - r:.1f}l{r:.1f} {r:.1f}l{-r:.1f} {r:.1f}l{-r:.1f} {-r:.1f}Z"
 
 
-def _triangle(x: float, y: float, r: float) -> str:
+def _triangle_path(x: float, y: float, r: float) -> str:
     return f"M{x:.1f} {y - r:.1f}l{r:.1f} {1.7 * r:.1f}h{-2 * r:.1f}Z"
 
 
-def _cross(x: float, y: float, r: float) -> str:
+def _cross_path(x: float, y: float, r: float) -> str:
     return (
         f"M{x - r:.1f} {y - r:.1f}l{2 * r:.1f} {2 * r:.1f}M{x - r:.1f} {y + r:.1f}l{2 * r:.1f} "
         f"{-2 * r:.1f}"
     )
 
 
-def _star(x: float, y: float, r: float) -> str:
-    return (
-        f"{_cross(x, y, 0.7 * r)}M{x - r:.1f} {y:.1f}h{2 * r:.1f}M{x:.1f} {y - r:.1f}v{2 * r:.1f}"
-    )
+def _star_path(x: float, y: float, r: float) -> str:
+    return f"{_cross_path(x, y, 0.7 * r)}M{x - r:.1f} {y:.1f}h{2 * r:.1f}M{x:.1f} {y - r:.1f}v{2 * r:.1f}"
 
 
-_PATHS: Mapping[str, _Path] = {
-    "diamond": _diamond, "triangle-up": _triangle, "x-thin": _cross, "star": _star,
+_MARKER_PATHS: Mapping[str, _MarkerPath] = {
+    "diamond": _diamond_path, "triangle-up": _triangle_path, "x-thin": _cross_path, "star": _star_path,
 }  # fmt: skip
-_THIN = ("x-thin", "star")
+_LINE_MARKERS = ("x-thin", "star")
 
-Trace = Mapping[str, Any]
-_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
-_STEPS = (1.0, 2.0, 5.0, 10.0)
+PlotlyTrace = Mapping[str, Any]
+_SI_PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
+_TICK_STEPS = (1.0, 2.0, 5.0, 10.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
+class SvgAxis:
     """One axis; `low` and `high` are exponents of ten where it is logarithmic.
 
     `start` and `stop` are the px of `low` and `high`; of an upright one `start` lies below.
@@ -80,27 +78,29 @@ class Axis:
     stop: float
     n_ticks: int
 
-    def at(self, value: float | None) -> float | None:
+    def to_pixel(self, value: float | None) -> float | None:
         """Place (px) of a value; None where it has none."""
         if value is None or not isfinite(value) or (self.is_log and value <= 0):
             return None
         place = log10(value) if self.is_log else value
         return self.start + (place - self.low) / (self.high - self.low) * (self.stop - self.start)
 
-    def share(self, part: float) -> float:
+    def fraction_to_pixel(self, part: float) -> float:
         """Place (px) of a part of the axis, from 0 to 1."""
         return self.start + part * (self.stop - self.start)
 
-    def ticks(self) -> Iterator[tuple[float, str]]:
+    def tick_positions(self) -> Iterator[tuple[float, str]]:
         """Places (px) and labels of the ticks inside the range."""
         decades = self.is_log and self.high - self.low >= 1
-        for value in _decades(self) if decades else _round_values(self):
-            place = self.at(value)
+        for value in _decade_ticks(self) if decades else _round_ticks(self):
+            place = self.to_pixel(value)
             if place is not None:
-                yield place, label_of(value)
+                yield place, format_tick(value)
 
 
-def axes_of(figure: Mapping[str, Any], box: tuple[float, float, float, float]) -> dict[str, Axis]:
+def build_axes(
+    figure: Mapping[str, Any], box: tuple[float, float, float, float]
+) -> dict[str, SvgAxis]:
     """All axes of a figure by their names (``x``, ``y2``).
 
     Parameters
@@ -118,8 +118,8 @@ def axes_of(figure: Mapping[str, Any], box: tuple[float, float, float, float]) -
         first, last = layout.get("domain", (0, 1))
         edges = (left, right) if kind == "x" else (bottom, top)
         is_log = layout.get("type") == "log"
-        low, high = _range(figure, name, layout, is_log)
-        found[name] = Axis(
+        low, high = _axis_range(figure, name, layout, is_log)
+        found[name] = SvgAxis(
             name=name, title=str((layout.get("title") or {}).get("text", "")), is_log=is_log,
             low=low, high=high, start=edges[0] + first * (edges[1] - edges[0]),
             stop=edges[0] + last * (edges[1] - edges[0]), n_ticks=layout.get("nticks", 7),
@@ -127,10 +127,10 @@ def axes_of(figure: Mapping[str, Any], box: tuple[float, float, float, float]) -
     return found
 
 
-def label_of(value: float) -> str:
+def format_tick(value: float) -> str:
     """A tick's value: thousands as k, M, G, small ones by powers of ten."""
     size = abs(value)
-    for unit, prefix in _PREFIXES:
+    for unit, prefix in _SI_PREFIXES:
         if 10_000 <= size < 1e13 and size >= unit:
             return f"{value / unit:.6g}{prefix}".replace("-", "−")
     if size >= 1e13 or 0 < size < 1e-3:
@@ -138,7 +138,7 @@ def label_of(value: float) -> str:
     return f"{value:.6g}".replace("-", "−")
 
 
-def axis_name(trace: Trace, kind: str) -> str:
+def axis_name(trace: PlotlyTrace, kind: str) -> str:
     """Name of the axis that a trace lies on."""
     return str(trace.get(f"{kind}axis", kind))
 
@@ -148,20 +148,22 @@ def _is_round(value: float) -> bool:
     return float(mantissa).is_integer()
 
 
-def _range(
+def _axis_range(
     figure: Mapping[str, Any], name: str, layout: Mapping[str, Any], is_log: bool
 ) -> tuple[float, float]:
     if "range" in layout:
         low, high = map(float, layout["range"])
     else:
-        low, high = _spanned(list(_values(figure, name, layout, is_log)), layout, name[0])
+        low, high = _pad_range(list(_axis_values(figure, name, layout, is_log)), layout, name[0])
     if not high > low:
         room = abs(low) * 0.1 or 1.0
         low, high = low - room, high + room
     return low, high
 
 
-def _spanned(values: Sequence[float], layout: Mapping[str, Any], kind: str) -> tuple[float, float]:
+def _pad_range(
+    values: Sequence[float], layout: Mapping[str, Any], kind: str
+) -> tuple[float, float]:
     if not values:
         return 0.0, 1.0
     low, high = min(values), max(values)
@@ -172,7 +174,7 @@ def _spanned(values: Sequence[float], layout: Mapping[str, Any], kind: str) -> t
     return low - (0.0 if at_zero and low == 0 else room), high + room
 
 
-def _values(
+def _axis_values(
     figure: Mapping[str, Any], name: str, layout: Mapping[str, Any], is_log: bool
 ) -> Iterator[float]:
     """What lies on an axis, or on one that it matches, as its exponents where it is one of ten."""
@@ -183,14 +185,14 @@ def _values(
             shared.add(kind + key.removeprefix(f"{kind}axis"))
     for trace in figure["data"]:
         if axis_name(trace, kind) in shared:
-            for value in _of_trace(trace, kind):
+            for value in _trace_extents(trace, kind):
                 if not is_log:
                     yield value
                 elif value > 0:
                     yield log10(value)
 
 
-def _of_trace(trace: Trace, kind: str) -> Iterator[float]:
+def _trace_extents(trace: PlotlyTrace, kind: str) -> Iterator[float]:
     errors = (trace.get("error_y") or {}).get("array") if kind == "y" else None
     for place, value in enumerate(trace[kind]):
         if value is None or not isfinite(value):
@@ -202,29 +204,29 @@ def _of_trace(trace: Trace, kind: str) -> Iterator[float]:
         yield 0.0
 
 
-def _decades(axis: Axis) -> Iterator[float]:
+def _decade_ticks(axis: SvgAxis) -> Iterator[float]:
     first, last = ceil(axis.low - 1e-9), floor(axis.high + 1e-9)
     step = max(1, -(-(last - first + 1) // axis.n_ticks))
     for exponent in range(first, last + 1, step):
         yield 10.0**exponent
 
 
-def _round_values(axis: Axis) -> Iterator[float]:
+def _round_ticks(axis: SvgAxis) -> Iterator[float]:
     low, high = (10**axis.low, 10**axis.high) if axis.is_log else (axis.low, axis.high)
     rough = (high - low) / max(axis.n_ticks, 1)
     power = 10.0 ** floor(log10(rough))
-    step = next(power * one for one in _STEPS if power * one >= rough * (1 - 1e-9))
+    step = next(power * one for one in _TICK_STEPS if power * one >= rough * (1 - 1e-9))
     for number in range(ceil(low / step - 1e-9), floor(high / step + 1e-9) + 1):
         yield number * step
 
 
-WIDTH = 900
-POINTS = 400
-MARKS = 400
-_LETTER, _LEGEND_ROW, _KEY = 6.7, 18, 30
-_DASHES = {"dash": "7 4", "dot": "2 3", "dashdot": "7 3 2 3"}
-_TAGS = re.compile(r"(</?b>|</?sup>|<br>)")
-_SPANS = {
+DEFAULT_WIDTH_PX = 900
+MAX_LINE_POINTS = 400
+MAX_MARKERS = 400
+_LETTER_PX, _LEGEND_ROW_PX, _LEGEND_KEY_PX = 6.7, 18, 30
+_DASH_ARRAYS = {"dash": "7 4", "dot": "2 3", "dashdot": "7 3 2 3"}
+_TAG_PATTERN = re.compile(r"(</?b>|</?sup>|<br>)")
+_TAG_SPANS = {
     "<b>": '<tspan font-weight="600">', "<sup>": '<tspan baseline-shift="super" font-size="9">',
     "</b>": "</tspan>", "</sup>": "</tspan>", "<br>": " ",
 }  # fmt: skip
@@ -235,7 +237,7 @@ def is_drawable(figure: Figure) -> bool:
     return bool(figure["data"]) and all(one["type"] == "scatter" for one in figure["data"])
 
 
-def drawing(figure: Figure, title: str, width: int = WIDTH) -> Markup:
+def to_svg(figure: Figure, title: str, width: int = DEFAULT_WIDTH_PX) -> Markup:
     """A figure as an SVG element.
 
     Parameters
@@ -245,16 +247,16 @@ def drawing(figure: Figure, title: str, width: int = WIDTH) -> Markup:
     width : int
         px; the height is the figure's.
     """
-    legend = list(_legend(figure, width))
+    legend = list(_lay_out_legend(figure, width))
     rows = 1 + max((row for _, row, _ in legend), default=-1)
     margin, height = figure["layout"]["margin"], figure["layout"]["height"]
-    more = max(rows - 1, 0) * _LEGEND_ROW  # the layout has left room for one row
+    more = max(rows - 1, 0) * _LEGEND_ROW_PX  # the layout has left room for one row
     box = (margin["l"], width - margin["r"], margin["t"] + more, height + more - margin["b"])
-    axes = axes_of(figure, box)
+    axes = build_axes(figure, box)
     parts = [
-        *_grid(figure, axes), *_shapes(figure, axes, box),
-        *(part for n, _ in enumerate(figure["data"]) for part in _trace(figure["data"], n, axes)),
-        *_labels(figure, axes, box), *_keys(legend),
+        *_draw_grid(figure, axes), *_draw_shapes(figure, axes, box),
+        *(part for n, _ in enumerate(figure["data"]) for part in _draw_trace(figure["data"], n, axes)),
+        *_draw_labels(figure, axes, box), *_draw_legend(legend),
     ]  # fmt: skip
     return Markup(
         f'<svg class="drawn" viewBox="0 0 {width} {height + more}" role="img" '
@@ -262,23 +264,23 @@ def drawing(figure: Figure, title: str, width: int = WIDTH) -> Markup:
     )
 
 
-def text_of(text: str) -> str:
+def to_markup(text: str) -> str:
     """A label as markup: bold and raised parts as such, all else escaped."""
-    return "".join(_SPANS.get(part) or str(escape(part)) for part in _TAGS.split(text))
+    return "".join(_TAG_SPANS.get(part) or str(escape(part)) for part in _TAG_PATTERN.split(text))
 
 
-def _grid(figure: Figure, axes: Mapping[str, Axis]) -> Iterator[str]:
-    for x, y in _pairs(figure, axes):
+def _draw_grid(figure: Figure, axes: Mapping[str, SvgAxis]) -> Iterator[str]:
+    for x, y in _axis_pairs(figure, axes):
         # Of several plots over one axis the one that it is anchored to has its labels.
         is_below = figure["layout"][f"xaxis{x.name[1:]}"].get("anchor", "y") == y.name
         for axis in (x, y):
-            for place, label in axis.ticks():
-                yield _tick(axis, x, y, place, label if axis is y or is_below else "")
+            for place, label in axis.tick_positions():
+                yield _draw_tick(axis, x, y, place, label if axis is y or is_below else "")
         yield (f'<path class="frame" d="M{x.start:.1f} {y.stop:.1f}V{y.start:.1f}'
                f'H{x.stop:.1f}"/>')  # fmt: skip
 
 
-def _tick(axis: Axis, x: Axis, y: Axis, place: float, label: str) -> str:
+def _draw_tick(axis: SvgAxis, x: SvgAxis, y: SvgAxis, place: float, label: str) -> str:
     if axis is x:
         line = f"M{place:.1f} {y.start:.1f}V{y.stop:.1f}"
         at = f'x="{place:.1f}" y="{y.start + 15:.1f}" text-anchor="middle"'
@@ -288,7 +290,7 @@ def _tick(axis: Axis, x: Axis, y: Axis, place: float, label: str) -> str:
     return f'<path class="grid" d="{line}"/><text {at}>{escape(label)}</text>'
 
 
-def _pairs(figure: Figure, axes: Mapping[str, Axis]) -> list[tuple[Axis, Axis]]:
+def _axis_pairs(figure: Figure, axes: Mapping[str, SvgAxis]) -> list[tuple[SvgAxis, SvgAxis]]:
     """Axes that are drawn at each other; of several over one time axis each has it."""
     layout = figure["layout"]
     return [
@@ -298,84 +300,92 @@ def _pairs(figure: Figure, axes: Mapping[str, Axis]) -> list[tuple[Axis, Axis]]:
     ]
 
 
-def _labels(
-    figure: Figure, axes: Mapping[str, Axis], box: tuple[float, float, float, float]
+def _draw_labels(
+    figure: Figure, axes: Mapping[str, SvgAxis], box: tuple[float, float, float, float]
 ) -> Iterator[str]:
-    for x, y in _pairs(figure, axes):
+    for x, y in _axis_pairs(figure, axes):
         if y.title:
             at = f"translate({x.start - 48:.1f} {0.5 * (y.start + y.stop):.1f}) rotate(-90)"
-            yield _titled(y.title, f'transform="{at}"')
+            yield _draw_title(y.title, f'transform="{at}"')
     for axis in (one for name, one in axes.items() if name.startswith("x") and one.title):
         below = str(figure["layout"][f"xaxis{axis.name[1:]}"].get("anchor", "y"))
         place = axes[below].start + 34
-        yield _titled(axis.title, f'x="{axis.share(0.5):.1f}" y="{place:.1f}"')
+        yield _draw_title(axis.title, f'x="{axis.fraction_to_pixel(0.5):.1f}" y="{place:.1f}"')
     left, right, top, bottom = box
     for one in figure["layout"].get("annotations", ()):
         x_at = left + one["x"] * (right - left)
         if one.get("xref") != "paper":
-            x_at = axes["x"].at(one["x"]) or left
+            x_at = axes["x"].to_pixel(one["x"]) or left
         y_at = bottom - one["y"] * (bottom - top)
         drop = 12 if one.get("yanchor") == "top" else -one.get("yshift", 0)
         yield (f'<text x="{x_at + one.get("xshift", 0):.1f}" y="{y_at + drop:.1f}">'
-               f"{text_of(one['text'])}</text>")  # fmt: skip
+               f"{to_markup(one['text'])}</text>")  # fmt: skip
 
 
-def _titled(text: str, at: str) -> str:
-    return f'<text class="title" text-anchor="middle" {at}>{text_of(text)}</text>'
+def _draw_title(text: str, at: str) -> str:
+    return f'<text class="title" text-anchor="middle" {at}>{to_markup(text)}</text>'
 
 
-def _shapes(
-    figure: Figure, axes: Mapping[str, Axis], box: tuple[float, float, float, float]
+def _draw_shapes(
+    figure: Figure, axes: Mapping[str, SvgAxis], box: tuple[float, float, float, float]
 ) -> Iterator[str]:
     for one in figure["layout"].get("shapes", ()):
-        x = [_placed(one.get("xref", "x"), one[k], axes, box[:2]) for k in ("x0", "x1")]
-        y = [_placed(one.get("yref", "y"), one[k], axes, (box[3], box[2])) for k in ("y0", "y1")]
+        x = [_to_pixel(one.get("xref", "x"), one[k], axes, box[:2]) for k in ("x0", "x1")]
+        y = [_to_pixel(one.get("yref", "y"), one[k], axes, (box[3], box[2])) for k in ("y0", "y1")]
         known = [place for place in (*x, *y) if place is not None]
         if len(known) == 4:
-            yield _shape(one, *known)
+            yield _draw_shape(one, *known)
 
 
-def _shape(one: Mapping[str, Any], x0: float, x1: float, y0: float, y1: float) -> str:
+def _draw_shape(one: Mapping[str, Any], x0: float, x1: float, y0: float, y1: float) -> str:
     if one["type"] == "rect":
         return (
             f'<rect x="{min(x0, x1):.1f}" y="{min(y0, y1):.1f}" width="{abs(x1 - x0):.1f}" '
             f'height="{abs(y1 - y0):.1f}" fill="{one["fillcolor"]}"/>'
         )
-    return f'<path d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" {_stroke(one["line"])}/>'
+    return f'<path d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" {_stroke_attributes(one["line"])}/>'
 
 
-def _placed(
-    ref: str, value: float, axes: Mapping[str, Axis], paper: tuple[float, float]
+def _to_pixel(
+    ref: str, value: float, axes: Mapping[str, SvgAxis], paper: tuple[float, float]
 ) -> float | None:
     if ref == "paper":
         return paper[0] + value * (paper[1] - paper[0])
     name, _, domain = ref.partition(" ")
-    return axes[name].share(value) if domain else axes[name].at(value)
+    return axes[name].fraction_to_pixel(value) if domain else axes[name].to_pixel(value)
 
 
-def _trace(data: Sequence[Trace], number: int, axes: Mapping[str, Axis]) -> Iterator[str]:
+def _draw_trace(
+    data: Sequence[PlotlyTrace], number: int, axes: Mapping[str, SvgAxis]
+) -> Iterator[str]:
     trace = data[number]
     x, y = axes[axis_name(trace, "x")], axes[axis_name(trace, "y")]
     if trace.get("fill") == "tonexty" and number:
-        yield _band(data[number - 1], trace, x, y)
+        yield _draw_band(data[number - 1], trace, x, y)
     mode = trace.get("mode", "lines")
     if "lines" in mode and trace.get("line", {}).get("width", 1):
-        yield (f'<path d="{_path(_thin(trace, x, y), trace)}" fill="none" '
-               f"{_stroke(trace.get('line', {}))}/>")  # fmt: skip
+        yield (f'<path d="{_path_data(_thin_line(trace, x, y), trace)}" fill="none" '
+               f"{_stroke_attributes(trace.get('line', {}))}/>")  # fmt: skip
     if "markers" in mode:
-        yield from _errors(trace, x, y)
-        yield from _marks(trace, x, y)
+        yield from _draw_error_bars(trace, x, y)
+        yield from _draw_markers(trace, x, y)
 
 
-def _thin(trace: Trace, x: Axis, y: Axis) -> list[tuple[float | None, float | None]]:
+def _thin_line(
+    trace: PlotlyTrace, x: SvgAxis, y: SvgAxis
+) -> list[tuple[float | None, float | None]]:
     """Places of a line, no more than a drawing needs; None where it has a gap."""
     values = np.array([np.nan if v is None else v for v in trace["y"]], dtype=np.float64)
     whole = bool(np.isfinite(values).all())
-    kept = thinned(values, POINTS) if whole else strided(values.size, POINTS)
-    return [(x.at(trace["x"][i]), y.at(trace["y"][i])) for i in kept]
+    kept = (
+        thin_indices(values, MAX_LINE_POINTS)
+        if whole
+        else stride_indices(values.size, MAX_LINE_POINTS)
+    )
+    return [(x.to_pixel(trace["x"][i]), y.to_pixel(trace["y"][i])) for i in kept]
 
 
-def _path(places: Sequence[tuple[float | None, float | None]], trace: Trace) -> str:
+def _path_data(places: Sequence[tuple[float | None, float | None]], trace: PlotlyTrace) -> str:
     is_held = trace.get("line", {}).get("shape") == "hv"
     words: list[str] = []
     before: tuple[str, str] | None = None
@@ -394,20 +404,22 @@ def _path(places: Sequence[tuple[float | None, float | None]], trace: Trace) -> 
     return "".join(words)
 
 
-def _band(lower: Trace, upper: Trace, x: Axis, y: Axis) -> str:
-    edge = [p for p in _thin(lower, x, y) if None not in p]
-    other = [p for p in _thin(upper, x, y) if None not in p]
-    path = _path([*edge, *reversed(other)], {}) + ("Z" if edge and other else "")
+def _draw_band(lower: PlotlyTrace, upper: PlotlyTrace, x: SvgAxis, y: SvgAxis) -> str:
+    edge = [p for p in _thin_line(lower, x, y) if None not in p]
+    other = [p for p in _thin_line(upper, x, y) if None not in p]
+    path = _path_data([*edge, *reversed(other)], {}) + ("Z" if edge and other else "")
     return f'<path d="{path}" fill="{upper.get("fillcolor", "none")}"/>'
 
 
-def _errors(trace: Trace, x: Axis, y: Axis) -> Iterator[str]:
+def _draw_error_bars(trace: PlotlyTrace, x: SvgAxis, y: SvgAxis) -> Iterator[str]:
     bars = trace.get("error_y")
     if not bars:
         return
     for across, up, reach in zip(trace["x"], trace["y"], bars["array"], strict=True):
-        at = x.at(across)
-        ends = [y.at(up + sign * reach) for sign in (-1, 1)] if up is not None and reach else []
+        at = x.to_pixel(across)
+        ends = (
+            [y.to_pixel(up + sign * reach) for sign in (-1, 1)] if up is not None and reach else []
+        )
         if at is None or not ends or None in ends:
             continue
         low, high = ends
@@ -415,27 +427,27 @@ def _errors(trace: Trace, x: Axis, y: Axis) -> Iterator[str]:
                f'M{at - 4:.1f} {high:.1f}h8" fill="none" stroke="{bars["color"]}"/>')  # fmt: skip
 
 
-def _marks(trace: Trace, x: Axis, y: Axis) -> Iterator[str]:
+def _draw_markers(trace: PlotlyTrace, x: SvgAxis, y: SvgAxis) -> Iterator[str]:
     marker = trace.get("marker", {})
-    for i in strided(len(trace["x"]), MARKS):
-        across, up = x.at(trace["x"][i]), y.at(trace["y"][i])
+    for i in stride_indices(len(trace["x"]), MAX_MARKERS):
+        across, up = x.to_pixel(trace["x"][i]), y.to_pixel(trace["y"][i])
         if across is not None and up is not None:
-            shape = _one(marker.get("symbol", "circle"), i)
-            colour = _one(marker.get("color", "currentColor"), i)
-            yield symbol(shape, across, up, 0.5 * marker.get("size", 6), colour)
+            shape = _marker_property(marker.get("symbol", "circle"), i)
+            colour = _marker_property(marker.get("color", "currentColor"), i)
+            yield draw_marker(shape, across, up, 0.5 * marker.get("size", 6), colour)
 
 
-def _one(value: Any, place: int) -> str:
+def _marker_property(value: Any, place: int) -> str:
     return str(value[place] if isinstance(value, list) else value)
 
 
-def _stroke(line: Mapping[str, Any]) -> str:
-    dash = _DASHES.get(line.get("dash", ""))
+def _stroke_attributes(line: Mapping[str, Any]) -> str:
+    dash = _DASH_ARRAYS.get(line.get("dash", ""))
     return (f'stroke="{line.get("color", "currentColor")}" stroke-width="{line.get("width", 1)}"'
             + (f' stroke-dasharray="{dash}"' if dash else ""))  # fmt: skip
 
 
-def _legend(figure: Figure, width: int) -> Iterator[tuple[float, int, Trace]]:
+def _lay_out_legend(figure: Figure, width: int) -> Iterator[tuple[float, int, PlotlyTrace]]:
     """Left edge (px), row and trace of each entry."""
     if figure["layout"].get("showlegend") is False:
         return
@@ -443,25 +455,25 @@ def _legend(figure: Figure, width: int) -> Iterator[tuple[float, int, Trace]]:
     for trace in figure["data"]:
         if not trace.get("showlegend", True):
             continue
-        wide = _KEY + 14 + _LETTER * len(_name(trace))
+        wide = _LEGEND_KEY_PX + 14 + _LETTER_PX * len(_trace_label(trace))
         if left + wide > width and left > figure["layout"]["margin"]["l"]:
             left, row = float(figure["layout"]["margin"]["l"]), row + 1
         yield left, row, trace
         left += wide
 
 
-def _keys(legend: Sequence[tuple[float, int, Trace]]) -> Iterator[str]:
+def _draw_legend(legend: Sequence[tuple[float, int, PlotlyTrace]]) -> Iterator[str]:
     for left, row, trace in legend:
-        y = 12 + row * _LEGEND_ROW
+        y = 12 + row * _LEGEND_ROW_PX
         mode = trace.get("mode", "lines")
         if "lines" in mode:
-            yield f'<path d="M{left:.1f} {y}h{_KEY - 6}" {_stroke(trace.get("line", {}))}/>'
+            yield f'<path d="M{left:.1f} {y}h{_LEGEND_KEY_PX - 6}" {_stroke_attributes(trace.get("line", {}))}/>'
         if "markers" in mode:
             marker = trace.get("marker", {})
-            yield symbol(_one(marker.get("symbol", "circle"), 0), left + _KEY / 2 - 3, y, 4,
-                         _one(marker.get("color", "currentColor"), 0))  # fmt: skip
-        yield f'<text x="{left + _KEY:.1f}" y="{y + 4}">{escape(_name(trace))}</text>'
+            yield draw_marker(_marker_property(marker.get("symbol", "circle"), 0), left + _LEGEND_KEY_PX / 2 - 3, y, 4,
+                         _marker_property(marker.get("color", "currentColor"), 0))  # fmt: skip
+        yield f'<text x="{left + _LEGEND_KEY_PX:.1f}" y="{y + 4}">{escape(_trace_label(trace))}</text>'
 
 
-def _name(trace: Trace) -> str:
+def _trace_label(trace: PlotlyTrace) -> str:
     return str(trace.get("name") or trace.get("legendgroup", ""))

@@ -12,20 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.figures.data import Floats
-from service.formats.decimate import extremes
+from service.formats.decimate import find_extremes
 
 Theme = Literal["light", "dark"]
 
 BLUE, VERMILLION, GREEN = "#2a83c4", "#d55e00", "#00916a"
 PURPLE, OCHRE, GREY = "#b9619b", "#b5830f", "#8a929b"
-SERIES = (BLUE, VERMILLION, GREEN, PURPLE, OCHRE, GREY)
-DASHES = ("solid", "dash", "dot", "dashdot")
+SERIES_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, OCHRE, GREY)
+SERIES_DASHES = ("solid", "dash", "dot", "dashdot")
 SHADE = "rgba(138,146,155,0.14)"
 HAIRLINE = "rgba(138,146,155,0.55)"
 DIVERGING = [[0.0, BLUE], [0.5, "rgba(138,146,155,0.10)"], [1.0, VERMILLION]]
 FONT = "system-ui, -apple-system, 'Segoe UI', Roboto, 'DejaVu Sans', sans-serif"
 
-_INK: dict[Theme, dict[str, str]] = {
+_INK_COLOURS: dict[Theme, dict[str, str]] = {
     "light": {"text": "#303a44", "grid": "#e6e9ec", "line": "#b9c0c7", "card": "#ffffff"},
     "dark": {"text": "#c6ced6", "grid": "#2a3138", "line": "#4c565f", "card": "#20262c"},
 }
@@ -34,15 +34,15 @@ _INK: dict[Theme, dict[str, str]] = {
 def series_style(number: int) -> dict[str, Any]:
     """Colour and dash of the numbered series; no two of the first 24 are alike."""
     return {
-        "color": SERIES[number % len(SERIES)],
-        "dash": DASHES[number // len(SERIES) % len(DASHES)],
+        "color": SERIES_COLOURS[number % len(SERIES_COLOURS)],
+        "dash": SERIES_DASHES[number // len(SERIES_COLOURS) % len(SERIES_DASHES)],
         "width": 1.6,
     }
 
 
-def template(theme: Theme) -> dict[str, Any]:
+def plotly_template(theme: Theme) -> dict[str, Any]:
     """Plotly template: quiet axes on a transparent ground."""
-    ink = _INK[theme]
+    ink = _INK_COLOURS[theme]
     axis = {
         "gridcolor": ink["grid"], "linecolor": ink["line"], "tickcolor": ink["line"],
         "zerolinecolor": ink["line"], "zerolinewidth": 1, "showline": True, "ticks": "outside",
@@ -55,7 +55,7 @@ def template(theme: Theme) -> dict[str, Any]:
             "paper_bgcolor": "rgba(0,0,0,0)",
             "plot_bgcolor": "rgba(0,0,0,0)",
             "font": {"family": FONT, "size": 12, "color": ink["text"]},
-            "colorway": list(SERIES),
+            "colorway": list(SERIES_COLOURS),
             "xaxis": axis,
             "yaxis": axis,
             "hoverlabel": {
@@ -76,25 +76,25 @@ def template(theme: Theme) -> dict[str, Any]:
 MAX_POINTS = 1000
 
 
-def thinned(values: Floats, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
+def thin_indices(values: Floats, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
     """Indices of at most `max_points` samples: the ends, and each bin's least and greatest.
 
     A spike of one sample therefore stays visible at any zoom. Several arrays may share them.
     """
     if values.size <= max_points:
         return np.arange(values.size)
-    inner = extremes(values, max_points - 2)
+    inner = find_extremes(values, max_points - 2)
     return np.unique(np.concatenate([[0, values.size - 1], inner])).astype(np.intp)
 
 
-def window(times: Floats, start: float | None, stop: float | None) -> slice:
+def window_slice(times: Floats, start: float | None, stop: float | None) -> slice:
     """Samples between two times (s), with one more at each side so that lines reach the edge."""
     first = 0 if start is None else int(np.searchsorted(times, start, "left")) - 1
     last = times.size if stop is None else int(np.searchsorted(times, stop, "right")) + 1
     return slice(max(first, 0), min(last, times.size))
 
 
-def strided(count: int, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
+def stride_indices(count: int, max_points: int = MAX_POINTS) -> NDArray[np.intp]:
     """Indices of at most `max_points` of `count` steps, the first and the last among them."""
     if count <= max_points:
         return np.arange(count)

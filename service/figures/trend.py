@@ -5,18 +5,22 @@ from typing import Any
 from service.core.text import append_unit
 from service.figures import theme
 from service.figures.grid import WIDE_MARGIN, Place, add_axes, add_caption, wide_grid
-from service.figures.plotly import Figure, finite, layout
-from service.trends.schemas import LawOut, PlaceOut, PointOut, QuantityOut, TrendOut
+from service.figures.plotly import Figure, base_layout, to_json_numbers
+from service.trends.schemas import LawOut, LawPointOut, PointOut, QuantityOut, TrendOut
 
 _BAND = "rgba(42,131,196,0.15)"
-_ESTIMATES, _LAW, _OTHER = "estimate ± standard error", "chosen law, 95 % band", "other law"
-_PREDICTED, _FLAGGED = "prediction, 95 % interval", "outlier or drift"
-_EXPECTED = "what the reference expects"
+_ESTIMATES_LABEL, _LAW_LABEL, _OTHER_LABEL = (
+    "estimate ± standard error",
+    "chosen law, 95 % band",
+    "other law",
+)
+_PREDICTED_LABEL, _FLAGGED_LABEL = "prediction, 95 % interval", "outlier or drift"
+_EXPECTED_LABEL = "what the reference expects"
 
-Axes = dict[str, str]
+AxisNames = dict[str, str]
 
 
-def trend_figure(found: TrendOut, columns: int = 2) -> Figure:
+def plot_trend(found: TrendOut, columns: int = 2) -> Figure:
     """Estimates with error bars over x, one small plot a quantity.
 
     In each the chosen law as a line in its confidence band, the other law dotted, predictions as
@@ -26,12 +30,12 @@ def trend_figure(found: TrendOut, columns: int = 2) -> Figure:
     grid = wide_grid(len(shown), columns)
     figure: Figure = {
         "data": [],
-        "layout": layout(grid.height(WIDE_MARGIN), annotations=[], margin=WIDE_MARGIN),
+        "layout": base_layout(grid.height(WIDE_MARGIN), annotations=[], margin=WIDE_MARGIN),
     }
     told: set[str] = set()
     for number, one in enumerate(shown):
-        at = _axes(figure, number, one, found.x, grid.place(number))
-        for trace in _traces(one):
+        at = _add_axes(figure, number, one, found.x, grid.place(number))
+        for trace in _quantity_traces(one):
             name = trace["legendgroup"]
             first = name not in told and trace.get("showlegend", True)
             label = name if first else f"{one.name}: {name}"
@@ -45,7 +49,7 @@ def trend_height(n_quantities: int, columns: int = 2) -> int:
     return wide_grid(n_quantities, columns).height(WIDE_MARGIN)
 
 
-def _axes(figure: Figure, number: int, one: QuantityOut, x: str, place: Place) -> Axes:
+def _add_axes(figure: Figure, number: int, one: QuantityOut, x: str, place: Place) -> AxisNames:
     small = {"size": 11}
     at = add_axes(
         figure,
@@ -59,75 +63,78 @@ def _axes(figure: Figure, number: int, one: QuantityOut, x: str, place: Place) -
         },
         {"nticks": 6, "title": {"text": append_unit(one.name, one.unit), "font": small}},
     )
-    add_caption(figure, _caption(one), place)
+    add_caption(figure, _law_caption(one), place)
     return at
 
 
-def _caption(one: QuantityOut) -> str:
+def _law_caption(one: QuantityOut) -> str:
     chosen = next((law for law in one.laws if law.is_chosen), None)
     if chosen is None:
         return f"<b>{one.name}</b>: no law"
-    return f"<b>{one.name}</b> = {_formula(chosen)}"
+    return f"<b>{one.name}</b> = {_law_formula(chosen)}"
 
 
-def _formula(law: LawOut) -> str:
+def _law_formula(law: LawOut) -> str:
     a, b = (f"{one.value:.4g}".replace("-", "−") for one in law.coefficients)
     return f"{a} + {b}·x".replace("+ −", "− ") if law.law == "line" else f"{a}·x<sup>{b}</sup>"
 
 
-def _traces(one: QuantityOut) -> list[dict[str, Any]]:
+def _quantity_traces(one: QuantityOut) -> list[dict[str, Any]]:
     known = [point for point in one.points if point.value is not None]
     return [
-        *_band(one.band), *_other(one), *_expected(known), *_predictions(one.predictions),
-        *_flagged(known), _estimates(known),
+        *_law_traces(one.band), *_other_law_traces(one), *_reference_traces(known), *_prediction_traces(one.predictions),
+        *_flag_traces(known), _estimate_trace(known),
     ]  # fmt: skip
 
 
-def _scatter(group: str, mode: str, x: list[Any], y: list[Any], **more: Any) -> dict[str, Any]:
+def _scatter_trace(
+    group: str, mode: str, x: list[Any], y: list[Any], **more: Any
+) -> dict[str, Any]:
     return {"type": "scatter", "legendgroup": group, "mode": mode, "x": x, "y": y, **more}
 
 
-def _band(places: list[PlaceOut]) -> list[dict[str, Any]]:
+def _law_traces(places: list[LawPointOut]) -> list[dict[str, Any]]:
     if not places:
         return []
-    x = finite(place.x for place in places)
+    x = to_json_numbers(place.x for place in places)
     edge = {"line": {"width": 0}, "showlegend": False, "hoverinfo": "skip"}
     low, high, middle = (
-        _numbers([getattr(place, name) for place in places]) for name in ("lower", "upper", "value")
+        _to_json_numbers([getattr(place, name) for place in places])
+        for name in ("lower", "upper", "value")
     )
     return [
-        _scatter(_LAW, "lines", x, low, **edge),
-        _scatter(_LAW, "lines", x, high, **edge, fill="tonexty", fillcolor=_BAND),
-        _scatter(_LAW, "lines", x, middle, line={"color": theme.BLUE, "width": 1.8},
+        _scatter_trace(_LAW_LABEL, "lines", x, low, **edge),
+        _scatter_trace(_LAW_LABEL, "lines", x, high, **edge, fill="tonexty", fillcolor=_BAND),
+        _scatter_trace(_LAW_LABEL, "lines", x, middle, line={"color": theme.BLUE, "width": 1.8},
                  hovertemplate="law at %{x:.4g}: %{y:.4g}<extra></extra>"),
     ]  # fmt: skip
 
 
-def _other(one: QuantityOut) -> list[dict[str, Any]]:
+def _other_law_traces(one: QuantityOut) -> list[dict[str, Any]]:
     """The law that was not chosen, over the same stretch."""
     law = next((law for law in one.laws if not law.is_chosen), None)
     if law is None:
         return []
     a, b = (coefficient.value for coefficient in law.coefficients)
     x = [place.x for place in one.band]
-    y = [a + b * at if law.law == "line" else _power(a, b, at) for at in x]
+    y = [a + b * at if law.law == "line" else _power_law(a, b, at) for at in x]
     return [
-        _scatter(_OTHER, "lines", finite(x), finite(y),
+        _scatter_trace(_OTHER_LABEL, "lines", to_json_numbers(x), to_json_numbers(y),
                  line={"color": theme.GREY, "dash": "dot", "width": 1.4},
                  hovertemplate=f"{law.formula} at %{{x:.4g}}: %{{y:.4g}}<extra></extra>")
     ]  # fmt: skip
 
 
-def _power(a: float, b: float, x: float) -> float:
+def _power_law(a: float, b: float, x: float) -> float:
     return float(a * x**b) if x > 0 else float("nan")
 
 
-def _estimates(known: list[PointOut]) -> dict[str, Any]:
+def _estimate_trace(known: list[PointOut]) -> dict[str, Any]:
     colour = theme.VERMILLION
-    return _scatter(
-        _ESTIMATES, "markers", finite(point.x for point in known),
-        _numbers([point.value for point in known]),
-        error_y={"type": "data", "array": _numbers([p.stderr or 0.0 for p in known]),
+    return _scatter_trace(
+        _ESTIMATES_LABEL, "markers", to_json_numbers(point.x for point in known),
+        _to_json_numbers([point.value for point in known]),
+        error_y={"type": "data", "array": _to_json_numbers([p.stderr or 0.0 for p in known]),
                  "color": colour, "thickness": 1.4, "width": 4},
         marker={"color": colour, "size": 7,
                 "symbol": ["circle" if p.is_used else "circle-open" for p in known]},
@@ -137,49 +144,49 @@ def _estimates(known: list[PointOut]) -> dict[str, Any]:
     )  # fmt: skip
 
 
-def _predictions(places: list[PlaceOut]) -> list[dict[str, Any]]:
+def _prediction_traces(places: list[LawPointOut]) -> list[dict[str, Any]]:
     known = [one for one in places if one.value is not None and one.upper is not None]
     if not known:
         return []
     return [
-        _scatter(
-            _PREDICTED, "markers", finite(one.x for one in known),
-            _numbers([one.value for one in known]),
+        _scatter_trace(
+            _PREDICTED_LABEL, "markers", to_json_numbers(one.x for one in known),
+            _to_json_numbers([one.value for one in known]),
             error_y={"type": "data", "symmetric": True, "color": theme.GREEN, "thickness": 1.4,
-                     "width": 6, "array": _numbers([_reach(one) for one in known])},
+                     "width": 6, "array": _to_json_numbers([_half_width(one) for one in known])},
             marker={"color": theme.GREEN, "size": 9, "symbol": "diamond-open"},
             hovertemplate="predicted at %{x:.4g}: %{y:.4g} ± %{error_y.array:.2g}<extra></extra>",
         )
     ]  # fmt: skip
 
 
-def _reach(one: PlaceOut) -> float:
+def _half_width(one: LawPointOut) -> float:
     return 0.5 * ((one.upper or 0.0) - (one.lower or 0.0))
 
 
-def _flagged(known: list[PointOut]) -> list[dict[str, Any]]:
+def _flag_traces(known: list[PointOut]) -> list[dict[str, Any]]:
     flagged = [p for p in known if p.is_outlier or any(one.drifted for one in p.drifts)]
     if not flagged:
         return []
     return [
-        _scatter(_FLAGGED, "markers", finite(p.x for p in flagged),
-                 _numbers([p.value for p in flagged]), hoverinfo="skip",
+        _scatter_trace(_FLAGGED_LABEL, "markers", to_json_numbers(p.x for p in flagged),
+                 _to_json_numbers([p.value for p in flagged]), hoverinfo="skip",
                  marker={"color": theme.PURPLE, "size": 18, "symbol": "circle-open",
                          "line": {"width": 2}})
     ]  # fmt: skip
 
 
-def _expected(known: list[PointOut]) -> list[dict[str, Any]]:
+def _reference_traces(known: list[PointOut]) -> list[dict[str, Any]]:
     pairs = [(p.x, one.expected) for p in known for one in p.drifts]
     if not pairs:
         return []
     return [
-        _scatter(_EXPECTED, "markers", finite(x for x, _ in pairs), finite(y for _, y in pairs),
+        _scatter_trace(_EXPECTED_LABEL, "markers", to_json_numbers(x for x, _ in pairs), to_json_numbers(y for _, y in pairs),
                  marker={"color": theme.GREY, "size": 10, "symbol": "x-thin",
                          "line": {"width": 2, "color": theme.GREY}},
                  hovertemplate="the reference expects %{y:.5g} at %{x:.4g}<extra></extra>")
     ]  # fmt: skip
 
 
-def _numbers(values: list[float | None]) -> list[float | None]:
-    return [None if value is None else finite([value])[0] for value in values]
+def _to_json_numbers(values: list[float | None]) -> list[float | None]:
+    return [None if value is None else to_json_numbers([value])[0] for value in values]

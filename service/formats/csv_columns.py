@@ -8,26 +8,26 @@ from math import isinf, isnan
 import numpy as np
 from numpy.typing import NDArray
 
-from service.formats.csv_layout import Column, Layout
+from service.formats.csv_layout import CsvColumn, CsvLayout
 from service.formats.errors import InvalidUpload
 from sysid.core.types import FloatArray
 
 BLOCK_ROWS = 50_000
-Values = FloatArray | NDArray[np.str_]
+ColumnValues = FloatArray | NDArray[np.str_]
 
 
-class Table:
+class CsvTable:
     """Columns of a file and the row of the file each sample stood in."""
 
-    def __init__(self, columns: dict[str, Values], rows: NDArray[np.int64]) -> None:
+    def __init__(self, columns: dict[str, ColumnValues], rows: NDArray[np.int64]) -> None:
         self.columns, self.rows = columns, rows
 
-    def numbers(self, name: str) -> FloatArray:
+    def parse_numbers(self, name: str) -> FloatArray:
         """The values of a column of numbers."""
         return np.asarray(self.columns[name], dtype=np.float64)
 
 
-def read_columns(lines: Iterable[str], layout: Layout) -> Table:
+def read_columns(lines: Iterable[str], layout: CsvLayout) -> CsvTable:
     """All columns of the body; `lines` begin with the header.
 
     Empty fields and ``nan`` in columns of values become ``nan``: they are missing.
@@ -38,7 +38,7 @@ def read_columns(lines: Iterable[str], layout: Layout) -> Table:
         With row and column, for a ragged row, a text or an infinite value in a column of
         numbers, or a missing time; and if there are no rows.
     """
-    blocks = list(_blocks(lines, layout))
+    blocks = list(_iterate_blocks(lines, layout))
     if not blocks:
         raise InvalidUpload("there are no rows below the header")
     rows = np.concatenate([block_rows for _, block_rows in blocks])
@@ -46,12 +46,12 @@ def read_columns(lines: Iterable[str], layout: Layout) -> Table:
         column.name: np.concatenate([block[i] for block, _ in blocks])
         for i, column in enumerate(layout.columns)
     }
-    return Table(columns, rows)
+    return CsvTable(columns, rows)
 
 
-def _blocks(
-    lines: Iterable[str], layout: Layout
-) -> Iterator[tuple[list[Values], NDArray[np.int64]]]:
+def _iterate_blocks(
+    lines: Iterable[str], layout: CsvLayout
+) -> Iterator[tuple[list[ColumnValues], NDArray[np.int64]]]:
     reader = csv.reader(lines, delimiter=layout.separator, strict=True)
     before = 0
     try:
@@ -65,12 +65,14 @@ def _blocks(
                 fields = [row for row, keep in zip(fields, filled, strict=True) if keep]
                 numbers = numbers[filled]
             if fields:
-                yield _block(fields, layout, numbers), numbers
+                yield _parse_block(fields, layout, numbers), numbers
     except csv.Error as error:
         raise InvalidUpload(f"this row cannot be read ({error})", row=reader.line_num) from None
 
 
-def _block(fields: list[list[str]], layout: Layout, numbers: NDArray[np.int64]) -> list[Values]:
+def _parse_block(
+    fields: list[list[str]], layout: CsvLayout, numbers: NDArray[np.int64]
+) -> list[ColumnValues]:
     width = len(layout.columns)
     for row, number in zip(fields, numbers, strict=True):
         if len(row) != width:
@@ -81,19 +83,19 @@ def _block(fields: list[list[str]], layout: Layout, numbers: NDArray[np.int64]) 
                 f"this row has {len(row)} fields, but the header has {width}{meant}",
                 row=int(number),
             )
-    convert = _decimal_comma if layout.has_decimal_commas else _decimal_point
+    convert = _parse_decimal_comma if layout.has_decimal_commas else _parse_decimal_point
     return [
-        _column(column, texts, convert, numbers)
+        _parse_column(column, texts, convert, numbers)
         for column, texts in zip(layout.columns, zip(*fields, strict=True), strict=True)
     ]
 
 
-def _column(
-    column: Column,
+def _parse_column(
+    column: CsvColumn,
     texts: tuple[str, ...],
     convert: Callable[[str], float],
     numbers: NDArray[np.int64],
-) -> Values:
+) -> ColumnValues:
     if column.role == "label":
         return np.array([text.strip() for text in texts], dtype=np.str_)
     try:
@@ -104,51 +106,51 @@ def _column(
         pass  # looked at field by field below, to name the one or to find it empty
     return np.array(
         [
-            _field(column, text, convert, int(number))
+            _parse_field(column, text, convert, int(number))
             for text, number in zip(texts, numbers, strict=True)
         ]
     )
 
 
-def _field(column: Column, text: str, convert: Callable[[str], float], row: int) -> float:
+def _parse_field(column: CsvColumn, text: str, convert: Callable[[str], float], row: int) -> float:
     try:
         value = convert(text) if text.strip() else float("nan")
     except ValueError:
         raise InvalidUpload(
-            f"found {_shortened(text)}, which is not a number{_hint(text, column, convert)}",
+            f"found {_shorten_text(text)}, which is not a number{_suggest_cause(text, column, convert)}",
             row=row, column=column.name,
         ) from None  # fmt: skip
     if isinf(value):
         raise InvalidUpload(
-            f"found {_shortened(text)}; values must be finite (an empty field is a missing value)",
+            f"found {_shorten_text(text)}; values must be finite (an empty field is a missing value)",
             row=row, column=column.name,
         )  # fmt: skip
     if isnan(value) and column.role == "time":
         raise InvalidUpload(
-            f"the time is missing (found {_shortened(text)}); every row needs a time in seconds",
+            f"the time is missing (found {_shorten_text(text)}); every row needs a time in seconds",
             row=row, column=column.name,
         )  # fmt: skip
     return value
 
 
-def _decimal_point(text: str) -> float:
+def _parse_decimal_point(text: str) -> float:
     if "_" in text:  # Python would read 1_000 as a number
         raise ValueError(text)
     return float(text)
 
 
-def _decimal_comma(text: str) -> float:
+def _parse_decimal_comma(text: str) -> float:
     if "." in text or "_" in text:
         raise ValueError(text)
     return float(text.replace(",", "."))
 
 
-def _shortened(text: str) -> str:
+def _shorten_text(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
 
 
-def _hint(text: str, column: Column, convert: Callable[[str], float]) -> str:
-    if convert is _decimal_comma and "." in text and not any(map(str.isalpha, text)):
+def _suggest_cause(text: str, column: CsvColumn, convert: Callable[[str], float]) -> str:
+    if convert is _parse_decimal_comma and "." in text and not any(map(str.isalpha, text)):
         return "; decimal points and commas are mixed: other numbers of the file have commas"
     if "," in text and "." in text:
         return "; decimal points and commas are mixed"

@@ -7,45 +7,47 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.formats.errors import InvalidUpload
-from sysid.core.errors import nearest
-from sysid.core.units import factor
+from sysid.core.errors import suggest_name
+from sysid.core.units import find_conversion_factor
 
 SEPARATORS = ("\t", ";", ",")
 TIME_NAMES = ("t", "t_s", "time", "time_s")
-SECONDS = ("", "s", "sec", "second", "seconds")
+SECOND_NAMES = ("", "s", "sec", "second", "seconds")
 LONGEST_TIME_UNIT = 86_400.0
 """Seconds of a day: a longer unit is a slip."""
 
 _UNIT = re.compile(r"^(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]$")
 _DECIMAL_COMMA = re.compile(r"^\s*[+-]?\d*,\d+([eE][+-]?\d+)?\s*$")
 
-Role = Literal["time", "label", "value"]
+ColumnRole = Literal["time", "label", "value"]
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class CsvColumn:
     """One column: its name without the unit, and what it is."""
 
     name: str
     unit: str
-    role: Role
+    role: ColumnRole
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class CsvLayout:
     """How a file is to be read."""
 
-    columns: tuple[Column, ...]
+    columns: tuple[CsvColumn, ...]
     separator: str
     has_decimal_commas: bool
 
     @property
-    def time(self) -> int | None:
+    def time_index(self) -> int | None:
         """Place of the time column, if there is one."""
         return next((i for i, one in enumerate(self.columns) if one.role == "time"), None)
 
 
-def find_layout(lines: Sequence[str], segments: Sequence[str], sample_time: float | None) -> Layout:
+def detect_layout(
+    lines: Sequence[str], segments: Sequence[str], sample_time: float | None
+) -> CsvLayout:
     """Layout of a file from its first lines.
 
     Raises
@@ -53,30 +55,30 @@ def find_layout(lines: Sequence[str], segments: Sequence[str], sample_time: floa
     InvalidUpload
         If there is no usable header, or the time is missing or told twice.
     """
-    separator = _separator(lines[0])
+    separator = _detect_separator(lines[0])
     try:
         rows = list(csv.reader(lines, delimiter=separator))
     except csv.Error as error:
         raise InvalidUpload(f"the first rows cannot be read ({error})") from None
-    names = [_name_and_unit(field) for field in rows[0]]
+    names = [_split_unit(field) for field in rows[0]]
     if len(names) == 1 and (sample_time is None or _is_number(rows[0][0])):
         raise InvalidUpload(
             f"there is only one column ({rows[0][0].strip()!r}); need a time column and a signal, "
             "separated by comma, semicolon or tab"
         )
     _check_names(names)
-    columns = _with_roles(names, segments, sample_time)
+    columns = _assign_roles(names, segments, sample_time)
     if not any(column.role == "value" for column in columns):
         raise InvalidUpload("there is no signal: every column is time or a label")
-    return Layout(columns, separator, separator != "," and _has_decimal_commas(rows[1:]))
+    return CsvLayout(columns, separator, separator != "," and _has_decimal_commas(rows[1:]))
 
 
-def _separator(header: str) -> str:
+def _detect_separator(header: str) -> str:
     unquoted = re.sub(r'"[^"]*"', "", header)
     return next((sign for sign in SEPARATORS if sign in unquoted), ",")
 
 
-def _name_and_unit(field: str) -> tuple[str, str]:
+def _split_unit(field: str) -> tuple[str, str]:
     found = _UNIT.match(field.strip())
     return (found["name"], found["unit"].strip()) if found else (field.strip(), "")
 
@@ -104,23 +106,25 @@ def _check_names(names: Sequence[tuple[str, str]]) -> None:
         seen.add(name)
 
 
-def _with_roles(
+def _assign_roles(
     names: Sequence[tuple[str, str]], segments: Sequence[str], sample_time: float | None
-) -> tuple[Column, ...]:
+) -> tuple[CsvColumn, ...]:
     known = [name for name, _ in names]
     for label in segments:
         if label not in known:
-            raise InvalidUpload(f"there is no label column {label!r}{nearest(label, known)}", row=1)
+            raise InvalidUpload(
+                f"there is no label column {label!r}{suggest_name(label, known)}", row=1
+            )
     is_time = [name.lower() in TIME_NAMES and name not in segments for name in known]
     time = is_time.index(True) if any(is_time) else None
-    _check_time(None if time is None else names[time], known, sample_time)
+    _check_time_column(None if time is None else names[time], known, sample_time)
     return tuple(
-        Column(name, unit, "time" if i == time else "label" if name in segments else "value")
+        CsvColumn(name, unit, "time" if i == time else "label" if name in segments else "value")
         for i, (name, unit) in enumerate(names)
     )
 
 
-def _check_time(
+def _check_time_column(
     column: tuple[str, str] | None, known: Sequence[str], sample_time: float | None
 ) -> None:
     if column is None:
@@ -141,18 +145,18 @@ def _check_time(
             "the file has this time column and sample_time is given too; leave one out",
             row=1, column=name,
         )  # fmt: skip
-    if seconds_in(unit) is None:
+    if find_unit_seconds(unit) is None:
         raise InvalidUpload(
             f"times are in [{unit}]; need seconds, or another unit of time such as [ms] or [min]",
             row=1, column=name,
         )  # fmt: skip
 
 
-def seconds_in(unit: str) -> float | None:
+def find_unit_seconds(unit: str) -> float | None:
     """Seconds in one unit of a time column; None if it is no unit of time."""
-    if unit.lower() in SECONDS:
+    if unit.lower() in SECOND_NAMES:
         return 1.0
-    found = factor(unit, "s")
+    found = find_conversion_factor(unit, "s")
     return found if found is not None and 0 < found <= LONGEST_TIME_UNIT else None
 
 

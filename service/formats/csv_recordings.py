@@ -24,17 +24,17 @@ from typing import BinaryIO, cast
 
 import numpy as np
 
-from service.formats.csv_columns import Table, Values, read_columns
-from service.formats.csv_layout import Layout, find_layout, seconds_in
+from service.formats.csv_columns import ColumnValues, CsvTable, read_columns
+from service.formats.csv_layout import CsvLayout, detect_layout, find_unit_seconds
 from service.formats.errors import InvalidUpload
 from sysid.core.types import FloatArray, IntArray
-from sysid.data.records import Channel, Recording, Segment, sampling_of
+from sysid.data.records import Channel, Recording, Segment, measure_sampling
 
-Labels = Mapping[str, float | str]
+SegmentLabels = Mapping[str, float | str]
 
 
-def lay_out(
-    times: FloatArray, starts: IntArray, labels: Sequence[Labels]
+def concatenate_segments(
+    times: FloatArray, starts: IntArray, labels: Sequence[SegmentLabels]
 ) -> tuple[FloatArray, tuple[Segment, ...]]:
     """Times on one axis for segments whose own times may all begin anew.
 
@@ -50,7 +50,7 @@ def lay_out(
     labels : sequence of mappings, n_segments long
     """
     lasts = np.append(starts[1:], times.size) - 1
-    step = _step_above(float(np.max(times[lasts] - times[starts])))
+    step = _round_up_step(float(np.max(times[lasts] - times[starts])))
     axis = np.empty_like(times)
     segments = []
     for i, (first, last) in enumerate(zip(starts, lasts, strict=True)):
@@ -61,7 +61,7 @@ def lay_out(
     return axis, tuple(segments)
 
 
-def _step_above(longest: float) -> float:
+def _round_up_step(longest: float) -> float:
     if longest <= 0:
         return 1.0
     decade = 10.0 ** floor(log10(longest))
@@ -70,7 +70,7 @@ def _step_above(longest: float) -> float:
 
 PEEK_LINES = 200
 LONGEST_LINE = 1_000_000
-CLOCK_FROM = 1e8
+EPOCH_THRESHOLD_SECONDS = 1e8
 """Times that begin later than this (s, three years) are a clock's, counted from some epoch."""
 
 
@@ -103,22 +103,22 @@ def read_csv(
     InvalidUpload
         If the file cannot be used; with row (the header is row 1) and column.
     """
-    with _opened(source) as stream:
-        lines = _lines(stream)
+    with _open_text(source) as stream:
+        lines = _iterate_lines(stream)
         first = list(islice(lines, PEEK_LINES))
         if not first:
             raise InvalidUpload("the file is empty; need a header and rows, such as t,u,y")
         if not first[0].strip():
             raise InvalidUpload("the first row is empty; need a header such as t,u,y", row=1)
-        layout = find_layout(first, segments, sample_time)
+        layout = detect_layout(first, segments, sample_time)
         table = read_columns(chain(first, lines), layout)
     notes = ["decimal commas were read as decimal points"] if layout.has_decimal_commas else []
-    times, spans = _times(table, layout, sample_time, notes)
-    return _recording(table, layout, times, spans, notes), tuple(notes)
+    times, spans = _build_times(table, layout, sample_time, notes)
+    return _build_recording(table, layout, times, spans, notes), tuple(notes)
 
 
 @contextmanager
-def _opened(source: Path | str | bytes) -> Iterator[TextIOWrapper]:
+def _open_text(source: Path | str | bytes) -> Iterator[TextIOWrapper]:
     binary: BinaryIO
     with BytesIO(source) if isinstance(source, bytes) else Path(source).open("rb") as binary:
         head = binary.read(65536)
@@ -130,7 +130,7 @@ def _opened(source: Path | str | bytes) -> Iterator[TextIOWrapper]:
         yield TextIOWrapper(binary, encoding="utf-8-sig", newline="")
 
 
-def _lines(stream: TextIOWrapper) -> Iterator[str]:
+def _iterate_lines(stream: TextIOWrapper) -> Iterator[str]:
     number = 0
     try:
         while line := stream.readline(LONGEST_LINE + 1):
@@ -142,11 +142,11 @@ def _lines(stream: TextIOWrapper) -> Iterator[str]:
         wrong = error.object[error.start]
         raise InvalidUpload(
             f"the file is not UTF-8 text (byte 0x{wrong:02x}); save it as CSV in UTF-8",
-            row=_row_of_bad_text(cast(BinaryIO, stream.buffer)),
+            row=_find_undecodable_row(cast(BinaryIO, stream.buffer)),
         ) from None
 
 
-def _row_of_bad_text(binary: BinaryIO) -> int | None:
+def _find_undecodable_row(binary: BinaryIO) -> int | None:
     # The decoder works on blocks of many rows, so the row is looked for again.
     binary.seek(0)
     for number, raw in enumerate(iter(lambda: binary.readline(LONGEST_LINE), b""), 1):
@@ -157,13 +157,13 @@ def _row_of_bad_text(binary: BinaryIO) -> int | None:
     return None
 
 
-def _times(
-    table: Table, layout: Layout, sample_time: float | None, notes: list[str]
+def _build_times(
+    table: CsvTable, layout: CsvLayout, sample_time: float | None, notes: list[str]
 ) -> tuple[FloatArray, tuple[Segment, ...]]:
     """Times on the recording's axis, and the segments."""
     labels = [column.name for column in layout.columns if column.role == "label"]
-    starts = _segment_starts(table, labels)
-    place = layout.time
+    starts = _find_segment_starts(table, labels)
+    place = layout.time_index
     if place is None:
         assert sample_time is not None  # the layout has checked it
         ends = [*starts[1:], table.rows.size]
@@ -171,23 +171,23 @@ def _times(
         times = np.concatenate(counts) * sample_time
     else:
         name = layout.columns[place].name
-        times = _in_seconds(table.numbers(name), layout.columns[place].unit, notes)
-        _check_growth(times, starts, table, name)
-        _report_shared(times, starts, notes)
-        times = _from_the_start(times, notes)
+        times = _convert_to_seconds(table.parse_numbers(name), layout.columns[place].unit, notes)
+        _check_increasing(times, starts, table, name)
+        _report_repeated_times(times, starts, notes)
+        times = _subtract_epoch(times, notes)
     if not labels:
-        _describe(times, notes)
+        _report_irregular_sampling(times, notes)
         return times, ()
-    values = {label: _labels(table.columns[label]) for label in labels}
-    each: list[Labels] = [
+    values = {label: _parse_labels(table.columns[label]) for label in labels}
+    each: list[SegmentLabels] = [
         {label: column[first] for label, column in values.items()} for first in starts
     ]
-    axis, spans = lay_out(times, starts, each)
+    axis, spans = concatenate_segments(times, starts, each)
     notes.append(f"{len(spans)} segments are laid end to end on one time axis")
     return axis, spans
 
 
-def _segment_starts(table: Table, labels: Sequence[str]) -> IntArray:
+def _find_segment_starts(table: CsvTable, labels: Sequence[str]) -> IntArray:
     changes = np.zeros(table.rows.size, dtype=bool)
     changes[0] = True
     for label in labels:
@@ -196,7 +196,7 @@ def _segment_starts(table: Table, labels: Sequence[str]) -> IntArray:
     return np.flatnonzero(changes).astype(np.int64)
 
 
-def _labels(column: Values) -> list[float | str]:
+def _parse_labels(column: ColumnValues) -> list[float | str]:
     texts = [str(text) for text in column]
     try:
         numbers = [float(text) for text in texts]
@@ -205,8 +205,8 @@ def _labels(column: Values) -> list[float | str]:
     return list(numbers) if np.isfinite(numbers).all() else list(texts)
 
 
-def _in_seconds(times: FloatArray, unit: str, notes: list[str]) -> FloatArray:
-    size = seconds_in(unit) or 1.0
+def _convert_to_seconds(times: FloatArray, unit: str, notes: list[str]) -> FloatArray:
+    size = find_unit_seconds(unit) or 1.0
     if size == 1.0:
         return times
     notes.append(f"times were converted from {unit} to s: lags and time constants are in s")
@@ -215,7 +215,7 @@ def _in_seconds(times: FloatArray, unit: str, notes: list[str]) -> FloatArray:
     return converted
 
 
-def _check_growth(times: FloatArray, starts: IntArray, table: Table, name: str) -> None:
+def _check_increasing(times: FloatArray, starts: IntArray, table: CsvTable, name: str) -> None:
     steps = np.diff(times)
     # Repeats are there to be pooled, and pooled samples may share a time.
     stays = steps < 0 if starts.size > 1 else steps <= 0
@@ -232,23 +232,23 @@ def _check_growth(times: FloatArray, starts: IntArray, table: Table, name: str) 
     )  # fmt: skip
 
 
-def _report_shared(times: FloatArray, starts: IntArray, notes: list[str]) -> None:
+def _report_repeated_times(times: FloatArray, starts: IntArray, notes: list[str]) -> None:
     shared = np.diff(times) == 0
     shared[starts[1:] - 1] = False
     if count := int(np.count_nonzero(shared)):
         notes.append(f"{count} samples have the same time as the one before, in their segment")
 
 
-def _from_the_start(times: FloatArray, notes: list[str]) -> FloatArray:
-    if float(np.min(times)) < CLOCK_FROM:
+def _subtract_epoch(times: FloatArray, notes: list[str]) -> FloatArray:
+    if float(np.min(times)) < EPOCH_THRESHOLD_SECONDS:
         return times
     notes.append(f"times are counted from the first, {float(times[0])!r} s of the file's clock")
     shifted: FloatArray = times - times[0]
     return shifted
 
 
-def _describe(times: FloatArray, notes: list[str]) -> None:
-    sampling = sampling_of(times)
+def _report_irregular_sampling(times: FloatArray, notes: list[str]) -> None:
+    sampling = measure_sampling(times)
     if sampling.samples > 1 and not sampling.is_regular:
         gaps = np.diff(times)
         notes.append(
@@ -257,9 +257,9 @@ def _describe(times: FloatArray, notes: list[str]) -> None:
         )
 
 
-def _recording(
-    table: Table,
-    layout: Layout,
+def _build_recording(
+    table: CsvTable,
+    layout: CsvLayout,
     times: FloatArray,
     spans: Iterable[Segment],
     notes: list[str],
@@ -268,13 +268,15 @@ def _recording(
     for column in layout.columns:
         if column.role != "value":
             continue
-        values = table.numbers(column.name)
-        _report_missing(column.name, values, table, notes)
+        values = table.parse_numbers(column.name)
+        _report_missing_values(column.name, values, table, notes)
         channels.append(Channel(column.name, times, values, column.unit or "1"))
     return Recording(tuple(channels), tuple(spans))
 
 
-def _report_missing(name: str, values: FloatArray, table: Table, notes: list[str]) -> None:
+def _report_missing_values(
+    name: str, values: FloatArray, table: CsvTable, notes: list[str]
+) -> None:
     missing = np.flatnonzero(np.isnan(values))
     if missing.size == 0:
         return
@@ -287,10 +289,10 @@ def _report_missing(name: str, values: FloatArray, table: Table, notes: list[str
     )
 
 
-BLOCK = 5000
+WRITTEN_BLOCK_ROWS = 5000
 
 
-def csv_rows(recording: Recording) -> Iterator[str]:
+def generate_csv(recording: Recording) -> Iterator[str]:
     """CSV text in blocks: time in s, label columns of segments, one column a channel.
 
     In a segment the time is the segment's own, so that an upload with ``?segments=`` and the
@@ -299,26 +301,26 @@ def csv_rows(recording: Recording) -> Iterator[str]:
     labels = sorted({name for segment in recording.segments for name in segment.labels})
     buffer = StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["t", *labels, *(_heading(channel) for channel in recording.channels)])
-    for number, row in enumerate(_rows(recording, labels), 1):
+    writer.writerow(["t", *labels, *(_format_heading(channel) for channel in recording.channels)])
+    for number, row in enumerate(_iterate_rows(recording, labels), 1):
         writer.writerow(row)
-        if number % BLOCK == 0:
-            yield _taken(buffer)
-    yield _taken(buffer)
+        if number % WRITTEN_BLOCK_ROWS == 0:
+            yield _drain_buffer(buffer)
+    yield _drain_buffer(buffer)
 
 
-def _rows(recording: Recording, labels: list[str]) -> Iterator[list[str]]:
+def _iterate_rows(recording: Recording, labels: list[str]) -> Iterator[list[str]]:
     if not recording.segments:
-        for time, values in _samples(recording):
+        for time, values in _iterate_samples(recording):
             yield [repr(time), *values]
         return
-    for segment, piece in zip(recording.segments, recording.pieces(), strict=True):
-        texts = [_text(segment.labels.get(name, "")) for name in labels]
-        for time, values in _samples(piece):
+    for segment, piece in zip(recording.segments, recording.split_segments(), strict=True):
+        texts = [_format_value(segment.labels.get(name, "")) for name in labels]
+        for time, values in _iterate_samples(piece):
             yield [repr(time), *texts, *values]
 
 
-def _samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
+def _iterate_samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
     """Times in their order; what a channel does not have at a time stays empty."""
     groups: list[list[int]] = []
     channels = recording.channels
@@ -335,27 +337,30 @@ def _samples(recording: Recording) -> Iterator[tuple[float, list[str]]]:
     )
     place = np.concatenate([np.arange(channels[group[0]].times.size) for group in groups])
     for index in np.argsort(times, kind="stable").tolist():
-        yield float(times[index]), _values(channels, groups[int(whose[index])], int(place[index]))
+        yield (
+            float(times[index]),
+            _format_values(channels, groups[int(whose[index])], int(place[index])),
+        )
 
 
-def _values(channels: tuple[Channel, ...], filled: list[int], place: int) -> list[str]:
+def _format_values(channels: tuple[Channel, ...], filled: list[int], place: int) -> list[str]:
     row = [""] * len(channels)
     for index in filled:
-        row[index] = _text(float(channels[index].values[place]))
+        row[index] = _format_value(float(channels[index].values[place]))
     return row
 
 
-def _text(value: float | str) -> str:
+def _format_value(value: float | str) -> str:
     if isinstance(value, str):
         return value
     return repr(value) if isfinite(value) else ""
 
 
-def _heading(channel: Channel) -> str:
+def _format_heading(channel: Channel) -> str:
     return channel.name if channel.unit == "1" else f"{channel.name} [{channel.unit}]"
 
 
-def _taken(buffer: StringIO) -> str:
+def _drain_buffer(buffer: StringIO) -> str:
     text = buffer.getvalue()
     buffer.seek(0)
     buffer.truncate()

@@ -25,11 +25,11 @@ def decimate(
     """
     if values.size <= max_points:
         return times, values
-    kept = extremes(values, max_points)
+    kept = find_extremes(values, max_points)
     return times[kept], values[kept]
 
 
-def extremes(values: FloatArray, max_points: int) -> IntArray:
+def find_extremes(values: FloatArray, max_points: int) -> IntArray:
     """Indices of the least and the greatest sample of each of ``max_points // 2`` buckets.
 
     Raises
@@ -41,12 +41,12 @@ def extremes(values: FloatArray, max_points: int) -> IntArray:
         raise ValueError(f"max_points is {max_points}; need 2 or more")
     edges = np.linspace(0, values.size, max_points // 2 + 1).astype(np.int64)[:-1]
     known = np.isfinite(values)
-    least = _first_extreme(np.where(known, values, np.inf), edges, np.minimum)
-    greatest = _first_extreme(np.where(known, values, -np.inf), edges, np.maximum)
+    least = _find_first_extreme(np.where(known, values, np.inf), edges, np.minimum)
+    greatest = _find_first_extreme(np.where(known, values, -np.inf), edges, np.maximum)
     return np.unique(np.concatenate([least, greatest]))
 
 
-def _first_extreme(values: FloatArray, edges: IntArray, extreme: np.ufunc) -> IntArray:
+def _find_first_extreme(values: FloatArray, edges: IntArray, extreme: np.ufunc) -> IntArray:
     """Index of the first sample of each bucket that is the bucket's extreme."""
     lengths = np.diff(edges, append=values.size)
     found = values == np.repeat(extreme.reduceat(values, edges), lengths)

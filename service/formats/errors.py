@@ -34,14 +34,14 @@ class InvalidUpload(InvalidRequest, ValueError):
         column: str | None = None,
         byte: int | None = None,
     ) -> None:
-        detail = _place(row, column, byte) + what
-        super().__init__((FieldError(_pointer(row, column, byte), detail),))
+        detail = _format_place(row, column, byte) + what
+        super().__init__((FieldError(_build_pointer(row, column, byte), detail),))
         self.detail = detail
         self.args = (detail,)
         self.what, self.row, self.column, self.byte = what, row, column, byte
 
 
-def _place(row: int | None, column: str | None, byte: int | None) -> str:
+def _format_place(row: int | None, column: str | None, byte: int | None) -> str:
     if byte is not None:
         return f"at byte {byte}: "
     named = [] if row is None else [f"row {row}"]
@@ -49,7 +49,7 @@ def _place(row: int | None, column: str | None, byte: int | None) -> str:
     return f"{', '.join(named)}: " if named else ""
 
 
-def _pointer(row: int | None, column: str | None, byte: int | None) -> str:
+def _build_pointer(row: int | None, column: str | None, byte: int | None) -> str:
     if byte is not None:
         return f"/bytes/{byte}"
     parts = [] if row is None else ["rows", str(row)]

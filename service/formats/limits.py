@@ -7,7 +7,7 @@ GIB = 1024**3
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class UploadLimits:
     """Limits of one upload. Lengths count both as declared and as found.
 
     Attributes
@@ -35,4 +35,4 @@ class Limits:
     memory_bytes: int = 4 * GIB
 
 
-DEFAULT_LIMITS = Limits()
+DEFAULT_LIMITS = UploadLimits()

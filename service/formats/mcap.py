@@ -14,27 +14,33 @@ from typing import BinaryIO, Literal, Protocol, cast
 import numpy as np
 
 from service.formats.errors import InvalidUpload
-from service.formats.limits import DEFAULT_LIMITS, Limits
-from service.formats.mcap_content import Content, Source, no_signals, read_content, sorted_columns
-from service.formats.mcap_writer import McapFile
+from service.formats.limits import DEFAULT_LIMITS, UploadLimits
+from service.formats.mcap_content import (
+    McapChannel,
+    McapContent,
+    build_no_signal_error,
+    read_content,
+    sort_columns,
+)
+from service.formats.mcap_writer import McapWriter
 from service.formats.topics import (
-    DATASET,
+    DATASET_RECORD,
     TIME_FIELD,
     ChannelEntry,
     Manifest,
     Topic,
-    history_topics_of,
+    build_manifest,
+    group_history_topics,
+    group_into_topics,
     make_topic,
-    manifest_of,
     parse_manifest,
-    topics_of,
 )
 from sysid.core.errors import InvalidRecord
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, History, Recording
 
 
-class Writable(Protocol):
+class ByteSink(Protocol):
     """What a file is written to: anything that takes bytes."""
 
     def write(self, data: bytes, /) -> object:
@@ -42,7 +48,7 @@ class Writable(Protocol):
         ...
 
 
-Target = str | os.PathLike[str] | Writable
+McapTarget = str | os.PathLike[str] | ByteSink
 
 
 FitRole = Literal["estimation", "validation"]
@@ -71,7 +77,7 @@ class FittedOutput:
 
 def write_recording(
     recording: Recording,
-    target: Target,
+    target: McapTarget,
     *,
     metadata: Mapping[str, str] | None = None,
 ) -> None:
@@ -91,15 +97,15 @@ def write_recording(
     ValueError
         If the times do not fit into a file's clock, or a metadata key is the file's own.
     """
-    topics, history = topics_of(recording), history_topics_of(recording)
-    manifest = manifest_of(recording, topics, metadata or {}, history)
-    _write(target, (*topics, *history), manifest)
+    topics, history = group_into_topics(recording), group_history_topics(recording)
+    manifest = build_manifest(recording, topics, metadata or {}, history)
+    _write_file(target, (*topics, *history), manifest)
 
 
-def write_fit(
+def write_fitted_outputs(
     run: str,
     fits: Sequence[FittedOutput],
-    target: Target,
+    target: McapTarget,
     *,
     metadata: Mapping[str, str] | None = None,
 ) -> None:
@@ -118,17 +124,17 @@ def write_fit(
             groups.append([fit])
     topics = []
     for number, group in enumerate(groups):
-        channels = [channel for fit in group for channel in _channels(fit)]
+        channels = [channel for fit in group for channel in _to_channels(fit)]
         names = [
             f"{fit.name}{suffix}" for fit in group for suffix in ("", "_measured", "_residual")
         ]
         path = f"/fit/{run}" if number == 0 else f"/fit/{run}/{number + 1}"
         topics.append(make_topic(path, channels, names))
     recording = Recording(tuple(channel for topic in topics for channel in topic.channels))
-    _write(target, topics, manifest_of(recording, topics, metadata or {}))
+    _write_file(target, topics, build_manifest(recording, topics, metadata or {}))
 
 
-def _channels(fit: FittedOutput) -> tuple[Channel, ...]:
+def _to_channels(fit: FittedOutput) -> tuple[Channel, ...]:
     """Channels of one output; '/' separates experiment, output and what it is."""
     named = f"{fit.experiment}/{fit.name}"
     values = (
@@ -139,29 +145,29 @@ def _channels(fit: FittedOutput) -> tuple[Channel, ...]:
     return tuple(Channel(f"{named}/{what}", fit.times, data, fit.unit) for what, data in values)
 
 
-def _write(target: Target, topics: Sequence[Topic], manifest: Mapping[str, str]) -> None:
+def _write_file(target: McapTarget, topics: Sequence[Topic], manifest: Mapping[str, str]) -> None:
     if isinstance(target, str | os.PathLike):
         with Path(target).open("wb") as stream:
-            _write(stream, topics, manifest)
+            _write_file(stream, topics, manifest)
         return
-    file = McapFile(target.write)
-    file.add_metadata(DATASET, manifest)
+    file = McapWriter(target.write)
+    file.add_metadata(DATASET_RECORD, manifest)
     numbers = [file.add_topic(topic.path, topic.all_fields) for topic in topics]
     for number, topic in zip(numbers, topics, strict=True):
         file.add_samples(number, topic.log_times, topic.columns)
-    file.finish()
+    file.finish_file()
 
 
-CLOCK_FROM_NS = 10**17
+EPOCH_THRESHOLD_NS = 10**17
 """Log times from here on (three years) are a clock's: they are counted from the first."""
 
-_Topics = Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]]
+_TopicColumns = Mapping[str, tuple[FloatArray, Mapping[str, FloatArray]]]
 """Of every topic its times and its columns."""
 
-Readable = str | os.PathLike[str] | bytes | BinaryIO
+McapSource = str | os.PathLike[str] | bytes | BinaryIO
 
 
-def read_recording(source: Readable, limits: Limits = DEFAULT_LIMITS) -> Recording:
+def read_recording(source: McapSource, limits: UploadLimits = DEFAULT_LIMITS) -> Recording:
     """Read a recording from an MCAP file (path, content, or seekable stream).
 
     Raises
@@ -169,11 +175,13 @@ def read_recording(source: Readable, limits: Limits = DEFAULT_LIMITS) -> Recordi
     InvalidUpload
         If the file is damaged, too large, or holds no signal.
     """
-    return read_mcap(source, limits)[0]
+    return read_mcap_with_notes(source, limits)[0]
 
 
-def read_fit(source: Readable, limits: Limits = DEFAULT_LIMITS) -> tuple[FittedOutput, ...]:
-    """Read what `write_fit` wrote.
+def read_fitted_outputs(
+    source: McapSource, limits: UploadLimits = DEFAULT_LIMITS
+) -> tuple[FittedOutput, ...]:
+    """Read what `write_fitted_outputs` wrote.
 
     Raises
     ------
@@ -205,7 +213,9 @@ def read_fit(source: Readable, limits: Limits = DEFAULT_LIMITS) -> tuple[FittedO
     return tuple(fits)
 
 
-def read_mcap(source: Readable, limits: Limits) -> tuple[Recording, tuple[str, ...]]:
+def read_mcap_with_notes(
+    source: McapSource, limits: UploadLimits
+) -> tuple[Recording, tuple[str, ...]]:
     """Read a recording, and notes on what was left out or changed.
 
     Raises
@@ -213,14 +223,18 @@ def read_mcap(source: Readable, limits: Limits) -> tuple[Recording, tuple[str, .
     InvalidUpload
         If the file is damaged, too large, or holds no signal.
     """
-    with _opened(source) as (binary, size):
+    with _open_binary(source) as (binary, size):
         content = read_content(binary, size, limits)
-    metadata = content.metadata.get(DATASET)
-    return _foreign(content, limits) if metadata is None else (_ours(content, metadata), ())
+    metadata = content.metadata.get(DATASET_RECORD)
+    return (
+        _build_foreign_recording(content, limits)
+        if metadata is None
+        else (_build_own_recording(content, metadata), ())
+    )
 
 
 @contextmanager
-def _opened(source: Readable) -> Iterator[tuple[BinaryIO, int]]:
+def _open_binary(source: McapSource) -> Iterator[tuple[BinaryIO, int]]:
     if isinstance(source, bytes):
         yield io.BytesIO(source), len(source)
     elif isinstance(source, str | os.PathLike):
@@ -232,46 +246,53 @@ def _opened(source: Readable) -> Iterator[tuple[BinaryIO, int]]:
         yield source, size
 
 
-def _ours(content: Content, metadata: Mapping[str, str]) -> Recording:
+def _build_own_recording(content: McapContent, metadata: Mapping[str, str]) -> Recording:
     try:
         manifest = parse_manifest(metadata)
     except ValueError as error:
-        raise InvalidUpload(f"the metadata record {DATASET!r} cannot be used: {error}") from None
+        raise InvalidUpload(
+            f"the metadata record {DATASET_RECORD!r} cannot be used: {error}"
+        ) from None
     topics: dict[str, tuple[FloatArray, dict[str, FloatArray]]] = {}
-    for source in content.sources.values():
+    for source in content.channels.values():
         if source.topic in manifest.clocks:
-            topics[source.topic] = _topic(source, manifest)
+            topics[source.topic] = _decode_topic(source, manifest)
     channels = tuple(
-        _with_history(_channel(entry, topics), manifest, topics) for entry in manifest.channels
+        _attach_history(_build_channel(entry, topics), manifest, topics)
+        for entry in manifest.channels
     )
     return Recording(channels, manifest.segments)
 
 
-def _topic(source: Source, manifest: Manifest) -> tuple[FloatArray, dict[str, FloatArray]]:
-    log_times, columns, _ = sorted_columns(source)
-    times = manifest.clocks[source.topic].times(log_times, columns.get(TIME_FIELD))
+def _decode_topic(
+    source: McapChannel, manifest: Manifest
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    log_times, columns, _ = sort_columns(source)
+    times = manifest.clocks[source.topic].to_times(log_times, columns.get(TIME_FIELD))
     if not np.all(np.isfinite(times)) or np.any(np.diff(times) < 0):
         raise InvalidUpload(f"the times of topic {source.topic!r} decrease or are not finite")
     return times, columns
 
 
-def _channel(entry: ChannelEntry, topics: _Topics) -> Channel:
-    times, values = _field(f"channel {entry.name!r}", entry.topic, entry.field, topics)
+def _build_channel(entry: ChannelEntry, topics: _TopicColumns) -> Channel:
+    times, values = _find_column(f"channel {entry.name!r}", entry.topic, entry.field, topics)
     return Channel(entry.name, times, values, entry.unit, entry.hold)
 
 
-def _with_history(channel: Channel, manifest: Manifest, topics: _Topics) -> Channel:
+def _attach_history(channel: Channel, manifest: Manifest, topics: _TopicColumns) -> Channel:
     if channel.name not in manifest.history:
         return channel
     topic, field = manifest.history[channel.name]
-    found = History(*_field(f"the history of {channel.name!r}", topic, field, topics))
+    found = History(*_find_column(f"the history of {channel.name!r}", topic, field, topics))
     try:
         return replace(channel, history=found)
     except InvalidRecord as error:
         raise InvalidUpload(str(error)) from None
 
 
-def _field(what: str, topic: str, field: str, topics: _Topics) -> tuple[FloatArray, FloatArray]:
+def _find_column(
+    what: str, topic: str, field: str, topics: _TopicColumns
+) -> tuple[FloatArray, FloatArray]:
     times, columns = topics.get(topic, (np.empty(0), {}))
     if field not in columns:
         raise InvalidUpload(
@@ -280,33 +301,35 @@ def _field(what: str, topic: str, field: str, topics: _Topics) -> tuple[FloatArr
     return times, columns[field]
 
 
-def _foreign(content: Content, limits: Limits) -> tuple[Recording, tuple[str, ...]]:
-    read = [(source, *sorted_columns(source)) for source in content.sources.values()]
+def _build_foreign_recording(
+    content: McapContent, limits: UploadLimits
+) -> tuple[Recording, tuple[str, ...]]:
+    read = [(source, *sort_columns(source)) for source in content.channels.values()]
     usable = [one for one in read if one[2]]
     if not usable:
-        raise no_signals(content)
+        raise build_no_signal_error(content)
     notes = [
-        f"topic {source.topic!r} is left out: {source.refused}"
-        for source in content.sources.values()
-        if source.refused
+        f"topic {source.topic!r} is left out: {source.refusal}"
+        for source in content.channels.values()
+        if source.refusal
     ]
     notes += [f"topic {one[0].topic!r} was not in the order of time" for one in usable if one[3]]
     first = min(int(times[0]) for _, times, _, _ in usable)
-    start = first if first >= CLOCK_FROM_NS else 0
+    start = first if first >= EPOCH_THRESHOLD_NS else 0
     if start:
         notes.append(f"times are counted from the first, {start} ns of the file's clock")
     channels: dict[str, Channel] = {}
     for source, log_times, columns, _ in usable:
         times = (log_times - np.uint64(start)).astype(np.float64) / 1e9
         for field, values in columns.items():
-            name = _free_name(source.topic, field, alone=len(usable) == 1, taken=channels)
+            name = _choose_free_name(source.topic, field, alone=len(usable) == 1, taken=channels)
             channels[name] = Channel(name, times, values)
     if len(channels) > limits.channels:
         raise InvalidUpload(f"the file has {len(channels)} signals; at most {limits.channels}")
     return Recording(tuple(channels.values())), tuple(notes)
 
 
-def _free_name(topic: str, field: str, *, alone: bool, taken: Mapping[str, object]) -> str:
+def _choose_free_name(topic: str, field: str, *, alone: bool, taken: Mapping[str, object]) -> str:
     wanted = field if alone else f"{topic.strip('/')}.{field}"
     number, name = 2, wanted
     while name in taken:

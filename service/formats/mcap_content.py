@@ -9,42 +9,49 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from service.formats.errors import InvalidUpload
-from service.formats.limits import Limits
+from service.formats.limits import UploadLimits
 from service.formats.mcap_messages import (
-    Decoder,
     FlatLayout,
-    Schema,
-    Series,
-    Unreadable,
-    decoder_for,
-    flat_layout,
+    MessageColumns,
+    MessageDecoder,
+    MessageSchema,
+    UnreadableMessages,
+    choose_decoder,
+    find_flat_layout,
 )
-from service.formats.mcap_records import HEAD, Cursor, Located, name_of, open_chunk, walk
+from service.formats.mcap_records import (
+    RECORD_HEAD,
+    RawRecord,
+    RecordCursor,
+    decompress_chunk,
+    describe_opcode,
+    iterate_records,
+)
 from service.formats.topics import LATEST_NS
 
-_MESSAGE: Final = struct.Struct("<HIQQ")
+_MESSAGE_HEAD: Final = struct.Struct("<HIQQ")
 
 
 @dataclass(eq=False)
-class Source:
+class McapChannel:
     """One MCAP channel: how it is read, and what has been read. `refused` says why it is not."""
 
     topic: str
     layout: FlatLayout | None = None
-    decode: Decoder | None = None
-    refused: str = ""
-    series: Series = field(default_factory=Series)
+    decode: MessageDecoder | None = None
+    refusal: str = ""
+    columns: MessageColumns = field(default_factory=MessageColumns)
 
 
 @dataclass(eq=False)
-class Content:
+class McapContent:
     """What a file holds: sources by channel number, and its metadata records by name."""
 
-    sources: dict[int, Source] = field(default_factory=dict)
+    channels: dict[int, McapChannel] = field(default_factory=dict)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
 
 
-def read_content(binary: BinaryIO, size: int, limits: Limits) -> Content:
+def read_content(binary: BinaryIO, size: int, limits: UploadLimits) -> McapContent:
     """Read a whole file in one pass.
 
     Raises
@@ -52,153 +59,161 @@ def read_content(binary: BinaryIO, size: int, limits: Limits) -> Content:
     InvalidUpload
         With the byte, if the file is damaged, goes beyond a limit, or contradicts itself.
     """
-    reader = _Reader(limits)
-    for record in walk(binary, size, limits):
-        reader.take(record)
+    reader = _ContentReader(limits)
+    for record in iterate_records(binary, size, limits):
+        reader.add_record(record)
     return reader.content
 
 
-class _Reader:
-    def __init__(self, limits: Limits) -> None:
-        self.content = Content()
+class _ContentReader:
+    def __init__(self, limits: UploadLimits) -> None:
+        self.content = McapContent()
         self._limits = limits
-        self._schemas: dict[int, Schema] = {}
+        self._schemas: dict[int, MessageSchema] = {}
         self._schemas_of: dict[int, tuple[int, str, str]] = {}
         self._messages = self._total = 0
 
-    def take(self, record: Located) -> None:
+    def add_record(self, record: RawRecord) -> None:
         """Take a record of the data section."""
         if record.opcode == Opcode.CHUNK:
-            content = open_chunk(record, self._limits)
+            content = decompress_chunk(record, self._limits)
             self._total += len(content)
             if self._total > self._limits.total_bytes:
-                record.fail(f"brings the content to more than {self._limits.total_bytes} bytes")
-            self._chunk(record, content)
+                record.raise_invalid(
+                    f"brings the content to more than {self._limits.total_bytes} bytes"
+                )
+            self._add_chunk(record, content)
         elif record.opcode == Opcode.METADATA:
-            fields = Cursor(record)
-            name = fields.text()
-            self.content.metadata[name] = fields.mapping()
+            fields = RecordCursor(record)
+            name = fields.read_text()
+            self.content.metadata[name] = fields.read_mapping()
         else:
-            self._inner(record)
+            self._add_inner_record(record)
 
-    def _inner(self, record: Located) -> None:
+    def _add_inner_record(self, record: RawRecord) -> None:
         """Take a record that may stand in a chunk as well as outside."""
         if record.opcode == Opcode.MESSAGE:
-            self._message(record)
+            self._add_message(record)
         elif record.opcode == Opcode.SCHEMA:
-            self._schema(record)
+            self._add_schema(record)
         elif record.opcode == Opcode.CHANNEL:
-            self._channel(record)
+            self._add_channel(record)
 
-    def _chunk(self, chunk: Located, content: bytes) -> None:
-        if self._uniform(chunk, content):
+    def _add_chunk(self, chunk: RawRecord, content: bytes) -> None:
+        if self._add_uniform_chunk(chunk, content):
             return
         at = 0
         while at < len(content):
-            if len(content) - at < HEAD.size:
-                chunk.fail(f"ends inside the head of a record, at byte {at} of its content")
-            opcode, length = HEAD.unpack_from(content, at)
-            start, at = at + HEAD.size, at + HEAD.size + length
+            if len(content) - at < RECORD_HEAD.size:
+                chunk.raise_invalid(
+                    f"ends inside the head of a record, at byte {at} of its content"
+                )
+            opcode, length = RECORD_HEAD.unpack_from(content, at)
+            start, at = at + RECORD_HEAD.size, at + RECORD_HEAD.size + length
             if at > len(content):
-                chunk.fail(
-                    f"ends inside the {name_of(opcode)} record at byte {start - HEAD.size} of its "
+                chunk.raise_invalid(
+                    f"ends inside the {describe_opcode(opcode)} record at byte {start - RECORD_HEAD.size} of its "
                     "content"
                 )
-            self._inner(Located(opcode, chunk.byte, content[start:at]))
+            self._add_inner_record(RawRecord(opcode, chunk.byte, content[start:at]))
 
-    def _uniform(self, chunk: Located, content: bytes) -> bool:
+    def _add_uniform_chunk(self, chunk: RawRecord, content: bytes) -> bool:
         """Take a chunk of messages that all have their channel's flat layout, at once."""
-        if len(content) < HEAD.size + 2 or content[0] != Opcode.MESSAGE:
+        if len(content) < RECORD_HEAD.size + 2 or content[0] != Opcode.MESSAGE:
             return False
-        source = self.content.sources.get(
-            int.from_bytes(content[HEAD.size : HEAD.size + 2], "little")
+        source = self.content.channels.get(
+            int.from_bytes(content[RECORD_HEAD.size : RECORD_HEAD.size + 2], "little")
         )
         if source is None or source.layout is None:
             return False
-        messages = source.layout.read(content)
+        messages = source.layout.parse_chunk(content)
         if messages is None:
             return False
-        self._count(chunk, messages.size)
+        self._count_messages(chunk, messages.size)
         if int(messages["log_time"].max()) >= LATEST_NS:
-            chunk.fail("has a message with a time beyond 2⁶³ ns")
-        source.series.add_block(source.layout, messages)
+            chunk.raise_invalid("has a message with a time beyond 2⁶³ ns")
+        source.columns.add_block(source.layout, messages)
         return True
 
-    def _schema(self, record: Located) -> None:
-        fields = Cursor(record)
-        number, name, encoding = fields.u16(), fields.text(), fields.text()
-        length = fields.u32()
+    def _add_schema(self, record: RawRecord) -> None:
+        fields = RecordCursor(record)
+        number, name, encoding = fields.read_u16(), fields.read_text(), fields.read_text()
+        length = fields.read_u32()
         if length > self._limits.schema_bytes:
-            record.fail(f"has {length} bytes; at most {self._limits.schema_bytes} are read")
-        schema = Schema(name, encoding, fields.blob(length))
+            record.raise_invalid(
+                f"has {length} bytes; at most {self._limits.schema_bytes} are read"
+            )
+        schema = MessageSchema(name, encoding, fields.read_bytes(length))
         if number == 0 or self._schemas.setdefault(number, schema) != schema:
-            record.fail(f"uses the number {number}, which is not free")
+            record.raise_invalid(f"uses the number {number}, which is not free")
         if len(self._schemas) > self._limits.channels:
-            record.fail(f"is one too many; at most {self._limits.channels} are read")
+            record.raise_invalid(f"is one too many; at most {self._limits.channels} are read")
 
-    def _channel(self, record: Located) -> None:
-        fields = Cursor(record)
-        number, schema_number = fields.u16(), fields.u16()
-        topic, encoding = fields.text(), fields.text()
-        fields.mapping()
+    def _add_channel(self, record: RawRecord) -> None:
+        fields = RecordCursor(record)
+        number, schema_number = fields.read_u16(), fields.read_u16()
+        topic, encoding = fields.read_text(), fields.read_text()
+        fields.read_mapping()
         entry = (schema_number, topic, encoding)
         if self._schemas_of.setdefault(number, entry) != entry:
-            record.fail(f"uses the number {number} a second time, for something else")
-        if number in self.content.sources:
+            record.raise_invalid(f"uses the number {number} a second time, for something else")
+        if number in self.content.channels:
             return
-        if len(self.content.sources) >= self._limits.channels:
-            record.fail(f"is one too many; at most {self._limits.channels} are read")
+        if len(self.content.channels) >= self._limits.channels:
+            record.raise_invalid(f"is one too many; at most {self._limits.channels} are read")
         schema = self._schemas.get(schema_number)
         if schema is None and schema_number != 0:
-            record.fail(f"names schema {schema_number}, which does not come before it")
-        source = self.content.sources[number] = Source(topic)
+            record.raise_invalid(f"names schema {schema_number}, which does not come before it")
+        source = self.content.channels[number] = McapChannel(topic)
         try:
-            source.decode = decoder_for(encoding, schema)
-            source.layout = flat_layout(number, encoding, schema)
-        except Unreadable as reason:
-            source.refused = str(reason)
+            source.decode = choose_decoder(encoding, schema)
+            source.layout = find_flat_layout(number, encoding, schema)
+        except UnreadableMessages as reason:
+            source.refusal = str(reason)
 
-    def _message(self, record: Located) -> None:
-        if len(record.body) < _MESSAGE.size:
-            record.fail(f"has {len(record.body)} bytes; its head alone has {_MESSAGE.size}")
-        number, _, log_time, _ = _MESSAGE.unpack_from(record.body)
-        source = self.content.sources.get(number)
+    def _add_message(self, record: RawRecord) -> None:
+        if len(record.body) < _MESSAGE_HEAD.size:
+            record.raise_invalid(
+                f"has {len(record.body)} bytes; its head alone has {_MESSAGE_HEAD.size}"
+            )
+        number, _, log_time, _ = _MESSAGE_HEAD.unpack_from(record.body)
+        source = self.content.channels.get(number)
         if source is None:
-            record.fail(f"names channel {number}, which does not come before it")
+            record.raise_invalid(f"names channel {number}, which does not come before it")
         if log_time >= LATEST_NS:
-            record.fail("has a time beyond 2⁶³ ns")
-        self._count(record, 1)
+            record.raise_invalid("has a time beyond 2⁶³ ns")
+        self._count_messages(record, 1)
         if source.decode is None:
             return
         try:
-            source.series.add(log_time, source.decode(record.body[_MESSAGE.size :]))
-        except Unreadable as reason:
-            record.fail(f"of topic {source.topic!r} cannot be read: {reason}")
-        if source.series.names() > self._limits.channels:
-            record.fail(f"has more than {self._limits.channels} fields")
+            source.columns.add_message(log_time, source.decode(record.body[_MESSAGE_HEAD.size :]))
+        except UnreadableMessages as reason:
+            record.raise_invalid(f"of topic {source.topic!r} cannot be read: {reason}")
+        if source.columns.count_names() > self._limits.channels:
+            record.raise_invalid(f"has more than {self._limits.channels} fields")
 
-    def _count(self, record: Located, more: int) -> None:
+    def _count_messages(self, record: RawRecord, more: int) -> None:
         self._messages += more
         if self._messages > self._limits.messages:
-            record.fail(f"brings the messages to more than {self._limits.messages}")
+            record.raise_invalid(f"brings the messages to more than {self._limits.messages}")
 
 
-def sorted_columns(
-    source: Source,
+def sort_columns(
+    source: McapChannel,
 ) -> tuple[NDArray[np.uint64], dict[str, NDArray[np.float64]], bool]:
     """Log times, columns, and whether they had to be sorted by time."""
-    times, columns = source.series.joined()
+    times, columns = source.columns.concatenate_blocks()
     if np.all(times[1:] >= times[:-1]):
         return times, columns, False
     order = np.argsort(times, kind="stable")
     return times[order], {name: values[order] for name, values in columns.items()}, True
 
 
-def no_signals(content: Content) -> InvalidUpload:
+def build_no_signal_error(content: McapContent) -> InvalidUpload:
     """Return the error of a file without a signal: for each topic, why."""
     reasons = [
-        f"topic {source.topic!r}: {source.refused or 'there is no message'}"
-        for source in content.sources.values()
+        f"topic {source.topic!r}: {source.refusal or 'there is no message'}"
+        for source in content.channels.values()
     ]
     listed = "; ".join(reasons[:5]) or "it has no channel"
     return InvalidUpload(f"the file holds no signal ({listed})")

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 MESSAGE_HEADER = 9
 """Opcode and length, which every MCAP record begins with."""
 
-_KEPT = 64
+_CACHE_SIZE = 64
 """Names and layouts that are remembered: the files of a sweep's runs have the same ones."""
 
 _WIRE_TYPES = {
@@ -40,7 +40,7 @@ _WIRE_TYPES = {
 }
 
 
-class Field(NamedTuple):
+class NumericField(NamedTuple):
     """A numeric field of a flat message: name, number, and type on the wire (``<f8``, ``<f4``)."""
 
     name: str
@@ -48,13 +48,13 @@ class Field(NamedTuple):
     wire: str = "<f8"
 
 
-def identifiers(names: Iterable[str]) -> tuple[str, ...]:
+def make_identifiers(names: Iterable[str]) -> tuple[str, ...]:
     """Return names that protobuf allows, all different, as near to `names` as can be."""
-    return _identifiers(tuple(names))
+    return _make_unique_identifiers(tuple(names))
 
 
-@lru_cache(maxsize=_KEPT)
-def _identifiers(names: tuple[str, ...]) -> tuple[str, ...]:
+@lru_cache(maxsize=_CACHE_SIZE)
+def _make_unique_identifiers(names: tuple[str, ...]) -> tuple[str, ...]:
     made: list[str] = []
     for name in names:
         plain = re.sub(r"\W", "_", name, flags=re.ASCII).strip("_") or "channel"
@@ -66,7 +66,7 @@ def _identifiers(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(made)
 
 
-def schema_of(message: str, fields: Sequence[str]) -> bytes:
+def build_schema(message: str, fields: Sequence[str]) -> bytes:
     """Return the FileDescriptorSet of message ``lagid.<message>`` with one double per field."""
     fields_of = [
         FieldDescriptorProto(
@@ -75,7 +75,7 @@ def schema_of(message: str, fields: Sequence[str]) -> bytes:
             type=FieldDescriptorProto.TYPE_DOUBLE,
             label=FieldDescriptorProto.LABEL_OPTIONAL,
         )
-        for number, name in zip(_numbers(), fields, strict=False)
+        for number, name in zip(_iterate_field_numbers(), fields, strict=False)
     ]
     file = FileDescriptorProto(
         name=f"lagid/{message}.proto",
@@ -86,18 +86,21 @@ def schema_of(message: str, fields: Sequence[str]) -> bytes:
     return bytes(FileDescriptorSet(file=[file]).SerializeToString(deterministic=True))
 
 
-def _numbers() -> Iterable[int]:
+def _iterate_field_numbers() -> Iterable[int]:
     yield from range(1, 19_000)
     yield from range(20_000, 2**29)  # those between belong to protobuf itself
 
 
-@lru_cache(maxsize=_KEPT)
-def double_fields(names: tuple[str, ...]) -> tuple[Field, ...]:
-    """Fields of a message of `schema_of`."""
-    return tuple(Field(name, number) for number, name in zip(_numbers(), names, strict=False))
+@lru_cache(maxsize=_CACHE_SIZE)
+def make_double_fields(names: tuple[str, ...]) -> tuple[NumericField, ...]:
+    """Fields of a message of `build_schema`."""
+    return tuple(
+        NumericField(name, number)
+        for number, name in zip(_iterate_field_numbers(), names, strict=False)
+    )
 
 
-def flat_fields(schema: bytes, message: str) -> tuple[Field, ...] | None:
+def parse_flat_fields(schema: bytes, message: str) -> tuple[NumericField, ...] | None:
     """Fields of a message that consists of floats only; None if it is of another kind."""
     try:
         files = FileDescriptorSet.FromString(schema).file
@@ -106,20 +109,20 @@ def flat_fields(schema: bytes, message: str) -> tuple[Field, ...] | None:
     for file in files:
         for found in file.message_type:
             if f"{file.package}.{found.name}".lstrip(".") == message:
-                return _flat(found)
+                return _parse_flat_message(found)
     return None
 
 
-def _flat(message: DescriptorProto) -> tuple[Field, ...] | None:
+def _parse_flat_message(message: DescriptorProto) -> tuple[NumericField, ...] | None:
     single = all(one.label != FieldDescriptorProto.LABEL_REPEATED for one in message.field)
     if not message.field or not single or not all(f.type in _WIRE_TYPES for f in message.field):
         return None
     ordered = sorted(message.field, key=lambda one: one.number)
-    return tuple(Field(one.name, one.number, _WIRE_TYPES[one.type][1]) for one in ordered)
+    return tuple(NumericField(one.name, one.number, _WIRE_TYPES[one.type][1]) for one in ordered)
 
 
-@lru_cache(maxsize=_KEPT)
-def record_layout(fields: tuple[Field, ...]) -> np.dtype[np.void]:
+@lru_cache(maxsize=_CACHE_SIZE)
+def make_record_dtype(fields: tuple[NumericField, ...]) -> np.dtype[np.void]:
     """One MCAP message record whose protobuf content writes every field, zeros too.
 
     ``tag0, value0, tag1, …`` follow the record's own fields; a tag is 1 to 5 bytes.
@@ -129,18 +132,18 @@ def record_layout(fields: tuple[Field, ...]) -> np.dtype[np.void]:
         ("log_time", "<u8"), ("publish_time", "<u8"),
     ]  # fmt: skip
     for i, field in enumerate(fields):
-        length = len(tag_bytes(field))
+        length = len(encode_tag(field))
         parts += [(f"tag{i}", "u1" if length == 1 else f"S{length}"), (f"value{i}", field.wire)]
     return np.dtype(parts)
 
 
-def tag_value(field: Field) -> int | bytes:
-    """The field's tag as it stands in a `record_layout`: numbers compare faster than texts."""
-    tag = tag_bytes(field)
+def encode_tag_value(field: NumericField) -> int | bytes:
+    """The field's tag as it stands in a `make_record_dtype`: numbers compare faster than texts."""
+    tag = encode_tag(field)
     return tag[0] if len(tag) == 1 else tag
 
 
-def tag_bytes(field: Field) -> bytes:
+def encode_tag(field: NumericField) -> bytes:
     """The field's tag as protobuf writes it: number and wire type as a varint."""
     value = field.number << 3 | (1 if field.wire == "<f8" else 5)
     encoded = bytearray()
@@ -150,19 +153,19 @@ def tag_bytes(field: Field) -> bytes:
     return bytes((*encoded, value))
 
 
-DEEPEST: Final = 4
+MAX_NESTING: Final = 4
 """Messages inside messages are looked into down to this depth."""
 
-CLOCKS: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
-Numbers = Mapping[str, float]
-Decoder = Callable[[bytes], Numbers]
+TIME_MESSAGES: Final = ("google.protobuf.Timestamp", "google.protobuf.Duration")
+NumbersByName = Mapping[str, float]
+MessageDecoder = Callable[[bytes], NumbersByName]
 
 
-class Unreadable(Exception):
+class UnreadableMessages(Exception):
     """Messages of a channel cannot be read; the text says why."""
 
 
-class Schema(NamedTuple):
+class MessageSchema(NamedTuple):
     """A schema record."""
 
     name: str
@@ -173,17 +176,17 @@ class Schema(NamedTuple):
 class FlatLayout:
     """A record layout, and what must stand at its fixed places."""
 
-    def __init__(self, channel: int, fields: tuple[Field, ...]) -> None:
+    def __init__(self, channel: int, fields: tuple[NumericField, ...]) -> None:
         self.names = tuple(field.name for field in fields)
-        self.dtype = record_layout(fields)
+        self.dtype = make_record_dtype(fields)
         self._fixed: list[tuple[str, object]] = [
             ("opcode", Opcode.MESSAGE),
             ("length", self.dtype.itemsize - MESSAGE_HEADER),
             ("channel", channel),
-            *((f"tag{i}", tag_value(field)) for i, field in enumerate(fields)),
+            *((f"tag{i}", encode_tag_value(field)) for i, field in enumerate(fields)),
         ]
 
-    def read(self, content: bytes) -> NDArray[np.void] | None:
+    def parse_chunk(self, content: bytes) -> NDArray[np.void] | None:
         """All messages of a chunk, if every one has this layout."""
         if not content or len(content) % self.dtype.itemsize:
             return None
@@ -193,15 +196,17 @@ class FlatLayout:
         return None
 
 
-def flat_layout(channel: int, encoding: str, schema: Schema | None) -> FlatLayout | None:
+def find_flat_layout(
+    channel: int, encoding: str, schema: MessageSchema | None
+) -> FlatLayout | None:
     """Layout of a channel's messages, if its schema is one of plain floats."""
     if encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
         return None
-    fields = flat_fields(schema.data, schema.name)
+    fields = parse_flat_fields(schema.data, schema.name)
     return FlatLayout(channel, fields) if fields else None
 
 
-def decoder_for(encoding: str, schema: Schema | None) -> Decoder:
+def choose_decoder(encoding: str, schema: MessageSchema | None) -> MessageDecoder:
     """Return what decodes a channel's messages one by one.
 
     Raises
@@ -213,24 +218,26 @@ def decoder_for(encoding: str, schema: Schema | None) -> Decoder:
         return _decode_json
     if encoding == "protobuf":
         if schema is None or schema.encoding != "protobuf":
-            raise Unreadable("its protobuf messages have no protobuf schema")
-        return _protobuf_decoder(schema)
+            raise UnreadableMessages("its protobuf messages have no protobuf schema")
+        return _make_protobuf_decoder(schema)
     if encoding == "cdr":
-        raise Unreadable("its messages are ROS 2 CDR, which is not read: export it as CSV")
-    raise Unreadable(f"its messages are encoded as {encoding[:40]!r}; need protobuf or json")
+        raise UnreadableMessages("its messages are ROS 2 CDR, which is not read: export it as CSV")
+    raise UnreadableMessages(
+        f"its messages are encoded as {encoding[:40]!r}; need protobuf or json"
+    )
 
 
-def _decode_json(data: bytes) -> Numbers:
+def _decode_json(data: bytes) -> NumbersByName:
     try:
         found = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise Unreadable(f"a message is not JSON ({type(error).__name__})") from None
+        raise UnreadableMessages(f"a message is not JSON ({type(error).__name__})") from None
     if not isinstance(found, dict):
-        raise Unreadable("a message is not a JSON object")
-    return dict(_channel_numbers(found, "", DEEPEST))
+        raise UnreadableMessages("a message is not a JSON object")
+    return dict(_flatten_numbers(found, "", MAX_NESTING))
 
 
-def _channel_numbers(
+def _flatten_numbers(
     found: Mapping[str, object], before: str, depth: int
 ) -> Iterator[tuple[str, float]]:
     for name, value in found.items():
@@ -238,34 +245,36 @@ def _channel_numbers(
             try:
                 yield before + name, float(value)
             except OverflowError:
-                raise Unreadable(f"the value of {name!r} is too large for a double") from None
+                raise UnreadableMessages(
+                    f"the value of {name!r} is too large for a double"
+                ) from None
         elif isinstance(value, dict) and depth > 1:
-            yield from _channel_numbers(value, f"{before}{name}.", depth - 1)
+            yield from _flatten_numbers(value, f"{before}{name}.", depth - 1)
 
 
-def _protobuf_decoder(schema: Schema) -> Decoder:
+def _make_protobuf_decoder(schema: MessageSchema) -> MessageDecoder:
     try:
         pool = DescriptorPool()
         for file in FileDescriptorSet.FromString(schema.data).file:
             pool.Add(file)
         made = GetMessageClass(pool.FindMessageTypeByName(schema.name))
-        getters = dict(_getters(made.DESCRIPTOR, "", (), DEEPEST))
+        getters = dict(_iterate_field_paths(made.DESCRIPTOR, "", (), MAX_NESTING))
     except (DecodeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise Unreadable(f"its schema cannot be used ({type(error).__name__})") from None
+        raise UnreadableMessages(f"its schema cannot be used ({type(error).__name__})") from None
     if not getters:
-        raise Unreadable("its messages have no field that is one number")
+        raise UnreadableMessages("its messages have no field that is one number")
 
-    def decode(data: bytes) -> Numbers:
+    def decode(data: bytes) -> NumbersByName:
         try:
             message = made.FromString(data)
         except (DecodeError, RecursionError):
-            raise Unreadable("a message does not follow its schema") from None
-        return {name: _value(message, path) for name, path in getters.items()}
+            raise UnreadableMessages("a message does not follow its schema") from None
+        return {name: _get_number(message, path) for name, path in getters.items()}
 
     return decode
 
 
-def _getters(
+def _iterate_field_paths(
     message: Descriptor, before: str, path: tuple[str, ...], depth: int
 ) -> Iterator[tuple[str, tuple[str, ...]]]:
     for field in message.fields:
@@ -273,20 +282,22 @@ def _getters(
             continue
         here = (*path, field.name)
         if field.cpp_type == FieldDescriptor.CPPTYPE_MESSAGE:
-            if depth > 1 and field.message_type.full_name not in CLOCKS:
-                yield from _getters(field.message_type, f"{before}{field.name}.", here, depth - 1)
+            if depth > 1 and field.message_type.full_name not in TIME_MESSAGES:
+                yield from _iterate_field_paths(
+                    field.message_type, f"{before}{field.name}.", here, depth - 1
+                )
         elif field.cpp_type != FieldDescriptor.CPPTYPE_STRING:
             yield before + field.name, here
 
 
-def _value(message: Message, path: tuple[str, ...]) -> float:
+def _get_number(message: Message, path: tuple[str, ...]) -> float:
     found: object = message
     for name in path:
         found = getattr(found, name)
     return float(found)  # type: ignore[arg-type]
 
 
-class Series:
+class MessageColumns:
     """Columns of one channel, as its messages come.
 
     A name that a message lacks is missing (``nan``) there.
@@ -299,13 +310,13 @@ class Series:
 
     def add_block(self, layout: FlatLayout, messages: NDArray[np.void]) -> None:
         """Add many messages of one layout."""
-        self._close()
+        self._close_block()
         columns = {
             name: messages[f"value{i}"].astype(np.float64) for i, name in enumerate(layout.names)
         }
         self._blocks.append((messages["log_time"].copy(), columns))
 
-    def add(self, log_time: int, numbers: Numbers) -> None:
+    def add_message(self, log_time: int, numbers: NumbersByName) -> None:
         """Add one message."""
         for name in numbers:
             if name not in self._columns:
@@ -314,13 +325,13 @@ class Series:
         for name, column in self._columns.items():
             column.append(numbers.get(name, float("nan")))
 
-    def names(self) -> int:
+    def count_names(self) -> int:
         """Count the names seen since the last block."""
         return len(self._columns)
 
-    def joined(self) -> tuple[NDArray[np.uint64], dict[str, NDArray[np.float64]]]:
+    def concatenate_blocks(self) -> tuple[NDArray[np.uint64], dict[str, NDArray[np.float64]]]:
         """Return log times and columns of all messages, in the file's order."""
-        self._close()
+        self._close_block()
         names = list(dict.fromkeys(name for _, columns in self._blocks for name in columns))
         if not names:
             return np.empty(0, np.uint64), {}
@@ -332,7 +343,7 @@ class Series:
             for name in names
         }
 
-    def _close(self) -> None:
+    def _close_block(self) -> None:
         if self._times:
             columns = {n: np.frombuffer(c, np.float64) for n, c in self._columns.items()}
             self._blocks.append((np.frombuffer(self._times, np.uint64), columns))

@@ -17,18 +17,18 @@ import zstandard
 from mcap.opcode import Opcode
 
 from service.formats.errors import InvalidUpload
-from service.formats.limits import Limits
-from service.formats.mcap_writer import FOOTER_BODY, MAGIC
+from service.formats.limits import UploadLimits
+from service.formats.mcap_writer import FOOTER_BODY, MCAP_MAGIC
 
-HEAD: Final = struct.Struct("<BQ")
-_NAMES: Final = {int(one): one.name.lower().replace("_", " ") for one in Opcode}
-_SUMMARY: Final = {
+RECORD_HEAD: Final = struct.Struct("<BQ")
+_OPCODE_NAMES: Final = {int(one): one.name.lower().replace("_", " ") for one in Opcode}
+_SUMMARY_OPCODES: Final = {
     Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
     Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET, Opcode.FOOTER,
 }  # fmt: skip
 
 
-class Located(NamedTuple):
+class RawRecord(NamedTuple):
     """A record's opcode, its place in the file, and its content without opcode and length."""
 
     opcode: int
@@ -38,72 +38,72 @@ class Located(NamedTuple):
     @property
     def name(self) -> str:
         """What the record is called."""
-        return name_of(self.opcode)
+        return describe_opcode(self.opcode)
 
-    def fail(self, what: str) -> NoReturn:
+    def raise_invalid(self, what: str) -> NoReturn:
         """Raise the error of this record."""
         raise InvalidUpload(f"the {self.name} record {what}", byte=self.byte)
 
 
-def name_of(opcode: int) -> str:
+def describe_opcode(opcode: int) -> str:
     """What a record of that opcode is called."""
-    return _NAMES.get(opcode, f"unknown (0x{opcode:02x})")
+    return _OPCODE_NAMES.get(opcode, f"unknown (0x{opcode:02x})")
 
 
-class Cursor:
+class RecordCursor:
     """Reads the parts of one record; a length that goes past the record's end is its error."""
 
-    def __init__(self, record: Located) -> None:
+    def __init__(self, record: RawRecord) -> None:
         self._record, self._at = record, 0
 
-    def u16(self) -> int:
+    def read_u16(self) -> int:
         """Two bytes."""
-        return int.from_bytes(self.blob(2), "little")
+        return int.from_bytes(self.read_bytes(2), "little")
 
-    def u32(self) -> int:
+    def read_u32(self) -> int:
         """Four bytes."""
-        return int.from_bytes(self.blob(4), "little")
+        return int.from_bytes(self.read_bytes(4), "little")
 
-    def u64(self) -> int:
+    def read_u64(self) -> int:
         """Eight bytes."""
-        return int.from_bytes(self.blob(8), "little")
+        return int.from_bytes(self.read_bytes(8), "little")
 
-    def blob(self, length: int) -> bytes:
+    def read_bytes(self, length: int) -> bytes:
         """Return the next `length` bytes."""
         body = self._record.body
         if length > len(body) - self._at:
-            self._record.fail(
+            self._record.raise_invalid(
                 f"has an inner length of {length} bytes where {len(body) - self._at} are left"
             )
         self._at += length
         return body[self._at - length : self._at]
 
-    def text(self) -> str:
+    def read_text(self) -> str:
         """Text with its length before it."""
         try:
-            return self.blob(self.u32()).decode()
+            return self.read_bytes(self.read_u32()).decode()
         except UnicodeDecodeError:
-            self._record.fail("has a text that is not UTF-8")
+            self._record.raise_invalid("has a text that is not UTF-8")
 
-    def mapping(self) -> dict[str, str]:
+    def read_mapping(self) -> dict[str, str]:
         """Texts by name, with the length of the whole before them."""
-        end = self.u32() + self._at
+        end = self.read_u32() + self._at
         found: dict[str, str] = {}
         while self._at < end:
-            name = self.text()
-            found[name] = self.text()
+            name = self.read_text()
+            found[name] = self.read_text()
         if self._at != end:
-            self._record.fail("has a map whose entries go past its length")
+            self._record.raise_invalid("has a map whose entries go past its length")
         return found
 
 
-class _Stream:
+class _CheckedStream:
     """The file as it is read: place, what is left, checksum since it was last reset."""
 
     def __init__(self, stream: BinaryIO, size: int) -> None:
         self._stream, self.size, self.at, self.crc = stream, size, 0, 0
 
-    def read(self, length: int, what: str) -> bytes:
+    def read_exactly(self, length: int, what: str) -> bytes:
         left = self.size - self.at
         data = self._stream.read(length) if length <= left else b""
         if len(data) != length:
@@ -116,7 +116,7 @@ class _Stream:
         return data
 
 
-def walk(binary: BinaryIO, size: int, limits: Limits) -> Iterator[Located]:
+def iterate_records(binary: BinaryIO, size: int, limits: UploadLimits) -> Iterator[RawRecord]:
     """Every record of the data section, in order, header first; then the end is checked.
 
     Raises
@@ -126,62 +126,73 @@ def walk(binary: BinaryIO, size: int, limits: Limits) -> Iterator[Located]:
     """
     if size > limits.file_bytes:
         raise InvalidUpload(f"the file has {size} bytes; at most {limits.file_bytes} are read")
-    stream = _Stream(binary, size)
-    if size < len(MAGIC) or stream.read(len(MAGIC), "the magic bytes") != MAGIC:
+    stream = _CheckedStream(binary, size)
+    if (
+        size < len(MCAP_MAGIC)
+        or stream.read_exactly(len(MCAP_MAGIC), "the magic bytes") != MCAP_MAGIC
+    ):
         raise InvalidUpload("the file does not begin with the magic bytes of MCAP", byte=0)
-    record = _next(stream, limits)
+    record = _read_record(stream, limits)
     if record.opcode != Opcode.HEADER:
-        record.fail("stands where the header should be")
+        record.raise_invalid("stands where the header should be")
     while record.opcode != Opcode.DATA_END:
         if record.opcode == Opcode.FOOTER:
-            record.fail("comes before the end of the data")
+            record.raise_invalid("comes before the end of the data")
         yield record
         crc = stream.crc
-        record = _next(stream, limits)
-    _check_crc(record, Cursor(record).u32(), crc, "data section")
+        record = _read_record(stream, limits)
+    _check_crc(record, RecordCursor(record).read_u32(), crc, "data section")
     _check_end(stream, limits)
 
 
-def _next(stream: _Stream, limits: Limits) -> Located:
+def _read_record(stream: _CheckedStream, limits: UploadLimits) -> RawRecord:
     start = stream.at
-    opcode, length = HEAD.unpack(stream.read(HEAD.size, "the head of a record"))
+    opcode, length = RECORD_HEAD.unpack(
+        stream.read_exactly(RECORD_HEAD.size, "the head of a record")
+    )
     if opcode == 0:
         raise InvalidUpload("a record has opcode 0, which is no record", byte=start)
     if length > limits.record_bytes:
-        Located(opcode, start, b"").fail(
+        RawRecord(opcode, start, b"").raise_invalid(
             f"declares {length} bytes; at most {limits.record_bytes} are read"
         )
-    return Located(opcode, start, stream.read(length, f"the {name_of(opcode)} record"))
+    return RawRecord(
+        opcode, start, stream.read_exactly(length, f"the {describe_opcode(opcode)} record")
+    )
 
 
-def _check_end(stream: _Stream, limits: Limits) -> None:
+def _check_end(stream: _CheckedStream, limits: UploadLimits) -> None:
     summary_start, stream.crc = stream.at, 0
     while True:
         start, crc = stream.at, stream.crc
-        record = _next(stream, limits)
-        if record.opcode < 0x80 and record.opcode not in _SUMMARY:
-            record.fail("stands in the summary, after the end of the data")
+        record = _read_record(stream, limits)
+        if record.opcode < 0x80 and record.opcode not in _SUMMARY_OPCODES:
+            record.raise_invalid("stands in the summary, after the end of the data")
         if record.opcode == Opcode.FOOTER:
             break
-    fields = Cursor(record)
-    declared = fields.u64()
+    fields = RecordCursor(record)
+    declared = fields.read_u64()
     if declared not in (0, summary_start) or (declared == 0 and start != summary_start):
-        record.fail(f"says that the summary begins at {declared}; it begins at {summary_start}")
-    head = HEAD.pack(Opcode.FOOTER, FOOTER_BODY) + record.body[: FOOTER_BODY - 4]
-    fields.u64()
-    _check_crc(record, fields.u32(), zlib.crc32(head, crc), "summary")
-    if stream.read(len(MAGIC), "the closing magic bytes") != MAGIC:
+        record.raise_invalid(
+            f"says that the summary begins at {declared}; it begins at {summary_start}"
+        )
+    head = RECORD_HEAD.pack(Opcode.FOOTER, FOOTER_BODY) + record.body[: FOOTER_BODY - 4]
+    fields.read_u64()
+    _check_crc(record, fields.read_u32(), zlib.crc32(head, crc), "summary")
+    if stream.read_exactly(len(MCAP_MAGIC), "the closing magic bytes") != MCAP_MAGIC:
         raise InvalidUpload("the file does not end with the magic bytes of MCAP", byte=stream.at)
     if stream.at != stream.size:
         raise InvalidUpload("there are bytes after the end of the file's content", byte=stream.at)
 
 
-def _check_crc(record: Located, stored: int, found: int, what: str) -> None:
+def _check_crc(record: RawRecord, stored: int, found: int, what: str) -> None:
     if stored not in (0, found):  # 0: the writer made none
-        record.fail(f"has the checksum {stored:08x} for the {what}; it is {found:08x}: damaged")
+        record.raise_invalid(
+            f"has the checksum {stored:08x} for the {what}; it is {found:08x}: damaged"
+        )
 
 
-def open_chunk(record: Located, limits: Limits) -> bytes:
+def decompress_chunk(record: RawRecord, limits: UploadLimits) -> bytes:
     """Content of a chunk record.
 
     Raises
@@ -189,23 +200,25 @@ def open_chunk(record: Located, limits: Limits) -> bytes:
     InvalidUpload
         If it is too large as declared or in truth, damaged, or compressed in an unknown way.
     """
-    fields = Cursor(record)
-    fields.u64(), fields.u64()  # first and last time: the messages say it themselves
-    size, crc, compression = fields.u64(), fields.u32(), fields.text()
+    fields = RecordCursor(record)
+    fields.read_u64(), fields.read_u64()  # first and last time: the messages say it themselves
+    size, crc, compression = fields.read_u64(), fields.read_u32(), fields.read_text()
     if size > limits.record_bytes:
-        record.fail(f"declares {size} bytes of content; at most {limits.record_bytes} are read")
-    content = _decompress(record, compression, fields.blob(fields.u64()), size)
+        record.raise_invalid(
+            f"declares {size} bytes of content; at most {limits.record_bytes} are read"
+        )
+    content = _decompress(record, compression, fields.read_bytes(fields.read_u64()), size)
     if len(content) != size:
         more = "more" if len(content) > size else f"{len(content)}"
-        record.fail(f"declares {size} bytes of content, but holds {more}")
+        record.raise_invalid(f"declares {size} bytes of content, but holds {more}")
     if crc not in (0, zlib.crc32(content)):
-        record.fail(
+        record.raise_invalid(
             f"has the checksum {crc:08x}, its content {zlib.crc32(content):08x}: it is damaged"
         )
     return content
 
 
-def _decompress(record: Located, compression: str, data: bytes, size: int) -> bytes:
+def _decompress(record: RawRecord, compression: str, data: bytes, size: int) -> bytes:
     try:
         if compression == "zstd":
             # The window is memory too, and a frame's header may ask for gigabytes of it.
@@ -214,15 +227,15 @@ def _decompress(record: Located, compression: str, data: bytes, size: int) -> by
             with reader.stream_reader(data) as stream:
                 return bytes(stream.read(size + 1))
         if compression == "lz4":
-            return _unlz4(data, size)
+            return _decompress_lz4(data, size)
     except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
-        record.fail(f"cannot be decompressed ({_first_line(error)}): it is damaged")
+        record.raise_invalid(f"cannot be decompressed ({_take_first_line(error)}): it is damaged")
     if compression:
-        record.fail(f"is compressed with {compression[:40]!r}; need zstd, lz4 or none")
+        record.raise_invalid(f"is compressed with {compression[:40]!r}; need zstd, lz4 or none")
     return data
 
 
-def _unlz4(data: bytes, size: int) -> bytes:
+def _decompress_lz4(data: bytes, size: int) -> bytes:
     decompressor = lz4.frame.LZ4FrameDecompressor()
     parts: list[bytes] = []
     wanted = size + 1
@@ -235,5 +248,5 @@ def _unlz4(data: bytes, size: int) -> bytes:
     return b"".join(parts)
 
 
-def _first_line(error: Exception) -> str:
+def _take_first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:80]

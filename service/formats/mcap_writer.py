@@ -31,17 +31,17 @@ from numpy.typing import NDArray
 
 from service.formats.mcap_messages import (
     MESSAGE_HEADER,
-    Field,
-    double_fields,
-    identifiers,
-    record_layout,
-    schema_of,
-    tag_value,
+    NumericField,
+    build_schema,
+    encode_tag_value,
+    make_double_fields,
+    make_identifiers,
+    make_record_dtype,
 )
 from service.formats.topics import Nanoseconds
 from sysid.core.types import FloatArray
 
-MAGIC: Final = b"\x89MCAP0\r\n"
+MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 CHUNK_SAMPLES: Final = 16_384
 LIBRARY: Final = "lagid"
 ZSTD_LEVEL: Final = -1  # half the time of the usual 3, and 4 % larger for measured doubles
@@ -50,7 +50,7 @@ _INDEX_HEAD = struct.Struct("<BQHI")
 _INDEX = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
 
-class McapFile:
+class McapWriter:
     """An MCAP file being written, front to back; `write` takes the bytes.
 
     All checksums are written: of each chunk, of the data section, and of the summary.
@@ -64,12 +64,12 @@ class McapFile:
         self._schemas: list[bytes] = []
         self._channels: list[bytes] = []
         self._messages: set[str] = set()
-        self._fields: list[tuple[Field, ...]] = []
+        self._fields: list[tuple[NumericField, ...]] = []
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
         self._span: tuple[int, int] | None = None
-        self._put(MAGIC)
+        self._put_bytes(MCAP_MAGIC)
         self._put_record(Header(profile="", library=LIBRARY))
 
     def add_metadata(self, name: str, content: Mapping[str, str]) -> None:
@@ -81,17 +81,17 @@ class McapFile:
     def add_topic(self, path: str, fields: Sequence[str]) -> int:
         """Register a schema and a channel of doubles; return the channel's number."""
         number = len(self._channels) + 1
-        message = identifiers([path.strip("/").replace("/", "_")])[0].capitalize()
+        message = make_identifiers([path.strip("/").replace("/", "_")])[0].capitalize()
         if message in self._messages:
             message = f"{message}_{number}"
-        data = schema_of(message, fields)
+        data = build_schema(message, fields)
         schema = Schema(number, data, "protobuf", f"lagid.{message}")
         channel = Channel(number, path, "protobuf", {}, number)
         for record, known in ((schema, self._schemas), (channel, self._channels)):
-            known.append(_bytes_of(record))  # written again in the summary
-            self._put(known[-1])
+            known.append(_encode_record(record))  # written again in the summary
+            self._put_bytes(known[-1])
         self._messages.add(message)
-        self._fields.append(double_fields(tuple(fields)))
+        self._fields.append(make_double_fields(tuple(fields)))
         self._counts[number] = 0
         return number
 
@@ -100,13 +100,13 @@ class McapFile:
     ) -> None:
         """Add all samples of a channel, in chunks."""
         fields = self._fields[channel - 1]
-        layout = record_layout(fields)
+        layout = make_record_dtype(fields)
         messages = np.zeros(min(CHUNK_SAMPLES, log_times.size), layout)
         messages["opcode"] = Opcode.MESSAGE
         messages["length"] = layout.itemsize - MESSAGE_HEADER
         messages["channel"] = channel
         for i, field in enumerate(fields):
-            messages[f"tag{i}"] = tag_value(field)
+            messages[f"tag{i}"] = encode_tag_value(field)
         index = np.zeros(messages.size, _INDEX)
         index["offset"] = layout.itemsize * np.arange(messages.size)
         for first in range(0, log_times.size, CHUNK_SAMPLES):
@@ -119,22 +119,22 @@ class McapFile:
                 chunk[f"value{i}"] = values[part]
             self._put_chunk(channel, chunk, index[: chunk.size])
 
-    def finish(self) -> None:
+    def finish_file(self) -> None:
         """Write the end of the data, the summary and the footer."""
         self._put_record(DataEnd(self._crc))
         summary_start, self._crc = self._offset, 0
         offsets = [
             SummaryOffset(Opcode(opcode), start, self._offset - start)
-            for opcode, records in self._summary()
+            for opcode, records in self._collect_summary()
             if records and (start := self._offset) >= 0 and self._put_records(records)
         ]
         offsets_start = self._offset
         self._put_records(offsets)
-        footer = _bytes_of(Footer(summary_start, offsets_start, 0))
+        footer = _encode_record(Footer(summary_start, offsets_start, 0))
         crc = zlib.crc32(footer[:-4], self._crc)
-        self._put(footer[:-4] + crc.to_bytes(4, "little") + MAGIC)
+        self._put_bytes(footer[:-4] + crc.to_bytes(4, "little") + MCAP_MAGIC)
 
-    def _summary(self) -> list[tuple[int, Sequence[McapRecord | bytes]]]:
+    def _collect_summary(self) -> list[tuple[int, Sequence[McapRecord | bytes]]]:
         first, last = self._span or (0, 0)
         statistics = Statistics(
             attachment_count=0,
@@ -171,7 +171,7 @@ class McapFile:
         index_start = self._offset
         entries = index.tobytes()
         head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), channel, len(entries))
-        self._put(head + entries)
+        self._put_bytes(head + entries)
         self._chunks.append(
             ChunkIndex(
                 chunk_length=length,
@@ -193,17 +193,17 @@ class McapFile:
         return sum(self._put_record(record) for record in records)
 
     def _put_record(self, record: McapRecord | bytes) -> int:
-        data = record if isinstance(record, bytes) else _bytes_of(record)
-        self._put(data)
+        data = record if isinstance(record, bytes) else _encode_record(record)
+        self._put_bytes(data)
         return len(data)
 
-    def _put(self, data: bytes) -> None:
+    def _put_bytes(self, data: bytes) -> None:
         self._write(data)
         self._crc = zlib.crc32(data, self._crc)
         self._offset += len(data)
 
 
-def _bytes_of(record: McapRecord) -> bytes:
+def _encode_record(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
     return bytes(builder.end())  # type: ignore[no-untyped-call]

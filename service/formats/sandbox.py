@@ -18,11 +18,11 @@ from typing import Any, Literal
 
 from service.core import temporary_files as temporary
 from service.formats.errors import InvalidUpload
-from service.formats.limits import DEFAULT_LIMITS, MIB, Limits
+from service.formats.limits import DEFAULT_LIMITS, MIB, UploadLimits
 from service.formats.mcap import read_recording
 from sysid.data.records import Recording
 
-Kind = Literal["csv", "mcap"]
+FileKind = Literal["csv", "mcap"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,8 +44,8 @@ class UploadedRecording:
 
 def read_untrusted(
     path: str | os.PathLike[str],
-    kind: Kind,
-    limits: Limits = DEFAULT_LIMITS,
+    kind: FileKind,
+    limits: UploadLimits = DEFAULT_LIMITS,
     *,
     sample_time: float | None = None,
     segments: Sequence[str] = (),
@@ -68,7 +68,7 @@ def read_untrusted(
         raise InvalidUpload(f"the file has {size} bytes; at most {limits.file_bytes} are read")
     with source.open("rb") as stream:
         sha256 = file_digest(stream, "sha256").hexdigest()
-    with TemporaryDirectory(prefix=temporary.prefix()) as folder:
+    with TemporaryDirectory(prefix=temporary.make_temporary_prefix()) as folder:
         clean = Path(folder) / "clean.mcap"
         task = {
             "source": str(source.absolute()),
@@ -78,11 +78,11 @@ def read_untrusted(
             "segments": list(segments),
             "limits": asdict(limits),
         }
-        notes = _answer(_run_child(task, limits), limits)
+        notes = _parse_answer(_run_child(task, limits), limits)
         return UploadedRecording(read_recording(clean, limits), notes, sha256)
 
 
-def _run_child(task: dict[str, Any], limits: Limits) -> "subprocess.CompletedProcess[str]":
+def _run_child(task: dict[str, Any], limits: UploadLimits) -> "subprocess.CompletedProcess[str]":
     # No secret of this process's environment goes to the child.
     environment = {
         "PATH": os.environ.get("PATH", ""),
@@ -101,12 +101,14 @@ def _run_child(task: dict[str, Any], limits: Limits) -> "subprocess.CompletedPro
             check=False,
         )
     except subprocess.TimeoutExpired:
-        raise _too_slow(limits) from None
+        raise _build_timeout_error(limits) from None
 
 
-def _answer(child: "subprocess.CompletedProcess[str]", limits: Limits) -> tuple[str, ...]:
+def _parse_answer(
+    child: "subprocess.CompletedProcess[str]", limits: UploadLimits
+) -> tuple[str, ...]:
     if child.returncode == -24:  # SIGXCPU: the child's own limit of processor time
-        raise _too_slow(limits)
+        raise _build_timeout_error(limits)
     try:
         answer = json.loads(child.stdout)
         if "error" in answer:
@@ -123,5 +125,5 @@ def _answer(child: "subprocess.CompletedProcess[str]", limits: Limits) -> tuple[
         ) from None
 
 
-def _too_slow(limits: Limits) -> InvalidUpload:
+def _build_timeout_error(limits: UploadLimits) -> InvalidUpload:
     return InvalidUpload(f"reading the file takes more than {limits.seconds:g} s")

@@ -11,27 +11,27 @@ import numpy as np
 
 from service.formats.csv_recordings import read_csv
 from service.formats.errors import InvalidUpload
-from service.formats.limits import MIB, Limits
-from service.formats.mcap import read_mcap, write_recording
+from service.formats.limits import MIB, UploadLimits
+from service.formats.mcap import read_mcap_with_notes, write_recording
 from sysid.data.records import Recording
 
 
 def main() -> int:
     """Read the task's file and write it anew; answer with notes or with the error."""
     task = json.load(sys.stdin)
-    limits = Limits(**task["limits"])
-    _limit_this_process(limits)
+    limits = UploadLimits(**task["limits"])
+    _limit_resources(limits)
     try:
-        answer: dict[str, Any] = {"notes": _read(task, limits)}
+        answer: dict[str, Any] = {"notes": _convert_file(task, limits)}
     except InvalidUpload as error:
-        answer = {"error": _place_of(error)}
+        answer = {"error": _describe_invalid_upload(error)}
     except MemoryError:
-        answer = {"error": {"what": _too_much_memory(limits)}}
+        answer = {"error": {"what": _describe_memory_limit(limits)}}
     sys.stdout.write(json.dumps(answer))
     return 0
 
 
-def _limit_this_process(limits: Limits) -> None:
+def _limit_resources(limits: UploadLimits) -> None:
     seconds = ceil(limits.seconds)
     for what, most in (
         (resource.RLIMIT_AS, limits.memory_bytes),
@@ -44,15 +44,15 @@ def _limit_this_process(limits: Limits) -> None:
         resource.setrlimit(what, (allowed, allowed if what != resource.RLIMIT_CPU else hard))
 
 
-def _read(task: dict[str, Any], limits: Limits) -> list[str]:
+def _convert_file(task: dict[str, Any], limits: UploadLimits) -> list[str]:
     if task["kind"] == "csv":
         recording, notes = read_csv(
             Path(task["source"]), sample_time=task["sample_time"], segments=task["segments"]
         )
         made = list(notes)
     else:
-        recording, notes = read_mcap(task["source"], limits)
-        made = [*notes, *_check_values(recording)]
+        recording, notes = read_mcap_with_notes(task["source"], limits)
+        made = [*notes, *_check_finite_values(recording)]
     try:
         write_recording(recording, task["target"])
     except ValueError as error:
@@ -60,7 +60,7 @@ def _read(task: dict[str, Any], limits: Limits) -> list[str]:
     return made
 
 
-def _check_values(recording: Recording) -> list[str]:
+def _check_finite_values(recording: Recording) -> list[str]:
     """Refuse infinite values; return a note for each channel with missing ones."""
     notes = []
     for channel in recording.channels:
@@ -80,11 +80,11 @@ def _check_values(recording: Recording) -> list[str]:
     return notes
 
 
-def _place_of(error: InvalidUpload) -> dict[str, Any]:
+def _describe_invalid_upload(error: InvalidUpload) -> dict[str, Any]:
     return {"what": error.what, "row": error.row, "column": error.column, "byte": error.byte}
 
 
-def _too_much_memory(limits: Limits) -> str:
+def _describe_memory_limit(limits: UploadLimits) -> str:
     return f"reading the file needs more than {limits.memory_bytes // MIB} MiB of memory"
 
 

@@ -17,11 +17,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from service.formats.mcap_messages import identifiers
+from service.formats.mcap_messages import make_identifiers
 from sysid.core.types import FloatArray
 from sysid.data.records import HOLDS, Channel, Recording, Segment
 
-Rule = Literal["nanoseconds", "regular", "field"]
+ClockRule = Literal["nanoseconds", "regular", "field"]
 Nanoseconds = NDArray[np.uint64]
 LATEST_NS = 2**63
 LATEST_S = LATEST_NS / 1e9
@@ -29,7 +29,7 @@ TIME_FIELD = "time_s"
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class TopicClock:
     """How the times of one topic come back from its file.
 
     Attributes
@@ -41,12 +41,12 @@ class Clock:
         First time and sampling period, for ``regular``.
     """
 
-    rule: Rule
+    rule: ClockRule
     epoch: int = 0
     start: float = 0.0
     period: float = 0.0
 
-    def times(self, log_times: Nanoseconds, field: FloatArray | None) -> FloatArray:
+    def to_times(self, log_times: Nanoseconds, field: FloatArray | None) -> FloatArray:
         """The times in s."""
         if self.rule == "field" and field is not None:
             return field
@@ -55,14 +55,14 @@ class Clock:
                 log_times.size, dtype=np.float64
             )
             return grid
-        return _seconds(log_times, self.epoch)
+        return _to_seconds(log_times, self.epoch)
 
-    def as_dict(self) -> dict[str, object]:
+    def to_dict(self) -> dict[str, object]:
         """The entry of the file's metadata."""
         return {"rule": self.rule, "epoch": self.epoch, "start": self.start, "period": self.period}
 
     @classmethod
-    def from_dict(cls, entry: Mapping[str, object]) -> "Clock":
+    def from_dict(cls, entry: Mapping[str, object]) -> "TopicClock":
         """Return the inverse of `as_dict`; ValueError for an entry that is none."""
         rule, epoch = entry.get("rule"), entry.get("epoch")
         start, period = entry.get("start"), entry.get("period")
@@ -75,7 +75,7 @@ class Clock:
         return cls(rule, epoch, float(start), float(period))
 
 
-def clock_for(times: FloatArray) -> tuple[Clock, Nanoseconds]:
+def choose_clock(times: FloatArray) -> tuple[TopicClock, Nanoseconds]:
     """Return the clock of times (s, not decreasing), and the times on it.
 
     Raises
@@ -87,22 +87,22 @@ def clock_for(times: FloatArray) -> tuple[Clock, Nanoseconds]:
     if epoch <= -LATEST_S or float(times[-1]) - epoch >= LATEST_S:
         raise ValueError(f"times up to {float(times[-1])!r} s do not fit into 63 bits of ns")
     log_times = np.rint((times - epoch) * 1e9).astype(np.uint64)
-    if np.array_equal(_seconds(log_times, epoch), times):
-        return Clock("nanoseconds", epoch), log_times
-    for period in _periods(times):
-        clock = Clock("regular", epoch, float(times[0]), period)
-        if np.array_equal(clock.times(log_times, None), times):
+    if np.array_equal(_to_seconds(log_times, epoch), times):
+        return TopicClock("nanoseconds", epoch), log_times
+    for period in _propose_periods(times):
+        clock = TopicClock("regular", epoch, float(times[0]), period)
+        if np.array_equal(clock.to_times(log_times, None), times):
             return clock, log_times
-    return Clock("field", epoch), log_times
+    return TopicClock("field", epoch), log_times
 
 
-def _seconds(log_times: Nanoseconds, epoch: int) -> FloatArray:
+def _to_seconds(log_times: Nanoseconds, epoch: int) -> FloatArray:
     # A quotient of whole numbers is correctly rounded, like the decimal number it stands for.
     signed = log_times.astype(np.int64) + epoch * 10**9
     return np.asarray(signed / 1e9, dtype=np.float64)
 
 
-def _periods(times: FloatArray) -> Iterator[float]:
+def _propose_periods(times: FloatArray) -> Iterator[float]:
     if times.size > 1:
         mean = float(times[-1] - times[0]) / (times.size - 1)
         yield float(times[1] - times[0])
@@ -110,11 +110,11 @@ def _periods(times: FloatArray) -> Iterator[float]:
             yield float(f"{mean:.{digits}g}")
 
 
-DATASET = "lagid.dataset"
+DATASET_RECORD = "lagid.dataset"
 """Name of the metadata record that says what a file of ours holds."""
 
-FORMAT = "1"
-RESERVED = ("format", "sample_time", "channels", "topics", "segments", "history")
+FORMAT_VERSION = "1"
+RESERVED_KEYS = ("format", "sample_time", "channels", "topics", "segments", "history")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,75 +127,75 @@ class Topic:
     path: str
     channels: tuple[Channel, ...]
     fields: tuple[str, ...]
-    clock: Clock
+    clock: TopicClock
     log_times: Nanoseconds
-    extra: tuple[FloatArray, ...] = ()
+    exact_times: tuple[FloatArray, ...] = ()
 
     @property
     def columns(self) -> tuple[FloatArray, ...]:
         """What is written for each of `all_fields`."""
-        return (*(channel.values for channel in self.channels), *self.extra)
+        return (*(channel.values for channel in self.channels), *self.exact_times)
 
     @property
     def all_fields(self) -> tuple[str, ...]:
         """Names of the message's fields."""
-        return (*self.fields, TIME_FIELD) if self.extra else self.fields
+        return (*self.fields, TIME_FIELD) if self.exact_times else self.fields
 
 
 def make_topic(path: str, channels: Sequence[Channel], names: Sequence[str]) -> Topic:
     """Topic of channels with equal times; `names` are what its fields are to be called."""
     times = channels[0].times
-    clock, log_times = clock_for(times)
+    clock, log_times = choose_clock(times)
     extra = (times,) if clock.rule == "field" else ()
-    fields = identifiers((TIME_FIELD, *names))[1:]
+    fields = make_identifiers((TIME_FIELD, *names))[1:]
     return Topic(path, tuple(channels), fields, clock, log_times, extra)
 
 
-def topics_of(recording: Recording, root: str = "/signals") -> tuple[Topic, ...]:
+def group_into_topics(recording: Recording, root: str = "/signals") -> tuple[Topic, ...]:
     """Topics of a recording: `root` for the first channel and all that share its times."""
     groups: list[list[Channel]] = []
     for channel in recording.channels:
         for group in groups:
-            if _same_times(group[0], channel):
+            if _have_same_times(group[0], channel):
                 group.append(channel)
                 break
         else:
             groups.append([channel])
-    paths = [root, *(f"{root}/{name}" for name in identifiers(g[0].name for g in groups[1:]))]
+    paths = [root, *(f"{root}/{name}" for name in make_identifiers(g[0].name for g in groups[1:]))]
     return tuple(
         make_topic(path, group, [one.name for one in group])
         for path, group in zip(paths, groups, strict=True)
     )
 
 
-def history_topics_of(recording: Recording) -> tuple[Topic, ...]:
+def group_history_topics(recording: Recording) -> tuple[Topic, ...]:
     """Topics of what was recorded before the first samples; none where nothing was."""
     known = tuple(
         Channel(one.name, one.history.times, one.history.values, one.unit)
         for one in recording.channels
         if one.history is not None and one.history.times.size
     )
-    return topics_of(Recording(known), "/history") if known else ()
+    return group_into_topics(Recording(known), "/history") if known else ()
 
 
-def _same_times(a: Channel, b: Channel) -> bool:
+def _have_same_times(a: Channel, b: Channel) -> bool:
     return a.times is b.times or np.array_equal(a.times, b.times)
 
 
-def manifest_of(
+def build_manifest(
     recording: Recording,
     topics: Sequence[Topic],
     metadata: Mapping[str, str],
     history: Sequence[Topic] = (),
 ) -> dict[str, str]:
-    """Content of the record `DATASET`: everything that the messages themselves do not say.
+    """Content of the record `DATASET_RECORD`: everything that the messages themselves do not say.
 
     Raises
     ------
     ValueError
         If `metadata` uses a reserved key.
     """
-    if taken := sorted(set(metadata) & set(RESERVED)):
+    if taken := sorted(set(metadata) & set(RESERVED_KEYS)):
         raise ValueError(f"the metadata keys {', '.join(taken)} are the file's own")
     order = [channel.name for channel in recording.channels]
     entries = [
@@ -209,10 +209,10 @@ def manifest_of(
         for topic in history
         for c, field in zip(topic.channels, topic.fields, strict=True)
     }
-    clocks = {topic.path: topic.clock.as_dict() for topic in (*topics, *history)}
+    clocks = {topic.path: topic.clock.to_dict() for topic in (*topics, *history)}
     sampling = recording.sampling
     return {
-        "format": FORMAT,
+        "format": FORMAT_VERSION,
         "sample_time": f"{sampling.period:.12g}" if sampling.is_regular else "",
         "channels": json.dumps(entries),
         "topics": json.dumps(clocks),
@@ -235,34 +235,36 @@ class ChannelEntry:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """The record `DATASET`, checked. `history`: topic and field of it, by channel."""
+    """The record `DATASET_RECORD`, checked. `history`: topic and field of it, by channel."""
 
     channels: tuple[ChannelEntry, ...]
-    clocks: Mapping[str, Clock]
+    clocks: Mapping[str, TopicClock]
     segments: tuple[Segment, ...]
     history: Mapping[str, tuple[str, str]]
 
 
 def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
-    """Check the content of a record `DATASET`.
+    """Check the content of a record `DATASET_RECORD`.
 
     Raises
     ------
     ValueError
-        If it is not what `manifest_of` writes; it may come from anyone.
+        If it is not what `build_manifest` writes; it may come from anyone.
     """
     try:
-        if metadata["format"] != FORMAT:
-            raise ValueError(f"its format is {metadata['format']!r}; this program reads {FORMAT!r}")
-        channels = tuple(_channel(entry) for entry in json.loads(metadata["channels"]))
+        if metadata["format"] != FORMAT_VERSION:
+            raise ValueError(
+                f"its format is {metadata['format']!r}; this program reads {FORMAT_VERSION!r}"
+            )
+        channels = tuple(_parse_channel(entry) for entry in json.loads(metadata["channels"]))
         clocks = json.loads(metadata["topics"])
-        segments = tuple(_segment(entry) for entry in json.loads(metadata["segments"]))
+        segments = tuple(_parse_segment(entry) for entry in json.loads(metadata["segments"]))
         history = {
             name: (entry["topic"], entry["field"])
             for name, entry in json.loads(metadata["history"]).items()
         }
         manifest = Manifest(
-            channels, {path: Clock.from_dict(entry) for path, entry in clocks.items()}, segments,
+            channels, {path: TopicClock.from_dict(entry) for path, entry in clocks.items()}, segments,
             history,
         )  # fmt: skip
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
@@ -279,7 +281,7 @@ def parse_manifest(metadata: Mapping[str, str]) -> Manifest:
     return manifest
 
 
-def _channel(entry: Mapping[str, Any]) -> ChannelEntry:
+def _parse_channel(entry: Mapping[str, Any]) -> ChannelEntry:
     made = ChannelEntry(**entry)
     texts = (made.name, made.unit, made.topic, made.field)
     if not all(isinstance(text, str) for text in texts) or made.hold not in HOLDS:
@@ -287,7 +289,7 @@ def _channel(entry: Mapping[str, Any]) -> ChannelEntry:
     return made
 
 
-def _segment(entry: Mapping[str, Any]) -> Segment:
+def _parse_segment(entry: Mapping[str, Any]) -> Segment:
     made = Segment(**entry)
     numbers = (made.start, made.stop, made.origin)
     plain = all(isinstance(one, int | float) and np.isfinite(one) for one in numbers)

@@ -6,18 +6,18 @@ from math import exp, log, prod
 from typing import Any
 
 from service.core.errors import FieldError
-from service.jobs.schemas import Axis, JobIn
-from sysid.core.errors import nearest, split_pointer
+from service.jobs.schemas import JobIn, SweepAxis
+from sysid.core.errors import split_pointer, suggest_name
 
 # Fields that decide on the job as a whole; a cell of it cannot have its own.
-FIXED_FIELDS = ("name", "priority", "reuse", "sweep", "trend")
+UNSWEPT_FIELDS = ("name", "priority", "reuse", "sweep", "trend")
 
-MOST_LABEL = 64
+MOST_LABEL_CHARACTERS = 64
 """Characters of the name of a label at most."""
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
+class SweepCell:
     """One run of a sweep: the value of each axis' field, and labels for tables and plots."""
 
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -25,15 +25,15 @@ class Cell:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class AxisPosition:
     """What one position of one group of axes sets, and where in the body it was written."""
 
     pointer: str
-    cell: Cell
+    cell: SweepCell
 
 
 @dataclass(frozen=True, slots=True)
-class Steps(Sequence[Step]):
+class AxisGroup(Sequence[AxisPosition]):
     """The positions of one group of axes, each made when it is asked for.
 
     Attributes
@@ -42,12 +42,12 @@ class Steps(Sequence[Step]):
         Number of each axis of the group in the sweep, the axis, and its values.
     """
 
-    columns: tuple[tuple[int, Axis, Sequence[Any]], ...]
+    columns: tuple[tuple[int, SweepAxis, Sequence[Any]], ...]
 
     @classmethod
-    def of(cls, axes: Sequence[Axis], numbers: Sequence[int]) -> "Steps":
+    def from_axes(cls, axes: Sequence[SweepAxis], numbers: Sequence[int]) -> "AxisGroup":
         """The group of the axes of these numbers."""
-        return cls(tuple((number, axes[number], values_of(axes[number])) for number in numbers))
+        return cls(tuple((number, axes[number], expand_values(axes[number])) for number in numbers))
 
     def __len__(self) -> int:
         return len(self.columns[0][2])
@@ -58,11 +58,11 @@ class Steps(Sequence[Step]):
         labels: dict[str, float | str] = {}
         for _, axis, _ in self.columns:
             labels.update(axis.labels[position] if axis.labels else {})
-        cell = Cell({axis.path: values[position] for _, axis, values in self.columns}, labels)
-        return Step(_pointer(self.columns[0][0], self.columns[0][1], position), cell)
+        cell = SweepCell({axis.path: values[position] for _, axis, values in self.columns}, labels)
+        return AxisPosition(_build_pointer(self.columns[0][0], self.columns[0][1], position), cell)
 
 
-def grouped(axes: Sequence[Axis]) -> list[list[int]]:
+def group_axes(axes: Sequence[SweepAxis]) -> list[list[int]]:
     """Numbers of the axes that step together, group by group."""
     groups: dict[str, list[int]] = {}
     for number, axis in enumerate(axes):
@@ -70,30 +70,30 @@ def grouped(axes: Sequence[Axis]) -> list[list[int]]:
     return list(groups.values())
 
 
-def count(job: JobIn, groups: list[list[int]]) -> int:
+def count_runs(job: JobIn, groups: list[list[int]]) -> int:
     """Number of runs that the crossed groups give."""
-    return prod(length_of(job.sweep.axes[numbers[0]]) for numbers in groups)
+    return prod(count_values(job.sweep.axes[numbers[0]]) for numbers in groups)
 
 
-def steps_of(axes: Sequence[Axis], groups: list[list[int]]) -> list[Steps]:
+def build_axis_groups(axes: Sequence[SweepAxis], groups: list[list[int]]) -> list[AxisGroup]:
     """What each position of each group sets."""
-    return [Steps.of(axes, numbers) for numbers in groups]
+    return [AxisGroup.from_axes(axes, numbers) for numbers in groups]
 
 
-def expand(groups: Sequence[Sequence[Step]], start: int = 0) -> Iterator[Cell]:
+def iterate_cells(groups: Sequence[Sequence[AxisPosition]], start: int = 0) -> Iterator[SweepCell]:
     """Cells of the crossed groups from number `start` on; one empty cell without axes."""
     lengths = [len(steps) for steps in groups]
     for number in range(start, prod(lengths)):
         values: dict[str, Any] = {}
         labels: dict[str, float | str] = {}
-        for steps, position in zip(groups, positions_of(number, lengths), strict=True):
+        for steps, position in zip(groups, locate_cell(number, lengths), strict=True):
             cell = steps[position].cell
             values.update(cell.values)
             labels.update(cell.labels)
-        yield Cell(values, labels)
+        yield SweepCell(values, labels)
 
 
-def positions_of(number: int, lengths: Sequence[int]) -> list[int]:
+def locate_cell(number: int, lengths: Sequence[int]) -> list[int]:
     """Position of a cell in each of the crossed groups, the last of which goes fastest."""
     found = []
     for length in reversed(lengths):
@@ -102,14 +102,14 @@ def positions_of(number: int, lengths: Sequence[int]) -> list[int]:
     return found[::-1]
 
 
-def length_of(axis: Axis) -> int:
+def count_values(axis: SweepAxis) -> int:
     """Number of values of an axis."""
     if axis.log is not None:
         return axis.log[2]
     return len(axis.values if axis.values is not None else range(*(axis.range or [0])))
 
 
-def values_of(axis: Axis) -> Sequence[Any]:
+def expand_values(axis: SweepAxis) -> Sequence[Any]:
     """Values of an axis."""
     if axis.values is not None:
         return axis.values
@@ -118,41 +118,43 @@ def values_of(axis: Axis) -> Sequence[Any]:
     assert axis.log is not None
     start, stop, points = axis.log
     ratio = log(stop / start) / max(points - 1, 1)
-    return [_plain(start * exp(ratio * i)) for i in range(points - 1)] + [_plain(stop)]
+    return [_to_whole_number(start * exp(ratio * i)) for i in range(points - 1)] + [
+        _to_whole_number(stop)
+    ]
 
 
-def _plain(value: float) -> float | int:
+def _to_whole_number(value: float) -> float | int:
     """A whole number as such, so that fields of whole numbers take it."""
     return int(value) if value.is_integer() and value < 2**53 else value
 
 
-def _pointer(number: int, axis: Axis, position: int) -> str:
+def _build_pointer(number: int, axis: SweepAxis, position: int) -> str:
     kind = next(n for n in ("values", "range", "log") if getattr(axis, n) is not None)
     return f"/sweep/axes/{number}/{kind}" + (f"/{position}" if kind == "values" else "")
 
 
-def axis_faults(job: JobIn) -> Iterator[FieldError]:
+def find_axis_faults(job: JobIn) -> Iterator[FieldError]:
     """What is wrong with the axes themselves: paths, lengths, labels."""
-    document = job.normal_form()
+    document = job.to_normal_form()
     lengths: dict[str, int] = {}
     seen: set[str] = set()
     for number, axis in enumerate(job.sweep.axes):
         place = f"/sweep/axes/{number}"
-        detail = _unknown_path(document, axis.path)
+        detail = _describe_unknown_path(document, axis.path)
         if axis.path in seen:
             detail = f"{axis.path!r} is already an axis of this sweep"
         if detail:
             yield FieldError(f"{place}/path", detail)
         seen.add(axis.path)
-        detail = _bad_spacing(axis)
+        detail = _describe_bad_spacing(axis)
         if detail:
             yield FieldError(f"{place}/{'log' if axis.log else 'range'}", detail)
             continue
-        n = length_of(axis)
+        n = count_values(axis)
         if axis.labels is not None and len(axis.labels) != n:
             found = f"found {len(axis.labels)} labels for {n} values; need one each"
             yield FieldError(f"{place}/labels", found)
-        yield from _bad_labels(axis, place)
+        yield from _find_axis_label_faults(axis, place)
         if axis.zip is not None and lengths.setdefault(axis.zip, n) != n:
             yield FieldError(
                 f"{place}/zip",
@@ -161,20 +163,24 @@ def axis_faults(job: JobIn) -> Iterator[FieldError]:
             )
 
 
-def _bad_labels(axis: Axis, place: str) -> Iterator[FieldError]:
+def _find_axis_label_faults(axis: SweepAxis, place: str) -> Iterator[FieldError]:
     """Names that a database cannot look up in a document, which would merge its groups."""
     for position, labels in enumerate(axis.labels or ()):
         for name in labels:
-            if not 1 <= len(name) <= MOST_LABEL or not name.isprintable() or set(name) & {*'"\\'}:
+            if (
+                not 1 <= len(name) <= MOST_LABEL_CHARACTERS
+                or not name.isprintable()
+                or set(name) & {*'"\\'}
+            ):
                 yield FieldError(
                     f"{place}/labels/{position}",
-                    f"found the name {name!r:.80}; need 1 to {MOST_LABEL} printable characters "
+                    f"found the name {name!r:.80}; need 1 to {MOST_LABEL_CHARACTERS} printable characters "
                     "without quotation marks and backslashes",
                 )
                 return  # the other positions mostly have the same names
 
 
-def _bad_spacing(axis: Axis) -> str | None:
+def _describe_bad_spacing(axis: SweepAxis) -> str | None:
     if axis.log is not None:
         start, stop, points = axis.log
         if not (start > 0 and stop > 0 and points >= 1):
@@ -185,10 +191,10 @@ def _bad_spacing(axis: Axis) -> str | None:
     return None
 
 
-def _unknown_path(document: Mapping[str, Any], path: str) -> str | None:
+def _describe_unknown_path(document: Mapping[str, Any], path: str) -> str | None:
     """Why a path is not a field of the body, or None."""
     parts = split_pointer(path)
-    if parts[0] in FIXED_FIELDS:
+    if parts[0] in UNSWEPT_FIELDS:
         return f"{path!r} cannot be swept"
     if parts[0] in ("channels", "weights") and len(parts) == 2:
         return None  # which signals there are, the check of each value tells
@@ -196,14 +202,14 @@ def _unknown_path(document: Mapping[str, Any], path: str) -> str | None:
         return None
     here: Any = document
     for part in parts:
-        known = _children(here)
+        known = _list_children(here)
         if part not in known:
-            return f"the job has no field {path!r}{nearest(part, known)}"
+            return f"the job has no field {path!r}{suggest_name(part, known)}"
         here = here[int(part)] if isinstance(here, list) else here[part]
     return None
 
 
-def _children(value: Any) -> list[str]:
+def _list_children(value: Any) -> list[str]:
     if isinstance(value, list):
         return [str(index) for index in range(len(value))]
     return list(value) if isinstance(value, dict) else []

@@ -6,34 +6,34 @@ from typing import Any
 from pydantic import ValidationError
 from sqlalchemy.orm import Session
 
-from service.core.errors import FieldError, faults_of
-from service.core.validation import explained
-from service.datasets.datasets import dataset_of
+from service.core.errors import FieldError, to_field_errors
+from service.core.validation import explain_errors
+from service.datasets.datasets import resolve_dataset
 from service.jobs import warm_starts
-from service.jobs.job_parameters import experiments_in, experiments_named
+from service.jobs.job_parameters import count_experiments, count_named_experiments
 from service.jobs.record_checks import (
-    channel_faults,
-    conversion_faults,
-    given_both_ways,
-    length_faults,
-    overridden,
-    pieces_of,
-    signal_faults,
-    tried,
-    unit_faults,
+    collect_faults,
+    find_channel_faults,
+    find_channels_given_twice,
+    find_length_faults,
+    find_setting_conflicts,
+    find_signal_faults,
+    find_unit_faults,
+    list_record_lengths,
+    override_by_request,
 )
 from service.jobs.schemas import JobIn
 from service.models import models
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
-from sysid.models.delays import check_lags, unused
-from sysid.models.model import Model, initial_parameters
+from sysid.models.delays import check_delays, find_unused_settings
+from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter
-from sysid.models.polynomial import check_samples
-from sysid.models.ties import tied_model, ties_of
+from sysid.models.polynomial import check_candidate_count
+from sysid.models.ties import apply_ties, resolve_ties
 
-Body = dict[str, Any]
-MOST_NAMED = 1000  # experiments that are believed before they are known
+JobBody = dict[str, Any]
+MOST_NAMED_EXPERIMENTS = 1000  # experiments that are believed before they are known
 MOST_GENES = 10_000_000  # individuals times parameters: 80 MB for each copy of a population
 
 
@@ -50,103 +50,109 @@ class JobChecker:
         self._models: dict[str, tuple[Model, Any] | list[FieldError]] = {}
         self._datasets: dict[str, Dataset | str] = {one.id: one for one in unstored}
 
-    def errors(self, body: Body) -> list[FieldError]:
+    def find_faults(self, body: JobBody) -> list[FieldError]:
         """Every fault of a body in its normal form."""
-        found = [*conversion_faults(body), *self._missing_datasets(body)]
-        known = self.model(body["model"])
+        found = [*find_setting_conflicts(body), *self._find_missing_datasets(body)]
+        known = self.resolve_model(body["model"])
         if isinstance(known, list):
             return found + known
         model = known[0]
-        parameters = overridden(found, self._all_parameters(body, model), body["parameters"])
+        parameters = override_by_request(
+            found, self._list_parameters(body, model), body["parameters"]
+        )
         own = parameters[: len(model.parameters)]
-        tied = tied_model(model, tried(ties_of, found, model, parameters) or {})
-        tried(check_lags, found, tied, own)
-        found += _freedom_faults(parameters, body["algorithm"]["population"])
-        found += self._too_few_for_terms(body, model)
-        found += _unused_faults(tied, own, body["weights"])
-        found += self._repeated(body)
-        found += self._channels(body, model)
-        found += self._lengths(body, tied, own)
-        found += self._too_few_samples(body, model, parameters)
-        found += self._units(body, model)
-        found += warm_starts.faults(self._session, body["warm_start"], model)
-        return found + list(signal_faults(body, model))
+        tied = apply_ties(model, collect_faults(resolve_ties, found, model, parameters) or {})
+        collect_faults(check_delays, found, tied, own)
+        found += _find_freedom_faults(parameters, body["algorithm"]["population"])
+        found += self._find_term_count_faults(body, model)
+        found += _find_unused_parameters(tied, own, body["weights"])
+        found += self._find_repeated_recordings(body)
+        found += self._find_channel_faults(body, model)
+        found += self._find_length_faults(body, tied, own)
+        found += self._find_sample_faults(body, model, parameters)
+        found += self._find_unit_faults(body, model)
+        found += warm_starts.find_warm_start_faults(self._session, body["warm_start"], model)
+        return found + list(find_signal_faults(body, model))
 
-    def resolved(self, body: Body) -> Body:
+    def resolve_body(self, body: JobBody) -> JobBody:
         """The body with identifiers of datasets, and an own model as its document."""
-        model = self.model(body["model"])
+        model = self.resolve_model(body["model"])
         assert not isinstance(model, list)
-        body = {**body, "model": model[1], "datasets": self.identifiers(body["datasets"])}
-        body["warm_start"] = self.warm_start(body["warm_start"])
+        body = {**body, "model": model[1], "datasets": self.resolve_dataset_ids(body["datasets"])}
+        body["warm_start"] = self.resolve_warm_start(body["warm_start"])
         if body["trend"] is not None:
-            reference = self.warm_start(body["trend"]["reference"])
+            reference = self.resolve_warm_start(body["trend"]["reference"])
             body["trend"] = {**body["trend"], "reference": reference}
         kept = body["validation"]
         if kept is not None and kept["datasets"] is not None:
-            body["validation"] = {**kept, "datasets": self.identifiers(kept["datasets"])}
+            body["validation"] = {**kept, "datasets": self.resolve_dataset_ids(kept["datasets"])}
         return body
 
-    def warm_start(self, reference: str | None) -> str | None:
+    def resolve_warm_start(self, reference: str | None) -> str | None:
         """The run that is meant now: what is accepted later does not change a job that waits."""
-        return warm_starts.resolved(self._session, reference)
+        return warm_starts.resolve_warm_start(self._session, reference)
 
-    def model(self, reference: Any) -> tuple[Model, Any] | list[FieldError]:
+    def resolve_model(self, reference: Any) -> tuple[Model, Any] | list[FieldError]:
         """The model and what to store for it, or what is wrong with it."""
         key = repr(reference)
         if key not in self._models:
             try:
-                self._models[key] = models.resolve(self._session, reference)
+                self._models[key] = models.resolve_model(self._session, reference)
             except SysidError as error:
-                self._models[key] = [fault_in_job(reference, fault) for fault in faults_of(error)]
+                self._models[key] = [
+                    fault_in_job(reference, fault) for fault in to_field_errors(error)
+                ]
         return self._models[key]
 
-    def identifiers(self, references: list[str]) -> list[str]:
+    def resolve_dataset_ids(self, references: list[str]) -> list[str]:
         """Identifiers of datasets that are known to be there."""
-        found = (self.dataset(reference) for reference in references)
+        found = (self.get_dataset(reference) for reference in references)
         return [one.id for one in found if isinstance(one, Dataset)]
 
-    def dataset(self, reference: str) -> Dataset | str:
+    def get_dataset(self, reference: str) -> Dataset | str:
         """The dataset of that identifier or name, or why there is none."""
         if reference not in self._datasets:
-            self._datasets[reference] = dataset_of(self._session, reference)
+            self._datasets[reference] = resolve_dataset(self._session, reference)
         return self._datasets[reference]
 
-    def _all_parameters(self, body: Body, model: Model) -> tuple[Parameter, ...]:
+    def _list_parameters(self, body: JobBody, model: Model) -> tuple[Parameter, ...]:
         """The model's parameters, and the initial states to be estimated in each experiment.
 
         Of datasets that are missing, as many experiments as are named.
         """
-        found = [self.dataset(reference) for reference in body["datasets"]]
-        pieces = sum(experiments_in(one) for one in found if isinstance(one, Dataset))
+        found = [self.get_dataset(reference) for reference in body["datasets"]]
+        pieces = sum(count_experiments(one) for one in found if isinstance(one, Dataset))
         if not all(isinstance(one, Dataset) for one in found):
-            pieces = max(pieces, min(experiments_named(body["parameters"]), MOST_NAMED))
-        return (*model.parameters, *initial_parameters(model, pieces))
+            pieces = max(
+                pieces, min(count_named_experiments(body["parameters"]), MOST_NAMED_EXPERIMENTS)
+            )
+        return (*model.parameters, *build_initial_parameters(model, pieces))
 
-    def _samples(self, body: Body) -> int:
+    def _count_samples(self, body: JobBody) -> int:
         """Samples of all datasets for the estimate together; a dataset that is missing has many."""
-        found = [self.dataset(reference) for reference in body["datasets"]]
+        found = [self.get_dataset(reference) for reference in body["datasets"]]
         if not all(isinstance(one, Dataset) for one in found):
             return MOST_GENES
         return sum(one.n_samples for one in found if isinstance(one, Dataset))
 
-    def _scored(self, body: Body, model: Model) -> int:
+    def _count_scored_samples(self, body: JobBody, model: Model) -> int:
         """Samples of all outputs that are fitted, if none is missing."""
         kept: float = (body["validation"] or {}).get("fraction") or 0.0
-        samples = self._samples(body)
+        samples = self._count_samples(body)
         skipped = body["skip"] * len(body["datasets"])
         return int(samples - round(kept * samples) - skipped) * len(model.outputs)
 
-    def _missing_datasets(self, body: Body) -> Iterator[FieldError]:
-        for pointer, reference in _references(body):
-            dataset = self.dataset(reference)
+    def _find_missing_datasets(self, body: JobBody) -> Iterator[FieldError]:
+        for pointer, reference in _list_dataset_references(body):
+            dataset = self.get_dataset(reference)
             if isinstance(dataset, str):
                 yield FieldError(pointer, dataset)
 
-    def _repeated(self, body: Body) -> Iterator[FieldError]:
+    def _find_repeated_recordings(self, body: JobBody) -> Iterator[FieldError]:
         """Datasets that are named twice, or kept for validation though they are fitted."""
         places: dict[str, tuple[str, str]] = {}
-        for pointer, reference in _references(body):
-            dataset = self.dataset(reference)
+        for pointer, reference in _list_dataset_references(body):
+            dataset = self.get_dataset(reference)
             if isinstance(dataset, str):
                 continue
             first, name = places.setdefault(dataset.sha256, (pointer, reference))
@@ -156,23 +162,25 @@ class JobChecker:
                     "name another, or leave it out",
                 )  # fmt: skip
 
-    def _units(self, body: Body, model: Model) -> Iterator[FieldError]:
-        return unit_faults(model, body["channels"], self._there(body))
+    def _find_unit_faults(self, body: JobBody, model: Model) -> Iterator[FieldError]:
+        return find_unit_faults(model, body["channels"], self._list_datasets(body))
 
-    def _channels(self, body: Body, model: Model) -> Iterator[FieldError]:
-        yield from given_both_ways(body["channels"], model)
-        for _, dataset in self._there(body):
-            yield from channel_faults(body["channels"], model, dataset)
+    def _find_channel_faults(self, body: JobBody, model: Model) -> Iterator[FieldError]:
+        yield from find_channels_given_twice(body["channels"], model)
+        for _, dataset in self._list_datasets(body):
+            yield from find_channel_faults(body["channels"], model, dataset)
 
-    def _lengths(
-        self, body: Body, model: Model, parameters: tuple[Parameter, ...]
+    def _find_length_faults(
+        self, body: JobBody, model: Model, parameters: tuple[Parameter, ...]
     ) -> Iterator[FieldError]:
         kept: float | None = (body["validation"] or {}).get("fraction")
-        for pointer, dataset in self._there(body):
-            for piece in pieces_of(dataset):
-                estimated = piece if kept is None else piece.without(kept)
+        for pointer, dataset in self._list_datasets(body):
+            for piece in list_record_lengths(dataset):
+                estimated = piece if kept is None else piece.take_estimation_part(kept)
                 if estimated is not None:
-                    yield from length_faults(pointer, model, parameters, estimated, body["skip"])
+                    yield from find_length_faults(
+                        pointer, model, parameters, estimated, body["skip"]
+                    )
                 else:
                     yield FieldError(
                         "/validation/fraction",
@@ -180,49 +188,59 @@ class JobChecker:
                         "be empty",
                     )
 
-    def _too_few_for_terms(self, body: Body, model: Model) -> list[FieldError]:
+    def _find_term_count_faults(self, body: JobBody, model: Model) -> list[FieldError]:
         found: list[FieldError] = []
         if model.rule is not None:
-            tried(check_samples, found, len(model.terms), self._samples(body))
+            collect_faults(
+                check_candidate_count, found, len(model.terms), self._count_samples(body)
+            )
         return found
 
-    def _too_few_samples(
-        self, body: Body, model: Model, parameters: tuple[Parameter, ...]
+    def _find_sample_faults(
+        self, body: JobBody, model: Model, parameters: tuple[Parameter, ...]
     ) -> Iterator[FieldError]:
-        if model.rule is None:  # of candidates not all are kept; `check_samples` looks at them
-            yield from _sample_faults(parameters, self._scored(body, model))
+        if (
+            model.rule is None
+        ):  # of candidates not all are kept; `check_candidate_count` looks at them
+            yield from _check_sample_count(parameters, self._count_scored_samples(body, model))
 
-    def _there(self, body: Body) -> list[tuple[str, Dataset]]:
+    def _list_datasets(self, body: JobBody) -> list[tuple[str, Dataset]]:
         """The datasets of a body that there are, with their places."""
-        found = ((pointer, self.dataset(reference)) for pointer, reference in _references(body))
+        found = (
+            (pointer, self.get_dataset(reference))
+            for pointer, reference in _list_dataset_references(body)
+        )
         return [(pointer, one) for pointer, one in found if isinstance(one, Dataset)]
 
 
-def value_faults(pointer: str, body: Body) -> list[FieldError]:
+def find_type_faults(pointer: str, body: JobBody) -> list[FieldError]:
     """What the wire type says against a body into which a sweep put a value."""
     try:
         JobIn.model_validate(body)
     except ValidationError as error:
-        faults = explained(error.errors(), body, JobIn)
+        faults = explain_errors(error.errors(), body, JobIn)
         return [FieldError(pointer, str(one)) for one in faults]
     return []
 
 
-def _unused_faults(
+def _find_unused_parameters(
     model: Model, parameters: tuple[Parameter, ...], weights: Mapping[str, float] | None
 ) -> list[FieldError]:
     """Parameters that no output depends on, and the like."""
-    return [FieldError(one.pointer, one.detail) for one in unused(model, parameters, weights)]
+    return [
+        FieldError(one.pointer, one.detail)
+        for one in find_unused_settings(model, parameters, weights)
+    ]
 
 
-def _references(body: Body) -> Iterator[tuple[str, str]]:
+def _list_dataset_references(body: JobBody) -> Iterator[tuple[str, str]]:
     for index, reference in enumerate(body["datasets"]):
         yield f"/datasets/{index}", reference
     for index, reference in enumerate((body["validation"] or {}).get("datasets") or []):
         yield f"/validation/datasets/{index}", reference
 
 
-def _sample_faults(parameters: tuple[Parameter, ...], samples: int) -> Iterator[FieldError]:
+def _check_sample_count(parameters: tuple[Parameter, ...], samples: int) -> Iterator[FieldError]:
     free = sum(one.is_free for one in parameters)
     if 0 < samples < free:
         yield FieldError(
@@ -232,7 +250,9 @@ def _sample_faults(parameters: tuple[Parameter, ...], samples: int) -> Iterator[
         )
 
 
-def _freedom_faults(parameters: tuple[Parameter, ...], population: int) -> Iterator[FieldError]:
+def _find_freedom_faults(
+    parameters: tuple[Parameter, ...], population: int
+) -> Iterator[FieldError]:
     free = [one for one in parameters if one.is_free]
     if not free:
         yield FieldError("/parameters", "every parameter is fixed; leave one free")

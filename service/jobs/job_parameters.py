@@ -9,18 +9,18 @@ from sqlalchemy.orm import Session
 from service.repositories.datasets import DatasetRepository
 from service.storage.errors import StorageError
 from service.storage.tables import Dataset
-from sysid.models.model import Model, initial_parameters
+from sysid.models.model import Model, build_initial_parameters
 from sysid.models.parameters import Parameter
 
 _NUMBERED = re.compile(r"\(0\)\[(\d{1,6})\]$")
 
 
-def experiments_in(dataset: Dataset) -> int:
+def count_experiments(dataset: Dataset) -> int:
     """Each segment of a recording is an experiment of its own; without segments it is one."""
     return max(1, len(dataset.details.get("segments") or ()))
 
 
-def parameters_of_job(
+def list_job_parameters(
     session: Session, model: Model, body: Mapping[str, Any]
 ) -> tuple[Parameter, ...]:
     """All parameters of a job that was accepted, in their order.
@@ -31,14 +31,14 @@ def parameters_of_job(
     repository, experiments = DatasetRepository(session), 0
     for name in body["datasets"]:
         try:
-            experiments += experiments_in(repository.get(name))
+            experiments += count_experiments(repository.get(name))
         except StorageError:
             experiments += 1
-    experiments = max(experiments, experiments_named(body["parameters"]))
-    return (*model.parameters, *initial_parameters(model, experiments))
+    experiments = max(experiments, count_named_experiments(body["parameters"]))
+    return (*model.parameters, *build_initial_parameters(model, experiments))
 
 
-def experiments_named(parameters: Iterable[str]) -> int:
+def count_named_experiments(parameters: Iterable[str]) -> int:
     """How many experiments there are at least, by the starts that are named."""
     named = (_NUMBERED.search(name) for name in parameters)
     return max((int(one[1]) for one in named if one), default=1)

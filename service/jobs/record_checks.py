@@ -9,15 +9,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from service.core.errors import FieldError, faults_of
+from service.core.errors import FieldError, to_field_errors
 from service.datasets.signal_channels import map_channels
-from service.jobs.to_core import algorithm_of, loss_of
-from sysid.core.errors import RecordTooShort, SysidError, nearest
-from sysid.data.records import both_ways
-from sysid.models.delays import check_length, longest_lag, past_signals
+from service.jobs.to_core import to_algorithm, to_loss
+from sysid.core.errors import RecordTooShort, SysidError, suggest_name
+from sysid.data.records import find_shared_channels
+from sysid.models.delays import check_record_length, compute_longest_delay, list_past_values
 from sysid.models.model import Model
-from sysid.models.parameters import Parameter, override
-from sysid.models.sections import interval
+from sysid.models.parameters import Parameter, override_parameters
+from sysid.models.sections import get_interval
 from sysid.models.units import SignalUnits
 
 if TYPE_CHECKING:
@@ -25,30 +25,30 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class RecordLength:
     """What is known of the length of one record; `words` say which part of it is meant."""
 
     duration: float
     samples: int
     period: float | None
-    words: str = ""
+    part: str = ""
 
-    def without(self, fraction: float) -> "Piece | None":
+    def take_estimation_part(self, fraction: float) -> "RecordLength | None":
         """The part for estimation; None if it, or the part for validation, has no sample."""
         left = self.samples - round(fraction * self.samples)
         if not 0 < left < self.samples:
             return None
         # Where an irregular record is cut is not known here: its whole length is asked for.
         duration = self.duration if self.period is None else (left - 1) * self.period
-        return Piece(duration, left, self.period, "of the part for estimation: ")
+        return RecordLength(duration, left, self.period, "of the part for estimation: ")
 
 
-def signals_of(model: Model) -> tuple[list[str], list[str]]:
+def list_signals(model: Model) -> tuple[list[str], list[str]]:
     """Names of a model's inputs and outputs: the signals that channels are given to."""
     return [one.name for one in model.inputs], [one.name for one in model.outputs]
 
 
-def channel_faults(
+def find_channel_faults(
     channels: Mapping[str, str], model: Model, dataset: "Dataset"
 ) -> Iterator[FieldError]:
     """Signals of the model for which a dataset has no channel."""
@@ -58,18 +58,18 @@ def channel_faults(
             yield FieldError(
                 f"/channels/{signal}" if signal in channels else "/channels",
                 f"dataset {dataset.id} ({dataset.name}) has no channel {channel!r} for signal "
-                f"{signal!r} of the model{nearest(channel, known)}",
+                f"{signal!r} of the model{suggest_name(channel, known)}",
             )
 
 
-def given_both_ways(channels: Mapping[str, str], model: Model) -> Iterator[FieldError]:
+def find_channels_given_twice(channels: Mapping[str, str], model: Model) -> Iterator[FieldError]:
     """Inputs to which the channel of an output is given."""
     mapped = map_channels(model, channels)
-    for signal, fault in both_ways(dict(mapped.inputs), dict(mapped.outputs)).items():
+    for signal, fault in find_shared_channels(dict(mapped.inputs), dict(mapped.outputs)).items():
         yield FieldError(f"/channels/{signal}" if signal in channels else "/channels", fault)
 
 
-def unit_faults(
+def find_unit_faults(
     model: Model, channels: Mapping[str, str], datasets: "Sequence[tuple[str, Dataset]]"
 ) -> Iterator[FieldError]:
     """Channels in another unit than the model has, or than a dataset before has.
@@ -84,110 +84,118 @@ def unit_faults(
     for pointer, dataset in datasets:
         found = {channel["name"]: channel["unit"] for channel in dataset.channels}
         for signal, channel in by_signal.items():
-            fault = units.fault(signal, channel, found.get(channel), f"dataset {dataset.name!r}")
+            fault = units.describe_mismatch(
+                signal, channel, found.get(channel), f"dataset {dataset.name!r}"
+            )
             if fault:
                 yield FieldError(pointer, fault)
 
 
-def pieces_of(dataset: "Dataset") -> list[Piece]:
+def list_record_lengths(dataset: "Dataset") -> list[RecordLength]:
     """The records that a dataset gives: its segments, or all of it."""
     period = dataset.sample_time
     spans = [one["stop"] - one["start"] for one in dataset.details.get("segments") or []]
     if not spans:
-        return [Piece(dataset.duration, dataset.n_samples, period)]
+        return [RecordLength(dataset.duration, dataset.n_samples, period)]
     if period is None:  # how many samples each has is not stored; all together are enough to ask
-        return [Piece(min(spans), dataset.n_samples, None)]
-    return [Piece(span, round(span / period) + 1, period) for span in sorted(set(spans))]
+        return [RecordLength(min(spans), dataset.n_samples, None)]
+    return [RecordLength(span, round(span / period) + 1, period) for span in sorted(set(spans))]
 
 
-def length_faults(
-    pointer: str, model: Model, parameters: tuple[Parameter, ...], piece: Piece, skip: int
+def find_length_faults(
+    pointer: str, model: Model, parameters: tuple[Parameter, ...], piece: RecordLength, skip: int
 ) -> Iterator[FieldError]:
     """Lags that may reach back as far as a piece lasts, and a memory that it does not fill."""
     period = model.solver.step or piece.period or piece.duration / max(piece.samples - 1, 1)
     substeps = model.solver.substeps
-    error = _too_short(model, parameters, period / substeps, piece.duration)
+    error = _check_longest_delay(model, parameters, period / substeps, piece.duration)
     if error is not None:
-        yield FieldError(pointer, f"{piece.words}{error}")
+        yield FieldError(pointer, f"{piece.part}{error}")
     if (piece.samples - 1 - skip) * substeps < model.memory:
         yield FieldError(
             pointer,
-            f"{piece.words}the record has {piece.samples} samples; the model's memory "
+            f"{piece.part}the record has {piece.samples} samples; the model's memory "
             f"({model.memory}) and 'skip' ({skip}) need more",
         )
 
 
-def _too_short(
+def _check_longest_delay(
     model: Model, parameters: tuple[Parameter, ...], step: float, duration: float
 ) -> RecordTooShort | None:
     """What is wrong with the longest of the lags, if it is too long."""
     if not duration > 0:
         return RecordTooShort(duration, 0.0, "a simulation")
-    spans = {p.name: interval(p) for p in parameters}
-    lagged = sorted(past_signals(model), key=lambda one: -longest_lag(model, one, spans, step))
+    spans = {p.name: get_interval(p) for p in parameters}
+    lagged = sorted(
+        list_past_values(model), key=lambda one: -compute_longest_delay(model, one, spans, step)
+    )
     try:
         for past in lagged[:1]:
-            check_length(model, past, spans, step, duration)
+            check_record_length(model, past, spans, step, duration)
     except RecordTooShort as error:
         return error
     return None
 
 
-Body = dict[str, Any]
+JobBody = dict[str, Any]
 
 
-def signal_faults(body: Body, model: Model) -> Iterator[FieldError]:
+def find_signal_faults(body: JobBody, model: Model) -> Iterator[FieldError]:
     """Channels, holds and weights of signals that the model does not have."""
     inputs, outputs = [one.name for one in model.inputs], [one.name for one in model.outputs]
     for name in body["channels"]:
         if name not in (*inputs, *outputs):
-            hint = nearest(name, (*inputs, *outputs))
+            hint = suggest_name(name, (*inputs, *outputs))
             yield FieldError(
                 f"/channels/{name}", f"model {model.name!r} has no signal {name!r}{hint}"
             )
     for name in body["hold"]:
         if name not in inputs:
-            hint = nearest(name, inputs)
+            hint = suggest_name(name, inputs)
             yield FieldError(f"/hold/{name}", f"model {model.name!r} has no input {name!r}{hint}")
     for name, weight in (body["weights"] or {}).items():
         if name not in outputs:
-            hint = nearest(name, outputs)
+            hint = suggest_name(name, outputs)
             yield FieldError(f"/weights/{name}", f"the model has no output {name!r}{hint}")
         elif not weight > 0:
             yield FieldError(f"/weights/{name}", f"found {weight:g}; need a positive number")
 
 
-def conversion_faults(body: Body) -> list[FieldError]:
+def find_setting_conflicts(body: JobBody) -> list[FieldError]:
     """Settings of search and loss that do not go together."""
     found: list[FieldError] = []
-    tried(algorithm_of, found, body["algorithm"])
-    tried(loss_of, found, body["loss"])
+    collect_faults(to_algorithm, found, body["algorithm"])
+    collect_faults(to_loss, found, body["loss"])
     if body["prediction"] == "one-step" and body["loss"]["noise_model"] == "ar1":
         detail = "ar1 is for free runs; predictions one step ahead contain the noise"
         found.append(FieldError("/loss/noise_model", detail))
     return found
 
 
-def setting_faults(body: Body, model: Model, parameters: tuple[Parameter, ...]) -> list[FieldError]:
+def find_setting_faults(
+    body: JobBody, model: Model, parameters: tuple[Parameter, ...]
+) -> list[FieldError]:
     """Faults of a body that its model shows: names that it does not have, values that are none."""
-    found = conversion_faults(body)
-    overridden(found, parameters, body["parameters"])
-    return [*found, *signal_faults(body, model)]
+    found = find_setting_conflicts(body)
+    override_by_request(found, parameters, body["parameters"])
+    return [*found, *find_signal_faults(body, model)]
 
 
-def overridden(
+def override_by_request(
     errors: list[FieldError], parameters: tuple[Parameter, ...], changes: Mapping[str, Any]
 ) -> tuple[Parameter, ...]:
     """The parameters with all changes that can be made; of each of the others its fault."""
     for name, change in changes.items():
-        parameters = tried(override, errors, parameters, {name: change}) or parameters
+        parameters = (
+            collect_faults(override_parameters, errors, parameters, {name: change}) or parameters
+        )
     return parameters
 
 
-def tried(make: Any, errors: list[FieldError], *arguments: Any) -> Any:
+def collect_faults(make: Any, errors: list[FieldError], *arguments: Any) -> Any:
     """What `make` gives; None where it raises, and its faults among `errors`."""
     try:
         return make(*arguments)
     except SysidError as error:
-        errors += faults_of(error)
+        errors += to_field_errors(error)
         return None

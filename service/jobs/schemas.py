@@ -13,34 +13,36 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from service.core.states import StateName
-from service.core.wire import Answer, Body, NoiseIn, Pointer, Seed, not_too_deep
+from service.core.wire import Answer, Body, NoiseIn, Pointer, Seed, check_depth
 from sysid.core.settings import (
     MAX_BITS,
+    MAX_EVALUATIONS,
+    MAX_GENERATIONS,
     MIN_POPULATION,
-    MOST_EVALUATIONS,
-    MOST_GENERATIONS,
     GeneticAlgorithm,
     Loss,
     LossKind,
     NoiseModel,
-    Prediction,
+    PredictionKind,
     SearchMethod,
     SequenceKind,
     TopologyName,
 )
 from sysid.data.records import Hold
-from sysid.models.parameters import Scale
+from sysid.models.parameters import ParameterScale
 
 SEARCH, LOSS = GeneticAlgorithm(), Loss()
 """The settings of the core, for their defaults."""
 
-Whole = Annotated[int, Field(gt=-(2**62), lt=2**62)]
-Count = Annotated[int, Field(ge=1, le=MOST_GENERATIONS)]
-Evaluations = Annotated[int, Field(ge=1, le=MOST_EVALUATIONS)]
-Generation = Annotated[int, Field(ge=0, le=MOST_GENERATIONS)]
+WholeNumber = Annotated[int, Field(gt=-(2**62), lt=2**62)]
+PositiveCount = Annotated[int, Field(ge=1, le=MAX_GENERATIONS)]
+EvaluationLimit = Annotated[int, Field(ge=1, le=MAX_EVALUATIONS)]
+GenerationNumber = Annotated[int, Field(ge=0, le=MAX_GENERATIONS)]
 Bits = Annotated[int, Field(ge=1, le=MAX_BITS)]
 MOST_INDIVIDUALS = 100_000
-Mutation = Annotated[list[tuple[Generation, float]], Field(min_length=1, max_length=1000)]
+MutationSchedule = Annotated[
+    list[tuple[GenerationNumber, float]], Field(min_length=1, max_length=1000)
+]
 
 
 class ParameterIn(Body):
@@ -48,7 +50,7 @@ class ParameterIn(Body):
 
     lower: float | None = None
     upper: float | None = None
-    scale: Scale | None = None
+    scale: ParameterScale | None = None
     fixed: float | None = None
     tied: str | None = Field(default=None, max_length=1000)
 
@@ -60,7 +62,7 @@ class ValidationIn(Body):
     fraction: float | None = Field(default=None, gt=0, lt=1)
 
     @model_validator(mode="after")
-    def _one_of_two(self) -> Self:
+    def _check_one_source(self) -> Self:
         if (self.datasets is None) == (self.fraction is None):
             raise PydanticCustomError("one_of", "give either 'datasets' or 'fraction'")
         return self
@@ -89,7 +91,7 @@ class SequenceIn(Body):
 class MigrationIn(Body):
     """Exchange between islands."""
 
-    every: Count = SEARCH.migration.every
+    every: PositiveCount = SEARCH.migration.every
     topology: TopologyName = SEARCH.migration.topology
     migrants: int = Field(default=SEARCH.migration.migrants, ge=0, le=MOST_INDIVIDUALS)
 
@@ -103,7 +105,7 @@ class StopIn(Body):
     all; null: never.
     """
 
-    evaluations: Evaluations | None = SEARCH.stop.evaluations
+    evaluations: EvaluationLimit | None = SEARCH.stop.evaluations
     seconds: float | None = Field(default=SEARCH.stop.seconds, gt=0)
     rms: float | None = Field(default=SEARCH.stop.rms, gt=0)
     settled: int | None = Field(default=SEARCH.stop.settled, ge=1, le=1_000_000)
@@ -114,7 +116,7 @@ class IslandIn(Body):
 
     method: SearchMethod | None = None
     bits: Bits | None = None
-    mutation: Mutation | None = None
+    mutation: MutationSchedule | None = None
 
 
 class AlgorithmIn(Body):
@@ -125,8 +127,8 @@ class AlgorithmIn(Body):
     generations: int = Field(default=SEARCH.generations, ge=1, le=10_000_000)
     bits: Bits = SEARCH.bits
     selection_rate: float = Field(default=SEARCH.selection_rate, gt=0, lt=1)
-    mutation: Mutation = Field(default=[*SEARCH.mutation])
-    stagnation: Count = SEARCH.stagnation
+    mutation: MutationSchedule = Field(default=[*SEARCH.mutation])
+    stagnation: PositiveCount = SEARCH.stagnation
     sequence: SequenceIn = SequenceIn()
     islands: int | list[IslandIn] | None = None
     migration: MigrationIn = MigrationIn()
@@ -135,11 +137,11 @@ class AlgorithmIn(Body):
     stop: StopIn = StopIn()
 
 
-MOST_VALUES = 1_000_000
-Labels = Annotated[dict[str, float | str], Field(max_length=32)]
+MOST_AXIS_VALUES = 1_000_000
+AxisLabels = Annotated[dict[str, float | str], Field(max_length=32)]
 
 
-class Axis(Body):
+class SweepAxis(Body):
     """One axis of a sweep: the field it changes and the values it takes.
 
     Exactly one of `values`, `range` (start, stop[, step]; whole numbers, stop left out) and `log`
@@ -148,14 +150,14 @@ class Axis(Body):
     """
 
     path: Pointer
-    values: list[Any] | None = Field(default=None, min_length=1, max_length=MOST_VALUES)
-    range: list[Whole] | None = Field(default=None, min_length=2, max_length=3)
+    values: list[Any] | None = Field(default=None, min_length=1, max_length=MOST_AXIS_VALUES)
+    range: list[WholeNumber] | None = Field(default=None, min_length=2, max_length=3)
     log: tuple[float, float, int] | None = None
     zip: str | None = Field(default=None, max_length=100)
-    labels: list[Labels] | None = Field(default=None, max_length=MOST_VALUES)
+    labels: list[AxisLabels] | None = Field(default=None, max_length=MOST_AXIS_VALUES)
 
     @model_validator(mode="after")
-    def _one_kind_of_values(self) -> Self:
+    def _check_one_kind(self) -> Self:
         given = [n for n in ("values", "range", "log") if getattr(self, n) is not None]
         if len(given) != 1:
             raise PydanticCustomError(
@@ -169,45 +171,45 @@ class Axis(Body):
 class SweepIn(Body):
     """A job of many runs: the crossed axes give one run a cell."""
 
-    axes: list[Axis] = Field(default=[], max_length=16)
+    axes: list[SweepAxis] = Field(default=[], max_length=16)
 
 
-PREVIOUS, REFERENCE, RUN = "previous", "reference:", "run_"
+PREVIOUS, REFERENCE_PREFIX, RUN_PREFIX = "previous", "reference:", "run_"
 
 
-def _warm_start(value: str) -> str:
-    named = value.removeprefix(REFERENCE)
-    if value != PREVIOUS and not value.startswith(RUN) and (named == value or not named):
+def _check_warm_start(value: str) -> str:
+    named = value.removeprefix(REFERENCE_PREFIX)
+    if value != PREVIOUS and not value.startswith(RUN_PREFIX) and (named == value or not named):
         raise PydanticCustomError(
             "warm_start", "need 'previous', the id of a run (run_…), or 'reference:' and a name"
         )
     return value
 
 
-def _reference(value: str) -> str:
+def _check_reference(value: str) -> str:
     if value == PREVIOUS:
         raise PydanticCustomError("reference", "need the id of a run, or 'reference:' and a name")
-    return _warm_start(value)
+    return _check_warm_start(value)
 
 
-LEAST_PLACE, MOST_PLACE = 1e-100, 1e100
+LEAST_X, MOST_X = 1e-100, 1e100
 """Sizes of x in a trend, whose squares are computed."""
 
 
-def is_place(value: float) -> bool:
+def is_valid_x(value: float) -> bool:
     """Whether a number can be the x of a trend."""
-    return value == 0 or LEAST_PLACE <= abs(value) <= MOST_PLACE
+    return value == 0 or LEAST_X <= abs(value) <= MOST_X
 
 
-def _place(value: float) -> float:
-    if not is_place(value):
+def _check_x(value: float) -> float:
+    if not is_valid_x(value):
         raise PydanticCustomError(
             "place", "need 0, or a size from 1e-100 to 1e100; write x in another unit"
         )
     return value
 
 
-PlaceIn = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_place)]
+TrendX = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_check_x)]
 
 
 class TrendIn(Body):
@@ -220,11 +222,11 @@ class TrendIn(Body):
 
     x: str = Field(min_length=1, max_length=64)
     parameters: list[str] = Field(default=[], max_length=100)
-    predict: list[PlaceIn] = Field(default=[], max_length=100)
-    reference: Annotated[str, Field(max_length=300), AfterValidator(_reference)] | None = None
+    predict: list[TrendX] = Field(default=[], max_length=100)
+    reference: Annotated[str, Field(max_length=300), AfterValidator(_check_reference)] | None = None
 
 
-def model_reference(value: Any) -> Any:
+def check_model_reference(value: Any) -> Any:
     """A model as a body may give it: by name or as a document."""
     if not isinstance(value, str | dict):
         raise PydanticCustomError(
@@ -238,11 +240,11 @@ class IdentificationIn(Body):
     """What a job and the recipes that make jobs have in common: the model, and how to fit it."""
 
     name: str | None = Field(default=None, max_length=200)
-    model: Annotated[Any, AfterValidator(model_reference)]
+    model: Annotated[Any, AfterValidator(check_model_reference)]
     channels: dict[str, str] = Field(default={})
     hold: dict[str, Hold] = Field(default={})
     parameters: dict[str, ParameterIn] = Field(default={})
-    prediction: Prediction = "simulation"
+    prediction: PredictionKind = "simulation"
     loss: LossIn = LossIn()
     weights: dict[str, float] | None = None
     skip: int = Field(default=0, ge=0)
@@ -252,10 +254,10 @@ class IdentificationIn(Body):
 
     @model_validator(mode="before")
     @classmethod
-    def _within_reach(cls, value: Any) -> Any:
-        return not_too_deep(value)
+    def _check_depth(cls, value: Any) -> Any:
+        return check_depth(value)
 
-    def given(self, *also: str) -> dict[str, Any]:
+    def dump_set_fields(self, *also: str) -> dict[str, Any]:
         """These fields, and those named besides, as far as they were given."""
         names = {*IdentificationIn.model_fields, *also}
         return self.model_dump(include=names, exclude_unset=True)
@@ -269,10 +271,12 @@ class JobIn(IdentificationIn):
     noise: NoiseIn = NoiseIn()
     seed: Seed = 1
     sweep: SweepIn = SweepIn()
-    warm_start: Annotated[str, Field(max_length=300), AfterValidator(_warm_start)] | None = None
+    warm_start: Annotated[str, Field(max_length=300), AfterValidator(_check_warm_start)] | None = (
+        None
+    )
     trend: TrendIn | None = None
 
-    def normal_form(self) -> dict[str, Any]:
+    def to_normal_form(self) -> dict[str, Any]:
         """The body with every default written out, as it is stored and handed to workers."""
         document = self.model_dump(mode="json")
         document["parameters"] = {
@@ -282,7 +286,7 @@ class JobIn(IdentificationIn):
         return document
 
 
-class Progress(Answer):
+class ProgressOut(Answer):
     """How far a job has come."""
 
     runs: int
@@ -311,7 +315,7 @@ class JobOut(Answer):
     error: str | None = None
     model: str
     priority: int
-    progress: Progress
+    progress: ProgressOut
     rms_unit: str | None = Field(
         default=None, description="of the best RMS; σ: of several outputs together"
     )
@@ -326,7 +330,7 @@ class ReferenceIn(Body):
     note: str | None = Field(default=None, max_length=2000)
 
 
-class AcceptedOut(Answer):
+class AcceptanceOut(Answer):
     """One acceptance."""
 
     run: str
@@ -346,4 +350,4 @@ class ReferenceOut(Answer):
     at: datetime
     labels: dict[str, Any] = Field(default={})
     estimates: dict[str, dict[str, float | None]] = Field(default={})
-    history: list[AcceptedOut] = Field(default=[], description="the 1,000 before, latest first")
+    history: list[AcceptanceOut] = Field(default=[], description="the 1,000 before, latest first")

@@ -8,78 +8,80 @@ values name was found at submission, so that a name that means something else la
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from service.core.json_pointer import body_of, value_at
-from service.jobs.axes import Cell, Steps, expand, grouped, steps_of
+from service.core.json_pointer import build_run_body, get_value
+from service.jobs.axes import AxisGroup, SweepCell, build_axis_groups, group_axes, iterate_cells
 from service.jobs.checks import JobChecker
 from service.jobs.schemas import JobIn, SweepIn
-from service.queue.run_writes import Cell as StoredCell
+from service.queue.run_writes import NewRun as StoredCell
 from service.storage.columns import Document
 
-AT_ONCE = 2_000
+CELLS_AT_SUBMISSION = 2_000
 """Cells that are made at submission; most jobs have no more."""
 
-NAMES = ("/model", "/datasets", "/validation", "/warm_start")
+REFERENCE_FIELDS = ("/model", "/datasets", "/validation", "/warm_start")
 """Fields that name what is stored, or hold such names."""
 
 
-def stored_groups(spec: Mapping[str, Any]) -> list[Steps]:
+def read_axis_groups(spec: Mapping[str, Any]) -> list[AxisGroup]:
     """The crossed groups of a stored job's axes."""
     axes = SweepIn.model_validate(spec["sweep"]).axes
-    return steps_of(axes, grouped(axes))
+    return build_axis_groups(axes, group_axes(axes))
 
 
-def stored_cells(
-    spec: Mapping[str, Any], groups: list[Steps], start: int = 0
+def build_stored_cells(
+    spec: Mapping[str, Any], groups: list[AxisGroup], start: int = 0
 ) -> Iterator[StoredCell]:
     """The rows of a job's runs, from number `start` on."""
-    for number, cell in enumerate(expand(groups, start), start):
+    for number, cell in enumerate(iterate_cells(groups, start), start):
         yield StoredCell(
             number=number, cell=dict(cell.values), labels=dict(cell.labels),
-            method=_field(spec, cell, "algorithm", "method"),
-            seed=_field(spec, cell, "seed"),
-            sigma=_field(spec, cell, "noise", "sigma"),
+            method=_find_field_value(spec, cell, "algorithm", "method"),
+            seed=_find_field_value(spec, cell, "seed"),
+            sigma=_find_field_value(spec, cell, "noise", "sigma"),
         )  # fmt: skip
 
 
-def resolved_axes(checker: JobChecker, spec: Document, groups: list[Steps]) -> list[Document]:
+def resolve_axes(checker: JobChecker, spec: Document, groups: list[AxisGroup]) -> list[Document]:
     """The axes of a checked job with identifiers for names, and objects with their defaults.
 
     Parameters
     ----------
     spec : dict
-        The body as `JobChecker.resolved` gives it.
+        The body as `JobChecker.resolve_body` gives it.
     """
     axes = [dict(axis) for axis in spec["sweep"]["axes"]]
     for steps in groups:
         named = {number: axis.path for number, axis, _ in steps.columns
                  if axis.values is not None
-                 and (_is_name(axis.path) or any(map(_is_object, axis.values)))}  # fmt: skip
+                 and (_is_reference_field(axis.path) or any(map(_is_object, axis.values)))}  # fmt: skip
         if not named:
             continue
-        found = [_resolved(checker, spec, step.cell) for step in steps]
+        found = [_resolve_values(checker, spec, step.cell) for step in steps]
         for number, path in named.items():
             axes[number]["values"] = [values[path] for values in found]
     return axes
 
 
-def _resolved(checker: JobChecker, spec: Document, cell: Cell) -> dict[str, Any]:
+def _resolve_values(checker: JobChecker, spec: Document, cell: SweepCell) -> dict[str, Any]:
     """The values of one step as they are stored."""
-    whole = checker.resolved(JobIn.model_validate(body_of(spec, cell.values)).normal_form())
+    whole = checker.resolve_body(
+        JobIn.model_validate(build_run_body(spec, cell.values)).to_normal_form()
+    )
     return {
-        path: value_at(whole, path) if _is_name(path) or _is_object(value) else value
+        path: get_value(whole, path) if _is_reference_field(path) or _is_object(value) else value
         for path, value in cell.values.items()
     }
 
 
-def _is_name(path: str) -> bool:
-    return path in NAMES or path.startswith(("/datasets/", "/validation/datasets"))
+def _is_reference_field(path: str) -> bool:
+    return path in REFERENCE_FIELDS or path.startswith(("/datasets/", "/validation/datasets"))
 
 
 def _is_object(value: Any) -> bool:
     return isinstance(value, dict)
 
 
-def _field(spec: Mapping[str, Any], cell: Cell, *parts: str) -> Any:
+def _find_field_value(spec: Mapping[str, Any], cell: SweepCell, *parts: str) -> Any:
     """A field of the run's body, found without making the body."""
     path = "/" + "/".join(parts)
     if path in cell.values:

@@ -10,24 +10,24 @@ from typing import TYPE_CHECKING, Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import Conflict
-from service.core.json_pointer import body_of
+from service.core.json_pointer import build_run_body
 from service.datasets.recordings import read_records
-from service.datasets.rms_unit import unit_of
+from service.datasets.rms_unit import find_rms_unit
 from service.datasets.signal_channels import SignalChannels, map_channels
-from service.jobs.job_parameters import parameters_of_job
+from service.jobs.job_parameters import list_job_parameters
 from service.jobs.results import read_noise_model
 from service.jobs.to_core import fit_settings_of
-from service.models.models import load_stored_model, resolved
+from service.models.models import apply_selection, load_stored_model
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore
 from service.storage.tables import Job, Run
-from sysid.data.noise import Noise, with_noise
+from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Record
 from sysid.data.splitting import split_record
-from sysid.models.model import Model, initial_parameters
-from sysid.models.parameters import Parameter, override
+from sysid.models.model import Model, build_initial_parameters
+from sysid.models.parameters import Parameter, override_parameters
 
 if TYPE_CHECKING:
     from sysid.simulation.problem import Problem
@@ -54,8 +54,8 @@ class StoredRun:
     @classmethod
     def from_rows(cls, job: Job, run: Run) -> "StoredRun":
         """Make the value from the rows of a run and its job."""
-        body = body_of(job.spec, run.cell)
-        return cls(job, run, body, resolved(load_stored_model(body["model"]), run.result))
+        body = build_run_body(job.spec, run.cell)
+        return cls(job, run, body, apply_selection(load_stored_model(body["model"]), run.result))
 
     @property
     def requested_model(self) -> Model:
@@ -80,12 +80,12 @@ class StoredRun:
 
     def rms_unit(self, session: Session) -> str:
         """Find the unit of the RMS."""
-        return unit_of(session, self.body)
+        return find_rms_unit(session, self.body)
 
     def parameters(self, session: Session) -> tuple[Parameter, ...]:
         """Give all parameters with the job's changes, starts of all experiments included."""
-        parameters = parameters_of_job(session, self.model, self.body)
-        return override(parameters, self._changes(parameters))
+        parameters = list_job_parameters(session, self.model, self.body)
+        return override_parameters(parameters, self._changes(parameters))
 
     def read_datasets(
         self, session: Session, store: ObjectStore, datasets: Sequence[str]
@@ -107,7 +107,7 @@ class StoredRun:
         if fraction is not None:
             records = [split_record(record, fraction)[0] for record in records]
         noise = Noise(float(self.body["noise"]["sigma"]), int(self.body["noise"]["seed"]))
-        return [with_noise(record, noise, number) for number, record in enumerate(records)]
+        return [add_output_noise(record, noise, number) for number, record in enumerate(records)]
 
     def problem(self, session: Session, store: ObjectStore) -> "Problem":
         """Build the problem that the run solved."""
@@ -115,7 +115,7 @@ class StoredRun:
         from sysid.simulation.problem import Problem
 
         records = self.records(session, store)
-        parameters = (*self.model.parameters, *initial_parameters(self.model, len(records)))
+        parameters = (*self.model.parameters, *build_initial_parameters(self.model, len(records)))
         loss = {**self.body["loss"], "noise_model": read_noise_model(self.result)}
         body = {**self.body, "parameters": self._changes(parameters), "loss": loss}
         return Problem.from_settings(self.model, records, fit_settings_of(body))

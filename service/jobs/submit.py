@@ -9,33 +9,39 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.core.errors import InvalidRequest, TooMuchUnfinished
+from service.core.errors import InvalidRequest, QuotaExceeded
 from service.core.settings import Settings
+from service.core.states import JobState
 from service.core.wire import Page
-from service.datasets.rms_unit import unit_of
-from service.jobs.axes import count, grouped, steps_of
+from service.datasets.rms_unit import find_rms_unit
+from service.jobs.axes import build_axis_groups, count_runs, group_axes
 from service.jobs.checks import JobChecker
-from service.jobs.schemas import JobIn, JobOut, Progress
-from service.jobs.stored_cells import AT_ONCE, resolved_axes, stored_cells, stored_groups
-from service.jobs.sweep_checks import faults_of_job
-from service.queue.admission import unfinished
-from service.queue.run_writes import Cell, add_runs
+from service.jobs.schemas import JobIn, JobOut, ProgressOut
+from service.jobs.stored_cells import (
+    CELLS_AT_SUBMISSION,
+    build_stored_cells,
+    read_axis_groups,
+    resolve_axes,
+)
+from service.jobs.sweep_checks import find_job_faults
+from service.queue.admission import count_unfinished
+from service.queue.run_writes import NewRun, insert_runs
 from service.repositories.jobs import JobRepository, NewJob, Submission
 from service.repositories.lineage import LineageRepository
 from service.storage.sessions import Database
-from service.storage.tables import Dataset, Job, State
+from service.storage.tables import Dataset, Job
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
+class CheckedJob:
     """A job that can be queued: what was asked for, by its digest, and what is stored of it."""
 
     job: NewJob
     digest: str
-    cells: tuple[Cell, ...]
+    cells: tuple[NewRun, ...]
 
 
-def submit_to(
+def submit_job(
     database: Database, body: JobIn, settings: Settings, key: str | None = None
 ) -> JobOut:
     """Queue a job with its first runs; the dispatcher makes the others as it comes to them.
@@ -51,15 +57,15 @@ def submit_to(
     TooMuchUnfinished
         If its project has as much queued and running as it may.
     """
-    with database.read() as session:
-        checked = check(session, body, settings)
-    with database.write() as session:
-        return told(store(session, checked, settings, key).job)
+    with database.read_session() as session:
+        checked = check_job(session, body, settings)
+    with database.write_session() as session:
+        return to_job_out(store_job(session, checked, settings, key).job)
 
 
-def check(
+def check_job(
     session: Session, body: JobIn, settings: Settings, unstored: Iterable[Dataset] = ()
-) -> Checked:
+) -> CheckedJob:
     """The job as it will be stored: with identifiers for names, also in its axes.
 
     `unstored` are datasets that it may name before they are stored.
@@ -69,26 +75,26 @@ def check(
     InvalidRequest
         With every fault that can be known before the job runs.
     """
-    document = body.normal_form()
+    document = body.to_normal_form()
     digest = hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
     checker = JobChecker(session, unstored)
-    faults = faults_of_job(session, checker, body, settings.max_runs_per_job)
+    faults = find_job_faults(session, checker, body, settings.max_runs_per_job)
     if faults:
         raise InvalidRequest(faults)
-    numbers = grouped(body.sweep.axes)
-    n_runs, groups = count(body, numbers), steps_of(body.sweep.axes, numbers)
-    spec = checker.resolved(document)
-    spec["sweep"] = {"axes": resolved_axes(checker, spec, groups)}
+    numbers = group_axes(body.sweep.axes)
+    n_runs, groups = count_runs(body, numbers), build_axis_groups(body.sweep.axes, numbers)
+    spec = checker.resolve_body(document)
+    spec["sweep"] = {"axes": resolve_axes(checker, spec, groups)}
     new = NewJob(
-        name=body.name or _name(checker, spec), spec=spec, n_runs=n_runs, priority=body.priority,
+        name=body.name or _choose_name(checker, spec), spec=spec, n_runs=n_runs, priority=body.priority,
         max_attempts=settings.max_attempts,
     )  # fmt: skip
-    first = islice(stored_cells(spec, stored_groups(spec)), AT_ONCE)
-    return Checked(new, digest, tuple(first))
+    first = islice(build_stored_cells(spec, read_axis_groups(spec)), CELLS_AT_SUBMISSION)
+    return CheckedJob(new, digest, tuple(first))
 
 
-def store(
-    session: Session, checked: Checked, settings: Settings, key: str | None = None
+def store_job(
+    session: Session, checked: CheckedJob, settings: Settings, key: str | None = None
 ) -> Submission:
     """Write a job that was checked, and its first runs.
 
@@ -103,11 +109,11 @@ def store(
     if submission.is_new:
         spec = checked.job.spec
         check_limits(session, submission.job, settings)
-        add_runs(session, submission.job, checked.cells)
+        insert_runs(session, submission.job, checked.cells)
         lineage = LineageRepository(session)
-        lineage.link(submission.job.id, spec["datasets"], "estimation")
+        lineage.add_links(submission.job.id, spec["datasets"], "estimation")
         kept = (spec["validation"] or {}).get("datasets") or []
-        lineage.link(submission.job.id, kept, "validation")
+        lineage.add_links(submission.job.id, kept, "validation")
     return submission
 
 
@@ -119,22 +125,22 @@ def check_limits(session: Session, job: Job, settings: Settings) -> None:
     TooMuchUnfinished
         With the counts; the caller's transaction ends with it.
     """
-    open_now = unfinished(session, job.project_id)
+    open_now = count_unfinished(session, job.project_id)
     if open_now.jobs > settings.max_open_jobs:
-        raise TooMuchUnfinished(
+        raise QuotaExceeded(
             f"{open_now.jobs - 1} jobs of the project wait or run, and at most "
             f"{settings.max_open_jobs} may; submit this one when some have ended, or cancel some"
         )
     if open_now.runs > settings.max_open_runs:
         left = job.n_runs - job.n_done
-        raise TooMuchUnfinished(
+        raise QuotaExceeded(
             f"{open_now.runs - left} runs of the project are not done, and this job has {left} "
             f"more; at most {settings.max_open_runs} may be open; submit it when some have ended, "
             "or cancel some"
         )
 
 
-def resume(session: Session, job_id: str, settings: Settings) -> Job:
+def resume_job(session: Session, job_id: str, settings: Settings) -> Job:
     """Queue a failed or cancelled job again.
 
     Raises
@@ -149,21 +155,21 @@ def resume(session: Session, job_id: str, settings: Settings) -> Job:
     return job
 
 
-def clone(database: Database, job_id: str, settings: Settings) -> JobOut:
+def clone_job(database: Database, job_id: str, settings: Settings) -> JobOut:
     """Queue the same request as a new job."""
-    with database.read() as session:
+    with database.read_session() as session:
         old = JobRepository(session).get(job_id)
     body = JobIn.model_validate({**old.spec, "name": old.name})
-    return submit_to(database, body, settings)
+    return submit_job(database, body, settings)
 
 
-def told(job: Job, *, with_request: bool = False, rms_unit: str | None = None) -> JobOut:
+def to_job_out(job: Job, *, with_request: bool = False, rms_unit: str | None = None) -> JobOut:
     """A job as it is told."""
     model = job.spec["model"]
     return JobOut.from_source(
         job,
         model=model["name"] if isinstance(model, Mapping) else model,
-        progress=Progress.from_source(
+        progress=ProgressOut.from_source(
             job,
             runs=job.n_runs,
             finished=job.n_done,
@@ -175,14 +181,16 @@ def told(job: Job, *, with_request: bool = False, rms_unit: str | None = None) -
     )
 
 
-def page(session: Session, cursor: str | None, limit: int, states: list[State]) -> Page[JobOut]:
+def list_jobs(
+    session: Session, cursor: str | None, limit: int, states: list[JobState]
+) -> Page[JobOut]:
     """Jobs, latest first."""
-    found = JobRepository(session).page(cursor=cursor, limit=limit, states=states)
-    items = [told(job, rms_unit=unit_of(session, job.spec)) for job in found.items]
+    found = JobRepository(session).list_page(cursor=cursor, limit=limit, states=states)
+    items = [to_job_out(job, rms_unit=find_rms_unit(session, job.spec)) for job in found.items]
     return Page(items=items, next=found.next)
 
 
-def _name(checker: JobChecker, spec: Mapping[str, Any]) -> str:
+def _choose_name(checker: JobChecker, spec: Mapping[str, Any]) -> str:
     model = spec["model"]["name"] if isinstance(spec["model"], Mapping) else spec["model"]
-    data = checker.dataset(spec["datasets"][0])
+    data = checker.get_dataset(spec["datasets"][0])
     return f"{model} on {data if isinstance(data, str) else data.name}"

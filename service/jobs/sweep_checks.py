@@ -10,36 +10,45 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError
-from service.core.json_pointer import body_of, value_at
+from service.core.json_pointer import build_run_body, get_value
 from service.core.wire import Seed, Sigma
 from service.jobs import warm_starts
-from service.jobs.axes import Cell, Step, axis_faults, count, grouped, steps_of
-from service.jobs.checks import JobChecker, value_faults
-from service.jobs.schemas import LEAST_PLACE, MOST_PLACE, PREVIOUS, JobIn, is_place
-from sysid.core.errors import nearest
+from service.jobs.axes import (
+    AxisPosition,
+    SweepCell,
+    build_axis_groups,
+    count_runs,
+    find_axis_faults,
+    group_axes,
+)
+from service.jobs.checks import JobChecker, find_type_faults
+from service.jobs.schemas import LEAST_X, MOST_X, PREVIOUS, JobIn, is_valid_x
+from sysid.core.errors import suggest_name
 from sysid.models.model import Model
 
 
-def trend_faults(session: Session, job: JobIn, model: Model | None) -> Iterator[FieldError]:
+def find_trend_faults(session: Session, job: JobIn, model: Model | None) -> Iterator[FieldError]:
     """Labels that are missing or no numbers, what the model or the reference does not have."""
     if job.warm_start == PREVIOUS and not job.sweep.axes:
         yield FieldError("/warm_start", "'previous' needs a sweep; this job has one run")
     if job.trend is None:
         return
-    yield from _label_faults(job, job.trend.x)
+    yield from _find_label_faults(job, job.trend.x)
     if model is None:
         return
-    yield from warm_starts.faults(session, job.trend.reference, model, "/trend/reference")
+    yield from warm_starts.find_warm_start_faults(
+        session, job.trend.reference, model, "/trend/reference"
+    )
     known = [one.name for one in model.parameters]
     for index, name in enumerate(job.trend.parameters):
         if name not in known:
             yield FieldError(
                 f"/trend/parameters/{index}",
-                f"the model has no parameter {name!r}{nearest(name, known)}",
+                f"the model has no parameter {name!r}{suggest_name(name, known)}",
             )
 
 
-def _label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
+def _find_label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
     axes = [(n, axis.labels) for n, axis in enumerate(job.sweep.axes) if axis.labels]
     named = [(n, labels) for n, labels in axes if any(x in one for one in labels)]
     if not named:
@@ -47,7 +56,7 @@ def _label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
         there = f"there are {', '.join(known)}" if known else "no axis has labels"
         yield FieldError(
             "/trend/x",
-            f"no run has a label {x!r}{nearest(x, known)}; {there}; give an axis "
+            f"no run has a label {x!r}{suggest_name(x, known)}; {there}; give an axis "
             f'"labels": [{{"{x}": …}}, …], one for each value',
         )
     for n, labels in named:
@@ -56,9 +65,9 @@ def _label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
             if not isinstance(value, float | int):
                 found = f"found {one[x]!r}" if x in one else "it is missing"
                 needed = "a number here"
-            elif not is_place(value):
+            elif not is_valid_x(value):
                 found = f"found {value!r}"
-                needed = f"0, or a size from {LEAST_PLACE:g} to {MOST_PLACE:g}"
+                needed = f"0, or a size from {LEAST_X:g} to {MOST_X:g}"
             else:
                 continue
             yield FieldError(
@@ -68,44 +77,44 @@ def _label_faults(job: JobIn, x: str) -> Iterator[FieldError]:
 
 # Fields that no other field depends on: their values are checked alone, a whole body for each of
 # a hundred thousand seeds would only take time.
-ALONE: Mapping[str, TypeAdapter[Any]] = {
+INDEPENDENT_FIELDS: Mapping[str, TypeAdapter[Any]] = {
     "/seed": TypeAdapter(Seed),
     "/noise/seed": TypeAdapter(Seed),
     "/noise/sigma": TypeAdapter(Sigma),
 }
-MOST_TOLD = 200
+MOST_FAULTY_VALUES = 200
 """Values that cannot be used, after which no more are looked at: of some that takes 2 ms each."""
 
 
-def faults_of_job(
+def find_job_faults(
     session: Session, checker: JobChecker, body: JobIn, most_runs: int
 ) -> list[FieldError]:
     """Every fault that can be known before the job runs.
 
     Values of axes are looked at where the axes are sound, and no more than `most_runs` of them.
     """
-    document = body.normal_form()
-    found = list(axis_faults(body))
-    known = checker.errors(body_of(document, {}))
+    document = body.to_normal_form()
+    found = list(find_axis_faults(body))
+    known = checker.find_faults(build_run_body(document, {}))
     if not found:
-        groups = grouped(body.sweep.axes)
-        n_runs = count(body, groups)
+        groups = group_axes(body.sweep.axes)
+        n_runs = count_runs(body, groups)
         if n_runs > most_runs:
             found.append(FieldError(
                 "/sweep/axes", f"the sweep has {n_runs} runs; at most {most_runs} a job"
             ))  # fmt: skip
         else:
-            steps = steps_of(body.sweep.axes, groups)
-            wrong = list(_sweep_faults(checker, document, steps, frozenset(known)))
+            steps = build_axis_groups(body.sweep.axes, groups)
+            wrong = list(_find_value_faults(checker, document, steps, frozenset(known)))
             found += wrong
-            if len(wrong) < MOST_TOLD:
-                found += _repeated_recordings(checker, body)
-    model = checker.model(body.model)
-    found += trend_faults(session, body, None if isinstance(model, list) else model[0])
+            if len(wrong) < MOST_FAULTY_VALUES:
+                found += _find_repeated_recordings(checker, body)
+    model = checker.resolve_model(body.model)
+    found += find_trend_faults(session, body, None if isinstance(model, list) else model[0])
     return list(dict.fromkeys([*known, *found]))
 
 
-def _repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldError]:
+def _find_repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldError]:
     """Recordings that a trend would take for measured at two places, or twice at one."""
     if body.trend is None:
         return
@@ -117,7 +126,7 @@ def _repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldErro
             x = labels.get(body.trend.x)
             names = given if isinstance(given, list) else [given]
             for name in (one for one in names if isinstance(one, str)):  # others are told before
-                dataset = checker.dataset(name)
+                dataset = checker.get_dataset(name)
                 key = dataset if isinstance(dataset, str) else dataset.sha256
                 at, before = first.setdefault(key, (position, (x, name)))
                 if at != position:
@@ -128,10 +137,10 @@ def _repeated_recordings(checker: JobChecker, body: JobIn) -> Iterator[FieldErro
                     )
 
 
-def _sweep_faults(
+def _find_value_faults(
     checker: JobChecker,
     document: dict[str, Any],
-    groups: Sequence[Sequence[Step]],
+    groups: Sequence[Sequence[AxisPosition]],
     known: Set[FieldError],
 ) -> Iterator[FieldError]:
     """Faults of the values; of a range or a logarithmic axis, those of its first bad value.
@@ -141,33 +150,38 @@ def _sweep_faults(
     told: set[str] = set()
     n_wrong = 0
     for step in (step for group in groups for step in group):
-        if step.pointer in told or _is_good_alone(step.cell):
+        if step.pointer in told or _is_valid_alone(step.cell):
             continue
-        if n_wrong == MOST_TOLD:
-            yield FieldError("", f"{MOST_TOLD} values of axes are told; the rest is not looked at")
+        if n_wrong == MOST_FAULTY_VALUES:
+            yield FieldError(
+                "", f"{MOST_FAULTY_VALUES} values of axes are told; the rest is not looked at"
+            )
             return
-        found = list(_step_faults(checker, document, step, known))
+        found = list(_find_position_faults(checker, document, step, known))
         if found:
             told.add(step.pointer)
             n_wrong += 1
         yield from found
 
 
-def _of_another_type(step: Step, whole: dict[str, Any]) -> Iterator[FieldError]:
+def _find_type_mismatches(step: AxisPosition, whole: dict[str, Any]) -> Iterator[FieldError]:
     """Values that a body would take for others, as '3' for 3: workers take a cell's as they are."""
     for path, value in step.cell.values.items():
         if not isinstance(value, str | bool | float):
             continue
-        taken = value_at(whole, path)
+        taken = get_value(whole, path)
         if not isinstance(taken, type(value) | list):
             yield FieldError(step.pointer, f"{path}: found {value!r}; write {taken!r}")
 
 
-def _is_good_alone(cell: Cell) -> bool:
-    return all(path in ALONE and _fits(ALONE[path], value) for path, value in cell.values.items())
+def _is_valid_alone(cell: SweepCell) -> bool:
+    return all(
+        path in INDEPENDENT_FIELDS and _has_type(INDEPENDENT_FIELDS[path], value)
+        for path, value in cell.values.items()
+    )
 
 
-def _fits(kind: TypeAdapter[Any], value: Any) -> bool:
+def _has_type(kind: TypeAdapter[Any], value: Any) -> bool:
     try:
         kind.validate_python(value, strict=True)
     except ValidationError:
@@ -175,19 +189,19 @@ def _fits(kind: TypeAdapter[Any], value: Any) -> bool:
     return True
 
 
-def _step_faults(
+def _find_position_faults(
     checker: JobChecker,
     document: dict[str, Any],
-    step: Step,
+    step: AxisPosition,
     known: Set[FieldError],
 ) -> Iterator[FieldError]:
-    body = body_of(document, step.cell.values)
-    wrong = value_faults(step.pointer, body)
+    body = build_run_body(document, step.cell.values)
+    wrong = find_type_faults(step.pointer, body)
     yield from wrong
     if wrong:
         return
-    whole = JobIn.model_validate(body).normal_form()
-    yield from _of_another_type(step, whole)
-    for fault in checker.errors(whole):
+    whole = JobIn.model_validate(body).to_normal_form()
+    yield from _find_type_mismatches(step, whole)
+    for fault in checker.find_faults(whole):
         if fault not in known:
             yield FieldError(step.pointer, str(fault), fault.column)

@@ -17,7 +17,7 @@ from sysid.core.settings import (
 )
 
 
-def algorithm_of(document: Mapping[str, Any]) -> GeneticAlgorithm:
+def to_algorithm(document: Mapping[str, Any]) -> GeneticAlgorithm:
     """Settings of the search, from the ``algorithm`` of a job body in its normal form.
 
     Raises
@@ -26,16 +26,16 @@ def algorithm_of(document: Mapping[str, Any]) -> GeneticAlgorithm:
         With the pointer of the field that cannot be used.
     """
     fields = dict(document)
-    fields["mutation"] = _schedule(fields["mutation"])
+    fields["mutation"] = _to_schedule(fields["mutation"])
     fields["sequence"] = SequenceSearch(**fields["sequence"])
     fields["migration"] = Migration(**fields["migration"])
     fields["stop"] = Stop(**fields["stop"])
     if isinstance(fields["islands"], list):
-        fields["islands"] = tuple(_island(change) for change in fields["islands"])
+        fields["islands"] = tuple(_to_island_change(change) for change in fields["islands"])
     return GeneticAlgorithm(**fields)
 
 
-def loss_of(document: Mapping[str, Any]) -> Loss:
+def to_loss(document: Mapping[str, Any]) -> Loss:
     """What is minimised, from the ``loss`` of a job body.
 
     Raises
@@ -57,20 +57,20 @@ def fit_settings_of(body: Mapping[str, Any]) -> FitSettings:
     return FitSettings(
         parameters=body["parameters"],
         prediction=body["prediction"],
-        loss=loss_of(body["loss"]),
+        loss=to_loss(body["loss"]),
         weights=body["weights"],
         skip=body["skip"],
     )
 
 
-def _island(change: Mapping[str, Any]) -> IslandChange:
+def _to_island_change(change: Mapping[str, Any]) -> IslandChange:
     mutation = change.get("mutation")
     return IslandChange(
         method=change.get("method"),
         bits=change.get("bits"),
-        mutation=None if mutation is None else _schedule(mutation),
+        mutation=None if mutation is None else _to_schedule(mutation),
     )
 
 
-def _schedule(pairs: Any) -> tuple[tuple[int, float], ...]:
+def _to_schedule(pairs: Any) -> tuple[tuple[int, float], ...]:
     return tuple((int(generation), float(rate)) for generation, rate in pairs)

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.jobs.axes import grouped, length_of
-from service.jobs.schemas import Axis
+from service.jobs.axes import count_values, group_axes
+from service.jobs.schemas import SweepAxis
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class ChainLayout:
     """Runs that differ in one group of axes only, in the order of its values.
 
     Attributes
@@ -23,39 +23,39 @@ class Chain:
     length: int
 
     @classmethod
-    def along(cls, axes: Sequence[Axis]) -> "Chain | None":
+    def from_axes(cls, axes: Sequence[SweepAxis]) -> "ChainLayout | None":
         """The chain along the axis that has labels, else over datasets, else the first.
 
         Its other axes go in parallel, each with a chain of its own. None without axes.
         """
-        groups = grouped(axes)
+        groups = group_axes(axes)
         if not groups:
             return None
-        chosen = min(range(len(groups)), key=lambda g: _rank([axes[n] for n in groups[g]]))
-        lengths = [length_of(axes[numbers[0]]) for numbers in groups]
+        chosen = min(range(len(groups)), key=lambda g: _rank_axes([axes[n] for n in groups[g]]))
+        lengths = [count_values(axes[numbers[0]]) for numbers in groups]
         stride = 1
         for length in lengths[chosen + 1 :]:
             stride *= length
         return cls(stride, lengths[chosen])
 
-    def before(self, number: int) -> int | None:
+    def find_previous(self, number: int) -> int | None:
         """Number of the run before that one; None for the first of its chain."""
         first = number // self.stride % self.length == 0
         return None if first else number - self.stride
 
-    def of(self, number: int) -> int:
+    def find_chain(self, number: int) -> int:
         """Number of the chain of a run: chains are counted in the order of their first runs."""
         block, place = divmod(number, self.stride * self.length)
         return block * self.stride + place % self.stride
 
-    def numbers(self, chain: int) -> range:
+    def list_runs(self, chain: int) -> range:
         """Numbers of the runs of a chain, in its order."""
         block, place = divmod(chain, self.stride)
         first = block * self.stride * self.length + place
         return range(first, first + self.stride * self.length, self.stride)
 
 
-def _rank(axes: Sequence[Axis]) -> int:
+def _rank_axes(axes: Sequence[SweepAxis]) -> int:
     if any(axis.labels for axis in axes):
         return 0
     return 1 if any(axis.path == "/datasets" for axis in axes) else 2

@@ -7,17 +7,17 @@ from sqlalchemy.orm import Session
 
 from service.core.errors import FieldError, InvalidRequest
 from service.jobs import references
-from service.jobs.schemas import PREVIOUS, REFERENCE
+from service.jobs.schemas import PREVIOUS, REFERENCE_PREFIX
 from service.jobs.stored_run import load_run
-from service.models.models import says_the_same
+from service.models.models import have_same_equations
 from service.storage.tables import Run
 from sysid.models.model import Model
 
-POINTER = "/warm_start"
+WARM_START_POINTER = "/warm_start"
 
 
-def faults(
-    session: Session, reference: str | None, model: Model, pointer: str = POINTER
+def find_warm_start_faults(
+    session: Session, reference: str | None, model: Model, pointer: str = WARM_START_POINTER
 ) -> list[FieldError]:
     """Why a body's warm start, or reference, cannot be used: no such run, or of another model.
 
@@ -27,25 +27,25 @@ def faults(
     if reference in (None, PREVIOUS):
         return []
     try:
-        run = references.run_of(session, str(reference), pointer)
+        run = references.resolve_reference(session, str(reference), pointer)
     except InvalidRequest as error:
         return list(error.errors)
-    text = _of_another_model(session, run, model)
-    if not text and (pointer != POINTER or str(reference).startswith(REFERENCE)):
-        text = _of_other_equations(session, run, model)
+    text = _describe_other_parameters(session, run, model)
+    if not text and (pointer != WARM_START_POINTER or str(reference).startswith(REFERENCE_PREFIX)):
+        text = _describe_other_equations(session, run, model)
     return [FieldError(pointer, text)] if text else []
 
 
-def resolved(session: Session, reference: str | None) -> str | None:
+def resolve_warm_start(session: Session, reference: str | None) -> str | None:
     """The run that is meant now: what is accepted later does not change a job that waits."""
     if reference in (None, PREVIOUS):
         return reference
-    return references.run_of(session, str(reference), POINTER).id
+    return references.resolve_reference(session, str(reference), WARM_START_POINTER).id
 
 
-def _of_other_equations(session: Session, run: Run, model: Model) -> str:
+def _describe_other_equations(session: Session, run: Run, model: Model) -> str:
     theirs = load_run(session, run.id).requested_model
-    if says_the_same(theirs, model):
+    if have_same_equations(theirs, model):
         return ""
     return (
         f"run {run.id} is of another model, {theirs.name!r}, whose equations are not those of "
@@ -53,7 +53,7 @@ def _of_other_equations(session: Session, run: Run, model: Model) -> str:
     )
 
 
-def _of_another_model(session: Session, run: Run, model: Model) -> str:
+def _describe_other_parameters(session: Session, run: Run, model: Model) -> str:
     """What differs between the run's parameters and the model's, by names and units."""
     known: Mapping[str, Any] = {one["name"]: one for one in (run.result or {})["parameters"]}
     names = [one.name for one in model.parameters]
@@ -64,8 +64,8 @@ def _of_another_model(session: Session, run: Run, model: Model) -> str:
         theirs = load_run(session, run.id).requested_model
         return (
             f"run {run.id} of {theirs.name!r} is of another model: "
-            f"it has the parameters {_listed(known)}, "
-            f"{model.name!r} has {_listed(names)}; need a run with {_listed(missing)}"
+            f"it has the parameters {_join_names(known)}, "
+            f"{model.name!r} has {_join_names(names)}; need a run with {_join_names(missing)}"
         )
     for one in model.parameters:
         unit = known[one.name]["unit"] if one.name in known else one.unit
@@ -77,6 +77,6 @@ def _of_another_model(session: Session, run: Run, model: Model) -> str:
     return ""
 
 
-def _listed(names: Any) -> str:
+def _join_names(names: Any) -> str:
     found = list(names)
     return ", ".join(found[:8]) + (" …" if len(found) > 8 else "")

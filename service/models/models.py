@@ -10,31 +10,31 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.core.errors import InvalidRequest, NotFound, faults_of
+from service.core.errors import InvalidRequest, NotFound, to_field_errors
 from service.core.wire import FieldProblem, Page
 from service.models.schemas import CheckOut, ModelOut
 from service.repositories.models import ModelRepository
 from service.storage import errors as storage_errors
-from service.storage.tables import Model as StoredModel
-from sysid.core.errors import SysidError, UnknownModel, nearest
+from service.storage.tables import ModelVersion as StoredModel
+from sysid.core.errors import SysidError, UnknownModel, suggest_name
 from sysid.models.catalogue import load as library
 from sysid.models.model import Model
-from sysid.models.parse import parse_model, with_terms
+from sysid.models.parse import keep_terms, parse_model
 
 
-def page(session: Session, cursor: str | None, limit: int) -> Page[ModelOut]:
+def list_models(session: Session, cursor: str | None, limit: int) -> Page[ModelOut]:
     """Built-in models on the first page, then every version of own ones, latest first."""
-    own = ModelRepository(session).page(cursor=cursor, limit=limit)
-    built_in = [] if cursor else catalogue()
-    return Page(items=built_in + [_stored(row) for row in own.items], next=own.next)
+    own = ModelRepository(session).list_page(cursor=cursor, limit=limit)
+    built_in = [] if cursor else list_catalogue()
+    return Page(items=built_in + [_to_own_out(row) for row in own.items], next=own.next)
 
 
-def catalogue() -> list[ModelOut]:
+def list_catalogue() -> list[ModelOut]:
     """The built-in models."""
-    return [_built_in(name) for name in library.catalogue()]
+    return [_to_builtin_out(name) for name in library.catalogue()]
 
 
-def one(session: Session, reference: str) -> ModelOut:
+def get_model(session: Session, reference: str) -> ModelOut:
     """A model by ``name`` or ``name@version``.
 
     Raises
@@ -43,11 +43,11 @@ def one(session: Session, reference: str) -> ModelOut:
         With the nearest known name.
     """
     if reference in library.catalogue():
-        return _built_in(reference, with_document=True)
-    return _stored(_own(session, reference), with_document=True)
+        return _to_builtin_out(reference, with_document=True)
+    return _to_own_out(_get_own_model(session, reference), with_document=True)
 
 
-def add(session: Session, document: Mapping[str, Any]) -> ModelOut:
+def add_model(session: Session, document: Mapping[str, Any]) -> ModelOut:
     """Store an own model; the same document again gives the same version.
 
     Raises
@@ -57,14 +57,14 @@ def add(session: Session, document: Mapping[str, Any]) -> ModelOut:
     """
     model = parse_model(document)
     if model.name in library.catalogue():
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "/name", f"{model.name!r} is the name of a built-in model; choose another"
         )
     stored = ModelRepository(session).add(model.name, dict(model.document))
-    return _stored(stored.model, with_document=True)
+    return _to_own_out(stored.model, with_document=True)
 
 
-def check(document: Any) -> CheckOut:
+def check_model(document: Any) -> CheckOut:
     """Whether a model document can be used, and every fault in it."""
     if not isinstance(document, Mapping):
         found = f"a model is an object with 'equations' and more; found {document!r:.60}"
@@ -72,12 +72,12 @@ def check(document: Any) -> CheckOut:
     try:
         model = parse_model(document)
     except SysidError as error:
-        problems = [FieldProblem(**fault.as_dict()) for fault in faults_of(error)]
+        problems = [FieldProblem(**fault.to_dict()) for fault in to_field_errors(error)]
         return CheckOut(valid=False, errors=problems)
     return CheckOut(valid=True, errors=[], normal_form=dict(model.document))
 
 
-def resolve(session: Session, reference: Any) -> tuple[Model, Any]:
+def resolve_model(session: Session, reference: Any) -> tuple[Model, Any]:
     """The model that a job names, and what to store for it.
 
     A built-in model stays a name; an own one is stored as its document, so that a later version
@@ -93,9 +93,9 @@ def resolve(session: Session, reference: Any) -> tuple[Model, Any]:
     if reference in library.catalogue():
         return library.load_model(reference), reference
     try:
-        row = _own(session, reference)
+        row = _get_own_model(session, reference)
     except NotFound:
-        raise UnknownModel(reference, _names(session)) from None
+        raise UnknownModel(reference, _list_names(session)) from None
     return parse_model(row.document), row.document
 
 
@@ -117,35 +117,39 @@ def _parse_stored(document: str) -> Model:
     return parse_model(json.loads(document))
 
 
-def resolved(model: Model, result: Mapping[str, Any] | None) -> Model:
+def apply_selection(model: Model, result: Mapping[str, Any] | None) -> Model:
     """A model with the terms that a run's result document says were selected, if it does."""
     if model.rule is None or not (result or {}).get("selection"):
         return model
-    return with_terms(model, [one["term"] for one in (result or {})["selection"]])
+    return keep_terms(model, [one["term"] for one in (result or {})["selection"]])
 
 
-def _own(session: Session, reference: str) -> StoredModel:
+def _get_own_model(session: Session, reference: str) -> StoredModel:
     try:
         return ModelRepository(session).get(reference)
-    except storage_errors.NotFound:
-        raise NotFound("model", reference, nearest(reference, _names(session))) from None
+    except storage_errors.RowNotFound:
+        raise NotFound("model", reference, suggest_name(reference, _list_names(session))) from None
 
 
-def _names(session: Session) -> set[str]:
-    own = ModelRepository(session).page(limit=1000).items
+def _list_names(session: Session) -> set[str]:
+    own = ModelRepository(session).list_page(limit=1000).items
     return {*library.catalogue(), *(row.name for row in own)}
 
 
-def _built_in(name: str, *, with_document: bool = False) -> ModelOut:
-    return _told(library.load_model(name), 0, library.document(name) if with_document else None)
+def _to_builtin_out(name: str, *, with_document: bool = False) -> ModelOut:
+    return _to_out(
+        library.load_model(name),
+        0,
+        library.copy_catalogue_document(name) if with_document else None,
+    )
 
 
-def _stored(row: StoredModel, *, with_document: bool = False) -> ModelOut:
+def _to_own_out(row: StoredModel, *, with_document: bool = False) -> ModelOut:
     document = row.document if with_document else None
-    return _told(parse_model(row.document), row.version, document)
+    return _to_out(parse_model(row.document), row.version, document)
 
 
-def _told(model: Model, version: int, document: Mapping[str, Any] | None) -> ModelOut:
+def _to_out(model: Model, version: int, document: Mapping[str, Any] | None) -> ModelOut:
     fields = ("lower", "upper", "unit", "scale", "fixed", "tied")
     return ModelOut.from_source(
         model,
@@ -158,18 +162,18 @@ def _told(model: Model, version: int, document: Mapping[str, Any] | None) -> Mod
     )
 
 
-_BESIDES = ("name", "title", "description", "source", "parameters", "initial", "solver")
+_IRRELEVANT_KEYS = ("name", "title", "description", "source", "parameters", "initial", "solver")
 """Of a model's document, what does not say what its parameters mean."""
 
 
-def says_the_same(one: Model, other: Model) -> bool:
+def have_same_equations(one: Model, other: Model) -> bool:
     """Whether two models have the same equations of the same parameters, in the same units.
 
     Names and texts, bounds, initial states and the solver may differ.
     """
-    return bool(_meaning(one) == _meaning(other))
+    return bool(_extract_equations(one) == _extract_equations(other))
 
 
-def _meaning(model: Model) -> Any:
-    document = {key: value for key, value in model.document.items() if key not in _BESIDES}
+def _extract_equations(model: Model) -> Any:
+    document = {key: value for key, value in model.document.items() if key not in _IRRELEVANT_KEYS}
     return document, [(one.name, one.unit) for one in model.parameters]

@@ -8,20 +8,21 @@ from urllib.parse import urlencode
 
 from sqlalchemy.orm import Session
 
+from service.core.states import JobState
 from service.core.text import format_count, format_number, format_value
-from service.figures.noise import SIGMA
-from service.repositories.summaries import Group, GroupKey, Quantity
+from service.figures.noise import SIGMA_PATH
+from service.repositories.summaries import GroupKey, RunGroup, SummaryQuantity
 from service.storage.columns import to_json
-from service.storage.tables import Job, State
-from service.sweeps.groups import groups_of
+from service.storage.tables import Job
+from service.sweeps.groups import get_groups
 
-LISTED = 50
+MAX_LISTED_RUNS = 50
 """Runs that a page lists one by one; of more it shows the grid."""
-MOST_CELLS = 2_000
-MOST_COLUMNS = 12
-MIDDLE = 2  # place of the median among the quantiles
+MAX_CELLS = 2_000
+MAX_COLUMNS = 12
+MEDIAN_INDEX = 2  # place of the median among the quantiles
 
-Key = tuple[Any, ...]
+CellKey = tuple[Any, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,90 +49,96 @@ class GridView:
     is_cut: bool
 
 
-def grid_of(session: Session, job: Job, chosen: Mapping[str, Any]) -> GridView | None:
+def build_cell_grid(session: Session, job: Job, chosen: Mapping[str, Any]) -> GridView | None:
     """The grid of a job; None where its runs are few, or differ by nothing but seeds."""
     paths = [axis["path"] for axis in job.spec["sweep"]["axes"]]
     keys = [path for path in paths if not path.endswith("/seed")]
-    if job.n_runs <= LISTED or not keys:
+    if job.n_runs <= MAX_LISTED_RUNS or not keys:
         return None
-    error = Quantity("rms_noise_free" if SIGMA in keys else "rms")
+    error = SummaryQuantity("rms_noise_free" if SIGMA_PATH in keys else "rms")
     named = [GroupKey("axis", path) for path in keys]
-    found = groups_of(session, job, named, [error], MOST_CELLS)
-    is_cut, found = len(found) > MOST_CELLS, found[:MOST_CELLS]
-    split = len(keys) - 1 if _fits_across([one.key[-1] for one in found]) else len(keys)
-    columns = _distinct([one.key[split:] for one in found])
-    shares = _shares(found, error)
+    found = get_groups(session, job, named, [error], MAX_CELLS)
+    is_cut, found = len(found) > MAX_CELLS, found[:MAX_CELLS]
+    split = len(keys) - 1 if _fits_as_columns([one.key[-1] for one in found]) else len(keys)
+    columns = _distinct_keys([one.key[split:] for one in found])
+    shares = _rank_medians(found, error)
     cells = {
-        to_json(one.key): _cell(one, keys, error, share, chosen)
+        to_json(one.key): _to_cell_view(one, keys, error, share, chosen)
         for one, share in zip(found, shares, strict=True)
     }
     rows = [
         ([format_value(value) for value in row],
          [cells.get(to_json((*row, *column))) for column in columns])
-        for row in _distinct([one.key[:split] for one in found])
+        for row in _distinct_keys([one.key[:split] for one in found])
     ]  # fmt: skip
     return GridView(
-        quantity="RMS error against the record without noise" if SIGMA in keys else "RMS",
-        row_names=[_name(path) for path in keys[:split]],
-        column_name=_name(keys[-1]) if split < len(keys) else "",
+        quantity="RMS error against the record without noise" if SIGMA_PATH in keys else "RMS",
+        row_names=[_axis_label(path) for path in keys[:split]],
+        column_name=_axis_label(keys[-1]) if split < len(keys) else "",
         columns=[format_value(column[0]) if column else "all" for column in columns],
         rows=rows, is_cut=is_cut,
     )  # fmt: skip
 
 
-def query_of(cell: Mapping[str, Any]) -> str:
+def cell_query(cell: Mapping[str, Any]) -> str:
     """Query that chooses the runs of a cell."""
     pairs = [("cell", f"{path}={json.dumps(value)}") for path, value in cell.items()]
     return f"?{urlencode(pairs)}" if pairs else ""
 
 
-def _fits_across(values: Sequence[Any]) -> bool:
-    return len({to_json(one) for one in values}) <= MOST_COLUMNS
+def _fits_as_columns(values: Sequence[Any]) -> bool:
+    return len({to_json(one) for one in values}) <= MAX_COLUMNS
 
 
-def _distinct(keys: Sequence[Key]) -> list[Key]:
+def _distinct_keys(keys: Sequence[CellKey]) -> list[CellKey]:
     return list({to_json(key): key for key in keys}.values())
 
 
-def _cell(
-    group: Group, keys: Sequence[str], error: Quantity, share: float, chosen: Mapping[str, Any]
+def _to_cell_view(
+    group: RunGroup,
+    keys: Sequence[str],
+    error: SummaryQuantity,
+    share: float,
+    chosen: Mapping[str, Any],
 ) -> CellView:
     cell = dict(zip(keys, group.key, strict=True))
     quantiles = group.quantiles.get(error)
     total = sum(group.states.values())
     over = sum(n for state, n in group.states.items() if state.is_terminal)
-    failed = group.states[State.FAILED]
+    failed = group.states[JobState.FAILED]
     count = format_count(total) if over == total else f"{over} of {total}"
     return CellView(
-        href=query_of(cell),
-        text="–" if quantiles is None else format_number(quantiles[MIDDLE], 3),
+        href=cell_query(cell),
+        text="–" if quantiles is None else format_number(quantiles[MEDIAN_INDEX], 3),
         count_text=f"{count} runs{f', {failed} failed' if failed else ''}",
-        state=_state(group, over == total),
+        state=_group_state(group, over == total),
         share=share,
         is_chosen=bool(chosen) and cell == dict(chosen),
     )
 
 
-def _state(group: Group, is_over: bool) -> str:
+def _group_state(group: RunGroup, is_over: bool) -> str:
     if not is_over:
-        return "running" if group.states[State.RUNNING] or _any_over(group) else "queued"
-    for state in (State.FAILED, State.CANCELLED):
+        return "running" if group.states[JobState.RUNNING] or _has_ended_runs(group) else "queued"
+    for state in (JobState.FAILED, JobState.CANCELLED):
         if group.states[state]:
             return state.value
-    return State.SUCCEEDED.value
+    return JobState.SUCCEEDED.value
 
 
-def _any_over(group: Group) -> bool:
+def _has_ended_runs(group: RunGroup) -> bool:
     return any(n for state, n in group.states.items() if state.is_terminal)
 
 
-def _shares(found: Sequence[Group], error: Quantity) -> list[float]:
+def _rank_medians(found: Sequence[RunGroup], error: SummaryQuantity) -> list[float]:
     """How dark each cell is, from 0 to 1: the rank of its median among all."""
-    medians = [one.quantiles[error][MIDDLE] if error in one.quantiles else None for one in found]
+    medians = [
+        one.quantiles[error][MEDIAN_INDEX] if error in one.quantiles else None for one in found
+    ]
     ranked = sorted({value for value in medians if value is not None})
     place = {value: number / max(len(ranked) - 1, 1) for number, value in enumerate(ranked)}
     return [0.0 if value is None else place[value] for value in medians]
 
 
-def _name(path: str) -> str:
-    return "σ" if path == SIGMA else path.rsplit("/", 1)[-1]
+def _axis_label(path: str) -> str:
+    return "σ" if path == SIGMA_PATH else path.rsplit("/", 1)[-1]

@@ -4,16 +4,16 @@ from collections.abc import Mapping, Sequence
 
 from sysid.core.settings import (
     LOSS_KINDS,
-    METHODS,
     NOISE_MODELS,
     PREDICTION_KINDS,
+    SEARCH_METHODS,
     GeneticAlgorithm,
     Loss,
 )
 from sysid.data.records import HOLDS
 
 NAMES: Mapping[str, Sequence[str]] = {
-    "method": METHODS,
+    "method": SEARCH_METHODS,
     "loss": LOSS_KINDS,
     "noise_model": NOISE_MODELS,
     "prediction": PREDICTION_KINDS,

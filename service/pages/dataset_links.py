@@ -7,14 +7,14 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.text import format_labels
-from service.pages.views import DATASETS, axes_of
+from service.pages.views import DATASETS_PATH, sweep_axes
 from service.repositories.datasets import DatasetRepository
 from service.repositories.lineage import LineageRepository
 from service.storage.columns import Document
-from service.storage.errors import NotFound
+from service.storage.errors import RowNotFound
 from service.storage.tables import Job
 
-MOST = 100
+MAX_LISTED_DATASETS = 100
 """Datasets of a job that are named."""
 
 
@@ -22,20 +22,22 @@ def dataset_links(session: Session, job: Job) -> list[dict[str, Any]]:
     """Datasets of a job, each with its role, label, name and parents."""
     lineage = LineageRepository(session)
     return [
-        {"role": role, "label": label, "id": one, "name": _name(session, one),
-         "parents": [e.parent for e in lineage.ancestors(one) if e.child == one]}
-        for role, label, one in islice(_of(job.spec), MOST)
+        {"role": role, "label": label, "id": one, "name": _dataset_name(session, one),
+         "parents": [e.parent for e in lineage.list_ancestors(one) if e.child == one]}
+        for role, label, one in islice(_iterate_datasets(job.spec), MAX_LISTED_DATASETS)
     ]  # fmt: skip
 
 
-def unnamed(job: Job) -> int:
+def count_unlisted_datasets(job: Job) -> int:
     """How many datasets of a job are not named."""
-    return max(0, sum(1 for _ in _of(job.spec)) - MOST)
+    return max(0, sum(1 for _ in _iterate_datasets(job.spec)) - MAX_LISTED_DATASETS)
 
 
-def _of(spec: Document) -> Iterator[tuple[str, str, str]]:
+def _iterate_datasets(spec: Document) -> Iterator[tuple[str, str, str]]:
     """Role, label and identifier of each; those of an axis stand for the job's own."""
-    axes = [axis for axis in axes_of(spec) if axis["path"] == DATASETS and axis.get("values")]
+    axes = [
+        axis for axis in sweep_axes(spec) if axis["path"] == DATASETS_PATH and axis.get("values")
+    ]
     for axis in axes:
         labels = axis["labels"] or [{}] * len(axis["values"])
         for value, label in zip(axis["values"], labels, strict=True):
@@ -48,8 +50,8 @@ def _of(spec: Document) -> Iterator[tuple[str, str, str]]:
         yield "validation", "", one
 
 
-def _name(session: Session, dataset_id: str) -> str:
+def _dataset_name(session: Session, dataset_id: str) -> str:
     try:
         return DatasetRepository(session).get(dataset_id).name
-    except NotFound:
+    except RowNotFound:
         return "deleted"

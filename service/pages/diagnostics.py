@@ -7,20 +7,20 @@ from typing import Any
 from service.core.text import DASH, format_estimate, format_number, format_p_value, join_estimate
 from service.figures.data import CorrelationTrace
 from service.figures.plotly import Figure
-from service.figures.residuals import residuals
-from service.runs.residuals import Tested
-from sysid.residuals.residual_tests import Correlation
+from service.figures.residuals import plot_residuals
+from service.runs.residuals import ResidualAnalysis
+from sysid.residuals.residual_tests import CorrelationFunction
 
 Document = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
-class TestView:
+class ResidualTestView:
     """One residual test as a line of a table."""
 
     experiment: int
     output: str
-    what: str
+    hypothesis: str
     inside95: str
     inside99: str
     p: str
@@ -38,16 +38,16 @@ class OnsetView:
 
 
 @dataclass(frozen=True, slots=True)
-class SelectedView:
+class SelectedTermView:
     """One selected term of a polynomial."""
 
     term: str
     err: str
-    left: str
+    unexplained: str
 
 
 @dataclass(frozen=True, slots=True)
-class Findings:
+class Diagnostics:
     """All of it for one run; empty where a result does not tell it.
 
     `verdict` is ``passed``, ``failed`` or ``not tested``, or empty without tests.
@@ -55,15 +55,15 @@ class Findings:
 
     verdict: str
     data: str
-    tests: Sequence[TestView]
+    tests: Sequence[ResidualTestView]
     n_figures: int
     onsets: Sequence[OnsetView]
     groups: Sequence[str]
     criteria: Mapping[str, float | None]
-    selection: Sequence[SelectedView] = ()
+    selection: Sequence[SelectedTermView] = ()
 
 
-def findings_of(result: Document) -> Findings:
+def to_diagnostics(result: Document) -> Diagnostics:
     """From a result document, which is empty as long as the run has none."""
     tested = result.get("residual_tests", {})
     tests = tested.get("tests", [])
@@ -71,22 +71,22 @@ def findings_of(result: Document) -> Findings:
     groups = result.get("identifiability", {}).get("groups", [])
     several = len({one["experiment"] for one in onsets}) > 1
     verdicts = {True: "passed", False: "failed", None: "not tested"}
-    return Findings(
+    return Diagnostics(
         verdict=verdicts[tested["passed"]] if tests else "", data=tested.get("data", ""),
-        tests=[_test(one) for one in tests],
+        tests=[_to_test_view(one) for one in tests],
         n_figures=sum(one["experiment"] == 0 and one["outcome"] != "not tested" for one in tests),
-        onsets=[_onset(one, several) for one in onsets],
-        groups=[_group(one) for one in groups],
+        onsets=[_to_onset_view(one, several) for one in onsets],
+        groups=[_format_group(one) for one in groups],
         criteria=result.get("criteria", {}),
         selection=[
-            SelectedView(one["term"], format_number(one["err"]),
+            SelectedTermView(one["term"], format_number(one["err"]),
                          format_number(max(1.0 - one["cumulated"], 0.0)))
             for one in result.get("selection", ())
         ],
     )  # fmt: skip
 
 
-def correlation_trace(one: Correlation) -> CorrelationTrace:
+def to_correlation_trace(one: CorrelationFunction) -> CorrelationTrace:
     """A correlation function as its figure wants it."""
     test = one.test
     of = "" if test.input is None else f" with {test.input}"
@@ -97,30 +97,30 @@ def correlation_trace(one: Correlation) -> CorrelationTrace:
     )
 
 
-def residual_figure(tested: Tested, experiment: int, columns: int = 2) -> Figure:
+def plot_residual_tests(tested: ResidualAnalysis, experiment: int, columns: int = 2) -> Figure:
     """Correlation functions of the residuals of one experiment; empty where none was tested."""
     functions = [
-        correlation_trace(one)
-        for one in tested.found
+        to_correlation_trace(one)
+        for one in tested.correlations
         if one.test.experiment == experiment and one.values.size
     ]
-    return residuals(functions, columns, tested.names)
+    return plot_residuals(functions, columns, tested.experiments)
 
 
-def _test(one: Document) -> TestView:
+def _to_test_view(one: Document) -> ResidualTestView:
     what = "white" if one["test"] == "whiteness" else f"independent of {one['input']}"
-    return TestView(
-        experiment=one["experiment"] + 1, output=one["output"], what=what,
-        inside95=_share(one.get("inside95")), inside99=_share(one.get("inside99")),
+    return ResidualTestView(
+        experiment=one["experiment"] + 1, output=one["output"], hypothesis=what,
+        inside95=_format_percent(one.get("inside95")), inside99=_format_percent(one.get("inside99")),
         p=format_p_value(one.get("p")), outcome=one["outcome"], reason=one.get("reason") or "",
     )  # fmt: skip
 
 
-def _share(part: float | None) -> str:
+def _format_percent(part: float | None) -> str:
     return DASH if part is None else f"{100 * part:.0f}\u202f%"
 
 
-def _onset(one: Document, several: bool) -> OnsetView:
+def _to_onset_view(one: Document, several: bool) -> OnsetView:
     where = f", experiment {one['experiment'] + 1}" if several else ""
     pair = f"{one['output']} behind {one['input']}{where}"
     if one["delay"] is None:
@@ -131,5 +131,5 @@ def _onset(one: Document, several: bool) -> OnsetView:
     return OnsetView(pair, f"{value}\u202fs", f"{steps}{scatter}")
 
 
-def _group(one: Document) -> str:
+def _format_group(one: Document) -> str:
     return f"{one['expression']} = {join_estimate(one['value'], one.get('stderr'))}"

@@ -11,36 +11,36 @@ from typing import Any
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.datasets.recordings import recording_of
+from service.datasets.recordings import load_recording
 from service.figures.data import (
-    Experiment,
+    ExperimentTraces,
     Floats,
-    Improvement,
+    FreeParameter,
+    IslandImprovement,
     OutputTraces,
-    RunEvidence,
-    SoughtParameter,
-    Trace,
+    RunFigureData,
+    SignalTrace,
 )
 from service.formats.mcap import FitRole, FittedOutput
 from service.jobs.results import is_free
 from service.jobs.stored_run import StoredRun
 from service.repositories.runs import RunRepository
-from service.runs.fitted import fits_of
+from service.runs.fitted import read_fitted_signals
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
 from sysid.data.records import Channel
-from sysid.models.parameters import Parameter, Scale
+from sysid.models.parameters import Parameter, ParameterScale
 
 
-def fitness_of(body: Mapping[str, Any]) -> str:
+def fitness_label(body: Mapping[str, Any]) -> str:
     """What the search minimises, as figures of it call it: with soft-l1 it is not J."""
     robust = (body.get("loss") or {}).get("kind") == "soft-l1"
     return "soft-l1 loss, as RMS" if robust else "RMS"
 
 
-def sought_parameters(session: Session, stored: StoredRun) -> list[SoughtParameter]:
+def list_free_parameters(session: Session, stored: StoredRun) -> list[FreeParameter]:
     """The free parameters in the order of the history's columns.
 
     The result names them once the run has ended; until then the model and the request do.
@@ -48,107 +48,115 @@ def sought_parameters(session: Session, stored: StoredRun) -> list[SoughtParamet
     known = stored.parameters(session)
     if stored.estimates:
         scales = {one.name: one.scale for one in known}
-        return [_estimated(one, scales) for one in stored.estimates if is_free(one)]
+        return [_to_estimated_parameter(one, scales) for one in stored.estimates if is_free(one)]
     if stored.model.rule is not None:
         return []  # which of the candidates are sought is told with the result
-    return [_sought(one) for one in known if one.is_free]
+    return [_to_free_parameter(one) for one in known if one.is_free]
 
 
-def evidence_of(session: Session, stored: StoredRun) -> RunEvidence:
+def read_run_figure_data(session: Session, stored: StoredRun) -> RunFigureData:
     """All that is known of a run's search and result."""
     job, run, body = stored.job, stored.run, stored.body
     runs = RunRepository(session)
-    history = _islands(runs.history(run.id))
-    return RunEvidence(
-        id=run.id, unit=stored.rms_unit(session), fitness=fitness_of(body),
+    history = _group_by_island(runs.read_history(run.id))
+    return RunFigureData(
+        id=run.id, unit=stored.rms_unit(session), fitness_label=fitness_label(body),
         generations=run.generations or (job.generation if job.n_runs == 1 else 0),
         evaluations=run.evaluations, history=history,
-        parameters=_covering(sought_parameters(session, stored), history),
+        parameters=_match_history_width(list_free_parameters(session, stored), history),
         epoch=int((body["algorithm"].get("migration") or {}).get("every", 0)),
-        migrations=sorted({one.epoch for one in runs.migrations(run.id)}),
-        islands=[(_or(one.get("champion_rms"), inf), one.get("refined_rms"))
+        migrations=sorted({one.epoch for one in runs.read_migrations(run.id)}),
+        islands=[(_replace_none(one.get("champion_rms"), inf), one.get("refined_rms"))
                  for one in stored.result.get("islands", ())],
-        correlation=_correlation(stored.result.get("correlation")),
+        correlation=_to_correlation(stored.result.get("correlation")),
     )  # fmt: skip
 
 
-def _correlation(stored: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+def _to_correlation(stored: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     if not stored:
         return None
-    rows = [[_or(value, nan) for value in row] for row in stored["matrix"]]
+    rows = [[_replace_none(value, nan) for value in row] for row in stored["matrix"]]
     return {"names": stored["names"], "matrix": rows}
 
 
-def _or(value: float | None, otherwise: float) -> float:
+def _replace_none(value: float | None, otherwise: float) -> float:
     return otherwise if value is None else value
 
 
-def _islands(rows: Sequence[Any]) -> list[list[Improvement]]:
-    found: list[list[Improvement]] = []
+def _group_by_island(rows: Sequence[Any]) -> list[list[IslandImprovement]]:
+    found: list[list[IslandImprovement]] = []
     for island, points in groupby(rows, key=lambda row: row.island):
         while len(found) < island:  # an island that has not told anything yet
             found.append([])
         found.append([
-            Improvement(p.generation, p.evaluations, p.rms, p.phase, tuple(p.parameters))
+            IslandImprovement(p.generation, p.evaluations, p.rms, p.phase, tuple(p.parameters))
             for p in points
         ])  # fmt: skip
     return found
 
 
-def _covering(
-    known: list[SoughtParameter], history: Sequence[Sequence[Improvement]]
-) -> list[SoughtParameter]:
+def _match_history_width(
+    known: list[FreeParameter], history: Sequence[Sequence[IslandImprovement]]
+) -> list[FreeParameter]:
     """As many parameters as the history has columns, whatever the model says today."""
     points = [point for island in history for point in island]
     if not points:
         return known
     width = len(points[0].parameters)
     unknown = range(min(len(known), width), width)
-    return known[:width] + [_by_its_values(points, column) for column in unknown]
+    return known[:width] + [_infer_parameter(points, column) for column in unknown]
 
 
-def _by_its_values(points: Sequence[Improvement], column: int) -> SoughtParameter:
+def _infer_parameter(points: Sequence[IslandImprovement], column: int) -> FreeParameter:
     values = [point.parameters[column] for point in points]
     lower, upper = min(values), max(values)
-    return SoughtParameter(f"parameter {column + 1}", "1", lower, upper if upper > lower
+    return FreeParameter(f"parameter {column + 1}", "1", lower, upper if upper > lower
                            else lower + 1.0)  # fmt: skip
 
 
-def _estimated(one: Mapping[str, Any], scales: Mapping[str, Scale]) -> SoughtParameter:
-    return SoughtParameter(
+def _to_estimated_parameter(
+    one: Mapping[str, Any], scales: Mapping[str, ParameterScale]
+) -> FreeParameter:
+    return FreeParameter(
         one["name"], one.get("unit", "1"), one["lower"], one["upper"],
         scales.get(one["name"], "linear"), value=one["value"], stderr=one.get("stderr"),
     )  # fmt: skip
 
 
-def _sought(parameter: Parameter) -> SoughtParameter:
-    return SoughtParameter(
+def _to_free_parameter(parameter: Parameter) -> FreeParameter:
+    return FreeParameter(
         parameter.name, parameter.unit, parameter.lower, parameter.upper, parameter.scale
     )
 
 
-def traces_of(store: ObjectStore, dataset: Dataset) -> list[Trace]:
+def read_dataset_traces(store: ObjectStore, dataset: Dataset) -> list[SignalTrace]:
     """The channels of a dataset."""
-    return [_trace(channel) for channel in recording_of(store, dataset.sha256).channels]
+    return [_to_signal_trace(channel) for channel in load_recording(store, dataset.sha256).channels]
 
 
-def experiments_of(session: Session, store: ObjectStore, stored: StoredRun) -> list[Experiment]:
+def read_run_experiments(
+    session: Session, store: ObjectStore, stored: StoredRun
+) -> list[ExperimentTraces]:
     """What a run was fitted to, record by record; empty as long as nothing is stored."""
     if stored.run.signals_sha256 is None:
         return []
-    fitted = _by_experiment(fits_of(store, stored.run))
+    fitted = _by_experiment(read_fitted_signals(store, stored.run))
     estimation, validation = fitted["estimation"], fitted["validation"]
     kept = stored.body["validation"] or {}
-    inputs = list(_inputs(session, store, stored, stored.body["datasets"]))
+    inputs = list(_read_inputs(session, store, stored, stored.body["datasets"]))
     found = [
-        Experiment(f"estimation {number}", _outputs(parts), _at(inputs, number))
+        ExperimentTraces(
+            f"estimation {number}", _to_output_traces(parts), _get_inputs(inputs, number)
+        )
         for number, parts in estimation.items()
     ]
     if kept.get("fraction") is not None:
-        return [_joined(one, validation.get(n, ())) for n, one in enumerate(found, 1)]
-    other = list(_inputs(session, store, stored, kept.get("datasets") or []))
+        return [_join_validation(one, validation.get(n, ())) for n, one in enumerate(found, 1)]
+    other = list(_read_inputs(session, store, stored, kept.get("datasets") or []))
     return found + [
-        Experiment(f"validation {number}", _outputs(parts), _at(other, number), -inf)
+        ExperimentTraces(
+            f"validation {number}", _to_output_traces(parts), _get_inputs(other, number), -inf
+        )
         for number, parts in validation.items()
     ]
 
@@ -163,55 +171,57 @@ def _by_experiment(
     return {role: dict(sorted(numbered.items())) for role, numbered in found.items()}
 
 
-def _outputs(parts: Iterable[FittedOutput]) -> tuple[OutputTraces, ...]:
+def _to_output_traces(parts: Iterable[FittedOutput]) -> tuple[OutputTraces, ...]:
     return tuple(
-        OutputTraces(Trace(one.name, one.unit, one.times, one.measured), one.simulated)
+        OutputTraces(SignalTrace(one.name, one.unit, one.times, one.measured), one.simulated)
         for one in parts
     )
 
 
-def _joined(experiment: Experiment, later: Sequence[FittedOutput]) -> Experiment:
+def _join_validation(
+    experiment: ExperimentTraces, later: Sequence[FittedOutput]
+) -> ExperimentTraces:
     """One record again, of which the last part was kept for validation."""
     if not later:
         return experiment
     outputs = tuple(
         OutputTraces(
-            Trace(first.measured.name, first.measured.unit, _both(first.measured.times, rest.times),
-                  _both(first.measured.values, rest.measured)),
-            _both(first.identified, rest.simulated),
+            SignalTrace(first.measured.name, first.measured.unit, _concatenate(first.measured.times, rest.times),
+                  _concatenate(first.measured.values, rest.measured)),
+            _concatenate(first.identified, rest.simulated),
         )
         for first, rest in zip(experiment.outputs, later, strict=True)
     )  # fmt: skip
     since = min(float(one.times[0]) for one in later)
-    return Experiment(experiment.name.replace("estimation", "record"), outputs,
+    return ExperimentTraces(experiment.name.replace("estimation", "record"), outputs,
                       experiment.inputs, since)  # fmt: skip
 
 
-def _both(first: Floats, rest: Floats) -> Floats:
+def _concatenate(first: Floats, rest: Floats) -> Floats:
     joined: Floats = np.concatenate([first, rest])
     return joined
 
 
-def _at(inputs: Sequence[tuple[Trace, ...]], number: int) -> tuple[Trace, ...]:
+def _get_inputs(inputs: Sequence[tuple[SignalTrace, ...]], number: int) -> tuple[SignalTrace, ...]:
     return inputs[number - 1] if number <= len(inputs) else ()
 
 
-def _inputs(
+def _read_inputs(
     session: Session, store: ObjectStore, stored: StoredRun, datasets: Sequence[str]
-) -> Iterator[tuple[Trace, ...]]:
+) -> Iterator[tuple[SignalTrace, ...]]:
     """Inputs of every record; a dataset that is gone takes only its own inputs off the plot."""
     for name in datasets:
         try:
             for record in stored.read_datasets(session, store, [name]):
-                yield tuple(_trace(channel) for channel in record.inputs)
+                yield tuple(_to_signal_trace(channel) for channel in record.inputs)
         except (StorageError, SysidError):
             yield ()
 
 
-def _trace(channel: Channel) -> Trace:
+def _to_signal_trace(channel: Channel) -> SignalTrace:
     held, before = channel.hold == "zero", None
     if channel.history is not None:  # as far as the first sample, so that the lines meet
         pairs = zip(channel.history, (channel.times, channel.values), strict=True)
         times, values = (np.append(known, own[0]) for known, own in pairs)
-        before = Trace(channel.name, channel.unit, times, values, held)
-    return Trace(channel.name, channel.unit, channel.times, channel.values, held, before)
+        before = SignalTrace(channel.name, channel.unit, times, values, held)
+    return SignalTrace(channel.name, channel.unit, channel.times, channel.values, held, before)

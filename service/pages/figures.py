@@ -6,22 +6,26 @@ from pydantic import BaseModel, ConfigDict, Field
 from sqlalchemy.orm import Session
 
 from service.core.errors import NotFound
-from service.datasets.rms_unit import unit_of
+from service.datasets.rms_unit import find_rms_unit
 from service.figures import plotly as figures
 from service.figures import signals as figures_signals
-from service.figures.noise import noise_keys, noise_sweep
+from service.figures.noise import noise_group_keys, plot_noise_sweep
 from service.figures.plotly import Abscissa, Figure
 from service.figures.theme import Theme
-from service.figures.trend import trend_figure
+from service.figures.trend import plot_trend
 from service.jobs.stored_run import load_run
-from service.pages.diagnostics import residual_figure
-from service.pages.figure_data import evidence_of, experiments_of, traces_of
-from service.pages.trend import trend_of
+from service.pages.diagnostics import plot_residual_tests
+from service.pages.figure_data import (
+    read_dataset_traces,
+    read_run_experiments,
+    read_run_figure_data,
+)
+from service.pages.trend import load_trend
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
-from service.runs.residuals import residuals_of
+from service.runs.residuals import analyse_residuals
 from service.storage.objects import ObjectStore
-from service.sweeps.summary import summary
+from service.sweeps.summary import summarise_job
 
 FigureName = Literal["history", "convergence", "response", "residuals", "correlation", "waterfall"]
 
@@ -40,7 +44,7 @@ class FigureChoice(BaseModel):
     stop: float | None = Field(default=None, allow_inf_nan=False, description="up to here, s")
 
 
-def run_figure(
+def load_run_figure(
     session: Session, store: ObjectStore, run_id: str, name: FigureName, choice: FigureChoice
 ) -> Figure:
     """One figure of a run; empty where the run has nothing to show yet.
@@ -52,43 +56,49 @@ def run_figure(
     """
     stored = load_run(session, run_id)
     if name == "response":
-        experiments = experiments_of(session, store, stored)
+        experiments = read_run_experiments(session, store, stored)
         if not experiments:
             return figures.empty_figure()
         _check_experiment(choice.experiment, len(experiments))
-        figure = figures_signals.response(experiments[choice.experiment], choice.start, choice.stop)
+        figure = figures_signals.plot_response(
+            experiments[choice.experiment], choice.start, choice.stop
+        )
         figure["layout"]["meta"]["experiments"] = [one.name for one in experiments]
         return figure
     if name == "residuals":
-        tested = residuals_of(session, store, stored)
+        tested = analyse_residuals(session, store, stored)
         if tested is None:
             return figures.empty_figure()
-        _check_experiment(choice.experiment, len(tested.names))
-        return residual_figure(tested, choice.experiment, min(choice.columns, 2))
-    evidence = evidence_of(session, stored)
+        _check_experiment(choice.experiment, len(tested.experiments))
+        return plot_residual_tests(tested, choice.experiment, min(choice.columns, 2))
+    evidence = read_run_figure_data(session, stored)
     if name == "history":
-        return figures.history(evidence, choice.abscissa)
+        return figures.plot_history(evidence, choice.abscissa)
     if name == "convergence":
-        return figures.convergence(evidence, choice.columns)
-    return figures.correlation(evidence) if name == "correlation" else figures.waterfall(evidence)
+        return figures.plot_convergence(evidence, choice.columns)
+    return (
+        figures.plot_correlation(evidence)
+        if name == "correlation"
+        else figures.plot_waterfall(evidence)
+    )
 
 
-def job_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
+def load_noise_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
     """Errors against the noise of a job; empty where σ is no axis of it, or nothing ended yet."""
     job = JobRepository(session).get(job_id)
-    keys = noise_keys(job.spec["sweep"]["axes"])
+    keys = noise_group_keys(job.spec["sweep"]["axes"])
     if keys is None:
         return figures.empty_figure()
-    found = summary(session, job.id, keys, errors_only=True)
-    return noise_sweep(found, unit_of(session, job.spec), min(choice.columns, 2))
+    found = summarise_job(session, job.id, keys, errors_only=True)
+    return plot_noise_sweep(found, find_rms_unit(session, job.spec), min(choice.columns, 2))
 
 
-def trend_of_job(session: Session, job_id: str, choice: FigureChoice) -> Figure:
+def load_trend_figure(session: Session, job_id: str, choice: FigureChoice) -> Figure:
     """Estimates over the label of a batch; empty where the job asks for no trend."""
-    found = trend_of(session, JobRepository(session).get(job_id))
+    found = load_trend(session, JobRepository(session).get(job_id))
     if found is None:
         return figures.empty_figure()
-    return trend_figure(found, min(choice.columns, 2))
+    return plot_trend(found, min(choice.columns, 2))
 
 
 def _check_experiment(number: int, count: int) -> None:
@@ -96,9 +106,11 @@ def _check_experiment(number: int, count: int) -> None:
         raise NotFound("experiment", str(number), f"; the last is {count - 1}")
 
 
-def dataset_figure(
+def load_dataset_figure(
     session: Session, store: ObjectStore, dataset_id: str, choice: FigureChoice
 ) -> Figure:
     """The signals of a dataset."""
     dataset = DatasetRepository(session).get(dataset_id)
-    return figures_signals.signals(traces_of(store, dataset), choice.start, choice.stop)
+    return figures_signals.plot_signals(
+        read_dataset_traces(store, dataset), choice.start, choice.stop
+    )

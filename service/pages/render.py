@@ -21,7 +21,7 @@ from markupsafe import Markup
 from service.core.text import TEMPLATE_FILTERS
 from sysid.core.settings import GeneticAlgorithm
 
-STATIC = Path(__file__).parent / "static"
+STATIC_FOLDER = Path(__file__).parent / "static"
 MEDIA_TYPES = {
     ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml",
 }  # fmt: skip
@@ -37,9 +37,9 @@ class Asset:
 
 
 @cache
-def asset(name: str) -> Asset | None:
+def load_asset(name: str) -> Asset | None:
     """One of our own files; None if there is no such file."""
-    path = STATIC / name
+    path = STATIC_FOLDER / name
     if Path(name).name != name or path.suffix not in MEDIA_TYPES or not path.is_file():
         return None
     content = path.read_bytes()
@@ -48,12 +48,12 @@ def asset(name: str) -> Asset | None:
 
 
 @cache
-def plotly_name() -> str:
+def plotly_file_name() -> str:
     """Name under which Plotly is served; it changes with the version, so it may be kept forever."""
     return f"plotly-{version('plotly')}.min.js"
 
 
-def plotly_file() -> Path:
+def plotly_path() -> Path:
     """The bundle inside the wheel. The package itself is not imported: that takes long."""
     spec = find_spec("plotly")
     assert spec is not None
@@ -62,13 +62,13 @@ def plotly_file() -> Path:
 
 
 @cache
-def plotly_compressed() -> bytes:
+def compress_plotly() -> bytes:
     """The bundle, compressed once per process."""
-    return gzip.compress(plotly_file().read_bytes(), compresslevel=6, mtime=0)
+    return gzip.compress(plotly_path().read_bytes(), compresslevel=6, mtime=0)
 
 
 @cache
-def environment() -> Environment:
+def template_environment() -> Environment:
     """The templates. Every text of a user is escaped, and a name that is not given is an error."""
     made = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
@@ -76,16 +76,18 @@ def environment() -> Environment:
     )  # fmt: skip
     made.filters.update(TEMPLATE_FILTERS)
     made.globals["default_algorithm"] = GeneticAlgorithm()
-    made.globals.update(static=lambda name: f"/static/{name}", plotly=f"/static/{plotly_name()}")
+    made.globals.update(
+        static=lambda name: f"/static/{name}", plotly=f"/static/{plotly_file_name()}"
+    )
     return made
 
 
-def render(template: str, **context: Any) -> str:
+def render_template(template: str, **context: Any) -> str:
     """A template with its context, as of now."""
-    return environment().get_template(template).render(now=datetime.now(UTC), **context)
+    return template_environment().get_template(template).render(now=datetime.now(UTC), **context)
 
 
 @cache
-def style() -> Markup:
+def load_stylesheet() -> Markup:
     """The sheet of pages and reports."""
-    return Markup((STATIC / "lagid.css").read_text(encoding="utf-8"))
+    return Markup((STATIC_FOLDER / "lagid.css").read_text(encoding="utf-8"))

@@ -16,48 +16,49 @@ from typing import Any
 from markupsafe import Markup
 from sqlalchemy.orm import Session
 
-from service.datasets.rms_unit import unit_of
+from service.core.states import JobState
+from service.datasets.rms_unit import find_rms_unit
 from service.figures import plotly as figures
 from service.figures import signals as figures_signals
-from service.figures.embed import as_json, bare, templates
+from service.figures.embed import strip_template, templates_json, to_script_json
 from service.figures.plotly import Figure
-from service.figures.svg import drawing, is_drawable
-from service.figures.trend import trend_figure
+from service.figures.svg import is_drawable, to_svg
+from service.figures.trend import plot_trend
 from service.jobs.stored_run import StoredRun
 from service.pages import render as assets
-from service.pages.cell_grid import LISTED, GridView, grid_of
-from service.pages.dataset_links import dataset_links, unnamed
-from service.pages.diagnostics import residual_figure
-from service.pages.figure_data import evidence_of, experiments_of
-from service.pages.figures import FigureChoice, job_figure
-from service.pages.pages import run_in_full, run_summary
-from service.pages.render import render, style
-from service.pages.trend import trend_of, trend_view
-from service.pages.views import RunView, job_view
+from service.pages.cell_grid import MAX_LISTED_RUNS, GridView, build_cell_grid
+from service.pages.dataset_links import count_unlisted_datasets, dataset_links
+from service.pages.diagnostics import plot_residual_tests
+from service.pages.figure_data import read_run_experiments, read_run_figure_data
+from service.pages.figures import FigureChoice, load_noise_figure
+from service.pages.pages import load_full_run, load_run_row
+from service.pages.render import load_stylesheet, render_template
+from service.pages.trend import load_trend, to_trend_view
+from service.pages.views import RunView, to_job_view
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunOrder, RunRepository
-from service.runs.residuals import residuals_of
+from service.runs.residuals import analyse_residuals
 from service.storage.objects import ObjectStore
-from service.storage.tables import Job, Run, State
+from service.storage.tables import Job, Run
 from service.trends.schemas import TrendOut
 
-STANDING_OUT = 10
-FAILED_SHOWN = 20
-ROWS_SHOWN = 60
+MAX_RANKED_RUNS = 10
+MAX_FAILED_RUNS = 20
+MAX_GRID_ROWS = 60
 """Rows of the grid of cells that a report shows."""
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+STATIC_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 
 
 @dataclass(frozen=True, slots=True)
-class _Section:
+class _ReportSection:
     """One run in full: why it is shown, and its drawings."""
 
-    why: str
+    reason: str
     run: RunView
     drawings: list[tuple[str, Markup]]
 
 
-def large_report(
+def render_large_report(
     session: Session, store: ObjectStore, job: Job, trend: TrendOut | None, made: datetime,
     base_url: str,
 ) -> str:  # fmt: skip
@@ -68,144 +69,170 @@ def large_report(
     base_url : str
         Of the service, for what the report leaves out.
     """
-    view = job_view(job, unit_of(session, job.spec), made)
-    best, worst = _ends(session, job, is_batch=view.is_batch)
-    failed = RunRepository(session).page(job.id, limit=FAILED_SHOWN, states=[State.FAILED]).items
-    grid = grid_of(session, job, {})
+    view = to_job_view(job, find_rms_unit(session, job.spec), made)
+    best, worst = _best_and_worst_runs(session, job, is_batch=view.is_batch)
+    failed = (
+        RunRepository(session)
+        .list_page(job.id, limit=MAX_FAILED_RUNS, states=[JobState.FAILED])
+        .items
+    )
+    grid = build_cell_grid(session, job, {})
     shown = [("The best run", best[:1]), ("The worst run that succeeded", worst[:1])]
     summaries = {
-        name: [run_summary(session, StoredRun.from_rows(job, run)) for run in found]
+        name: [load_run_row(session, StoredRun.from_rows(job, run)) for run in found]
         for name, found in (("best", best), ("worst", worst), ("failed", failed))
     }
-    return render(
+    return render_template(
         "report_large.html", job=view, made=made, **summaries,
-        order="fit" if view.is_batch else "RMS", grid=_cut(grid),
-        hidden_rows=max(len(grid.rows) - ROWS_SHOWN, 0) if grid else 0,
-        trend=None if trend is None else trend_view(trend),
-        drawings=_overview(session, job, trend),
+        order="fit" if view.is_batch else "RMS", grid=_truncate_grid(grid),
+        hidden_rows=max(len(grid.rows) - MAX_GRID_ROWS, 0) if grid else 0,
+        trend=None if trend is None else to_trend_view(trend),
+        drawings=_overview_drawings(session, job, trend),
         sections=[
-            _section(session, store, StoredRun.from_rows(job, run), why)
+            _build_section(session, store, StoredRun.from_rows(job, run), why)
             for why, runs in shown for run in runs
         ],
-        datasets=dataset_links(session, job), more_datasets=unnamed(job),
-        address=f"{base_url.rstrip('/')}/v1/jobs/{job.id}", policy=POLICY, style=style(),
+        datasets=dataset_links(session, job), more_datasets=count_unlisted_datasets(job),
+        address=f"{base_url.rstrip('/')}/v1/jobs/{job.id}", policy=STATIC_POLICY, style=load_stylesheet(),
     )  # fmt: skip
 
 
-def _ends(session: Session, job: Job, *, is_batch: bool) -> tuple[list[Run], list[Run]]:
+def _best_and_worst_runs(
+    session: Session, job: Job, *, is_batch: bool
+) -> tuple[list[Run], list[Run]]:
     """The best and the worst runs that succeeded; of a batch by fit: RMS do not compare."""
-    runs, only = RunRepository(session), [State.SUCCEEDED]
+    runs, only = RunRepository(session), [JobState.SUCCEEDED]
     by: Any = "fit_estimation" if is_batch else "best_rms"
     best, worst = (
-        list(runs.page(job.id, limit=STANDING_OUT, states=only, order=by, descending=down).items)
+        list(
+            runs.list_page(
+                job.id, limit=MAX_RANKED_RUNS, states=only, order=by, descending=down
+            ).items
+        )
         for down in (is_batch, not is_batch)
     )
     return best, worst
 
 
-def _cut(grid: GridView | None) -> GridView | None:
+def _truncate_grid(grid: GridView | None) -> GridView | None:
     if grid is None:
         return None
     return GridView(
-        grid.quantity, grid.row_names, grid.column_name, grid.columns, grid.rows[:ROWS_SHOWN],
+        grid.quantity, grid.row_names, grid.column_name, grid.columns, grid.rows[:MAX_GRID_ROWS],
         grid.is_cut,
     )  # fmt: skip
 
 
-def _overview(session: Session, job: Job, trend: TrendOut | None) -> list[tuple[str, Markup]]:
+def _overview_drawings(
+    session: Session, job: Job, trend: TrendOut | None
+) -> list[tuple[str, Markup]]:
     """Titles and drawings of the figures of all runs together."""
-    found = [("Errors against the noise", job_figure(session, job.id, FigureChoice(columns=2)))]
+    found = [
+        ("Errors against the noise", load_noise_figure(session, job.id, FigureChoice(columns=2)))
+    ]
     if trend is not None:
-        found.append((f"Trend over {trend.x}", trend_figure(trend, 2)))
-    return _drawn(found)
+        found.append((f"Trend over {trend.x}", plot_trend(trend, 2)))
+    return _draw_figures(found)
 
 
-def _section(session: Session, store: ObjectStore, stored: StoredRun, why: str) -> _Section:
-    evidence = evidence_of(session, stored)
-    made = [("Progress of every island", figures.history(evidence))]
-    experiments = experiments_of(session, store, stored)[:1]
-    made += [("Measured against identified", figures_signals.response(one)) for one in experiments]
-    made.append(("Convergence of the parameters", figures.convergence(evidence)))
-    return _Section(why, run_in_full(session, stored), _drawn(made))
+def _build_section(
+    session: Session, store: ObjectStore, stored: StoredRun, why: str
+) -> _ReportSection:
+    evidence = read_run_figure_data(session, stored)
+    made = [("Progress of every island", figures.plot_history(evidence))]
+    experiments = read_run_experiments(session, store, stored)[:1]
+    made += [
+        ("Measured against identified", figures_signals.plot_response(one)) for one in experiments
+    ]
+    made.append(("Convergence of the parameters", figures.plot_convergence(evidence)))
+    return _ReportSection(why, load_full_run(session, stored), _draw_figures(made))
 
 
-def _drawn(made: list[tuple[str, Figure]]) -> list[tuple[str, Markup]]:
-    return [(title, drawing(figure, title)) for title, figure in made if is_drawable(figure)]
+def _draw_figures(made: list[tuple[str, Figure]]) -> list[tuple[str, Markup]]:
+    return [(title, to_svg(figure, title)) for title, figure in made if is_drawable(figure)]
 
 
-RUNS_IN_FULL = 6
-EXPERIMENTS_SHOWN = 4
+MAX_FULL_RUNS = 6
+MAX_EXPERIMENTS = 4
 
 
-def job_report(session: Session, store: ObjectStore, job_id: str, base_url: str = "") -> str:
+def render_job_report(session: Session, store: ObjectStore, job_id: str, base_url: str = "") -> str:
     """The report of a job: every run in a table, the few best (of a batch first) in full.
 
     Of a job of more runs than a page lists: what they have in common, and those that stand out.
     """
     job = JobRepository(session).get(job_id)
-    made, batch = datetime.now(UTC), trend_of(session, job)
-    if job.n_runs > LISTED:
-        return large_report(session, store, job, batch, made, base_url)
-    view = job_view(job, unit_of(session, job.spec), made)
-    runs = RunRepository(session).page(job.id, limit=LISTED).items
-    is_in_order = view.is_batch or len(runs) <= RUNS_IN_FULL
+    made, batch = datetime.now(UTC), load_trend(session, job)
+    if job.n_runs > MAX_LISTED_RUNS:
+        return render_large_report(session, store, job, batch, made, base_url)
+    view = to_job_view(job, find_rms_unit(session, job.spec), made)
+    runs = RunRepository(session).list_page(job.id, limit=MAX_LISTED_RUNS).items
+    is_in_order = view.is_batch or len(runs) <= MAX_FULL_RUNS
     order: RunOrder = "number" if is_in_order else "best_rms"
-    chosen = RunRepository(session).page(job.id, limit=RUNS_IN_FULL, order=order).items
+    chosen = RunRepository(session).list_page(job.id, limit=MAX_FULL_RUNS, order=order).items
     full = [StoredRun.from_rows(job, run) for run in chosen]
-    return render(
+    return render_template(
         "report.html", job=view, made=made,
-        runs=[run_summary(session, StoredRun.from_rows(job, run)) for run in runs],
-        overview=_full_overview(session, job), trend=None if batch is None else trend_view(batch),
-        trend_figure=None if batch is None else as_json(bare(trend_figure(batch))),
+        runs=[load_run_row(session, StoredRun.from_rows(job, run)) for run in runs],
+        overview=_overview_figures(session, job), trend=None if batch is None else to_trend_view(batch),
+        trend_figure=None if batch is None else to_script_json(strip_template(plot_trend(batch))),
         sections=[
-            (run_in_full(session, stored), _figures(session, store, stored)) for stored in full
+            (load_full_run(session, stored), _run_figures(session, store, stored)) for stored in full
         ],
-        datasets=dataset_links(session, job), more_datasets=unnamed(job),
-        policy=policy(), style=style(),
-        plotly_code=plotly(), draw=draw(),
-        templates=templates(),
+        datasets=dataset_links(session, job), more_datasets=count_unlisted_datasets(job),
+        policy=security_policy(), style=load_stylesheet(),
+        plotly_code=plotly_script(), draw=draw_script(),
+        templates=templates_json(),
     )  # fmt: skip
 
 
 @cache
-def policy() -> str:
+def security_policy() -> str:
     """Content security policy: the two scripts of the report by their hashes, nothing from afar."""
-    hashes = " ".join(f"'sha256-{_hash(script)}'" for script in (plotly(), draw()))
+    hashes = " ".join(
+        f"'sha256-{_script_hash(script)}'" for script in (plotly_script(), draw_script())
+    )
     return (
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; img-src data: blob:"
     )
 
 
-def _full_overview(session: Session, job: Job) -> list[tuple[str, int, Markup]]:
+def _overview_figures(session: Session, job: Job) -> list[tuple[str, int, Markup]]:
     """Title, height (px) and Plotly JSON of the figures of all runs together."""
-    found = job_figure(session, job.id, FigureChoice(columns=2))
+    found = load_noise_figure(session, job.id, FigureChoice(columns=2))
     if not found["data"]:
         return []
-    return [("Errors against the noise", found["layout"]["height"], as_json(bare(found)))]
+    return [
+        (
+            "Errors against the noise",
+            found["layout"]["height"],
+            to_script_json(strip_template(found)),
+        )
+    ]
 
 
-def _figures(
+def _run_figures(
     session: Session, store: ObjectStore, stored: StoredRun
 ) -> list[tuple[str, int, Markup]]:
     """Title, height (px) and Plotly JSON of a run's figures, those with something to show."""
-    evidence = evidence_of(session, stored)
-    made = [("Progress of every island", figures.history(evidence))]
-    for experiment in experiments_of(session, store, stored)[:EXPERIMENTS_SHOWN]:
+    evidence = read_run_figure_data(session, stored)
+    made = [("Progress of every island", figures.plot_history(evidence))]
+    for experiment in read_run_experiments(session, store, stored)[:MAX_EXPERIMENTS]:
         title = f"Measured against identified: {experiment.name}"
-        made.append((title, figures_signals.response(experiment)))
-    tested = residuals_of(session, store, stored)
+        made.append((title, figures_signals.plot_response(experiment)))
+    tested = analyse_residuals(session, store, stored)
     if tested is not None:
         made += [
-            (f"Correlation of the residuals: {name}", residual_figure(tested, number))
-            for number, name in enumerate(tested.names[:EXPERIMENTS_SHOWN])
+            (f"Correlation of the residuals: {name}", plot_residual_tests(tested, number))
+            for number, name in enumerate(tested.experiments[:MAX_EXPERIMENTS])
         ]
     made += [
-        ("Convergence of the parameters", figures.convergence(evidence)),
-        ("Correlation of the estimates", figures.correlation(evidence)),
-        ("What each island found", figures.waterfall(evidence)),
+        ("Convergence of the parameters", figures.plot_convergence(evidence)),
+        ("Correlation of the estimates", figures.plot_correlation(evidence)),
+        ("What each island found", figures.plot_waterfall(evidence)),
     ]
     return [
-        (title, figure["layout"]["height"], as_json(bare(figure)))
+        (title, figure["layout"]["height"], to_script_json(strip_template(figure)))
         for title, figure in made
         if any(_has_points(trace) for trace in figure["data"])
     ]
@@ -216,21 +243,21 @@ def _has_points(trace: dict[str, Any]) -> bool:
 
 
 @cache
-def plotly() -> Markup:
+def plotly_script() -> Markup:
     """The Plotly bundle as the content of a script element."""
-    return _script(assets.plotly_file().read_text(encoding="utf-8"))
+    return _to_script(assets.plotly_path().read_text(encoding="utf-8"))
 
 
 @cache
-def draw() -> Markup:
+def draw_script() -> Markup:
     """What draws the figures, as the content of a script element."""
-    return _script((assets.STATIC / "report.js").read_text(encoding="utf-8"))
+    return _to_script((assets.STATIC_FOLDER / "report.js").read_text(encoding="utf-8"))
 
 
-def _script(text: str) -> Markup:
+def _to_script(text: str) -> Markup:
     # In a string or an expression of a script, <\/ means the same and does not end the element.
     return Markup(text.replace("</script", "<\\/script"))
 
 
-def _hash(script: str) -> str:
+def _script_hash(script: str) -> str:
     return base64.b64encode(hashlib.sha256(str(script).encode()).digest()).decode()

@@ -11,28 +11,34 @@ from sqlalchemy.orm import Session
 
 from service.control import simulate as run_simulations
 from service.control.schemas import RunSimulateIn, RunSimulationOut, StepMetricsOut
-from service.core.errors import FieldError, InvalidRequest, ServiceError, Unavailable, faults_of
+from service.core.errors import (
+    FieldError,
+    InvalidRequest,
+    ServiceError,
+    Unavailable,
+    to_field_errors,
+)
 from service.core.text import bracket_unit
-from service.core.validation import explained
-from service.figures.data import Experiment, OutputTraces, Trace
-from service.figures.embed import as_json, bare, templates
-from service.figures.plotly import Figure, as_csv
-from service.figures.signals import response
-from service.figures.simulation import in_units, simulation
+from service.core.validation import explain_errors
+from service.figures.data import ExperimentTraces, OutputTraces, SignalTrace
+from service.figures.embed import strip_template, templates_json, to_script_json
+from service.figures.plotly import Figure, to_csv
+from service.figures.signals import plot_response
+from service.figures.simulation import apply_units, plot_simulation
 from service.figures.theme import MAX_POINTS
 from service.jobs.stored_run import StoredRun, load_run
-from service.pages.render import render
+from service.pages.render import render_template
 from service.pages.simulate_form import (
     CHOICES,
-    KINDS,
+    NOISE_KINDS,
     TUNINGS,
-    Asked,
-    Kind,
-    asked,
-    at_home,
-    is_asked,
-    kind_of,
-    label_of,
+    SimulationKind,
+    SimulationQuery,
+    field_label,
+    has_request,
+    parse_query,
+    read_kind,
+    to_form_fault,
 )
 from service.repositories.datasets import DatasetRepository
 from service.runs import free_run as free_runs
@@ -43,19 +49,19 @@ from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
 from sysid.core.errors import SysidError
-from sysid.core.units import multiplied
+from sysid.core.units import multiply_units
 from sysid.data.records import Record
 from sysid.models.model import Model
 
-DATASETS_LISTED = 200
-RECORDS_LISTED = 50
-MOST_DEFAULT_SAMPLES = 5000
-TAKEN = {"amplitude": "1", "offset": "0", "time": "0"}
+MAX_LISTED_DATASETS = 200
+MAX_LISTED_RECORDS = 50
+MAX_DEFAULT_SAMPLES = 5000
+IMPLIED_VALUES = {"amplitude": "1", "offset": "0", "time": "0"}
 """What an address without them means; a form that is still empty suggests others."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
+class _FormContext:
     """What the form is made from."""
 
     run: str
@@ -69,12 +75,12 @@ class _Known:
     defaults: Mapping[str, str]
 
     @property
-    def inputs(self) -> list[tuple[str, str]]:
+    def input_choices(self) -> list[tuple[str, str]]:
         """Choices of an input."""
         return [(one.name, one.name) for one in self.model.inputs]
 
     @property
-    def outputs(self) -> list[tuple[str, str]]:
+    def output_choices(self) -> list[tuple[str, str]]:
         """Choices of an output."""
         return [(one.name, one.name) for one in self.model.outputs]
 
@@ -89,13 +95,13 @@ class _Known:
         return "" if above == below else f"{above}/({below})"
 
     @property
-    def recordings(self) -> list[tuple[str, str]]:
+    def recording_choices(self) -> list[tuple[str, str]]:
         """Choices of a stored recording."""
         return [("", "choose one…"), *((one.id, one.name) for one in self.datasets)]
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class SimulationAnswer:
     """The answer to a request: a page, or the numbers of its figure."""
 
     text: str
@@ -105,7 +111,7 @@ class Shown:
 
 def simulate_page(
     database: Database, store: ObjectStore, run_id: str, query: Mapping[str, str], base_url: str
-) -> Shown:
+) -> SimulationAnswer:
     """The form, and what the model does where the query asks for it.
 
     Raises
@@ -113,59 +119,59 @@ def simulate_page(
     NotFound
         If there is no such run.
     """
-    with database.read() as session:
-        known = _known(session, run_id, query)
-    kind: Kind = "loop"
+    with database.read_session() as session:
+        known = _load_form_context(session, run_id, query)
+    kind: SimulationKind = "loop"
     context: dict[str, Any] = {}
     faults: list[FieldError] = []
     status = 200
     try:
-        kind = kind_of(query)
-        if is_asked(query):
-            wanted = asked(known.model, query)
-            figure, context = _simulated(database, store, known, wanted)
+        kind = read_kind(query)
+        if has_request(query):
+            wanted = parse_query(known.model, query)
+            figure, context = _simulate_query(database, store, known, wanted)
             if query.get("format") == "csv":
-                return Shown(as_csv(figure), is_csv=True)
-            context |= _figure_context(figure) | _request(known.run, wanted, base_url)
+                return SimulationAnswer(to_csv(figure), is_csv=True)
+            context |= _figure_context(figure) | _request_context(known.run, wanted, base_url)
     except (ServiceError, StorageError, SysidError) as error:
-        faults = [at_home(one) for one in _faults(error)]
+        faults = [to_form_fault(one) for one in _to_field_errors(error)]
         status = error.status if isinstance(error, Unavailable) else 422
-    page = render(
-        "simulate.html", known=known, kind=kind, kinds=KINDS, tunings=TUNINGS, choices=CHOICES,
-        values={**known.defaults, **(_late(known.defaults) if kind == "loop" else {}),
-                **(TAKEN if is_asked(query) else {}), **query,
-                **_numbers(context.get("result"))},
+    page = render_template(
+        "simulate.html", known=known, kind=kind, kinds=NOISE_KINDS, tunings=TUNINGS, choices=CHOICES,
+        values={**known.defaults, **(_shift_step_time(known.defaults) if kind == "loop" else {}),
+                **(IMPLIED_VALUES if has_request(query) else {}), **query,
+                **_controller_values(context.get("result"))},
         faults={f.pointer[1:]: f.detail for f in faults},
-        lines=[_line(one) for one in faults], query=_address(query),
-        times=multiplied, bracket=bracket_unit,
+        lines=[_format_fault(one) for one in faults], query=_encode_query(query),
+        times=multiply_units, bracket=bracket_unit,
         **{"result": None, "free": None, "figure": None, **context},
     )  # fmt: skip
-    return Shown(page, is_csv=False, status=status)
+    return SimulationAnswer(page, is_csv=False, status=status)
 
 
-def _known(session: Session, run_id: str, query: Mapping[str, str]) -> _Known:
+def _load_form_context(session: Session, run_id: str, query: Mapping[str, str]) -> _FormContext:
     stored = load_run(session, run_id)
     run, job, fitted_to = stored.run, stored.job, stored.body["datasets"][0]
-    datasets = list(DatasetRepository(session).page(limit=DATASETS_LISTED).items)
+    datasets = list(DatasetRepository(session).list_page(limit=MAX_LISTED_DATASETS).items)
     for wanted in (query.get("dataset"), fitted_to):
         if wanted and wanted not in [one.id for one in datasets]:
-            datasets += _one(session, wanted)
+            datasets += _find_dataset(session, wanted)
     fitted = next((one for one in datasets if one.id == fitted_to), None)
-    return _Known(
+    return _FormContext(
         run=run.id, title=f"run {run.number + 1}", job=job.id, job_name=job.name,
         model=stored.model, datasets=datasets, has_estimates=bool(stored.estimates),
-        units=_units(stored, fitted), defaults=_defaults(stored, fitted) | _step(stored),
+        units=_signal_units(stored, fitted), defaults=_default_values(stored, fitted) | _default_step(stored),
     )  # fmt: skip
 
 
-def _one(session: Session, dataset: str) -> list[Dataset]:
+def _find_dataset(session: Session, dataset: str) -> list[Dataset]:
     try:
         return [DatasetRepository(session).get(dataset)]
     except StorageError:  # deleted since, or never there: the form says so where it is chosen
         return []
 
 
-def _units(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]:
+def _signal_units(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]:
     """Unit of every signal: the model's, or where it leaves it open that of the recording."""
     recorded = {one["name"]: str(one["unit"]) for one in (fitted.channels if fitted else [])}
     model, by_signal = stored.model, stored.channels.by_signal
@@ -176,11 +182,11 @@ def _units(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]:
     }
 
 
-def _defaults(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]:
+def _default_values(stored: StoredRun, fitted: Dataset | None) -> dict[str, str]:
     model = stored.model
     period = (fitted.sample_time or _mean_period(fitted)) if fitted else None
     period = period or model.solver.step or 0.01
-    duration = min(fitted.duration if fitted else 10.0, MOST_DEFAULT_SAMPLES * period)
+    duration = min(fitted.duration if fitted else 10.0, MAX_DEFAULT_SAMPLES * period)
     return {
         "input": model.inputs[0].name if model.inputs else "", "output": model.outputs[0].name,
         "gain": "1", "amplitude": "1", "time": "0", "offset": "0", "skip": "0",
@@ -196,7 +202,7 @@ def _mean_period(irregular: Dataset) -> float | None:
     return float(f"{irregular.duration / (irregular.n_samples - 1):.2g}")
 
 
-def _step(stored: StoredRun) -> dict[str, str]:
+def _default_step(stored: StoredRun) -> dict[str, str]:
     """A step of the reference within what was measured: half the span of the first output.
 
     A step from 0 to 1 would lie outside it for most plants, with an output's offset or in Pa.
@@ -207,10 +213,13 @@ def _step(stored: StoredRun) -> dict[str, str]:
     if not spans:
         return {}
     low, high = min(span[0] for span in spans), max(span[1] for span in spans)
-    return {"offset": _round(low + (high - low) / 4), "amplitude": _round((high - low) / 2)}
+    return {
+        "offset": _round_text(low + (high - low) / 4),
+        "amplitude": _round_text((high - low) / 2),
+    }
 
 
-def _late(defaults: Mapping[str, str]) -> dict[str, str]:
+def _shift_step_time(defaults: Mapping[str, str]) -> dict[str, str]:
     """The step one record later: the model starts at rest, not at the reference before the step."""
     if defaults["offset"] == "0":
         return {}
@@ -218,37 +227,37 @@ def _late(defaults: Mapping[str, str]) -> dict[str, str]:
     return {"time": f"{duration:.6g}", "duration": f"{2 * duration:.6g}"}
 
 
-def _round(value: float) -> str:
+def _round_text(value: float) -> str:
     """Two significant digits, without a power of ten as long as that can be read."""
     return f"{float(f'{value:.2g}'):.10g}"
 
 
-def _simulated(
-    database: Database, store: ObjectStore, known: _Known, wanted: Asked
+def _simulate_query(
+    database: Database, store: ObjectStore, known: _FormContext, wanted: SimulationQuery
 ) -> tuple[Figure, dict[str, Any]]:
     if wanted.kind == "recording":
-        body = _valid(FreeRunIn, wanted.body)
-        free = free_runs.judged(database, store, known.run, body)
+        body = _validate_body(FreeRunIn, wanted.body)
+        free = free_runs.simulate_free_run(database, store, known.run, body)
         name = next((d.name for d in known.datasets if d.id == free.dataset), free.dataset)
-        return response(_experiment(free)), {"free": free, "dataset_name": name,
-                                             "records": RECORDS_LISTED}  # fmt: skip
-    body = _valid(RunSimulateIn, wanted.body)
-    told = run_simulations.simulate(database, store, known.run, body, MAX_POINTS)
-    found = in_units(told, known.units)
+        return plot_response(_to_experiment_traces(free)), {"free": free, "dataset_name": name,
+                                             "records": MAX_LISTED_RECORDS}  # fmt: skip
+    body = _validate_body(RunSimulateIn, wanted.body)
+    told = run_simulations.simulate_run(database, store, known.run, body, MAX_POINTS)
+    found = apply_units(told, known.units)
     since = wanted.body["control"]["reference"]["time"] if wanted.kind == "loop" else None
     entered = known.units.get(wanted.body["control"]["input"], "1") if since is not None else "1"
-    return simulation(found, since), {"result": found, "verdict": _verdict(found),
+    return plot_simulation(found, since), {"result": found, "verdict": _step_verdict(found),
                                       "command_unit": entered}  # fmt: skip
 
 
-def _valid(kind: type[Any], body: Mapping[str, Any]) -> Any:
+def _validate_body(kind: type[Any], body: Mapping[str, Any]) -> Any:
     try:
         return kind.model_validate(body)
     except ValidationError as error:
-        raise InvalidRequest(explained(error.errors(), body, kind)) from None
+        raise InvalidRequest(explain_errors(error.errors(), body, kind)) from None
 
 
-def _numbers(found: RunSimulationOut | None) -> dict[str, str]:
+def _controller_values(found: RunSimulationOut | None) -> dict[str, str]:
     """What a rule chose, as the form's own numbers: to go on from there by hand."""
     if found is None or found.tuning is None or found.controller is None:
         return {}
@@ -258,7 +267,7 @@ def _numbers(found: RunSimulationOut | None) -> dict[str, str]:
     return {name: "" if value is None else f"{value:.6g}" for name, value in chosen.items()}
 
 
-def _verdict(found: RunSimulationOut) -> tuple[str, str]:
+def _step_verdict(found: RunSimulationOut) -> tuple[str, str]:
     """The verdict on a step response as the sheet styles it, and in words."""
     metrics: StepMetricsOut | None = found.metrics
     if metrics is None:
@@ -270,29 +279,29 @@ def _verdict(found: RunSimulationOut) -> tuple[str, str]:
     return ("passed", "settles") if metrics.is_settled else ("apart", "does not settle")
 
 
-def _experiment(free: FreeRun) -> Experiment:
+def _to_experiment_traces(free: FreeRun) -> ExperimentTraces:
     """The first record; a table tells the agreement of all."""
     record, simulated = free.records[0], free.simulated[0]
     outputs = tuple(
-        OutputTraces(Trace(one.name, one.unit, one.times, one.values), values)
+        OutputTraces(SignalTrace(one.name, one.unit, one.times, one.values), values)
         for one, values in zip(record.outputs, simulated, strict=True)
     )
-    return Experiment("record 1", outputs, _inputs(record))
+    return ExperimentTraces("record 1", outputs, _to_input_traces(record))
 
 
-def _inputs(record: Record) -> tuple[Trace, ...]:
+def _to_input_traces(record: Record) -> tuple[SignalTrace, ...]:
     return tuple(
-        Trace(one.name, one.unit, one.times, one.values, one.hold == "zero")
+        SignalTrace(one.name, one.unit, one.times, one.values, one.hold == "zero")
         for one in record.inputs
     )
 
 
 def _figure_context(figure: Figure) -> dict[str, Any]:
-    return {"figure": as_json(bare(figure)), "height": figure["layout"]["height"],
-            "templates": templates()}  # fmt: skip
+    return {"figure": to_script_json(strip_template(figure)), "height": figure["layout"]["height"],
+            "templates": templates_json()}  # fmt: skip
 
 
-def _request(run: str, wanted: Asked, base_url: str) -> dict[str, str]:
+def _request_context(run: str, wanted: SimulationQuery, base_url: str) -> dict[str, str]:
     """The same over REST."""
     verb = "validate" if wanted.kind == "recording" else "simulate"
     body = json.dumps(wanted.body, indent=2, ensure_ascii=False)
@@ -303,20 +312,20 @@ def _request(run: str, wanted: Asked, base_url: str) -> dict[str, str]:
     }
 
 
-def _faults(error: ServiceError | StorageError | SysidError) -> Iterator[FieldError]:
+def _to_field_errors(error: ServiceError | StorageError | SysidError) -> Iterator[FieldError]:
     if isinstance(error, SysidError):
-        yield from faults_of(error)
+        yield from to_field_errors(error)
     elif isinstance(error, ServiceError) and error.errors:
         yield from error.errors
     else:
         yield FieldError("", str(error))
 
 
-def _line(fault: FieldError) -> str:
+def _format_fault(fault: FieldError) -> str:
     field = fault.pointer.removeprefix("?")
     column = f" (column {fault.column})" if fault.column else ""
-    return f"{label_of(field)}: {fault.detail}{column}" if field else f"{fault.detail}{column}"
+    return f"{field_label(field)}: {fault.detail}{column}" if field else f"{fault.detail}{column}"
 
 
-def _address(query: Mapping[str, str]) -> str:
+def _encode_query(query: Mapping[str, str]) -> str:
     return urlencode({name: value for name, value in query.items() if name != "format"})

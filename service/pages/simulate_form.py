@@ -7,20 +7,20 @@ from math import isfinite
 from typing import Any, Literal, get_args
 
 from service.core.errors import FieldError, InvalidRequest
-from service.datasets.schemas import MAX_SIMULATED
-from service.jobs.record_checks import signals_of
+from service.datasets.schemas import MAX_SERIES_SAMPLES
+from service.jobs.record_checks import list_signals
 from sysid.control.controllers import AntiWindup, DerivativeOn
 from sysid.control.tuning import CONTROLLERS, RULES
-from sysid.core.errors import nearest
+from sysid.core.errors import suggest_name
 from sysid.models.model import Model
 
-Kind = Literal["loop", "recording", "signal"]
-KINDS: Mapping[Kind, str] = {
+SimulationKind = Literal["loop", "recording", "signal"]
+NOISE_KINDS: Mapping[SimulationKind, str] = {
     "loop": "Closed loop: a step of the reference",
     "recording": "Free run over a recording",
     "signal": "Free run on a signal",
 }
-LABELS = {
+FIELD_LABELS = {
     "kind": "kind", "input": "controlled input", "output": "controlled output", "gain": "gain",
     "integral_time": "integral time", "derivative_time": "derivative time",
     "derivative_filter": "derivative filter N", "derivative_on": "derivative on",
@@ -33,9 +33,9 @@ LABELS = {
     "duration": "duration", "sample_time": "sampling period", "dataset": "recording",
     "skip": "samples not judged",
 }  # fmt: skip
-BY_HAND = "by hand"
+MANUAL_TUNING = "by hand"
 TUNINGS = {
-    BY_HAND: "by hand",
+    MANUAL_TUNING: "by hand",
     **{f"{rule} {kind}": f"{rule.upper()}, {kind}" for rule in RULES for kind in CONTROLLERS},
 }
 """Rule and controller: a rule chooses gain and times itself."""
@@ -44,12 +44,19 @@ CHOICES = {
     "anti_windup": [(one, one) for one in get_args(AntiWindup)],
 }
 """Values and texts of the fields of a controller that take one of some names."""
-_NUMBERS = ("derivative_filter", "setpoint_weight", "limit", "lower", "upper", "tracking_time")
-_TUNED = ("gain", "integral_time", "derivative_time")
-_CHOSEN = tuple(CHOICES)
-_PLACES = {
+_NUMBER_FIELDS = (
+    "derivative_filter",
+    "setpoint_weight",
+    "limit",
+    "lower",
+    "upper",
+    "tracking_time",
+)
+_TUNED_FIELDS = ("gain", "integral_time", "derivative_time")
+_CHOICE_FIELDS = tuple(CHOICES)
+_POINTER_FIELDS = {
     "/control/tuning/closed_loop_time_constant": "closed_loop_time_constant",
-    **{f"/control/{name}": name for name in ("tuning", *_TUNED, *_NUMBERS, *_CHOSEN)},
+    **{f"/control/{name}": name for name in ("tuning", *_TUNED_FIELDS, *_NUMBER_FIELDS, *_CHOICE_FIELDS)},
     "/control/input": "input", "/control/output": "output",
     "/control/transport/gain": "transport_gain",
     "/control/transport/time_constant": "time_constant",
@@ -61,14 +68,14 @@ _PLACES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class SimulationQuery:
     """A query that can be read: its kind, and the body for it."""
 
-    kind: Kind
+    kind: SimulationKind
     body: Mapping[str, Any]
 
 
-def kind_of(query: Mapping[str, str]) -> Kind:
+def read_kind(query: Mapping[str, str]) -> SimulationKind:
     """What is to be simulated; a closed loop if the query does not say.
 
     Raises
@@ -77,31 +84,33 @@ def kind_of(query: Mapping[str, str]) -> Kind:
         If it says something else.
     """
     wanted = query.get("kind", "loop")
-    for kind in KINDS:
+    for kind in NOISE_KINDS:
         if kind == wanted:
             return kind
-    raise InvalidRequest.at("?kind", f"found {wanted!r}; need one of {', '.join(KINDS)}")
+    raise InvalidRequest.from_fault(
+        "?kind", f"found {wanted!r}; need one of {', '.join(NOISE_KINDS)}"
+    )
 
 
-def is_asked(query: Mapping[str, str]) -> bool:
+def has_request(query: Mapping[str, str]) -> bool:
     """Whether something is to be simulated, or only the form to be shown."""
     return any(name not in ("kind", "format") for name in query)
 
 
-def fields_of(model: Model, kind: Kind) -> list[str]:
+def list_form_fields(model: Model, kind: SimulationKind) -> list[str]:
     """Names of the fields of a form."""
     inputs = [f"input.{one.name}" for one in model.inputs]
     if kind == "recording":
-        signals = list(chain(*signals_of(model)))
+        signals = list(chain(*list_signals(model)))
         return ["dataset", "skip", *(f"channel.{name}" for name in signals)]
     if kind == "signal":
         return [*inputs, "duration", "sample_time"]
-    return ["input", "output", "tuning", "closed_loop_time_constant", *_TUNED, *_NUMBERS, *_CHOSEN,
+    return ["input", "output", "tuning", "closed_loop_time_constant", *_TUNED_FIELDS, *_NUMBER_FIELDS, *_CHOICE_FIELDS,
             "amplitude", "time", "offset", "transport_gain", "time_constant", "transport_delay",
             *inputs, "duration", "sample_time"]  # fmt: skip
 
 
-def asked(model: Model, query: Mapping[str, str]) -> Asked:
+def parse_query(model: Model, query: Mapping[str, str]) -> SimulationQuery:
     """What a query asks for.
 
     Raises
@@ -109,27 +118,27 @@ def asked(model: Model, query: Mapping[str, str]) -> Asked:
     InvalidRequest
         With every field that is unknown or no number, its pointer ``?name``.
     """
-    kind = kind_of(query)
-    known = fields_of(model, kind)
+    kind = read_kind(query)
+    known = list_form_fields(model, kind)
     faults = [
-        FieldError(f"?{name}", f"there is no such field{nearest(name, known)}")
+        FieldError(f"?{name}", f"there is no such field{suggest_name(name, known)}")
         for name in query
         if name not in (*known, "kind", "format")
     ]
-    reader = _Reader(query)
-    make = {"loop": _loop, "recording": _recording, "signal": _signal}[kind]
+    reader = _QueryReader(query)
+    make = {"loop": _loop_body, "recording": _recording_body, "signal": _signal_body}[kind]
     body = make(reader, model)
     faults += reader.faults
     if faults:
         raise InvalidRequest(faults)
-    return Asked(kind, body)
+    return SimulationQuery(kind, body)
 
 
-def at_home(fault: FieldError) -> FieldError:
+def to_form_fault(fault: FieldError) -> FieldError:
     """A fault of the body at the field of the form that it comes from."""
     if fault.pointer.startswith("?"):
         return fault
-    for theirs, field in _PLACES.items():
+    for theirs, field in _POINTER_FIELDS.items():
         if fault.pointer == theirs or fault.pointer.startswith(f"{theirs}/"):
             return FieldError(f"?{field}", fault.detail, fault.column)
     for theirs, prefix in (("/inputs/", "input."), ("/channels/", "channel.")):
@@ -139,25 +148,25 @@ def at_home(fault: FieldError) -> FieldError:
     return fault
 
 
-def label_of(field: str) -> str:
+def field_label(field: str) -> str:
     """How the form calls a field."""
     head, _, name = field.partition(".")
-    return f"{head} {name}" if name else LABELS.get(field, field)
+    return f"{head} {name}" if name else FIELD_LABELS.get(field, field)
 
 
-class _Reader:
+class _QueryReader:
     """Numbers and texts of a query; what cannot be read is kept as a fault."""
 
     def __init__(self, query: Mapping[str, str]) -> None:
         self._query = query
         self.faults: list[FieldError] = []
 
-    def text(self, name: str, default: str = "") -> str:
+    def read_text(self, name: str, default: str = "") -> str:
         return self._query.get(name, "").strip() or default
 
-    def number(self, name: str, default: float | None = None) -> float | None:
+    def read_number(self, name: str, default: float | None = None) -> float | None:
         """A number; the default where the field is empty, and where there is a fault."""
-        given = self.text(name)
+        given = self.read_text(name)
         if not given:
             return default
         try:
@@ -169,9 +178,9 @@ class _Reader:
         self.faults.append(FieldError(f"?{name}", f"found {given!r}; need a number"))
         return default
 
-    def samples(self) -> tuple[int, float]:
+    def read_samples(self) -> tuple[int, float]:
         """Number of samples and sampling period (s) of a duration; both fields are needed."""
-        duration, period = self.number("duration"), self.number("sample_time")
+        duration, period = self.read_number("duration"), self.read_number("sample_time")
         for name, value in (("duration", duration), ("sample_time", period)):
             if any(one.pointer == f"?{name}" for one in self.faults):
                 continue
@@ -181,73 +190,73 @@ class _Reader:
         if not duration or not period or self.faults:
             return 2, 1.0
         count = duration / period
-        if not 1 <= count < MAX_SIMULATED:
+        if not 1 <= count < MAX_SERIES_SAMPLES:
             self.faults.append(FieldError(
                 "?duration",
                 f"{duration:g} s in steps of {period:g} s are {count:.3g} samples; need 2 to "
-                f"{MAX_SIMULATED}",
+                f"{MAX_SERIES_SAMPLES}",
             ))  # fmt: skip
             return 2, 1.0
         return round(count) + 1, period
 
 
-def _loop(reader: _Reader, model: Model) -> dict[str, Any]:
+def _loop_body(reader: _QueryReader, model: Model) -> dict[str, Any]:
     control: dict[str, Any] = {
-        "input": reader.text("input", model.inputs[0].name if model.inputs else ""),
-        "output": reader.text("output", model.outputs[0].name),
-        **_controller(reader),
+        "input": reader.read_text("input", model.inputs[0].name if model.inputs else ""),
+        "output": reader.read_text("output", model.outputs[0].name),
+        **_controller_body(reader),
         "reference": {
-            "kind": "step", "amplitude": reader.number("amplitude", 1.0),
-            "time": reader.number("time", 0.0), "offset": reader.number("offset", 0.0),
+            "kind": "step", "amplitude": reader.read_number("amplitude", 1.0),
+            "time": reader.read_number("time", 0.0), "offset": reader.read_number("offset", 0.0),
         },
     }  # fmt: skip
     transport = {
-        "gain": reader.number("transport_gain"), "time_constant": reader.number("time_constant"),
-        "delay": reader.number("transport_delay"),
+        "gain": reader.read_number("transport_gain"), "time_constant": reader.read_number("time_constant"),
+        "delay": reader.read_number("transport_delay"),
     }  # fmt: skip
     given = {name: value for name, value in transport.items() if value is not None}
     if given:
         control["transport"] = given
-    samples, period = reader.samples()
+    samples, period = reader.read_samples()
     others = [one.name for one in model.inputs if one.name != control["input"]]
-    return {"control": control, "inputs": dict(_expressions(reader, others, "0")),
+    return {"control": control, "inputs": dict(_input_expressions(reader, others, "0")),
             "samples": samples, "sample_time": period}  # fmt: skip
 
 
-def _controller(reader: _Reader) -> dict[str, Any]:
+def _controller_body(reader: _QueryReader) -> dict[str, Any]:
     """The controller's numbers; with a rule, which chooses them, those that it leaves."""
-    tuning = reader.text("tuning", BY_HAND)
+    tuning = reader.read_text("tuning", MANUAL_TUNING)
     found: dict[str, Any] = {}
-    if tuning == BY_HAND:
-        found["gain"] = reader.number("gain", 1.0)
-        names: tuple[str, ...] = (*_TUNED[1:], *_NUMBERS)
+    if tuning == MANUAL_TUNING:
+        found["gain"] = reader.read_number("gain", 1.0)
+        names: tuple[str, ...] = (*_TUNED_FIELDS[1:], *_NUMBER_FIELDS)
     else:
         rule, _, controller = tuning.partition(" ")
         found["tuning"] = {"rule": rule, "controller": controller}
-        wanted = reader.number("closed_loop_time_constant")
+        wanted = reader.read_number("closed_loop_time_constant")
         if wanted is not None:
             found["tuning"]["closed_loop_time_constant"] = wanted
-        names = _NUMBERS
+        names = _NUMBER_FIELDS
         if tuning not in TUNINGS:
             known = ", ".join(TUNINGS)
             reader.faults.append(FieldError("?tuning", f"found {tuning!r}; need one of {known}"))
-    given = {name: reader.number(name) for name in names}
+    given = {name: reader.read_number(name) for name in names}
     found |= {name: value for name, value in given.items() if value is not None}
-    return found | {name: text for name in _CHOSEN if (text := reader.text(name))}
+    return found | {name: text for name in _CHOICE_FIELDS if (text := reader.read_text(name))}
 
 
-def _signal(reader: _Reader, model: Model) -> dict[str, Any]:
+def _signal_body(reader: _QueryReader, model: Model) -> dict[str, Any]:
     names = [one.name for one in model.inputs]
-    samples, period = reader.samples()
-    return {"inputs": dict(_expressions(reader, names, "")), "samples": samples,
+    samples, period = reader.read_samples()
+    return {"inputs": dict(_input_expressions(reader, names, "")), "samples": samples,
             "sample_time": period}  # fmt: skip
 
 
-def _expressions(
-    reader: _Reader, names: list[str], default: str
+def _input_expressions(
+    reader: _QueryReader, names: list[str], default: str
 ) -> Iterator[tuple[str, dict[str, str]]]:
     for name in names:
-        text = reader.text(f"input.{name}", default)
+        text = reader.read_text(f"input.{name}", default)
         if text:
             yield name, {"kind": "expression", "expression": text}
         else:
@@ -255,12 +264,12 @@ def _expressions(
             reader.faults.append(FieldError(f"?input.{name}", fault))
 
 
-def _recording(reader: _Reader, model: Model) -> dict[str, Any]:
-    dataset = reader.text("dataset")
+def _recording_body(reader: _QueryReader, model: Model) -> dict[str, Any]:
+    dataset = reader.read_text("dataset")
     if not dataset:
         reader.faults.append(FieldError("?dataset", "it is missing; choose a stored recording"))
-    chosen = {name: reader.text(f"channel.{name}") for name in chain(*signals_of(model))}
-    skip = reader.number("skip", 0.0) or 0.0
+    chosen = {name: reader.read_text(f"channel.{name}") for name in chain(*list_signals(model))}
+    skip = reader.read_number("skip", 0.0) or 0.0
     if skip != int(skip):
         reader.faults.append(FieldError("?skip", f"found {skip:g}; need a whole number"))
     return {"dataset": dataset, "channels": {k: v for k, v in chosen.items() if v},

@@ -15,10 +15,10 @@ from service.trends.text import (
     PlaceRow,
     PredictionRow,
     build_tables,
-    notes,
-    reference_text,
+    format_reference,
+    list_notes,
 )
-from service.trends.trend import has_trend, trend
+from service.trends.trend import compute_trend, has_trend
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,22 +38,22 @@ class TrendView:
     notes: Sequence[str]
     reference: str | None
     reference_text: str
-    offered: str
-    offered_name: str
+    suggested_run: str
+    suggested_name: str
     height: int
 
 
-def trend_of(session: Session, job: Job) -> TrendOut | None:
+def load_trend(session: Session, job: Job) -> TrendOut | None:
     """The trend of a job; None where it asks for none, or has too many runs for one."""
     if not has_trend(job):
         return None
     try:
-        return trend(session, job.id)
+        return compute_trend(session, job.id)
     except InvalidRequest:
         return None
 
 
-def trend_view(found: TrendOut) -> TrendView:
+def to_trend_view(found: TrendOut) -> TrendView:
     """The tables of a trend."""
     document = found.model_dump()
     tables = build_tables(document, TYPESET)
@@ -67,16 +67,16 @@ def trend_view(found: TrendOut) -> TrendView:
         ],
         predictions=tables.predictions,
         reasons=[f"{name}: {reason}" for name, reason in tables.reasons],
-        notes=notes(document),
+        notes=list_notes(document),
         reference=found.reference,
-        reference_text=reference_text(document),
-        offered=_offered(found),
-        offered_name=next(iter(found.reference_names), ""),
+        reference_text=format_reference(document),
+        suggested_run=_suggest_run(found),
+        suggested_name=next(iter(found.reference_names), ""),
         height=trend_height(max(len(tables.headings), 1)),
     )
 
 
-def _offered(found: TrendOut) -> str:
+def _suggest_run(found: TrendOut) -> str:
     runs = {place.x: place.runs[0] for place in found.places if place.runs}
     middle = list(runs.values())[len(runs) // 2 : len(runs) // 2 + 1]
     known = None if found.reference_x is None else runs.get(found.reference_x)

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
-from service.core.states import OPEN, StateName
+from service.core.states import OPEN_STATES, StateName
 from service.core.text import format_count, format_estimate, format_interval, format_value
 from service.core.wire import Answer
 from service.jobs.schemas import JobOut
-from service.jobs.submit import told
-from service.pages.diagnostics import Findings, findings_of
+from service.jobs.submit import to_job_out
+from service.pages.diagnostics import Diagnostics, to_diagnostics
 from service.storage.tables import Event, Job, Run
 
 Document = Mapping[str, Any]
@@ -31,7 +31,7 @@ class EstimateView:
     reason: str
 
 
-DATASETS = "/datasets"
+DATASETS_PATH = "/datasets"
 
 
 class RunView(Answer):
@@ -56,7 +56,7 @@ class RunView(Answer):
     warnings: Sequence[str]
     has_signals: bool
     heights: Mapping[str, int]
-    findings: Findings
+    diagnostics: Diagnostics
 
 
 class JobView(JobOut):
@@ -73,7 +73,7 @@ class JobView(JobOut):
     @property
     def is_open(self) -> bool:
         """Whether it waits or runs."""
-        return self.state in OPEN
+        return self.state in OPEN_STATES
 
     @property
     def can_resume(self) -> bool:
@@ -83,7 +83,7 @@ class JobView(JobOut):
     @property
     def is_batch(self) -> bool:
         """Whether its runs see different recordings."""
-        return any(axis["path"].startswith(DATASETS) for axis in axes_of(self.request))
+        return any(axis["path"].startswith(DATASETS_PATH) for axis in sweep_axes(self.request))
 
     @property
     def best_rms(self) -> float | None:
@@ -144,32 +144,32 @@ class EventView:
     text: str
 
 
-def job_view(job: Job, unit: str, now: datetime) -> JobView:
+def to_job_view(job: Job, unit: str, now: datetime) -> JobView:
     """What pages show of a job; `unit` is that of its RMS."""
-    document = told(job, with_request=True, rms_unit=unit)
+    document = to_job_out(job, with_request=True, rms_unit=unit)
     return JobView.from_source(
         document, lost_leases=job.lost_leases, max_attempts=job.max_attempts, now=now
     )
 
 
-def run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
+def to_run_view(run: Run, unit: str, heights: Mapping[str, int]) -> RunView:
     """What pages show of a run; `heights` (px) are those of its plots."""
     result = run.result or {}
     return RunView.from_source(
         run,
         title=f"run {run.number + 1}",
         is_open=not run.state.is_terminal,
-        cell_text=cell_text(run.cell, run.labels),
+        cell_text=format_cell(run.cell, run.labels),
         unit=unit,
-        estimates=[estimate_view(one) for one in result.get("parameters", ())],
+        estimates=[to_estimate_view(one) for one in result.get("parameters", ())],
         warnings=result.get("warnings", ()),
         has_signals=run.signals_sha256 is not None,
         heights=heights,
-        findings=findings_of(result),
+        findings=to_diagnostics(result),
     )
 
 
-def estimate_view(one: Document) -> EstimateView:
+def to_estimate_view(one: Document) -> EstimateView:
     """A line of the table, from an entry of the result's ``parameters``."""
     stderr = one["stderr"]
     value, error = format_estimate(one["value"], stderr)
@@ -182,7 +182,7 @@ def estimate_view(one: Document) -> EstimateView:
     )  # fmt: skip
 
 
-def event_view(event: Event) -> EventView:
+def to_event_view(event: Event) -> EventView:
     """An event as one line of text."""
     data = event.data
     if event.kind in ("state", "end"):
@@ -198,19 +198,19 @@ def event_view(event: Event) -> EventView:
     return EventView(event.created_at, event.kind, str(text))
 
 
-def axes_of(spec: Document) -> list[Document]:
+def sweep_axes(spec: Document) -> list[Document]:
     """The axes of a job's sweep."""
     return list(spec["sweep"]["axes"])
 
 
-def cell_text(cell: Document, labels: Document) -> str:
+def format_cell(cell: Document, labels: Document) -> str:
     """What distinguishes a run from the others of its job; labels tell data better than ids."""
-    told = {path: value for path, value in cell.items() if not (labels and path == DATASETS)}
-    pairs = [(_field_name(path, told), value) for path, value in told.items()]
+    told = {path: value for path, value in cell.items() if not (labels and path == DATASETS_PATH)}
+    pairs = [(_axis_name(path, told), value) for path, value in told.items()]
     return ", ".join(f"{name} {format_value(value)}" for name, value in [*labels.items(), *pairs])
 
 
-def _field_name(path: str, others: Iterable[str]) -> str:
+def _axis_name(path: str, others: Iterable[str]) -> str:
     """Last part of a pointer; all of it where others end like it, as those of two seeds do."""
     last = path.rsplit("/", 1)[-1]
     same = [one for one in others if one.rsplit("/", 1)[-1] == last]

@@ -9,34 +9,38 @@ import numpy as np
 from service.core.text import format_number
 from service.figures import theme
 from service.paper import figures, published
-from service.paper.bench import METHODS, Bench, Found
-from service.paper.document import Check, Plot, Section, Table
-from service.paper.oscillators import estimate_text
+from service.paper.bench import METHODS, MethodRun, StudyBench
+from service.paper.document import Check, Plot, ReportTable, Section
+from service.paper.oscillators import format_estimate
 
 TITLE = "Table 4, Figures 20 and 21: pneumatic actuator"
 # The paper's proposed column, with k_b = k_a: only then do six numbers follow from P_a and θ. It
 # gives no A_m and no B; those of the catalogue stand in.
-TRUE = {name: published.TABLE_4.proposed[name] for name in ("J", "F_c", "F_max", "k_a", "k_c")}
-NAMES = (*TRUE, "k_b")
+TRUE_PARAMETERS = {
+    name: published.TABLE_4.proposed[name] for name in ("J", "F_c", "F_max", "k_a", "k_c")
+}
+PARAMETER_NAMES = (*TRUE_PARAMETERS, "k_b")
 SIGMA, SAMPLES, SAMPLE_TIME = 1e-3, 800, 0.01
 # Waves that break the arm away and let it stick again and again.
-WAVES = "12e3*(0.55*sin(2.2*t) + 0.6*sin(5.7*t + 1) + 0.5*sin(14.5*t + 2) + 0.5*sin(1.1*t*t))"
+INPUT_EXPRESSION = (
+    "12e3*(0.55*sin(2.2*t) + 0.6*sin(5.7*t + 1) + 0.5*sin(14.5*t + 2) + 0.5*sin(1.1*t*t))"
+)
 # Figure 21: P control through the tube of 40 m (section 5.2) with the supply's limit.
-GAIN, LIMIT, STEP, LONG = 1e4, 0.25e6, pi / 2, 600
+GAIN, LIMIT, STEP_ANGLE, LOOP_SAMPLES = 1e4, 0.25e6, pi / 2, 600
 TRANSPORT = {"gain": 1.0, "time_constant": 0.35, "delay": 0.127}
-SECOND = {"k_b": {"lower": 5, "upper": 500, "scale": "log"}}
+SEPARATE_K_B = {"k_b": {"lower": 5, "upper": 500, "scale": "log"}}
 
 
-def dataset() -> dict[str, Any]:
+def record_body() -> dict[str, Any]:
     """Body of the record: the reference plant, exact between its events, not the model fitted."""
     return {
-        "name": "paper Table 4: actuator", "plant": "actuator", "parameters": dict(TRUE),
-        "inputs": {"P_a": {"kind": "expression", "expression": WAVES}},
+        "name": "paper Table 4: actuator", "plant": "actuator", "parameters": dict(TRUE_PARAMETERS),
+        "inputs": {"P_a": {"kind": "expression", "expression": INPUT_EXPRESSION}},
         "samples": SAMPLES, "sample_time": SAMPLE_TIME, "noise": {"sigma": SIGMA, "seed": 1},
     }  # fmt: skip
 
 
-def job(record: str, parameters: Mapping[str, Any], reading: str) -> dict[str, Any]:
+def job_body(record: str, parameters: Mapping[str, Any], reading: str) -> dict[str, Any]:
     """Body of the job; the arm starts at rest in the middle."""
     return {
         "name": f"paper Table 4: {reading}", "model": "actuator", "datasets": [record],
@@ -45,30 +49,31 @@ def job(record: str, parameters: Mapping[str, Any], reading: str) -> dict[str, A
     }  # fmt: skip
 
 
-def loop(parameters: Mapping[str, float]) -> dict[str, Any]:
+def loop_body(parameters: Mapping[str, float]) -> dict[str, Any]:
     """Body of the simulation of Figure 21: a step of 90° under P control through the tube."""
     return {
-        "samples": LONG, "sample_time": SAMPLE_TIME,
+        "samples": LOOP_SAMPLES, "sample_time": SAMPLE_TIME,
         "parameters": {**parameters, "theta(0)": 0.0},
         "control": {
             "input": "P_a", "output": "theta", "gain": GAIN, "limit": LIMIT,
-            "transport": TRANSPORT, "reference": {"kind": "step", "amplitude": STEP},
+            "transport": TRANSPORT, "reference": {"kind": "step", "amplitude": STEP_ANGLE},
         },
     }  # fmt: skip
 
 
-def sections(bench: Bench) -> list[Section]:
+def build_sections(bench: StudyBench) -> list[Section]:
     """The corrected reading with its closed loop, then the equations as printed."""
-    record = bench.client.simulate_dataset(dataset())["id"]
-    return [_corrected(bench, record), _printed(bench, record)]
+    record = bench.client.simulate_dataset(record_body())["id"]
+    return [_corrected_section(bench, record), _printed_section(bench, record)]
 
 
-def _corrected(bench: Bench, record: str) -> Section:
-    found = bench.methods(job(record, {}, "k_b = k_a"))
+def _corrected_section(bench: StudyBench, record: str) -> Section:
+    found = bench.compare_methods(job_body(record, {}, "k_b = k_a"))
     steps = {
-        method: bench.client.simulate_run(one.run["id"], loop({})) for method, one in found.items()
+        method: bench.client.simulate_run(one.run["id"], loop_body({}))
+        for method, one in found.items()
     }
-    exact = bench.client.simulate_run(found["improved"].run["id"], loop(TRUE))
+    exact = bench.client.simulate_run(found["improved"].run["id"], loop_body(TRUE_PARAMETERS))
     return Section(
         f"{TITLE}, k_b = k_a and A_m given",
         "Model `actuator` (Eq. 23 to 25) from the pressure difference to the angle of the arm. "
@@ -76,15 +81,15 @@ def _corrected(bench: Bench, record: str) -> Section:
         f"estimates as the truth, {SAMPLES} samples and noise of {1e3 * SIGMA:g} mrad. The "
         "paper gives neither A_m nor B; ours are 5e-6 m³/rad and 1e-3 N·m·s/rad. Its k_b differs "
         "from k_a, which no record of P_a and θ can show apart from A_m (next section).",
-        [_table(found, "Table 4"), _step_table(steps, exact)],
-        _plots(found, steps, exact),
-        _checks(found, steps, exact),
+        [_estimates_table(found, "Table 4"), _step_table(steps, exact)],
+        _build_plots(found, steps, exact),
+        _build_checks(found, steps, exact),
         links=[found["improved"].run["job"]],
     )
 
 
-def _printed(bench: Bench, record: str) -> Section:
-    found = bench.methods(job(record, SECOND, "as printed, k_b by itself"))
+def _printed_section(bench: StudyBench, record: str) -> Section:
+    found = bench.compare_methods(job_body(record, SEPARATE_K_B, "as printed, k_b by itself"))
     groups = found["improved"].run["identifiability"]["groups"]
     told = "; ".join(
         f"{one['expression']} = {format_number(one['value'], 5)}"
@@ -97,94 +102,103 @@ def _printed(bench: Bench, record: str) -> Section:
         "F_c, F_max and B, by one factor leaves the angle nearly as it is (B is fixed here and "
         "hardly shows), so the data hold five numbers and a ridge."
         + (f" What lagid names instead of the single values: {told}." if told else ""),
-        [_table(found, "Table 4, as printed")],
+        [_estimates_table(found, "Table 4, as printed")],
         [Plot("Figure 20, as printed: RMS of the best individual",
-              figures.rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
+              figures.plot_rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
               "Paper: falls gradually under the proposed search. Ours: "
-              f"{_ends(found)}. A low RMS does not make six numbers out of five.")],
+              f"{_format_final_rms(found)}. A low RMS does not make six numbers out of five.")],
         links=[found["improved"].run["job"]],
     )  # fmt: skip
 
 
-def _table(found: Mapping[str, Found], title: str) -> Table:
+def _estimates_table(found: Mapping[str, MethodRun], title: str) -> ReportTable:
     rows = []
-    for name in NAMES:
-        unit = found["improved"].parameter(name)["unit"]
-        true = TRUE.get(name, TRUE["k_a"])
+    for name in PARAMETER_NAMES:
+        unit = found["improved"].get_parameter(name)["unit"]
+        true = TRUE_PARAMETERS.get(name, TRUE_PARAMETERS["k_a"])
         paper = (published.TABLE_4.simple[name], published.TABLE_4.proposed[name])
         rows.append([
             f"{name} [{unit}]", f"{true:.6g}", *(f"{value:.6g}" for value in paper),
-            *(_cell(found[method], name) for method in METHODS),
+            *(_format_cell(found[method], name) for method in METHODS),
         ])  # fmt: skip
     rows.append(["RMS [mrad]", f"{1e3 * SIGMA:g}", "", "",
                  *(f"{1e3 * found[m].run['rms']:.4f}" for m in METHODS)])  # fmt: skip
     headings = ["parameter", "true", "paper, simple", "paper, proposed"]
-    return Table(
+    return ReportTable(
         title, [*headings, *(f"ours, {m}" for m in METHODS)], rows,
         "k_a, k_b are rates in 1/s and k_c is in Pa/rad (printed without its kilo); the table of "
         "the paper says N·m/Pa of all three.",
     )  # fmt: skip
 
 
-def _cell(found: Found, name: str) -> str:
-    status = found.parameter(name)["status"]
-    text = estimate_text(found, name)
+def _format_cell(found: MethodRun, name: str) -> str:
+    status = found.get_parameter(name)["status"]
+    text = format_estimate(found, name)
     return text if status == "identified" or text.endswith(")") else f"{text} ({status})"
 
 
-def _step_table(steps: Mapping[str, Any], exact: Mapping[str, Any]) -> Table:
+def _step_table(steps: Mapping[str, Any], exact: Mapping[str, Any]) -> ReportTable:
     def row(name: str, answer: Mapping[str, Any]) -> list[str]:
         found = answer["metrics"]
         if found["runs_away"]:
-            return [name, _seconds(found["rise_time"]), "runs away", "", ""]
+            return [name, _format_seconds(found["rise_time"]), "runs away", "", ""]
         return [
-            name, _seconds(found["rise_time"]), f"{found['overshoot_percent']:.1f}",
-            _seconds(found["settling_time"]), f"{_degrees(found['steady_error']):.2f}",
+            name, _format_seconds(found["rise_time"]), f"{found['overshoot_percent']:.1f}",
+            _format_seconds(found["settling_time"]), f"{_to_degrees(found['steady_error']):.2f}",
         ]  # fmt: skip
 
-    return Table(
+    return ReportTable(
         "Step of 90° under P control, 10 kPa/rad, through the tube (1, 0.35 s, 0.127 s)",
         ["model", "rise time [s]", "overshoot [%]", "settling time [s]", "steady error [°]"],
         [row("true parameters", exact), *(row(method, steps[method]) for method in METHODS)],
     )
 
 
-def _plots(
-    found: Mapping[str, Found], steps: Mapping[str, Any], exact: Mapping[str, Any]
+def _build_plots(
+    found: Mapping[str, MethodRun], steps: Mapping[str, Any], exact: Mapping[str, Any]
 ) -> list[Plot]:
     series = exact["outputs"][0]
     heavy = {"color": theme.GREY, "width": 4}
-    data = [figures.line("true parameters", series["times"], _in_degrees(series), line=heavy)]
+    data = [
+        figures.line_trace(
+            "true parameters", series["times"], _to_degrees_series(series), line=heavy
+        )
+    ]
     for method, answer in steps.items():
         one = answer["outputs"][0]
         data.append(
-            figures.line(method, one["times"], _in_degrees(one), line=figures.style(method))
+            figures.line_trace(
+                method, one["times"], _to_degrees_series(one), line=figures.method_style(method)
+            )
         )
     level = {"color": theme.GREY, "dash": "dot", "width": 1}
     end = series["times"][-1]
-    data.append(figures.line("reference", [0, end], [90, 90], line=level))
+    data.append(figures.line_trace("reference", [0, end], [90, 90], line=level))
     return [
         Plot("Figure 20: RMS of the best individual",
-             figures.rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
+             figures.plot_rms_history(found, "mrad", 1e3 * SIGMA, scale=1e3),
              "Paper: the error becomes smaller gradually under the proposed search. "
-             f"Ours: {_ends(found)}; the noise has {1e3 * SIGMA:g} mrad."),
-        Plot("Figure 21: step response under P control", figures.chart(data, "time [s]",
+             f"Ours: {_format_final_rms(found)}; the noise has {1e3 * SIGMA:g} mrad."),
+        Plot("Figure 21: step response under P control", figures.plot_lines(data, "time [s]",
                                                                      "angle θ [°]"),
              "Paper: the response of the proposed search's model lies on the experiment's, that "
              "of the simple search beside it. Ours: the loop closed around each identified "
              "model, against the true parameters in place of the experiment."),
-        Plot("Response to the record's input", figures.responses(found),
+        Plot("Response to the record's input", figures.plot_responses(found),
              "Not in the paper: the record itself, with breaks in its course where the arm "
              "sticks, and what is left of it."),
     ]  # fmt: skip
 
 
-def _checks(
-    found: Mapping[str, Found], steps: Mapping[str, Any], exact: Mapping[str, Any]
+def _build_checks(
+    found: Mapping[str, MethodRun], steps: Mapping[str, Any], exact: Mapping[str, Any]
 ) -> list[Check]:
-    off = {name: abs(found["improved"].value(name) / value - 1) for name, value in TRUE.items()}
+    off = {
+        name: abs(found["improved"].get_estimate(name) / value - 1)
+        for name, value in TRUE_PARAMETERS.items()
+    }
     worst = max(off, key=lambda name: off[name])
-    apart = {method: _apart(answer, exact) for method, answer in steps.items()}
+    apart = {method: _greatest_distance(answer, exact) for method, answer in steps.items()}
     text = ", ".join(f"{method} {value:.2f}°" for method, value in apart.items())
     return [
         Check(f"`improved` finds each parameter within 2 % (farthest: {worst}, "
@@ -194,24 +208,24 @@ def _checks(
     ]  # fmt: skip
 
 
-def _apart(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
+def _greatest_distance(one: Mapping[str, Any], other: Mapping[str, Any]) -> float:
     """Greatest distance in degrees between two responses that may be thinned differently."""
     a, b = one["outputs"][0], other["outputs"][0]
     there = np.interp(a["times"], b["times"], b["values"])
-    return _degrees(float(np.max(np.abs(np.asarray(a["values"]) - there))))
+    return _to_degrees(float(np.max(np.abs(np.asarray(a["values"]) - there))))
 
 
-def _ends(found: Mapping[str, Found]) -> str:
+def _format_final_rms(found: Mapping[str, MethodRun]) -> str:
     return ", ".join(f"{m} ends at {1e3 * found[m].run['rms']:.3g} mrad" for m in METHODS)
 
 
-def _in_degrees(series: Mapping[str, Any]) -> list[float | None]:
-    return [None if value is None else _degrees(value) for value in series["values"]]
+def _to_degrees_series(series: Mapping[str, Any]) -> list[float | None]:
+    return [None if value is None else _to_degrees(value) for value in series["values"]]
 
 
-def _degrees(angle: float) -> float:
+def _to_degrees(angle: float) -> float:
     return angle * 180 / pi
 
 
-def _seconds(value: float | None) -> str:
+def _format_seconds(value: float | None) -> str:
     return "never" if value is None else f"{value:.2f}"

@@ -21,7 +21,7 @@ class StudyFailed(ServiceError):
 
 
 @dataclass(frozen=True, slots=True)
-class Improvement:
+class ArchipelagoImprovement:
     """A better champion of a whole archipelago."""
 
     generation: int
@@ -30,36 +30,36 @@ class Improvement:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class MethodRun:
     """One run: its result document, its champion's progress, its response."""
 
     run: Document
-    progress: Sequence[Improvement]
+    progress: Sequence[ArchipelagoImprovement]
     response: Document
 
-    def value(self, name: str) -> float:
+    def get_estimate(self, name: str) -> float:
         """An estimate."""
-        return float(self.parameter(name)["value"])
+        return float(self.get_parameter(name)["value"])
 
-    def stderr(self, name: str) -> float | None:
+    def get_standard_error(self, name: str) -> float | None:
         """Its standard error; None where there is none."""
-        found = self.parameter(name)["stderr"]
+        found = self.get_parameter(name)["stderr"]
         return None if found is None else float(found)
 
-    def parameter(self, name: str) -> Document:
+    def get_parameter(self, name: str) -> Document:
         """The entry of one parameter."""
         return next(one for one in self.run["parameters"] if one["name"] == name)
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
+class StudyBench:
     """The service that does the work. `quick` asks for smaller studies; `say` tells what is on."""
 
     client: Client
     quick: bool
     say: Callable[[str], object]
 
-    def runs(self, body: Document) -> list[dict[str, Any]]:
+    def run_job(self, body: Document) -> list[dict[str, Any]]:
         """Submit one job and wait for its runs.
 
         Raises
@@ -75,26 +75,26 @@ class Bench:
             raise StudyFailed(name, ended)
         return self.client.runs(job["id"])
 
-    def methods(self, body: Document) -> dict[str, Found]:
+    def compare_methods(self, body: Document) -> dict[str, MethodRun]:
         """One job that compares the three methods on one problem: method → what it found."""
         axes = [{"path": "/algorithm/method", "values": list(METHODS)}]
-        runs = self.runs({**body, "sweep": {"axes": axes}})
-        return {run["cell"]["/algorithm/method"]: self.found(run) for run in runs}
+        runs = self.run_job({**body, "sweep": {"axes": axes}})
+        return {run["cell"]["/algorithm/method"]: self.read_run(run) for run in runs}
 
-    def found(self, run: Document) -> Found:
+    def read_run(self, run: Document) -> MethodRun:
         """A run with its history and response."""
         history = self.client.history(run["id"])
         response = self.client.response(run["id"], max_points=RESPONSE_POINTS)
-        return Found(run, champions(history), response)
+        return MethodRun(run, champion_history(history), response)
 
 
-def champions(history: Document) -> list[Improvement]:
+def champion_history(history: Document) -> list[ArchipelagoImprovement]:
     """The best of all islands over the generations, from the history of each island."""
     points = [one for island in history["islands"] for one in island]
-    kept: list[Improvement] = []
+    kept: list[ArchipelagoImprovement] = []
     for point in sorted(points, key=lambda one: (one["generation"], -one["rms"])):
         if kept and point["rms"] >= kept[-1].rms:
             continue
         values = dict(zip(history["names"], point["parameters"], strict=True))
-        kept.append(Improvement(point["generation"], point["rms"], values))
+        kept.append(ArchipelagoImprovement(point["generation"], point["rms"], values))
     return kept

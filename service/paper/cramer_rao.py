@@ -9,10 +9,10 @@ from sysid.data.records import Channel
 from sysid.models.model import Model
 from sysid.simulation.simulate import simulate
 
-STEP = 1e-4
+RELATIVE_STEP = 1e-4
 
 
-def cramer_rao(
+def cramer_rao_bound(
     model: Model,
     inputs: list[Channel],
     true: Mapping[str, float],
@@ -29,7 +29,7 @@ def cramer_rao(
         moved = {**true, name: true[name] + shift}
         return np.asarray(simulate(model, inputs, moved, times=times).channels[0].values)
 
-    steps = {name: STEP * max(abs(value), 1e-6) for name, value in true.items()}
+    steps = {name: RELATIVE_STEP * max(abs(value), 1e-6) for name, value in true.items()}
     columns = [
         (output(name, step) - output(name, -step)) / (2 * step) for name, step in steps.items()
     ]

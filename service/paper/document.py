@@ -6,7 +6,7 @@ from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class ReportTable:
     """Rows of text under headings; the first column names the rows."""
 
     title: str
@@ -38,40 +38,40 @@ class Section:
 
     title: str
     text: str = ""
-    tables: Sequence[Table] = ()
+    tables: Sequence[ReportTable] = ()
     plots: Sequence[Plot] = ()
     checks: Sequence[Check] = ()
     links: Sequence[str] = field(default=())
 
 
-def markdown(section: Section) -> str:
+def to_markdown(section: Section) -> str:
     """The tables and statements of a section for the terminal; figures are in the report."""
     blocks = [f"## {section.title}"]
     if section.text:
         blocks.append(section.text)
     for table in section.tables:
-        blocks += [f"**{table.title}**", _rows(table)]
+        blocks += [f"**{table.title}**", _table_markdown(table)]
         if table.note:
             blocks.append(table.note)
     if section.checks:
-        blocks.append("\n".join(f"- {verdict(one)}: {one.text}" for one in section.checks))
+        blocks.append("\n".join(f"- {describe_check(one)}: {one.text}" for one in section.checks))
     return "\n\n".join(blocks) + "\n"
 
 
-def verdict(check: Check) -> str:
+def describe_check(check: Check) -> str:
     """How a check is announced."""
     return "holds" if check.holds else "does NOT hold"
 
 
-def _rows(table: Table) -> str:
+def _table_markdown(table: ReportTable) -> str:
     cells = [list(table.headings), *[list(row) for row in table.rows]]
     cells = [[cell.replace("|", "\\|") for cell in row] for row in cells]
     widths = [max(3, *(len(row[n]) for row in cells)) for n in range(len(table.headings))]
     marks = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
     lines = [cells[0], marks, *cells[1:]]
-    return "\n".join(f"| {' | '.join(_set(line, widths))} |" for line in lines)
+    return "\n".join(f"| {' | '.join(_align_cells(line, widths))} |" for line in lines)
 
 
-def _set(line: Sequence[str], widths: Sequence[int]) -> list[str]:
+def _align_cells(line: Sequence[str], widths: Sequence[int]) -> list[str]:
     first, *rest = zip(line, widths, strict=True)
     return [first[0].ljust(first[1]), *(cell.rjust(width) for cell, width in rest)]

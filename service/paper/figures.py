@@ -9,44 +9,54 @@ import numpy as np
 from service.core.text import append_unit
 from service.figures import theme
 from service.figures.data import Floats
-from service.figures.plotly import Figure, finite, layout
-from service.paper.bench import Found
+from service.figures.plotly import Figure, base_layout, to_json_numbers
+from service.paper.bench import MethodRun
 
 Line = dict[str, Any]
-_STYLES: Mapping[str, dict[str, Any]] = {
+_METHOD_STYLES: Mapping[str, dict[str, Any]] = {
     "simple": {"color": theme.VERMILLION, "dash": "dash", "width": 1.6},
     "improved-paper": {"color": theme.PURPLE, "dash": "dashdot", "width": 1.6},
     "improved": {"color": theme.BLUE, "dash": "solid", "width": 2},
 }
-HEIGHT = 320
-GAP = 0.07  # half the room between two plots, as a share of the width
+HEIGHT_PX = 320
+PLOT_GAP = 0.07  # half the room between two plots, as a share of the width
 
 
-def style(method: str) -> dict[str, Any]:
+def method_style(method: str) -> dict[str, Any]:
     """Colour and dash of a method, the same in every figure."""
-    return dict(_STYLES[method])
+    return dict(_METHOD_STYLES[method])
 
 
-def line(name: str, x: Sequence[float], y: Sequence[float | None], **looks: Any) -> Line:
+def line_trace(name: str, x: Sequence[float], y: Sequence[float | None], **looks: Any) -> Line:
     """A line of a figure."""
-    values = finite(float("nan") if v is None else v for v in y)
-    return {"type": "scatter", "mode": "lines", "name": name, "x": finite(x), "y": values, **looks}
+    values = to_json_numbers(float("nan") if v is None else v for v in y)
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "name": name,
+        "x": to_json_numbers(x),
+        "y": values,
+        **looks,
+    }
 
 
-def axis(title: str, **more: Any) -> dict[str, Any]:
+def make_axis(title: str, **more: Any) -> dict[str, Any]:
     """An axis with its title."""
     return {"title": {"text": title}, **more}
 
 
-def chart(data: list[Line], x: str, y: str, **more: Any) -> Figure:
+def plot_lines(data: list[Line], x: str, y: str, **more: Any) -> Figure:
     """One pair of axes."""
-    return {"data": data, "layout": layout(HEIGHT, **{"xaxis": axis(x), "yaxis": axis(y), **more})}
+    return {
+        "data": data,
+        "layout": base_layout(HEIGHT_PX, **{"xaxis": make_axis(x), "yaxis": make_axis(y), **more}),
+    }
 
 
-def convergence(found: Mapping[str, Found], names: Sequence[str],
+def plot_convergence(found: Mapping[str, MethodRun], names: Sequence[str],
                 true: Mapping[str, float]) -> Figure:  # fmt: skip
     """Champion's parameters over the generations, method by method, one plot a parameter."""
-    end = _end(found)
+    end = _last_generation(found)
     data: list[Line] = []
     axes: dict[str, Any] = {}
     width = 1 / len(names)
@@ -56,48 +66,50 @@ def convergence(found: Mapping[str, Found], names: Sequence[str],
         for method, one in found.items():
             x = [float(point.generation) for point in one.progress]
             y = [point.parameters[name] for point in one.progress]
-            looks = {**style(method), "shape": "hv"}
-            data.append(line(method, [*x, end], [*y, y[-1]], line=looks, **place))
+            looks = {**method_style(method), "shape": "hv"}
+            data.append(line_trace(method, [*x, end], [*y, y[-1]], line=looks, **place))
         if name in true:
             level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
-            data.append(line("true value", [0, end], [true[name]] * 2, line=level, **place))
+            data.append(line_trace("true value", [0, end], [true[name]] * 2, line=level, **place))
         last = number + 1 == len(names)
         span = {
             "domain": [
-                number * width + (GAP if number else 0),
-                (number + 1) * width - (0 if last else GAP),
+                number * width + (PLOT_GAP if number else 0),
+                (number + 1) * width - (0 if last else PLOT_GAP),
             ]
         }
-        axes[f"xaxis{tag}"] = axis("generation", anchor=f"y{tag}", rangemode="tozero", **span)
-        unit = next(iter(found.values())).parameter(name)["unit"]
-        axes[f"yaxis{tag}"] = axis(append_unit(name, unit), anchor=f"x{tag}")
-    return {"data": data, "layout": layout(HEIGHT, **axes)}
+        axes[f"xaxis{tag}"] = make_axis("generation", anchor=f"y{tag}", rangemode="tozero", **span)
+        unit = next(iter(found.values())).get_parameter(name)["unit"]
+        axes[f"yaxis{tag}"] = make_axis(append_unit(name, unit), anchor=f"x{tag}")
+    return {"data": data, "layout": base_layout(HEIGHT_PX, **axes)}
 
 
-def rms_history(
-    found: Mapping[str, Found], unit: str, noise: float | None = None, *, scale: float = 1.0
+def plot_rms_history(
+    found: Mapping[str, MethodRun], unit: str, noise: float | None = None, *, scale: float = 1.0
 ) -> Figure:
     """RMS of the champion over the generations, method by method, and the noise's deviation.
 
     `scale` turns the results' unit into `unit`, which is also that of `noise`.
     """
-    end = _end(found)
+    end = _last_generation(found)
     data = []
     for method, one in found.items():
         x = [float(point.generation) for point in one.progress]
         y = [scale * point.rms for point in one.progress]
-        looks = {**style(method), "shape": "hv"}
-        data.append(line(method, [*x, end], [*y, y[-1]], line=looks))
+        looks = {**method_style(method), "shape": "hv"}
+        data.append(line_trace(method, [*x, end], [*y, y[-1]], line=looks))
     if noise is not None:
         level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
-        data.append(line("noise", [0, end], [noise] * 2, line=level))
+        data.append(line_trace("noise", [0, end], [noise] * 2, line=level))
     values = [scale * point.rms for one in found.values() for point in one.progress]
-    marks = decades(min(values), max(values))
-    log = axis(f"RMS [{unit}]", type="log", tickvals=marks, ticktext=[f"{v:g}" for v in marks])
-    return chart(data, "generation", "", xaxis=axis("generation", rangemode="tozero"), yaxis=log)
+    marks = decade_marks(min(values), max(values))
+    log = make_axis(f"RMS [{unit}]", type="log", tickvals=marks, ticktext=[f"{v:g}" for v in marks])
+    return plot_lines(
+        data, "generation", "", xaxis=make_axis("generation", rangemode="tozero"), yaxis=log
+    )
 
 
-def decades(low: float, high: float) -> list[float]:
+def decade_marks(low: float, high: float) -> list[float]:
     """Marks 1, 2, 5, 10 … of a logarithmic axis around what is drawn; Plotly's own drop zeros."""
     if not 0 < low <= high:
         return []
@@ -109,46 +121,50 @@ def decades(low: float, high: float) -> list[float]:
     return kept if len(kept) <= 9 else [v for v in kept if f"{v:e}".startswith("1")]
 
 
-def responses(found: Mapping[str, Found], experiment: int = 0) -> Figure:
+def plot_responses(found: Mapping[str, MethodRun], experiment: int = 0) -> Figure:
     """The measured output and what each method's model gives; below, what is left of it."""
     first = next(iter(found.values())).response["experiments"][experiment]["measured"][0]
     dots = {"mode": "markers", "marker": {"color": theme.GREY, "size": 4}}
-    data = [line("measured", first["times"], first["values"], **dots)]
+    data = [line_trace("measured", first["times"], first["values"], **dots)]
     for method, one in found.items():
         shown = one.response["experiments"][experiment]
         series, measured = shown["simulated"][0], shown["measured"][0]
-        looks = style(method)
-        data.append(line(method, series["times"], series["values"], line=looks))
-        there = np.interp(measured["times"], series["times"], _numbers(series["values"]))
-        rest = (_numbers(measured["values"]) - there).tolist()
+        looks = method_style(method)
+        data.append(line_trace(method, series["times"], series["values"], line=looks))
+        there = np.interp(measured["times"], series["times"], _to_array(series["values"]))
+        rest = (_to_array(measured["values"]) - there).tolist()
         thin = {**looks, "width": 1}
-        data.append(line(method, measured["times"], rest, line=thin, yaxis="y2", showlegend=False))
+        data.append(
+            line_trace(method, measured["times"], rest, line=thin, yaxis="y2", showlegend=False)
+        )
     unit = first["unit"]
     axes = {
-        "xaxis": axis("time [s]", anchor="y2"),
-        "yaxis": axis(append_unit(first["name"], unit), domain=[0.42, 1]),
-        "yaxis2": axis(append_unit("residual", unit), domain=[0, 0.32], nticks=4),
+        "xaxis": make_axis("time [s]", anchor="y2"),
+        "yaxis": make_axis(append_unit(first["name"], unit), domain=[0.42, 1]),
+        "yaxis2": make_axis(append_unit("residual", unit), domain=[0, 0.32], nticks=4),
     }
-    return {"data": data, "layout": layout(HEIGHT + 100, **axes)}
+    return {"data": data, "layout": base_layout(HEIGHT_PX + 100, **axes)}
 
 
-def _numbers(values: Sequence[float | None]) -> Floats:
+def _to_array(values: Sequence[float | None]) -> Floats:
     return np.array([np.nan if v is None else v for v in values], dtype=np.float64)
 
 
-def band(x: Sequence[float], lower: Sequence[float], upper: Sequence[float], method: str) -> Line:
+def band_trace(
+    x: Sequence[float], lower: Sequence[float], upper: Sequence[float], method: str
+) -> Line:
     """The area between two lines, in the method's colour."""
-    colour = theme.SHADE if method == "" else theme.fade(style(method)["color"], 0.16)
+    colour = theme.SHADE if method == "" else theme.fade(method_style(method)["color"], 0.16)
     around = [*x, *reversed(x)], [*upper, *reversed(lower)]
-    return line("", *around, fill="toself", fillcolor=colour, line={"width": 0},
+    return line_trace("", *around, fill="toself", fillcolor=colour, line={"width": 0},
                 hoverinfo="skip", showlegend=False)  # fmt: skip
 
 
-def points(name: str, x: Sequence[float], y: Sequence[float], method: str) -> Line:
+def marker_trace(name: str, x: Sequence[float], y: Sequence[float], method: str) -> Line:
     """Single runs of a method."""
-    marker = {"color": style(method)["color"], "size": 4, "opacity": 0.45}
-    return line(name, x, y, mode="markers", marker=marker, showlegend=False)
+    marker = {"color": method_style(method)["color"], "size": 4, "opacity": 0.45}
+    return line_trace(name, x, y, mode="markers", marker=marker, showlegend=False)
 
 
-def _end(found: Mapping[str, Found]) -> float:
+def _last_generation(found: Mapping[str, MethodRun]) -> float:
     return float(max(one.run["generations"] for one in found.values()))

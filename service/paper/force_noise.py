@@ -7,61 +7,69 @@ import numpy as np
 
 from service.client.calls import ProblemError
 from service.paper import figures, published
-from service.paper.bench import METHODS, Bench
-from service.paper.document import Plot, Section, Table
+from service.paper.bench import METHODS, StudyBench
+from service.paper.document import Plot, ReportTable, Section
 from service.paper.oscillators import EXAMPLE_1
 
-LEVELS = (0.1, 0.5, 1.0, 2.0)
-PRINTED = (0.01, 0.1)  # m
+FORCE_SIGMAS = (0.1, 0.5, 1.0, 2.0)
+PRINTED_SIGMAS = (0.01, 0.1)  # m
 # φ(t) in Eq. 13 is a force, so it comes into the recursion with h²/m; Eq. 16 adds it bare.
-BARE = "q(k-2))/m"
-TERMS = {
+BARE_TERM = "q(k-2))/m"
+NOISE_TERMS = {
     "force": ("q(k-2) - sigma*phi(k-2))/m", "N"),
     "printed": ("q(k-2))/m + sigma*phi(k-2)", "m"),
 }  # fmt: skip
-DRAWS = 20
+N_DRAWS = 20
 # Draws of unit deviation, one a channel; the models scale them.
-NOISE = {
+NOISE_MODEL = {
     "name": "noise", "form": "difference", "states": {"x": "1"}, "equations": {"x": "0"},
-    "outputs": {f"phi_{n}": "x" for n in range(DRAWS)}, "initial": {"x": 0},
+    "outputs": {f"phi_{n}": "x" for n in range(N_DRAWS)}, "initial": {"x": 0},
 }  # fmt: skip
-SHARED = {"samples": published.SAMPLES, "sample_time": published.SAMPLE_TIME}
+SAMPLING = {"samples": published.SAMPLES, "sample_time": published.SAMPLE_TIME}
 
 
-def document(known: Mapping[str, Any], kind: str) -> dict[str, Any]:
+def model_document(known: Mapping[str, Any], kind: str) -> dict[str, Any]:
     """Example 1's recursion with φ as a second input."""
-    after, unit = TERMS[kind]
+    after, unit = NOISE_TERMS[kind]
     equation = str(known["equations"]["x"])
-    if equation.count(BARE) != 1:
-        raise ValueError(f"the recursion {equation!r} has no {BARE!r} to put the noise beside")
+    if equation.count(BARE_TERM) != 1:
+        raise ValueError(f"the recursion {equation!r} has no {BARE_TERM!r} to put the noise beside")
     return {
         **known, "name": f"duffing-{kind}-noise", "inputs": {**known["inputs"], "phi": "1"},
         "parameters": {**known["parameters"], "sigma": {"lower": 0, "upper": 10, "unit": unit}},
-        "equations": {"x": equation.replace(BARE, after)},
+        "equations": {"x": equation.replace(BARE_TERM, after)},
     }  # fmt: skip
 
 
-def section(bench: Bench, exact: str) -> Section:
+def build_section(bench: StudyBench, exact: str) -> Section:
     """Both ways; `exact` is the dataset without any noise."""
     draws = 3 if bench.quick else 8
     known = bench.client.model(EXAMPLE_1.recursion)["document"]
     bench.say("paper Figure 15: records with noise inside the equation")
     noise = bench.client.simulate_dataset({
-        **SHARED, "name": "φ of Eq. 13, unit deviation", "model": NOISE,
+        **SAMPLING, "name": "φ of Eq. 13, unit deviation", "model": NOISE_MODEL,
         "noise": {"sigma": 1.0, "seed": 1},
     })["id"]  # fmt: skip
-    force, printed = (document(known, kind) for kind in TERMS)
+    force, printed = (model_document(known, kind) for kind in NOISE_TERMS)
     records = [
-        (sigma, _record(bench, force, noise, sigma, draw))
-        for sigma in LEVELS for draw in range(draws)
+        (sigma, _simulate_record(bench, force, noise, sigma, draw))
+        for sigma in FORCE_SIGMAS for draw in range(draws)
     ]  # fmt: skip
     kept = [(sigma, record) for sigma, record in records if record is not None]
-    runs = bench.runs(job(kept, exact))
+    runs = bench.run_job(job_body(kept, exact))
     lost = [
-        (sigma, sum(_record(bench, printed, noise, sigma, draw) is None for draw in range(DRAWS)))
-        for sigma in PRINTED
+        (
+            sigma,
+            sum(
+                _simulate_record(bench, printed, noise, sigma, draw) is None
+                for draw in range(N_DRAWS)
+            ),
+        )
+        for sigma in PRINTED_SIGMAS
     ]
-    medians = {method: [_median(runs, method, sigma) for sigma in LEVELS] for method in METHODS}
+    medians = {
+        method: [_median_error(runs, method, sigma) for sigma in FORCE_SIGMAS] for method in METHODS
+    }
     return Section(
         "Figure 15, the noise inside the equation",
         "Eq. 13 has φ(t) beside the force q(t), so in Eq. 16 it ought to be h²φ(k)/m; there it "
@@ -69,14 +77,14 @@ def section(bench: Bench, exact: str) -> Section:
         f"{draws} draws for each σ, identified without knowledge of φ, the error taken against "
         "the response without φ. As printed, φ(k) is added to the displacement at every step.",
         [
-            Table("φ as a force: median error of the identified response [m]", ["σ [N]", *METHODS],
+            ReportTable("φ as a force: median error of the identified response [m]", ["σ [N]", *METHODS],
                   [[f"{sigma:g}", *(f"{medians[m][n]:.4f}" for m in METHODS)]
-                   for n, sigma in enumerate(LEVELS)]),
-            Table(f"φ as printed: records that diverge within 300 samples, of {DRAWS} draws",
+                   for n, sigma in enumerate(FORCE_SIGMAS)]),
+            ReportTable(f"φ as printed: records that diverge within 300 samples, of {N_DRAWS} draws",
                   ["", *(f"σ = {sigma:g} m" for sigma, _ in lost)],
                   [["diverge", *(str(count) for _, count in lost)]]),
         ],
-        [Plot("Figure 15: φ as a force", _figure(runs, medians),
+        [Plot("Figure 15: φ as a force", _plot_errors(runs, medians),
               "Paper: low up to σ about 0.5, then rising. Ours: medians and single runs. Force "
               "noise bends the estimates of every method alike, since a search for the free "
               "run's error takes the motion that φ made for the system's own.")],
@@ -84,7 +92,7 @@ def section(bench: Bench, exact: str) -> Section:
     )  # fmt: skip
 
 
-def job(records: Sequence[tuple[float, str]], exact: str) -> dict[str, Any]:
+def job_body(records: Sequence[tuple[float, str]], exact: str) -> dict[str, Any]:
     """Body of the job: every record with every method."""
     return {
         "name": "paper Figure 15: force noise", "model": EXAMPLE_1.recursion,
@@ -98,13 +106,15 @@ def job(records: Sequence[tuple[float, str]], exact: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _record(bench: Bench, model: dict[str, Any], noise: str, sigma: float, draw: int) -> str | None:
+def _simulate_record(
+    bench: StudyBench, model: dict[str, Any], noise: str, sigma: float, draw: int
+) -> str | None:
     """A record of the model driven by q and by a draw of φ; None if it diverges."""
     wave = {"kind": "cosine", "amplitude": published.AMPLITUDE, "omega": published.OMEGA}
     phi = {"kind": "dataset", "dataset": noise, "channel": f"phi_{draw}"}
     try:
         made = bench.client.simulate_dataset({
-            **SHARED, "name": f"paper example 1, φ of σ {sigma:g}, draw {draw}", "model": model,
+            **SAMPLING, "name": f"paper example 1, φ of σ {sigma:g}, draw {draw}", "model": model,
             "parameters": {**EXAMPLE_1.true, "sigma": sigma}, "inputs": {"q": wave, "phi": phi},
         })  # fmt: skip
     except ProblemError as problem:
@@ -114,7 +124,7 @@ def _record(bench: Bench, model: dict[str, Any], noise: str, sigma: float, draw:
     return str(made["id"])
 
 
-def _of(runs: Sequence[Mapping[str, Any]], method: str, sigma: float) -> list[float]:
+def _select_errors(runs: Sequence[Mapping[str, Any]], method: str, sigma: float) -> list[float]:
     return [
         run["rms_validation"] for run in runs
         if run["cell"]["/algorithm/method"] == method and run["labels"]["sigma"] == sigma
@@ -122,18 +132,24 @@ def _of(runs: Sequence[Mapping[str, Any]], method: str, sigma: float) -> list[fl
     ]  # fmt: skip
 
 
-def _median(runs: Sequence[Mapping[str, Any]], method: str, sigma: float) -> float:
-    return float(np.median(_of(runs, method, sigma)))
+def _median_error(runs: Sequence[Mapping[str, Any]], method: str, sigma: float) -> float:
+    return float(np.median(_select_errors(runs, method, sigma)))
 
 
-def _figure(
+def _plot_errors(
     runs: Sequence[Mapping[str, Any]], medians: Mapping[str, Sequence[float]]
 ) -> dict[str, Any]:
     data = []
     for method in METHODS:
-        single = [(sigma, value) for sigma in LEVELS for value in _of(runs, method, sigma)]
-        data += [
-            figures.points(method, [s for s, _ in single], [v for _, v in single], method),
-            figures.line(method, list(LEVELS), medians[method], line=figures.style(method)),
+        single = [
+            (sigma, value)
+            for sigma in FORCE_SIGMAS
+            for value in _select_errors(runs, method, sigma)
         ]
-    return figures.chart(data, "standard deviation of φ [N]", "RMS error [m]")
+        data += [
+            figures.marker_trace(method, [s for s, _ in single], [v for _, v in single], method),
+            figures.line_trace(
+                method, list(FORCE_SIGMAS), medians[method], line=figures.method_style(method)
+            ),
+        ]
+    return figures.plot_lines(data, "standard deviation of φ [N]", "RMS error [m]")

@@ -10,16 +10,16 @@ import numpy as np
 from service.figures import theme
 from service.paper import figures, published
 from service.paper import force_noise as forces
-from service.paper.bench import METHODS, Bench
-from service.paper.document import Check, Plot, Section, Table
-from service.paper.oscillators import EXAMPLE_1, dataset, readings
+from service.paper.bench import METHODS, StudyBench
+from service.paper.document import Check, Plot, ReportTable, Section
+from service.paper.oscillators import EXAMPLE_1, list_readings, record_body
 
 SIGMAS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 QUANTILES = (0.1, 0.5, 0.9)
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class ReplicateErrors:
     """What the replicates of one σ and one method gave."""
 
     sigma: float
@@ -27,13 +27,13 @@ class Spread:
     quantiles: tuple[float, float, float]
 
 
-def clean(samples: int) -> dict[str, Any]:
+def noise_free_body(samples: int) -> dict[str, Any]:
     """Body of a record without noise."""
-    return {**dataset(EXAMPLE_1, readings(EXAMPLE_1)[0]), "name": "paper example 1, no noise",
+    return {**record_body(EXAMPLE_1, list_readings(EXAMPLE_1)[0]), "name": "paper example 1, no noise",
             "samples": samples, "noise": {"sigma": 0.0}}  # fmt: skip
 
 
-def job(record: str, exact: str, replicates: int) -> dict[str, Any]:
+def job_body(record: str, exact: str, replicates: int) -> dict[str, Any]:
     """Body of the sweep: noise is added to `record`, and the RMS on `exact` is the model's error.
 
     They must be two datasets; one has a sample more.
@@ -51,9 +51,11 @@ def job(record: str, exact: str, replicates: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def spreads(runs: Sequence[dict[str, Any]], field: str) -> dict[str, list[Spread]]:
+def group_replicates(
+    runs: Sequence[dict[str, Any]], field: str
+) -> dict[str, list[ReplicateErrors]]:
     """Quantiles of one field of the results over the replicates, by method and σ."""
-    found: dict[str, list[Spread]] = {}
+    found: dict[str, list[ReplicateErrors]] = {}
     for method in METHODS:
         for sigma in SIGMAS:
             values = [
@@ -62,31 +64,32 @@ def spreads(runs: Sequence[dict[str, Any]], field: str) -> dict[str, list[Spread
                 and run["cell"]["/noise/sigma"] == sigma and run[field] is not None
             ]  # fmt: skip
             low, middle, high = (float(q) for q in np.quantile(values, QUANTILES))
-            found.setdefault(method, []).append(Spread(sigma, values, (low, middle, high)))
+            found.setdefault(method, []).append(ReplicateErrors(sigma, values, (low, middle, high)))
     return found
 
 
-def floor(sigma: float) -> float:
+def response_floor(sigma: float) -> float:
     """Error of the response (RMS) when the parameters reach the Cramér–Rao bound: σ √(p/N)."""
     return sigma * sqrt(len(EXAMPLE_1.true) / published.SAMPLES)
 
 
-def sections(bench: Bench) -> list[Section]:
+def build_sections(bench: StudyBench) -> list[Section]:
     """The sweep as a table and two figures."""
     replicates = 3 if bench.quick else 20
     record, exact = (
-        bench.client.simulate_dataset(clean(published.SAMPLES + more))["id"] for more in (0, 1)
+        bench.client.simulate_dataset(noise_free_body(published.SAMPLES + more))["id"]
+        for more in (0, 1)
     )
-    runs = bench.runs(job(record, exact, replicates))
-    errors, fits = spreads(runs, "rms_validation"), spreads(runs, "rms")
+    runs = bench.run_job(job_body(record, exact, replicates))
+    errors, fits = group_replicates(runs, "rms_validation"), group_replicates(runs, "rms")
     return [Section(
         "Figure 15: noise and RMS error",
         f"Example 1, Eq. 16 with cos(ωhk); white Gaussian noise on the displacement, "
         f"{replicates} draws of noise and of the search for each σ, {len(runs)} identifications "
         "in one job. Error: the identified response against the response without noise.",
-        [_table(errors)],
+        [_median_table(errors)],
         [
-            Plot("Figure 15: error of the identified response", figure(errors, True),
+            Plot("Figure 15: error of the identified response", plot_spread(errors, True),
                  "Paper: round marks stay low up to σ about 0.5, then rise. Ours: median (line), "
                  "10 to 90 % (band) and single runs (points). The error of `improved` grows in "
                  "proportion to σ from the start, along the floor σ√(p/N), without a knee. The "
@@ -96,16 +99,16 @@ def sections(bench: Bench) -> list[Section]:
                  "either, so there the simple one is no worse; the parameters' bounds hold all "
                  "below the floor, which knows no bounds."),
             Plot("Figure 15, measured otherwise: RMS against the noisy record",
-                 figure(fits, False),
+                 plot_spread(fits, False),
                  "The paper does not say against which record. Against the noisy one every RMS "
                  "is at least about σ, so it shows the noise and not the identification."),
         ],
-        _checks(errors),
+        _build_checks(errors),
         links=[runs[0]["job"]],
-    ), forces.section(bench, exact)]  # fmt: skip
+    ), forces.build_section(bench, exact)]  # fmt: skip
 
 
-def figure(found: dict[str, list[Spread]], with_floor: bool) -> dict[str, Any]:
+def plot_spread(found: dict[str, list[ReplicateErrors]], with_floor: bool) -> dict[str, Any]:
     """Median, band and points over σ."""
     data = []
     for method, spread in found.items():
@@ -113,28 +116,30 @@ def figure(found: dict[str, list[Spread]], with_floor: bool) -> dict[str, Any]:
         low, middle, high = ([one.quantiles[n] for one in spread] for n in range(3))
         single = [(one.sigma, value) for one in spread for value in one.values]
         data += [
-            figures.band(x, low, high, method),
-            figures.points(method, [s for s, _ in single], [v for _, v in single], method),
-            figures.line(method, x, middle, line=figures.style(method)),
+            figures.band_trace(x, low, high, method),
+            figures.marker_trace(method, [s for s, _ in single], [v for _, v in single], method),
+            figures.line_trace(method, x, middle, line=figures.method_style(method)),
         ]
     level = {"color": theme.GREY, "dash": "dot", "width": 1.6}
     name = "Cramér–Rao floor σ√(p/N)" if with_floor else "σ"
-    least = [floor(s) if with_floor else s for s in SIGMAS]
-    data.append(figures.line(name, list(SIGMAS), least, line=level))
-    return figures.chart(data, "standard deviation of the noise σ [m]", "RMS error [m]")
+    least = [response_floor(s) if with_floor else s for s in SIGMAS]
+    data.append(figures.line_trace(name, list(SIGMAS), least, line=level))
+    return figures.plot_lines(data, "standard deviation of the noise σ [m]", "RMS error [m]")
 
 
-def _table(found: dict[str, list[Spread]]) -> Table:
+def _median_table(found: dict[str, list[ReplicateErrors]]) -> ReportTable:
     rows = [
         [f"{sigma:g}", *(f"{found[method][n].quantiles[1]:.4f}" for method in METHODS),
-         f"{floor(sigma):.4f}"]
+         f"{response_floor(sigma):.4f}"]
         for n, sigma in enumerate(SIGMAS)
     ]  # fmt: skip
-    return Table("Median error [m]", ["σ [m]", *METHODS, "Cramér–Rao floor"], rows)
+    return ReportTable("Median error [m]", ["σ [m]", *METHODS, "Cramér–Rao floor"], rows)
 
 
-def _checks(found: dict[str, list[Spread]]) -> list[Check]:
-    ratios = [one.quantiles[1] / floor(one.sigma) for one in found["improved"] if one.sigma > 0]
+def _build_checks(found: dict[str, list[ReplicateErrors]]) -> list[Check]:
+    ratios = [
+        one.quantiles[1] / response_floor(one.sigma) for one in found["improved"] if one.sigma > 0
+    ]
     worst = max(
         found["improved"][n].quantiles[1] / found["simple"][n].quantiles[1]
         for n, sigma in enumerate(SIGMAS) if 0 < sigma <= 0.2

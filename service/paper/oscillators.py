@@ -9,10 +9,10 @@ import numpy as np
 from service.core.text import format_number, join_estimate
 from service.figures.data import Floats
 from service.paper import figures, published
-from service.paper.bench import METHODS, Bench, Found
-from service.paper.cramer_rao import cramer_rao
-from service.paper.document import Check, Plot, Section, Table
-from service.paper.published import Columns
+from service.paper.bench import METHODS, MethodRun, StudyBench
+from service.paper.cramer_rao import cramer_rao_bound
+from service.paper.document import Check, Plot, ReportTable, Section
+from service.paper.published import PublishedColumns
 from sysid.data.records import Channel
 from sysid.models.catalogue.load import load_model
 
@@ -25,14 +25,14 @@ class Example:
     table: int
     figures: tuple[int, int, int, int]  # first parameters, last parameters, RMS, response
     true: Mapping[str, float]
-    columns: Columns
+    columns: PublishedColumns
     recursion: str
     continuous: str
-    stops: str  # what the paper says of the simple search
+    simple_search_remark: str  # what the paper says of the simple search
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class EquationReading:
     """How the equations are read: the model, and the input's frequency as rad/s."""
 
     title: str
@@ -51,18 +51,18 @@ EXAMPLE_2 = Example(
 )  # fmt: skip
 
 
-def readings(example: Example) -> list[Reading]:
+def list_readings(example: Example) -> list[EquationReading]:
     """The corrected reading first, then the differential equation, then the letter."""
     return [
-        Reading(
+        EquationReading(
             "Eq. 16 with cos(ωhk)", example.recursion, published.OMEGA,
             "the paper's recursion, the input sampled at the times hk",
         ),
-        Reading(
+        EquationReading(
             "Eq. 13 itself", example.continuous, published.OMEGA,
             "the delay differential equation, which the recursion approximates",
         ),
-        Reading(
+        EquationReading(
             "Eq. 16 as printed, cos(ωk)", example.recursion,
             published.OMEGA / published.SAMPLE_TIME,
             "the input as printed, without h: 250 rad/s, which samples 0.02 s apart cannot follow",
@@ -70,7 +70,7 @@ def readings(example: Example) -> list[Reading]:
     ]  # fmt: skip
 
 
-def dataset(example: Example, reading: Reading) -> dict[str, Any]:
+def record_body(example: Example, reading: EquationReading) -> dict[str, Any]:
     """Body of the record: the reading's model with the true parameters and measurement noise."""
     wave = {"kind": "cosine", "amplitude": published.AMPLITUDE, "omega": reading.omega}
     return {
@@ -80,7 +80,7 @@ def dataset(example: Example, reading: Reading) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def job(example: Example, reading: Reading, record: str) -> dict[str, Any]:
+def job_body(example: Example, reading: EquationReading, record: str) -> dict[str, Any]:
     """Body of the job, with the settings of section 4."""
     return {
         "name": f"paper Table {example.table}: {reading.title}", "model": reading.model,
@@ -88,64 +88,66 @@ def job(example: Example, reading: Reading, record: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def sections(bench: Bench, example: Example) -> list[Section]:
+def build_sections(bench: StudyBench, example: Example) -> list[Section]:
     """One section for each reading."""
-    return [_section(bench, example, reading) for reading in readings(example)]
+    return [_build_section(bench, example, reading) for reading in list_readings(example)]
 
 
-def _section(bench: Bench, example: Example, reading: Reading) -> Section:
-    record = bench.client.simulate_dataset(dataset(example, reading))
-    found = bench.methods(job(example, reading, record["id"]))
-    least = bound(example, reading)
+def _build_section(bench: StudyBench, example: Example, reading: EquationReading) -> Section:
+    record = bench.client.simulate_dataset(record_body(example, reading))
+    found = bench.compare_methods(job_body(example, reading, record["id"]))
+    least = reading_bound(example, reading)
     return Section(
         f"Table {example.table}, Figures {example.figures[0]} to {example.figures[-1]}: "
         f"Example {example.number}, {reading.title}",
         f"Model `{reading.model}`: {reading.remark}. {published.SAMPLES} samples, "
         f"h = {published.SAMPLE_TIME:g} s, measurement noise of sd {published.SIGMA:g} m.",
-        [estimates(example, found, least), efforts(found)],
-        plots(example, found),
-        checks(example, found, least),
+        [estimates_table(example, found, least), efforts_table(found)],
+        build_plots(example, found),
+        build_checks(example, found, least),
         links=[found["improved"].run["job"]],
     )
 
 
-def bound(example: Example, reading: Reading) -> dict[str, float]:
+def reading_bound(example: Example, reading: EquationReading) -> dict[str, float]:
     """The Cramér–Rao bound of the reading's record."""
     times = np.arange(published.SAMPLES, dtype=np.float64) * published.SAMPLE_TIME
     force: Floats = published.AMPLITUDE * np.cos(reading.omega * times)
     inputs = [Channel("q", times, force, "N")]
-    return cramer_rao(load_model(reading.model), inputs, example.true, published.SIGMA, times)
+    return cramer_rao_bound(load_model(reading.model), inputs, example.true, published.SIGMA, times)
 
 
-def estimates(example: Example, found: Mapping[str, Found], least: Mapping[str, float]) -> Table:
+def estimates_table(
+    example: Example, found: Mapping[str, MethodRun], least: Mapping[str, float]
+) -> ReportTable:
     """The paper's columns beside ours, with standard errors and the bound."""
     rows = []
     for name, true in example.true.items():
-        unit = found["improved"].parameter(name)["unit"]
+        unit = found["improved"].get_parameter(name)["unit"]
         rows.append([
             f"{name} [{unit}]", f"{true:g}", f"{example.columns.simple[name]:.6f}",
             f"{example.columns.proposed[name]:.6f}",
-            *(estimate_text(found[method], name) for method in METHODS),
+            *(format_estimate(found[method], name) for method in METHODS),
             format_number(least[name], 2),
         ])  # fmt: skip
     for name, true in example.true.items():
         printed = (example.columns.simple[name], example.columns.proposed[name])
-        ours = [found[method].value(name) for method in METHODS]
+        ours = [found[method].get_estimate(name) for method in METHODS]
         rows.append([
             f"error of {name}", "", *(f"{abs(value - true):.4f}" for value in (*printed, *ours)),
             "",
         ])  # fmt: skip
-    return Table(
+    return ReportTable(
         f"Table {example.table}",
         ["parameter", "true", "paper, simple", "paper, proposed",
          *(f"ours, {method}" for method in METHODS), "Cramér–Rao sd"],
         rows,
         "Ours: estimate ± standard error. The paper's draw of the noise is not known; its columns "
-        f"are the same under every reading. {_against_bound(example, least)}",
+        f"are the same under every reading. {_compare_with_bound(example, least)}",
     )  # fmt: skip
 
 
-def _against_bound(example: Example, least: Mapping[str, float]) -> str:
+def _compare_with_bound(example: Example, least: Mapping[str, float]) -> str:
     """How the paper's errors compare with what any unbiased estimator can reach on average."""
     ratios = {
         name: abs(example.columns.proposed[name] - true) / least[name]
@@ -161,15 +163,15 @@ def _against_bound(example: Example, least: Mapping[str, float]) -> str:
     return f"{told}."
 
 
-def estimate_text(found: Found, name: str) -> str:
+def format_estimate(found: MethodRun, name: str) -> str:
     """An estimate with its standard error; why there is none where there is none."""
-    text = join_estimate(found.value(name), found.stderr(name))
-    return text if "±" in text else f"{text} ({found.parameter(name)['status']})"
+    text = join_estimate(found.get_estimate(name), found.get_standard_error(name))
+    return text if "±" in text else f"{text} ({found.get_parameter(name)['status']})"
 
 
-def efforts(found: Mapping[str, Found]) -> Table:
+def efforts_table(found: Mapping[str, MethodRun]) -> ReportTable:
     """RMS and number of simulations of each method."""
-    return Table(
+    return ReportTable(
         "Search", ["", *METHODS],
         [
             ["RMS [m]", *(f"{found[m].run['rms']:.6f}" for m in METHODS)],
@@ -178,32 +180,32 @@ def efforts(found: Mapping[str, Found]) -> Table:
     )  # fmt: skip
 
 
-def plots(example: Example, found: Mapping[str, Found]) -> list[Plot]:
+def build_plots(example: Example, found: Mapping[str, MethodRun]) -> list[Plot]:
     """The four figures of an example."""
     names = list(example.true)
     firsts, lasts, rms, response = example.figures
-    ends = {method: _off(found[method], example.true) for method in METHODS}
+    ends = {method: _absolute_errors(found[method], example.true) for method in METHODS}
     reached = {method: found[method].run["rms"] for method in METHODS}
     return [
         Plot(
             f"Figure {number}: convergence of {' and '.join(pair)}",
-            figures.convergence(found, pair, example.true),
+            figures.plot_convergence(found, pair, example.true),
             "Paper: the proposed search goes on to the true values after the simple one has "
-            f"stopped. Ours: {_ends(ends, pair)}",
+            f"stopped. Ours: {_describe_ends(ends, pair)}",
         )
         for number, pair in ((firsts, names[:2]), (lasts, names[2:]))
     ] + [
         Plot(
             f"Figure {rms}: RMS of the best individual",
-            figures.rms_history(found, "m", published.SIGMA),
-            f"Paper: the simple search {example.stops}"
+            figures.plot_rms_history(found, "m", published.SIGMA),
+            f"Paper: the simple search {example.simple_search_remark}"
             ", the proposed one goes on in steps. Ours: "
             + ", ".join(f"{method} ends at {value:.5f} m" for method, value in reached.items())
             + f"; the noise alone has {published.SIGMA:g} m.",
         ),
         Plot(
             f"Figure {response}: responses",
-            figures.responses(found),
+            figures.plot_responses(found),
             "Paper: the simple search leaves a visible residual, the proposed one lies on the "
             "exact solution. Ours: RMS over the sd of the noise is "
             + ", ".join(f"{value / published.SIGMA:.2f} ({m})" for m, value in reached.items())
@@ -212,11 +214,11 @@ def plots(example: Example, found: Mapping[str, Found]) -> list[Plot]:
     ]  # fmt: skip
 
 
-def _off(found: Found, true: Mapping[str, float]) -> dict[str, float]:
-    return {name: abs(found.value(name) - value) for name, value in true.items()}
+def _absolute_errors(found: MethodRun, true: Mapping[str, float]) -> dict[str, float]:
+    return {name: abs(found.get_estimate(name) - value) for name, value in true.items()}
 
 
-def _ends(ends: Mapping[str, Mapping[str, float]], names: list[str]) -> str:
+def _describe_ends(ends: Mapping[str, Mapping[str, float]], names: list[str]) -> str:
     parts = [
         f"{method} ends {' and '.join(f'{off[name]:.2g} from {name}' for name in names)}"
         for method, off in ends.items()
@@ -224,11 +226,13 @@ def _ends(ends: Mapping[str, Mapping[str, float]], names: list[str]) -> str:
     return "; ".join(parts) + "."
 
 
-def checks(example: Example, found: Mapping[str, Found], least: Mapping[str, float]) -> list[Check]:
+def build_checks(
+    example: Example, found: Mapping[str, MethodRun], least: Mapping[str, float]
+) -> list[Check]:
     """What this study says about the paper's claim and about the data."""
     rms = {method: found[method].run["rms"] for method in METHODS}
     ours = found["improved"]
-    within = {name: abs(ours.value(name) - true) / least[name]
+    within = {name: abs(ours.get_estimate(name) - true) / least[name]
               for name, true in example.true.items()}  # fmt: skip
     worst = max(within, key=lambda name: within[name])
     return [

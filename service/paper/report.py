@@ -5,21 +5,21 @@ from datetime import UTC, datetime
 
 from markupsafe import Markup
 
-from service.figures.embed import as_json, bare, templates
+from service.figures.embed import strip_template, templates_json, to_script_json
 from service.pages import report as jobs
-from service.pages.render import render, style
-from service.paper.document import Plot, Section, verdict
+from service.pages.render import load_stylesheet, render_template
+from service.paper.document import Plot, Section, describe_check
 
 
-def page(sections: Sequence[Section], *, quick: bool) -> str:
+def render_report(sections: Sequence[Section], *, quick: bool) -> str:
     """The report: tables, figures with captions, and what held."""
-    return render(
+    return render_template(
         "paper.html", sections=sections, made=datetime.now(UTC), quick=quick,
-        policy=jobs.policy(), style=style(), plotly_code=jobs.plotly(), draw=jobs.draw(),
-        templates=templates(),
-        figure_json=_figure_json, verdict=verdict,
+        policy=jobs.security_policy(), style=load_stylesheet(), plotly_code=jobs.plotly_script(), draw=jobs.draw_script(),
+        templates=templates_json(),
+        figure_json=_figure_json, verdict=describe_check,
     )  # fmt: skip
 
 
 def _figure_json(plot: Plot) -> Markup:
-    return as_json(bare(dict(plot.figure)))
+    return to_script_json(strip_template(dict(plot.figure)))

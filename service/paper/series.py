@@ -6,17 +6,17 @@ from typing import Any
 from service.core.text import format_number
 from service.figures import theme
 from service.paper import figures
-from service.paper.bench import Bench
-from service.paper.document import Plot, Section, Table
+from service.paper.bench import StudyBench
+from service.paper.document import Plot, ReportTable, Section
 
-RATE, END = 0.8, 5.0
+RATE, END_TIME = 0.8, 5.0
 TERMS = (1, 2, 3, 4, 5)
 # As printed, y(kT+1) follows y(kT): one second later. That is a step only where T is one second.
 READINGS = (("as printed: y(kT + 1), so T = 1 s", 1.0),
             ("as corrected: y((k + 1)T), T = 0.02 s", 0.02))  # fmt: skip
 
 
-def document(n: int) -> dict[str, Any]:
+def model_document(n: int) -> dict[str, Any]:
     """Model document of Eq. 7 with terms up to power n."""
     powers = [f"(L*h*(k-1))**{i}/{factorial(i)}" for i in range(1, n + 1)]
     return {
@@ -27,25 +27,27 @@ def document(n: int) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def exact(t: float) -> float:
+def exact_solution(t: float) -> float:
     """The solution of Eq. 4 that starts at 0."""
     return (exp(RATE * t) - 1) / RATE
 
 
-def sections(bench: Bench) -> list[Section]:
+def build_sections(bench: StudyBench) -> list[Section]:
     """One section with both readings."""
     rows, plots = [], []
     for title, period in READINGS:
         bench.say(f"paper Figures 2 and 3, {title}")
-        lines = {n: _simulated(bench, n, period) for n in TERMS}
-        rows.append([title, *(format_number(y[-1] - exact(t[-1])) for t, y in lines.values())])
-        plots += _plots(title, lines)
+        lines = {n: _simulate_series(bench, n, period) for n in TERMS}
+        rows.append(
+            [title, *(format_number(y[-1] - exact_solution(t[-1])) for t, y in lines.values())]
+        )
+        plots += _build_plots(title, lines)
     return [
         Section(
             "Figures 2 and 3: truncated exponential series",
-            f"dy/dt = exp(Lt), L = {RATE:g} 1/s, from y(0) = 0 to {END:g} s; the paper gives "
+            f"dy/dt = exp(Lt), L = {RATE:g} 1/s, from y(0) = 0 to {END_TIME:g} s; the paper gives "
             "neither T nor the span.",
-            [Table(f"Error at {END:g} s", ["reading", *(f"n = {n}" for n in TERMS)], rows,
+            [ReportTable(f"Error at {END_TIME:g} s", ["reading", *(f"n = {n}" for n in TERMS)], rows,
                    "More terms help until the step itself (Euler's) is the greater error: with "
                    "T = 1 s a longer series cannot mend it.")],
             plots,
@@ -53,33 +55,33 @@ def sections(bench: Bench) -> list[Section]:
     ]  # fmt: skip
 
 
-def _simulated(bench: Bench, n: int, period: float) -> tuple[list[float], list[float]]:
+def _simulate_series(bench: StudyBench, n: int, period: float) -> tuple[list[float], list[float]]:
     made = bench.client.simulate_dataset({
-        "name": f"paper Figure 2, n = {n}, T = {period:g} s", "model": document(n),
-        "parameters": {"L": RATE}, "samples": round(END / period) + 1, "sample_time": period,
+        "name": f"paper Figure 2, n = {n}, T = {period:g} s", "model": model_document(n),
+        "parameters": {"L": RATE}, "samples": round(END_TIME / period) + 1, "sample_time": period,
     })  # fmt: skip
     series = bench.client.signals(made["id"])["channels"][0]
     return series["times"], series["values"]
 
 
-def _plots(title: str, lines: dict[int, tuple[list[float], list[float]]]) -> list[Plot]:
+def _build_plots(title: str, lines: dict[int, tuple[list[float], list[float]]]) -> list[Plot]:
     times = next(iter(lines.values()))[0]
-    fine = [END * k / 200 for k in range(201)]
+    fine = [END_TIME * k / 200 for k in range(201)]
     solid = {"color": theme.GREY, "width": 2.4}
-    outputs = [figures.line("exact", fine, [exact(t) for t in fine], line=solid)]
+    outputs = [figures.line_trace("exact", fine, [exact_solution(t) for t in fine], line=solid)]
     errors = []
     for number, (n, (x, y)) in enumerate(lines.items()):
         looks = {**theme.series_style(number), "dash": "dash"}
-        outputs.append(figures.line(f"n = {n}", x, y, line=looks))
-        off = [value - exact(t) for t, value in zip(x, y, strict=True)]
-        errors.append(figures.line(f"n = {n}", x, off, line={**looks, "dash": "solid"}))
-    first, last = (abs(lines[n][1][-1] - exact(times[-1])) for n in (TERMS[0], TERMS[-1]))
+        outputs.append(figures.line_trace(f"n = {n}", x, y, line=looks))
+        off = [value - exact_solution(t) for t, value in zip(x, y, strict=True)]
+        errors.append(figures.line_trace(f"n = {n}", x, off, line={**looks, "dash": "solid"}))
+    first, last = (abs(lines[n][1][-1] - exact_solution(times[-1])) for n in (TERMS[0], TERMS[-1]))
     return [
-        Plot(f"Figure 2, {title}", figures.chart(outputs, "time [s]", "y"),
+        Plot(f"Figure 2, {title}", figures.plot_lines(outputs, "time [s]", "y"),
              "Paper: the broken lines of the series near the solid exact solution as n grows. "
              f"Ours too; n = {TERMS[-1]} reaches "
-             f"{100 * lines[TERMS[-1]][1][-1] / exact(times[-1]):.0f} % of it at {END:g} s."),
-        Plot(f"Figure 3, {title}", figures.chart(errors, "time [s]", "ŷ − y"),
+             f"{100 * lines[TERMS[-1]][1][-1] / exact_solution(times[-1]):.0f} % of it at {END_TIME:g} s."),
+        Plot(f"Figure 3, {title}", figures.plot_lines(errors, "time [s]", "ŷ − y"),
              "Paper: the error shrinks with n. Ours: at the end "
              f"{first:.3g} with n = {TERMS[0]} and {last:.3g} with n = {TERMS[-1]}."),
     ]  # fmt: skip

@@ -5,37 +5,37 @@ from functools import partial
 
 from service.core.errors import ServiceError
 from service.paper import actuator, noise, oscillators, series, tube
-from service.paper.bench import Bench
+from service.paper.bench import StudyBench
 from service.paper.document import Section
 
-Part = Callable[[Bench], list[Section]]
-PARTS: Mapping[str, Part] = {
-    "series": series.sections,
-    "table1": partial(oscillators.sections, example=oscillators.EXAMPLE_1),
-    "table2": partial(oscillators.sections, example=oscillators.EXAMPLE_2),
-    "noise": noise.sections,
-    "table3": tube.sections,
-    "table4": actuator.sections,
+StudyPart = Callable[[StudyBench], list[Section]]
+PARTS: Mapping[str, StudyPart] = {
+    "series": series.build_sections,
+    "table1": partial(oscillators.build_sections, example=oscillators.EXAMPLE_1),
+    "table2": partial(oscillators.build_sections, example=oscillators.EXAMPLE_2),
+    "noise": noise.build_sections,
+    "table3": tube.build_sections,
+    "table4": actuator.build_sections,
 }
 _FIGURES: Mapping[str, Iterable[int]] = {
     "series": (2, 3), "table1": range(7, 11), "table2": range(11, 15), "noise": (15,),
     "table3": (17, 18), "table4": (20, 21),
 }  # fmt: skip
-_BY_FIGURE = {f"figure{number}": part for part, all_ in _FIGURES.items() for number in all_}
+_PART_BY_FIGURE = {f"figure{number}": part for part, all_ in _FIGURES.items() for number in all_}
 
 
 class UnknownPart(ServiceError):
     """A part was asked for that the study does not have."""
 
     def __init__(self, name: str) -> None:
-        numbers = ", ".join(name.removeprefix("figure") for name in _BY_FIGURE)
+        numbers = ", ".join(name.removeprefix("figure") for name in _PART_BY_FIGURE)
         super().__init__(
             f"--only: the study has no part {name!r}; need some of {', '.join(PARTS)}, "
             f"or figureN with N of {numbers}"
         )
 
 
-def chosen(only: str | None) -> list[str]:
+def choose_parts(only: str | None) -> list[str]:
     """Names of the parts that ``table1,figure15`` asks for, in the study's order; all if None.
 
     Raises
@@ -49,13 +49,13 @@ def chosen(only: str | None) -> list[str]:
     if not asked:
         raise UnknownPart(only)
     for name in asked:
-        if name not in PARTS and name not in _BY_FIGURE:
+        if name not in PARTS and name not in _PART_BY_FIGURE:
             raise UnknownPart(name)
-    wanted = {_BY_FIGURE.get(name, name) for name in asked}
+    wanted = {_PART_BY_FIGURE.get(name, name) for name in asked}
     return [name for name in PARTS if name in wanted]
 
 
-def conduct(bench: Bench, names: Iterable[str]) -> Iterable[Section]:
+def conduct_study(bench: StudyBench, names: Iterable[str]) -> Iterable[Section]:
     """The sections of the named parts, one after the other as they are done."""
     for name in names:
         yield from PARTS[name](bench)

@@ -8,25 +8,25 @@ from typing import Any
 
 from service.figures import theme
 from service.paper import figures, published
-from service.paper.bench import METHODS, Bench, Found
-from service.paper.document import Check, Plot, Section, Table
-from service.paper.oscillators import estimate_text
+from service.paper.bench import METHODS, MethodRun, StudyBench
+from service.paper.document import Check, Plot, ReportTable, Section
+from service.paper.oscillators import format_estimate
 
-LENGTH = 40
-NAMES = ("K", "T", "L")
+LENGTH_M = 40
+PARAMETER_NAMES = ("K", "T", "L")
 TITLE = "Table 3, Figures 17 and 18: pneumatic tube of 40 m"
-L_AGREES_S, T_AGREES = 0.010, 0.03
+L_TOLERANCE_S, T_TOLERANCE = 0.010, 0.03
 
 
-def folder() -> Path | None:
+def find_records_folder() -> Path | None:
     """The folder below LAGID_DATA that has the reference records; None where they are absent."""
     data = os.environ.get("LAGID_DATA")
     found = Path(data or Path("..") / "shared" / "data") / "tube_reference"
-    return found if all(one.is_file() for one in _files(found)) else None
+    return found if all(one.is_file() for one in _record_files(found)) else None
 
 
 @dataclass(frozen=True, slots=True)
-class Records:
+class TubeRecords:
     """One dataset for each pattern, the names of their channels, and where they come from."""
 
     datasets: list[str]
@@ -35,32 +35,32 @@ class Records:
     origin: str
 
 
-def stored(bench: Bench) -> Records:
+def store_records(bench: StudyBench) -> TubeRecords:
     """The reference records of LAGID_DATA, or, where they are absent, the plant's own."""
-    source = folder()
+    source = find_records_folder()
     if source is not None:
-        ids = [bench.client.add_dataset(one, name=one.stem)["id"] for one in _files(source)]
-        return Records(ids, "P1_meas_Pa", "P2_meas_Pa", "The records are those of LAGID_DATA")
+        ids = [bench.client.add_dataset(one, name=one.stem)["id"] for one in _record_files(source)]
+        return TubeRecords(ids, "P1_meas_Pa", "P2_meas_Pa", "The records are those of LAGID_DATA")
     bench.say("paper Table 3: the reference plant makes the records, as LAGID_DATA has none")
     made = [
         bench.client.simulate_dataset({
-            "name": f"paper Table 3: tube {LENGTH} m, pattern {pattern}", "plant": "tube",
-            "parameters": {"length_m": LENGTH, "pattern": pattern, "gauges": pattern},
+            "name": f"paper Table 3: tube {LENGTH_M} m, pattern {pattern}", "plant": "tube",
+            "parameters": {"length_m": LENGTH_M, "pattern": pattern, "gauges": pattern},
         })["id"]
         for pattern in (1, 2)
     ]  # fmt: skip
-    return Records(made, "P1", "P2", "LAGID_DATA has no records, so the service made them")
+    return TubeRecords(made, "P1", "P2", "LAGID_DATA has no records, so the service made them")
 
 
-def _files(source: Path) -> list[Path]:
-    return [source / f"tube_{LENGTH:03d}m_pattern{n}.csv" for n in (1, 2)]
+def _record_files(source: Path) -> list[Path]:
+    return [source / f"tube_{LENGTH_M:03d}m_pattern{n}.csv" for n in (1, 2)]
 
 
-def job(records: Records) -> dict[str, Any]:
+def job_body(records: TubeRecords) -> dict[str, Any]:
     """Body of the job: both patterns, each by itself, with every method."""
     labels = [{"pattern": float(n)} for n in (1, 2)]
     return {
-        "name": f"paper Table 3: tube {LENGTH} m", "model": "tube",
+        "name": f"paper Table 3: tube {LENGTH_M} m", "model": "tube",
         "datasets": records.datasets[:1],
         "channels": {"u": records.inlet, "y": records.outlet},
         "algorithm": dict(published.SETTINGS),
@@ -71,42 +71,42 @@ def job(records: Records) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def sections(bench: Bench) -> list[Section]:
+def build_sections(bench: StudyBench) -> list[Section]:
     """The section."""
-    records = stored(bench)
-    runs = bench.runs(job(records))
-    found: list[dict[str, Found]] = [{}, {}]
+    records = store_records(bench)
+    runs = bench.run_job(job_body(records))
+    found: list[dict[str, MethodRun]] = [{}, {}]
     for run in runs:
         pattern = int(run["labels"]["pattern"]) - 1
-        found[pattern][run["cell"]["/algorithm/method"]] = bench.found(run)
+        found[pattern][run["cell"]["/algorithm/method"]] = bench.read_run(run)
     return [Section(
         TITLE,
         "Model `tube`, K e^(−Ls)/(Ts + 1) (Eq. 21), from the pressure at one gauge to that at the "
         f"other. {records.origin}: a gas-dynamic model of the paper's tube with gauges of 12 bit "
         "and noise of 0.5 kPa, not of the paper's own tube, whose records are not published.",
-        [_table(found)],
-        [plot for n, one in enumerate(found) for plot in _plots(bench, n, one, records)],
-        checks(found),
+        [_estimates_table(found)],
+        [plot for n, one in enumerate(found) for plot in _build_plots(bench, n, one, records)],
+        build_checks(found),
         links=[runs[0]["job"]],
     )]  # fmt: skip
 
 
-def _table(found: list[dict[str, Found]]) -> Table:
+def _estimates_table(found: list[dict[str, MethodRun]]) -> ReportTable:
     rows = []
-    for name in NAMES:
-        unit = found[0]["improved"].parameter(name)["unit"]
+    for name in PARAMETER_NAMES:
+        unit = found[0]["improved"].get_parameter(name)["unit"]
         for n, by_method in enumerate(found):
             printed = published.TABLE_3[n]
             label = name if unit == "1" else f"{name} [{unit}]"
             rows.append([
                 f"{label}, pattern {n + 1}", f"{printed.simple[name]:.4f}",
                 f"{printed.proposed[name]:.4f}",
-                *(estimate_text(by_method[method], name) for method in METHODS),
+                *(format_estimate(by_method[method], name) for method in METHODS),
             ])  # fmt: skip
     for n, by_method in enumerate(found):
         rms = (f"{by_method[m].run['rms'] / 1e3:.3f}" for m in METHODS)
         rows.append([f"RMS [kPa], pattern {n + 1}", "", "", *rms])
-    return Table(
+    return ReportTable(
         "Table 3",
         ["parameter", "paper, simple", "paper, proposed", *(f"ours, {m}" for m in METHODS)], rows,
         "A first-order model of a long tube leaves structure in the residuals; the standard errors "
@@ -114,49 +114,51 @@ def _table(found: list[dict[str, Found]]) -> Table:
     )  # fmt: skip
 
 
-def _plots(bench: Bench, number: int, found: Mapping[str, Found], records: Records) -> list[Plot]:
+def _build_plots(
+    bench: StudyBench, number: int, found: Mapping[str, MethodRun], records: TubeRecords
+) -> list[Plot]:
     pattern = number + 1
     rms = ", ".join(f"{m} ends at {found[m].run['rms'] / 1e3:.2f} kPa" for m in METHODS)
     return [
         Plot(f"Figure 17: input and output, pattern {pattern}",
-             _signals(bench, found, records, number),
+             _plot_signals(bench, found, records, number),
              "Paper: the outlet follows the inlet late and rounded. Ours: the same, with the "
              "response of the model that `improved` found."),
         Plot(f"Figure 18: RMS of the best individual, pattern {pattern}",
-             figures.rms_history(found, "kPa", scale=1e-3),
+             figures.plot_rms_history(found, "kPa", scale=1e-3),
              f"Paper: the error of the proposed search is the smaller. Ours: {rms}."),
     ]  # fmt: skip
 
 
-def _signals(
-    bench: Bench, found: Mapping[str, Found], records: Records, number: int
+def _plot_signals(
+    bench: StudyBench, found: Mapping[str, MethodRun], records: TubeRecords, number: int
 ) -> dict[str, Any]:
     answer = bench.client.signals(records.datasets[number], 900)
     channels = {one["name"]: one for one in answer["channels"]}
     looks = {records.inlet: (theme.GREEN, "inlet (1)"), records.outlet: (theme.GREY, "outlet (2)")}
     data = [
-        figures.line(text, channels[name]["times"], _kilo(channels[name]["values"]),
+        figures.line_trace(text, channels[name]["times"], _to_kilo(channels[name]["values"]),
                      line={"color": colour, "width": 1.6})
         for name, (colour, text) in looks.items()
     ]  # fmt: skip
     model = found["improved"].response["experiments"][0]["simulated"][0]
-    dashed = {**figures.style("improved"), "dash": "dash", "width": 1.4}
-    data.append(figures.line("model", model["times"], _kilo(model["values"]), line=dashed))
-    return figures.chart(data, "time [s]", "pressure [kPa absolute]")
+    dashed = {**figures.method_style("improved"), "dash": "dash", "width": 1.4}
+    data.append(figures.line_trace("model", model["times"], _to_kilo(model["values"]), line=dashed))
+    return figures.plot_lines(data, "time [s]", "pressure [kPa absolute]")
 
 
-def _kilo(values: list[float | None]) -> list[float | None]:
+def _to_kilo(values: list[float | None]) -> list[float | None]:
     return [None if value is None else value / 1e3 for value in values]
 
 
-def checks(found: list[dict[str, Found]]) -> list[Check]:
+def build_checks(found: list[dict[str, MethodRun]]) -> list[Check]:
     """Whether the two patterns give the same tube."""
     first, second = (one["improved"] for one in found)
-    lag = abs(first.value("L") - second.value("L"))
-    constant = abs(first.value("T") - second.value("T")) / first.value("T")
+    lag = abs(first.get_estimate("L") - second.get_estimate("L"))
+    constant = abs(first.get_estimate("T") - second.get_estimate("T")) / first.get_estimate("T")
     return [
-        Check(f"L of the two patterns agrees within {1e3 * L_AGREES_S:g} ms ({1e3 * lag:.2f} ms; "
-              "the paper's differ by 15.6 ms)", lag <= L_AGREES_S),
-        Check(f"T of the two patterns agrees within {100 * T_AGREES:g} % ({100 * constant:.2f} %; "
-              "the paper's differ by 6.3 %)", constant <= T_AGREES),
+        Check(f"L of the two patterns agrees within {1e3 * L_TOLERANCE_S:g} ms ({1e3 * lag:.2f} ms; "
+              "the paper's differ by 15.6 ms)", lag <= L_TOLERANCE_S),
+        Check(f"T of the two patterns agrees within {100 * T_TOLERANCE:g} % ({100 * constant:.2f} %; "
+              "the paper's differ by 6.3 %)", constant <= T_TOLERANCE),
     ]  # fmt: skip

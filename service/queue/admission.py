@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from sqlalchemy import ColumnElement, Subquery, func, or_, select
 from sqlalchemy.orm import Session
 
-from service.storage.tables import OPEN, Job, State
+from service.core.states import OPEN_STATES, JobState
+from service.storage.tables import Job
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,36 +21,36 @@ class Admission:
         A job of a higher priority is urgent.
     """
 
-    most_runs: int
-    above: int
+    max_runs: int
+    above_priority: int
 
-    def holds(self, job: type[Job]) -> ColumnElement[bool]:
+    def admits(self, job: type[Job]) -> ColumnElement[bool]:
         """Condition that a row of `jobs` gets in."""
-        return or_(job.n_runs <= self.most_runs, job.priority > self.above)
+        return or_(job.n_runs <= self.max_runs, job.priority > self.above_priority)
 
 
 @dataclass(frozen=True, slots=True)
-class Unfinished:
+class UnfinishedWork:
     """Jobs of a project that wait or run, and their runs that are not done."""
 
     jobs: int
     runs: int
 
 
-def unfinished(session: Session, project_id: str) -> Unfinished:
+def count_unfinished(session: Session, project_id: str) -> UnfinishedWork:
     """What a project has queued or running."""
     query = select(func.count(), func.coalesce(func.sum(Job.n_runs - Job.n_done), 0)).where(
-        Job.state.in_(OPEN), Job.project_id == project_id
+        Job.state.in_(OPEN_STATES), Job.project_id == project_id
     )
     jobs, runs = session.execute(query).one()
-    return Unfinished(int(jobs), int(runs))
+    return UnfinishedWork(int(jobs), int(runs))
 
 
-def in_hand() -> Subquery:
+def count_running_jobs() -> Subquery:
     """How many jobs of each project dispatchers have in hand, counted once: who has fewest is next.
 
     Columns ``project_id`` and ``n``; a project that has none is not among them.
     """
     count = func.count().label("n")
-    running = select(Job.project_id, count).where(Job.state == State.RUNNING)
+    running = select(Job.project_id, count).where(Job.state == JobState.RUNNING)
     return running.group_by(Job.project_id).subquery("in_hand")

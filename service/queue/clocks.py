@@ -13,13 +13,13 @@ from service.storage.columns import UtcDateTime
 Clock = Callable[[], datetime]
 
 
-def clock_of(session: Session) -> Clock:
+def choose_database_clock(session: Session) -> Clock:
     """PostgreSQL's own clock: those of its hosts may differ. SQLite is used on one host only."""
     if session.get_bind().dialect.name == "postgresql":
-        return partial(_server_time, session)
+        return partial(_read_server_time, session)
     return columns.utc_now
 
 
-def _server_time(session: Session) -> datetime:
+def _read_server_time(session: Session) -> datetime:
     # Not now(), which is when the transaction began: it may have waited since.
     return session.scalars(select(func.clock_timestamp(type_=UtcDateTime))).one()

@@ -5,13 +5,13 @@ from datetime import timedelta
 from sqlalchemy import delete, select, update
 from sqlalchemy.orm import Session
 
-from service.queue.clocks import Clock, clock_of
+from service.queue.clocks import Clock, choose_database_clock
 from service.storage.columns import Document
 from service.storage.statements import upsert
-from service.storage.tables import Dispatcher
+from service.storage.tables import DispatcherHeartbeat
 
 _FORGET_AFTER = timedelta(days=1)
-LEASE_SECONDS = "lease_seconds"
+LEASE_SECONDS_KEY = "lease_seconds"
 """Under this name a dispatcher tells how long its leases are."""
 
 
@@ -19,34 +19,38 @@ class DispatcherRepository:
     """The dispatchers in one session."""
 
     def __init__(self, session: Session, clock: Clock | None = None) -> None:
-        self._session, self._clock = session, clock or clock_of(session)
+        self._session, self._clock = session, clock or choose_database_clock(session)
 
-    def announce(self, owner: str, details: Document) -> None:
+    def add_dispatcher(self, owner: str, details: Document) -> None:
         """Tell that a dispatcher has started, and forget those long silent."""
         now = self._clock()
         row = {"owner": owner, "details": details, "started_at": now, "seen_at": now}
-        upsert(self._session, Dispatcher, [row])
-        self._session.execute(delete(Dispatcher).where(Dispatcher.seen_at < now - _FORGET_AFTER))
+        upsert(self._session, DispatcherHeartbeat, [row])
+        self._session.execute(
+            delete(DispatcherHeartbeat).where(DispatcherHeartbeat.seen_at < now - _FORGET_AFTER)
+        )
 
-    def beat(self, owner: str) -> None:
+    def record_heartbeat(self, owner: str) -> None:
         """Tell that a dispatcher is still there; goes with the heartbeat of its leases."""
-        seen = update(Dispatcher).where(Dispatcher.owner == owner)
+        seen = update(DispatcherHeartbeat).where(DispatcherHeartbeat.owner == owner)
         self._session.execute(seen.values(seen_at=self._clock()))
 
-    def leave(self, owner: str) -> None:
+    def remove_dispatcher(self, owner: str) -> None:
         """Tell that a dispatcher has stopped."""
-        self._session.execute(delete(Dispatcher).where(Dispatcher.owner == owner))
+        self._session.execute(delete(DispatcherHeartbeat).where(DispatcherHeartbeat.owner == owner))
 
-    def all(self) -> list[Dispatcher]:
+    def list_all(self) -> list[DispatcherHeartbeat]:
         """Every dispatcher that has not taken leave, by name."""
-        return list(self._session.scalars(select(Dispatcher).order_by(Dispatcher.owner)))
+        return list(
+            self._session.scalars(select(DispatcherHeartbeat).order_by(DispatcherHeartbeat.owner))
+        )
 
-    def alive(self) -> list[Dispatcher]:
+    def list_alive(self) -> list[DispatcherHeartbeat]:
         """Dispatchers seen within the length of their leases, by name."""
         now = self._clock()
-        return [one for one in self.all() if one.seen_at >= now - length_of(one)]
+        return [one for one in self.list_all() if one.seen_at >= now - find_lease_length(one)]
 
 
-def length_of(dispatcher: Dispatcher) -> timedelta:
+def find_lease_length(dispatcher: DispatcherHeartbeat) -> timedelta:
     """How long the leases of a dispatcher are."""
-    return timedelta(seconds=dispatcher.details[LEASE_SECONDS])
+    return timedelta(seconds=dispatcher.details[LEASE_SECONDS_KEY])

@@ -12,20 +12,21 @@ import psycopg
 from sqlalchemy import bindparam, select
 from sqlalchemy.orm import Session
 
+from service.core.states import JobState
 from service.queue.admission import Admission
 from service.repositories.jobs import QUEUE_CHANNEL
 from service.storage.sessions import Database
-from service.storage.tables import Job, State
+from service.storage.tables import Job
 
 POLL_SECONDS = 1.0
-_GLANCE_SECONDS = 0.05
+_FILE_POLL_SECONDS = 0.05
 
 
-class Waker(ABC):
+class Notifier(ABC):
     """Waits until there may be work. It may wake in vain, so the caller looks at the queue."""
 
     @abstractmethod
-    def wait(self, seconds: float = POLL_SECONDS) -> bool:
+    def wait_for_change(self, seconds: float = POLL_SECONDS) -> bool:
         """Whether something may have changed, within that time."""
 
     @abstractmethod
@@ -39,14 +40,18 @@ class Waker(ABC):
         self.close()
 
 
-def new_waker(database: Database, stop: threading.Event | None = None) -> Waker:
+def open_notifier(database: Database, stop: threading.Event | None = None) -> Notifier:
     """A waker for this database, to be used in one thread; `stop` ends a wait at once."""
     stop = stop or threading.Event()
-    return _FileWaker(database, stop) if database.is_sqlite else _ListenWaker(database, stop)
+    return (
+        _SqliteNotifier(database, stop)
+        if database.is_sqlite
+        else _PostgresqlNotifier(database, stop)
+    )
 
 
 @final
-class _FileWaker(Waker):
+class _SqliteNotifier(Notifier):
     """Glances at SQLite's count of the changes that other connections have committed."""
 
     def __init__(self, database: Database, stop: threading.Event) -> None:
@@ -54,13 +59,13 @@ class _FileWaker(Waker):
         # Not a pooled connection: the pool would give it to writers, whose changes do not count.
         self._connection = database.engine.raw_connection()
         self._connection.detach()
-        self._seen = self._version()
+        self._seen = self._read_data_version()
 
-    def wait(self, seconds: float = POLL_SECONDS) -> bool:
+    def wait_for_change(self, seconds: float = POLL_SECONDS) -> bool:
         deadline = time.monotonic() + seconds
-        while (version := self._version()) == self._seen:
+        while (version := self._read_data_version()) == self._seen:
             left = deadline - time.monotonic()
-            if left <= 0 or self._stop.wait(min(left, _GLANCE_SECONDS)):
+            if left <= 0 or self._stop.wait(min(left, _FILE_POLL_SECONDS)):
                 return self._stop.is_set()
         self._seen = version
         return True
@@ -68,7 +73,7 @@ class _FileWaker(Waker):
     def close(self) -> None:
         self._connection.close()
 
-    def _version(self) -> int:
+    def _read_data_version(self) -> int:
         cursor = self._connection.cursor()
         try:
             cursor.execute("PRAGMA data_version")
@@ -79,20 +84,20 @@ class _FileWaker(Waker):
 
 
 @final
-class _ListenWaker(Waker):
+class _PostgresqlNotifier(Notifier):
     """Listens on PostgreSQL's channel; a broken connection is replaced at the next wait."""
 
     def __init__(self, database: Database, stop: threading.Event) -> None:
         self._database, self._stop = database, stop
         self._connection: psycopg.Connection | None = None
 
-    def wait(self, seconds: float = POLL_SECONDS) -> bool:
+    def wait_for_change(self, seconds: float = POLL_SECONDS) -> bool:
         deadline = time.monotonic() + seconds
         try:
             if self._connection is None:
-                self._listen()
+                self._open_connection()
                 return True  # what was queued before it listened was not heard
-            return self._heard(self._connection, deadline)
+            return self._wait_for_notification(self._connection, deadline)
         except psycopg.OperationalError:
             self.close()
             return self._stop.wait(max(deadline - time.monotonic(), 0.0))
@@ -102,14 +107,14 @@ class _ListenWaker(Waker):
             self._connection.close()
             self._connection = None
 
-    def _heard(self, connection: psycopg.Connection, deadline: float) -> bool:
+    def _wait_for_notification(self, connection: psycopg.Connection, deadline: float) -> bool:
         while not self._stop.is_set() and (left := deadline - time.monotonic()) > 0:
             heard = connection.notifies(timeout=min(left, 0.2), stop_after=1)
             if any(True for _ in heard):
                 return True
         return self._stop.is_set()
 
-    def _listen(self) -> None:
+    def _open_connection(self) -> None:
         url = self._database.engine.url.set(drivername="postgresql")
         address = url.render_as_string(hide_password=False)
         self._connection = psycopg.connect(address, autocommit=True)
@@ -118,23 +123,29 @@ class _ListenWaker(Waker):
 
 # Made once: to make a statement costs more than to carry it out.
 # The key, not every column: so the indexes alone answer.
-_QUEUED = select(Job.id).where(Job.state == State.QUEUED)
-_ASKED = select(Job.id).where(
-    Job.lease_owner == bindparam("owner"), Job.state == State.RUNNING, Job.cancel_requested
+_QUEUED_JOBS = select(Job.id).where(Job.state == JobState.QUEUED)
+_CANCELLED_JOBS = select(Job.id).where(
+    Job.lease_owner == bindparam("owner"), Job.state == JobState.RUNNING, Job.cancel_requested
 )
-_ANY = select(_QUEUED.exists())
+_ANY_QUEUED = select(_QUEUED_JOBS.exists())
 
 
-class Signals(NamedTuple):
+class QueueStatus(NamedTuple):
     """Whether a job waits, and which of a dispatcher's jobs are to be cancelled."""
 
-    is_waiting: bool
-    to_cancel: frozenset[str]
+    has_waiting_job: bool
+    jobs_to_cancel: frozenset[str]
 
 
-def look(session: Session, owner: str, admission: Admission | None = None) -> Signals:
+def read_queue_status(
+    session: Session, owner: str, admission: Admission | None = None
+) -> QueueStatus:
     """What a dispatcher should attend to: waiting jobs that `admission` lets in, and cancelled."""
-    admitted = _ANY if admission is None else select(_QUEUED.where(admission.holds(Job)).exists())
+    admitted = (
+        _ANY_QUEUED
+        if admission is None
+        else select(_QUEUED_JOBS.where(admission.admits(Job)).exists())
+    )
     is_waiting = session.scalar(admitted)
-    asked = session.scalars(_ASKED, {"owner": owner})
-    return Signals(bool(is_waiting), frozenset(asked))
+    asked = session.scalars(_CANCELLED_JOBS, {"owner": owner})
+    return QueueStatus(bool(is_waiting), frozenset(asked))

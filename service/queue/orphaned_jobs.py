@@ -12,8 +12,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.core.processes import is_awake, is_gone
 from service.queue.clocks import Clock
-from service.queue.dispatchers import DispatcherRepository, length_of
-from service.queue.leases import HUNG, Owners, Queue, Reaped
+from service.queue.dispatchers import DispatcherRepository, find_lease_length
+from service.queue.leases import HUNG_AFTER, LeaseOwners, LeaseQueue, ReapResult
 from service.storage.sessions import Database
 
 _log = logging.getLogger(__name__)
@@ -22,12 +22,12 @@ PAUSE_SECONDS = 1.0
 """Between two looks of the web process."""
 
 
-def reap(
+def reap_jobs(
     database: Database,
     clock: Clock | None = None,
     *,
     busy_seconds: float | None = None,
-) -> Reaped:
+) -> ReapResult:
     """Give back, or end, every job that nobody works on; writes only where there is one.
 
     Parameters
@@ -37,39 +37,41 @@ def reap(
     busy_seconds : float, optional
         How long to wait for the database.
     """
-    with database.read() as session:
-        known = DispatcherRepository(session, clock).all()
-        owners = Owners(
-            gone=frozenset(one.owner for one in known if is_gone(one.details)),
-            living=frozenset(one.owner for one in known if is_awake(one.details)),
-            lengths={one.owner: length_of(one) for one in known},
+    with database.read_session() as session:
+        known = DispatcherRepository(session, clock).list_all()
+        owners = LeaseOwners(
+            ended=frozenset(one.owner for one in known if is_gone(one.details)),
+            awake=frozenset(one.owner for one in known if is_awake(one.details)),
+            lease_lengths={one.owner: find_lease_length(one) for one in known},
         )
-        if not owners.gone and not Queue(session, clock).has_silent(owners):
-            return Reaped()
-    with database.write(busy_seconds) as session:
-        reaped = Queue(session, clock).reap(owners)
+        if not owners.ended and not LeaseQueue(session, clock).has_expired(owners):
+            return ReapResult()
+    with database.write_session(busy_seconds) as session:
+        reaped = LeaseQueue(session, clock).reap_expired(owners)
         dispatchers = DispatcherRepository(session, clock)
-        for owner in owners.gone:
-            dispatchers.leave(owner)
-    _tell(reaped, owners)
+        for owner in owners.ended:
+            dispatchers.remove_dispatcher(owner)
+    _log_reaped(reaped, owners)
     return reaped
 
 
-def _tell(reaped: Reaped, owners: Owners) -> None:
+def _log_reaped(reaped: ReapResult, owners: LeaseOwners) -> None:
     if not reaped.owners:
         return
-    reasons = ", ".join(f"{owner} {_why(owner, owners)}" for owner in sorted(reaped.owners))
+    reasons = ", ".join(
+        f"{owner} {_explain_reaping(owner, owners)}" for owner in sorted(reaped.owners)
+    )
     taken = (("queued again", reaped.requeued), ("failed", reaped.failed),
              ("cancelled", reaped.cancelled))  # fmt: skip
     fates = "; ".join(f"{fate}: {', '.join(jobs)}" for fate, jobs in taken if jobs)
     _log.warning("%s; its jobs: %s", reasons, fates)
 
 
-def _why(owner: str, owners: Owners) -> str:
-    if owner in owners.gone:
+def _explain_reaping(owner: str, owners: LeaseOwners) -> str:
+    if owner in owners.ended:
         return "has ended"
-    if owner in owners.living:
-        return f"lives, but has not renewed its leases for {HUNG.total_seconds():g} s"
+    if owner in owners.awake:
+        return f"lives, but has not renewed its leases for {HUNG_AFTER.total_seconds():g} s"
     return "was not heard of within its lease"
 
 
@@ -78,7 +80,7 @@ class Reaper:
 
     def __init__(self, database: Database, stopping: threading.Event) -> None:
         self._database, self._stopping = database, stopping
-        self._thread = threading.Thread(target=self._go_on, name="reaper", daemon=True)
+        self._thread = threading.Thread(target=self._run_loop, name="reaper", daemon=True)
 
     def start(self) -> None:
         """Begin."""
@@ -88,11 +90,11 @@ class Reaper:
         """Wait for the last look to end, once `stopping` is set."""
         self._thread.join(5.0)
 
-    def _go_on(self) -> None:
+    def _run_loop(self) -> None:
         is_cut_off = False
         while not self._stopping.wait(PAUSE_SECONDS):
             try:
-                reap(self._database)
+                reap_jobs(self._database)
                 is_cut_off = False
             except SQLAlchemyError as error:  # the database may come back
                 if not is_cut_off:

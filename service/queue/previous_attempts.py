@@ -6,13 +6,14 @@ from dataclasses import dataclass, field
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
-from service.queue.leases import Lease, Queue
-from service.storage.statements import chunks
-from service.storage.tables import OPEN, Checkpoint, MigrationLog, Run, RunHistory, State
+from service.core.states import OPEN_STATES, JobState
+from service.queue.leases import Lease, LeaseQueue
+from service.storage.statements import split_chunks
+from service.storage.tables import Checkpoint, MigrationLog, Run, RunHistory
 
 
 @dataclass(frozen=True, slots=True)
-class Tally:
+class PreviousAttempts:
     """What is behind a job that is claimed.
 
     Attributes
@@ -27,24 +28,24 @@ class Tally:
 
     evaluations: int = 0
     generations: int = 0
-    reasons: tuple[str, ...] = ()
-    waiting: dict[str, int] = field(default_factory=dict)
+    failure_reasons: tuple[str, ...] = ()
+    checkpoint_evaluations: dict[str, int] = field(default_factory=dict)
 
 
-def tally(session: Session, lease: Lease, n_reasons: int) -> Tally:
+def summarize_attempts(session: Session, lease: Lease, n_reasons: int) -> PreviousAttempts:
     """Add up what earlier attempts left; `LeaseLost` when the lease is not held."""
-    Queue(session).hold(lease)
+    LeaseQueue(session).lock_job(lease)
     mine = Run.job_id == lease.job_id
     sums = select(
         func.coalesce(func.sum(Run.evaluations), 0), func.coalesce(func.max(Run.generations), 0)
-    ).where(mine, Run.state.not_in(OPEN))
+    ).where(mine, Run.state.not_in(OPEN_STATES))
     evaluations, generations = session.execute(sums).one()
-    failed = select(Run.error).where(mine, Run.state == State.FAILED, Run.error.is_not(None))
+    failed = select(Run.error).where(mine, Run.state == JobState.FAILED, Run.error.is_not(None))
     first = failed.group_by(Run.error).order_by(func.min(Run.number)).limit(n_reasons)
     kept = select(Checkpoint.run_id, Checkpoint.evaluations).where(
         Checkpoint.job_id == lease.job_id
     )
-    return Tally(
+    return PreviousAttempts(
         int(evaluations),
         int(generations),
         tuple(str(reason) for reason in session.scalars(first)),
@@ -52,12 +53,12 @@ def tally(session: Session, lease: Lease, n_reasons: int) -> Tally:
     )
 
 
-def forget_progress(session: Session, lease: Lease, run_ids: Collection[str]) -> None:
+def delete_progress(session: Session, lease: Lease, run_ids: Collection[str]) -> None:
     """Delete checkpoint and history of runs that begin anew.
 
     Another version of the program may find other numbers, and history is only ever added to.
     """
-    Queue(session).hold(lease)
-    for chunk in chunks(run_ids):
+    LeaseQueue(session).lock_job(lease)
+    for chunk in split_chunks(run_ids):
         for table in (Checkpoint, RunHistory, MigrationLog):
             session.execute(delete(table).where(table.run_id.in_(chunk)))

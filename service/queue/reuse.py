@@ -6,25 +6,26 @@ from typing import Any
 from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
-from service.queue.leases import Lease, Queue
-from service.queue.run_writes import RunLedger, RunOutcome
-from service.storage.statements import IN_PLACE, chunks, insert_missing, update_by_id
-from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory, State
+from service.core.states import JobState
+from service.queue.leases import Lease, LeaseQueue
+from service.queue.run_writes import RunOutcome, RunWriter
+from service.storage.statements import RETURNING_OPTIONS, insert_missing, split_chunks, update_by_id
+from service.storage.tables import DEFAULT_PROJECT, Job, MigrationLog, Run, RunHistory
 
-_COPIED = (
+_COPIED_COLUMNS = (
     "result", "valid", "best_rms", "rms_noise_free", "fit_estimation", "fit_validation",
     "evaluations", "generations", "seconds", "signals_sha256", "signals_start", "signals_size",
 )  # fmt: skip
 
 
-def mark(session: Session, lease: Lease, hashes: Mapping[str, str]) -> None:
+def write_hashes(session: Session, lease: Lease, hashes: Mapping[str, str]) -> None:
     """Write the hashes of runs' specifications, given by run; `LeaseLost` without the lease."""
-    Queue(session).hold(lease)
+    LeaseQueue(session).lock_job(lease)
     rows = ({"id": run, "spec_hash": digest} for run, digest in hashes.items())
     update_by_id(session, Run, rows)
 
 
-def computed(
+def find_computed_runs(
     session: Session, hashes: Collection[str], project_id: str = DEFAULT_PROJECT
 ) -> dict[str, str]:
     """For each hash that a run of the project has succeeded with, the first such run.
@@ -32,45 +33,47 @@ def computed(
     Not those of jobs that were deleted: their signals are garbage, and may be gone.
     """
     found: dict[str, str] = {}
-    for chunk in chunks(hashes):
+    for chunk in split_chunks(hashes):
         first = select(Run.spec_hash, func.min(Run.id)).join(Job, Job.id == Run.job_id)
         query = first.where(
             Job.deleted_at.is_(None), Run.project_id == project_id, Run.spec_hash.in_(chunk),
-            Run.state == State.SUCCEEDED,
+            Run.state == JobState.SUCCEEDED,
             Run.signals_sha256.is_not(None),  # one whose signals could not be stored is not whole
         )  # fmt: skip
         found.update({str(one): run for one, run in session.execute(query.group_by(Run.spec_hash))})
     return found
 
 
-def take_over(session: Session, lease: Lease, sources: Mapping[str, str]) -> list[RunOutcome]:
+def take_over_runs(session: Session, lease: Lease, sources: Mapping[str, str]) -> list[RunOutcome]:
     """End runs with the results of others, given by run; gives what was written of them.
 
     History and migrations are copied, so that each run is complete by itself.
     """
-    ledger, taken = RunLedger(session, lease), []
-    for chunk in chunks(sources.items()):
+    ledger, taken = RunWriter(session, lease), []
+    for chunk in split_chunks(sources.items()):
         pairs = dict(chunk)
         query = select(Run).where(Run.id.in_(set(pairs.values())))
         known = {run.id: run for run in session.scalars(query)}
-        outcomes = [_outcome(run, known[source]) for run, source in pairs.items()]
-        written = ledger.record(outcomes)
+        outcomes = [_copy_outcome(run, known[source]) for run, source in pairs.items()]
+        written = ledger.record_outcomes(outcomes)
         for table in (RunHistory, MigrationLog):
-            insert_missing(session, table, _copies(session, table, pairs))
+            insert_missing(session, table, _copy_rows(session, table, pairs))
         more = update(Job).where(*lease.fence()).values(n_reused=Job.n_reused + len(written))
-        session.execute(more, execution_options=IN_PLACE)
+        session.execute(more, execution_options=RETURNING_OPTIONS)
         taken += outcomes
     return taken
 
 
-def _outcome(run: str, source: Run) -> RunOutcome:
-    values = {name: getattr(source, name) for name in _COPIED}
+def _copy_outcome(run: str, source: Run) -> RunOutcome:
+    values = {name: getattr(source, name) for name in _COPIED_COLUMNS}
     first = (source.result or {}).get("reused_from", source.id)
     values["result"] = {**(source.result or {}), "reused_from": first}
-    return RunOutcome(run_id=run, state=State.SUCCEEDED, **values)
+    return RunOutcome(run_id=run, state=JobState.SUCCEEDED, **values)
 
 
-def _copies(session: Session, table: Any, sources: Mapping[str, str]) -> Iterator[dict[str, Any]]:
+def _copy_rows(
+    session: Session, table: Any, sources: Mapping[str, str]
+) -> Iterator[dict[str, Any]]:
     columns = table.__table__.c
     rows: dict[str, list[Any]] = {}
     query = select(*columns).where(columns.run_id.in_(set(sources.values())))

@@ -7,27 +7,34 @@ from typing import Any
 from sqlalchemy import delete, func, select, update
 from sqlalchemy.orm import Session
 
+from service.core.states import OPEN_STATES, JobState
 from service.queue.clocks import Clock
-from service.queue.leases import Lease, Outcome, Queue, smaller
-from service.repositories.history import HistoryPoint, MigrantPoint, history_parts, migrant_parts
+from service.queue.leases import FinalState, Lease, LeaseQueue, choose_smaller_rms
+from service.repositories.history import HistoryPoint, MigrantPoint, pack_history, pack_migrants
 from service.storage.columns import Document, utc_now
 from service.storage.statements import (
-    CHUNK,
-    IN_PLACE,
-    chunks,
+    CHUNK_ROWS,
+    RETURNING_OPTIONS,
     insert_missing,
     new_ids,
+    split_chunks,
     update_by_id,
     upsert,
 )
-from service.storage.tables import OPEN, Checkpoint, Job, MigrationLog, Run, RunHistory, State
+from service.storage.tables import Checkpoint, Job, MigrationLog, Run, RunHistory
 
 # Every default of the table: with one missing, the rows would take the ORM's slow way.
-_FRESH = {"state": State.QUEUED, "attempt": 0, "kills": 0, "evaluations": 0, "generations": 0}
+_RUN_DEFAULTS = {
+    "state": JobState.QUEUED,
+    "attempt": 0,
+    "kills": 0,
+    "evaluations": 0,
+    "generations": 0,
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Cell:
+class NewRun:
     """One run to be made: its place in the sweep and what distinguishes it."""
 
     number: int
@@ -44,7 +51,7 @@ class RunOutcome:
     """How a run ended. `result` is the document of the run result; None when it failed."""
 
     run_id: str
-    state: Outcome
+    state: FinalState
     error: str | None = None
     result: Document | None = None
     valid: bool | None = None
@@ -60,7 +67,7 @@ class RunOutcome:
     signals_size: int | None = None
 
 
-class RunLedger:
+class RunWriter:
     """Writes to the runs of one leased job, in one writing session.
 
     The first method that is called locks the job's row, or raises `LeaseLost` when the lease is
@@ -69,48 +76,48 @@ class RunLedger:
 
     def __init__(self, session: Session, lease: Lease, clock: Clock = utc_now) -> None:
         self._session, self._lease, self._clock = session, lease, clock
-        self._queue = Queue(session, clock)
+        self._queue = LeaseQueue(session, clock)
         self._held: Job | None = None
 
-    def create(self, cells: Iterable[Cell]) -> None:
+    def create_runs(self, cells: Iterable[NewRun]) -> None:
         """Make the job's runs; those that are there already stay, so a second call is harmless."""
-        add_runs(self._session, self._hold(), cells)
+        insert_runs(self._session, self._lock_job(), cells)
 
-    def pending(self, limit: int = CHUNK, after: int = -1) -> list[Run]:
+    def list_pending(self, limit: int = CHUNK_ROWS, after: int = -1) -> list[Run]:
         """Unfinished runs with a `number` above `after`, in order."""
-        self._hold()
+        self._lock_job()
         left = select(Run).where(
-            Run.job_id == self._lease.job_id, Run.state.in_(OPEN), Run.number > after
+            Run.job_id == self._lease.job_id, Run.state.in_(OPEN_STATES), Run.number > after
         )
         return list(self._session.scalars(left.order_by(Run.number).limit(limit)))
 
-    def unfinished(self, numbers: Sequence[int]) -> list[Run]:
+    def list_unfinished(self, numbers: Sequence[int]) -> list[Run]:
         """Those of the runs of these numbers that are unfinished, in their order."""
-        self._hold()
+        self._lock_job()
         found: list[Run] = []
-        for chunk in chunks(numbers):
+        for chunk in split_chunks(numbers):
             mine = (Run.job_id == self._lease.job_id) & Run.number.in_(chunk)
-            found += self._session.scalars(select(Run).where(mine, Run.state.in_(OPEN)))
+            found += self._session.scalars(select(Run).where(mine, Run.state.in_(OPEN_STATES)))
         return sorted(found, key=lambda run: run.number)
 
-    def start(self, run_ids: Collection[str]) -> None:
+    def start_runs(self, run_ids: Collection[str]) -> None:
         """Mark queued runs as running."""
-        self._hold()
-        for chunk in chunks(run_ids):
-            begun = update(Run).where(self._is_mine(chunk), Run.state == State.QUEUED).values(
-                state=State.RUNNING, attempt=self._lease.attempt,
+        self._lock_job()
+        for chunk in split_chunks(run_ids):
+            begun = update(Run).where(self._filter_runs(chunk), Run.state == JobState.QUEUED).values(
+                state=JobState.RUNNING, attempt=self._lease.attempt,
                 started_at=func.coalesce(Run.started_at, self._clock()),
             )  # fmt: skip
-            self._session.execute(begun, execution_options=IN_PLACE)
+            self._session.execute(begun, execution_options=RETURNING_OPTIONS)
 
-    def blame(self, kills: Mapping[str, int]) -> None:
+    def write_kills(self, kills: Mapping[str, int]) -> None:
         """Write how often in a row a worker died over each of these runs."""
-        self._hold()
+        self._lock_job()
         if kills:
             rows = [{"id": run, "kills": count} for run, count in kills.items()]
             update_by_id(self._session, Run, rows)
 
-    def record(
+    def record_outcomes(
         self,
         outcomes: Sequence[RunOutcome],
         history: Iterable[HistoryPoint] = (),
@@ -120,20 +127,22 @@ class RunLedger:
 
         A run that has ended already keeps its result. Gives the identifiers of those written.
         """
-        self._hold()
-        open_ids = self._open_ids([one.run_id for one in outcomes])
+        self._lock_job()
+        open_ids = self._find_open_ids([one.run_id for one in outcomes])
         fresh = [one for one in outcomes if one.run_id in open_ids]
-        self._insert(history, migrants)
+        self._insert_history(history, migrants)
         if not fresh:
             return ()
         now, attempt = self._clock(), self._lease.attempt
-        update_by_id(self._session, Run, (_ended(one, now, attempt) for one in fresh))
-        self._count(fresh)
-        for chunk in chunks(open_ids):
+        update_by_id(
+            self._session, Run, (_build_outcome_values(one, now, attempt) for one in fresh)
+        )
+        self._update_counts(fresh)
+        for chunk in split_chunks(open_ids):
             self._session.execute(delete(Checkpoint).where(Checkpoint.run_id.in_(chunk)))
         return tuple(one.run_id for one in fresh)
 
-    def append(
+    def append_history(
         self, history: Iterable[HistoryPoint], migrants: Iterable[MigrantPoint] = ()
     ) -> None:
         """Add to the history of runs.
@@ -141,12 +150,12 @@ class RunLedger:
         A run that goes on from a checkpoint finds the same points again, bit for bit; they count
         once.
         """
-        self._hold()
-        self._insert(history, migrants)
+        self._lock_job()
+        self._insert_history(history, migrants)
 
-    def save(self, states: Iterable[tuple[str, int, bytes]]) -> None:
+    def save_checkpoints(self, states: Iterable[tuple[str, int, bytes]]) -> None:
         """Replace the checkpoints of runs, given as (run, evaluations, state)."""
-        self._hold()
+        self._lock_job()
         now = self._clock()
         rows = (
             {"run_id": run_id, "job_id": self._lease.job_id, "attempt": self._lease.attempt,
@@ -155,70 +164,72 @@ class RunLedger:
         )  # fmt: skip
         upsert(self._session, Checkpoint, rows)
 
-    def checkpoints(self) -> dict[str, bytes]:
+    def read_checkpoints(self) -> dict[str, bytes]:
         """The states from which unfinished runs of the job can go on, by run."""
-        self._hold()
+        self._lock_job()
         query = select(Checkpoint.run_id, Checkpoint.state).where(
             Checkpoint.job_id == self._lease.job_id
         )
         return dict(self._session.execute(query).all())
 
-    def _hold(self) -> Job:
+    def _lock_job(self) -> Job:
         if self._held is None:
-            self._held = self._queue.hold(self._lease)
+            self._held = self._queue.lock_job(self._lease)
         return self._held
 
-    def _is_mine(self, run_ids: Collection[str]) -> Any:
+    def _filter_runs(self, run_ids: Collection[str]) -> Any:
         return (Run.job_id == self._lease.job_id) & Run.id.in_(run_ids)
 
-    def _open_ids(self, run_ids: Iterable[str]) -> set[str]:
+    def _find_open_ids(self, run_ids: Iterable[str]) -> set[str]:
         found: set[str] = set()
-        for chunk in chunks(run_ids):
-            query = select(Run.id).where(self._is_mine(chunk), Run.state.in_(OPEN))
+        for chunk in split_chunks(run_ids):
+            query = select(Run.id).where(self._filter_runs(chunk), Run.state.in_(OPEN_STATES))
             found.update(self._session.scalars(query))
         return found
 
-    def _insert(self, history: Iterable[HistoryPoint], migrants: Iterable[MigrantPoint]) -> None:
-        insert_missing(self._session, RunHistory, history_parts(history))
-        insert_missing(self._session, MigrationLog, migrant_parts(migrants))
+    def _insert_history(
+        self, history: Iterable[HistoryPoint], migrants: Iterable[MigrantPoint]
+    ) -> None:
+        insert_missing(self._session, RunHistory, pack_history(history))
+        insert_missing(self._session, MigrationLog, pack_migrants(migrants))
 
-    def _count(self, ended: Sequence[RunOutcome]) -> None:
+    def _update_counts(self, ended: Sequence[RunOutcome]) -> None:
         values: dict[str, Any] = {
             "n_done": Job.n_done + len(ended),
-            "n_failed": Job.n_failed + sum(one.state is State.FAILED for one in ended),
+            "n_failed": Job.n_failed + sum(one.state is JobState.FAILED for one in ended),
         }
         found = [one.best_rms for one in ended if one.best_rms is not None]
         if found:
-            values["best_rms"] = smaller(min(found))
+            values["best_rms"] = choose_smaller_rms(min(found))
         changed = update(Job).where(*self._lease.fence()).values(values)
-        self._session.execute(changed, execution_options=IN_PLACE)
+        self._session.execute(changed, execution_options=RETURNING_OPTIONS)
 
 
-def add_runs(session: Session, job: Job, cells: Iterable[Cell]) -> None:
+def insert_runs(session: Session, job: Job, cells: Iterable[NewRun]) -> None:
     """Make the queued runs of a job, in bulk; those that are there already stay as they are."""
     now = utc_now()
-    for chunk in chunks(cells):
+    for chunk in split_chunks(cells):
         rows = [
-            {**_shallow(cell), **_FRESH, "id": run_id, "project_id": job.project_id,
+            {**_build_run_values(cell), **_RUN_DEFAULTS, "id": run_id, "project_id": job.project_id,
              "job_id": job.id, "created_at": now}
             for cell, run_id in zip(chunk, new_ids("run", len(chunk)), strict=True)
         ]  # fmt: skip
         insert_missing(session, Run, rows)
 
 
-def _ended(one: RunOutcome, now: Any, attempt: int) -> dict[str, Any]:
+def _build_outcome_values(one: RunOutcome, now: Any, attempt: int) -> dict[str, Any]:
     values = {name: getattr(one, name) for name in RunOutcome.__slots__ if name != "run_id"}
     return {
-        **values, "id": one.run_id, "estimates": _estimates(one.result), "attempt": attempt,
+        **values, "id": one.run_id, "estimates": _extract_estimates(one.result), "attempt": attempt,
         "finished_at": now,
     }  # fmt: skip
 
 
-def _shallow(cell: Cell) -> dict[str, Any]:
-    return {name: getattr(cell, name) for name in Cell.__slots__}
+def _build_run_values(cell: NewRun) -> dict[str, Any]:
+    return {name: getattr(cell, name) for name in NewRun.__slots__}
 
 
-def _estimates(result: Document | None) -> Document | None:
+def _extract_estimates(result: Document | None) -> Document | None:
     if result is None:
         return None
     return {

@@ -6,8 +6,9 @@ from typing import Literal
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from service.core.states import OPEN_STATES
 from service.storage.columns import Document
-from service.storage.tables import OPEN, Event, Job
+from service.storage.tables import Event, Job
 
 EventKind = Literal["state", "progress", "log", "end"]
 
@@ -23,7 +24,7 @@ class EventRepository:
     def __init__(self, session: Session) -> None:
         self._session = session
 
-    def append(self, job_id: str, kind: EventKind, data: Document) -> Event:
+    def append_event(self, job_id: str, kind: EventKind, data: Document) -> Event:
         """Add an event to a job."""
         self._session.execute(
             select(Job.id).where(Job.id == job_id).with_for_update(key_share=True)
@@ -36,16 +37,18 @@ class EventRepository:
     def append_state(self, job: Job) -> None:
         """Tell the job's new state, and when it is a terminal one, that no event follows."""
         data = {"state": job.state.value, "attempt": job.attempt, "error": job.error}
-        self.append(job.id, "state", data)
-        if job.state not in OPEN:
-            self.append(job.id, "end", data)
+        self.append_event(job.id, "state", data)
+        if job.state not in OPEN_STATES:
+            self.append_event(job.id, "end", data)
 
-    def after(self, job_id: str, last_id: int = 0, limit: int = 500) -> list[Event]:
+    def list_after(self, job_id: str, last_id: int = 0, limit: int = 500) -> list[Event]:
         """A job's events after the one numbered `last_id`, oldest first."""
         newer = select(Event).where(Event.job_id == job_id, Event.id > last_id)
         return list(self._session.scalars(newer.order_by(Event.id).limit(limit)))
 
-    def latest(self, job_id: str, limit: int = 100, kinds: Sequence[EventKind] = ()) -> list[Event]:
+    def list_latest(
+        self, job_id: str, limit: int = 100, kinds: Sequence[EventKind] = ()
+    ) -> list[Event]:
         """A job's last events of these kinds (of all, if none is named), oldest first."""
         query = select(Event).where(Event.job_id == job_id).order_by(Event.id.desc()).limit(limit)
         if kinds:

@@ -19,7 +19,7 @@ PHASES = ("start", "genetic", "sequence", "migration", "refinement")
 _HEAD = "<IIIQdB"  # island, number, generation, evaluations, rms, phase
 _MIGRANT = struct.Struct("<IIIId")  # number, epoch, source, destination, fitness
 _NUMBER_OF = {phase: number for number, phase in enumerate(PHASES)}
-_of_run = attrgetter("run_id")
+_get_run_id = attrgetter("run_id")
 
 
 class HistoryPoint(NamedTuple):
@@ -46,33 +46,33 @@ class MigrantPoint(NamedTuple):
     fitness: float
 
 
-def history_parts(points: Iterable[HistoryPoint]) -> Iterator[dict[str, Any]]:
+def pack_history(points: Iterable[HistoryPoint]) -> Iterator[dict[str, Any]]:
     """Rows of `run_history`: one for the points of each run that follow each other."""
-    for run, mine in groupby(points, _of_run):
+    for run, mine in groupby(points, _get_run_id):
         part = list(mine)
         count = len(part[0].parameters)
-        pack = _point(count).pack
+        pack = _make_point_struct(count).pack
         data = b"".join([
             pack(one.island, one.number, one.generation, one.evaluations, one.rms,
                  _NUMBER_OF[one.phase], *one.parameters)
             for one in part
         ])  # fmt: skip
         yield {
-            "run_id": run, "digest": _digest(data), "n_parameters": count,
+            "run_id": run, "digest": _hash_part(data), "n_parameters": count,
             "generation": max([int(one.generation) for one in part]),
             "evaluations": max([int(one.evaluations) for one in part]),
             "rms": min([float(one.rms) for one in part]), "points": data,
         }  # fmt: skip
 
 
-def migrant_parts(points: Iterable[MigrantPoint]) -> Iterator[dict[str, Any]]:
+def pack_migrants(points: Iterable[MigrantPoint]) -> Iterator[dict[str, Any]]:
     """Rows of `migrations_log`: one for the migrants of each run that follow each other."""
-    for run, mine in groupby(points, _of_run):
+    for run, mine in groupby(points, _get_run_id):
         data = b"".join([_MIGRANT.pack(*one[1:]) for one in mine])
-        yield {"run_id": run, "digest": _digest(data), "migrants": data}
+        yield {"run_id": run, "digest": _hash_part(data), "migrants": data}
 
 
-def history_of(run: str, parts: Iterable[tuple[bytes, int]]) -> list[HistoryPoint]:
+def unpack_history(run: str, parts: Iterable[tuple[bytes, int]]) -> list[HistoryPoint]:
     """The points of one run, island by island.
 
     Parameters
@@ -82,7 +82,7 @@ def history_of(run: str, parts: Iterable[tuple[bytes, int]]) -> list[HistoryPoin
     """
     found: dict[tuple[int, int], HistoryPoint] = {}
     for data, count in parts:
-        for values in _point(count).iter_unpack(data):
+        for values in _make_point_struct(count).iter_unpack(data):
             island, number, generation, evaluations, rms, phase = values[:6]
             found[island, number] = HistoryPoint(
                 run, island, number, generation, evaluations, rms, PHASES[phase], list(values[6:])
@@ -90,7 +90,7 @@ def history_of(run: str, parts: Iterable[tuple[bytes, int]]) -> list[HistoryPoin
     return [found[place] for place in sorted(found)]
 
 
-def migrants_of(run: str, parts: Iterable[bytes]) -> list[MigrantPoint]:
+def unpack_migrants(run: str, parts: Iterable[bytes]) -> list[MigrantPoint]:
     """The migrants of one run, in their order."""
     found = {
         values[0]: MigrantPoint(run, *values)
@@ -101,9 +101,9 @@ def migrants_of(run: str, parts: Iterable[bytes]) -> list[MigrantPoint]:
 
 
 @lru_cache(maxsize=64)
-def _point(n_parameters: int) -> struct.Struct:
+def _make_point_struct(n_parameters: int) -> struct.Struct:
     return struct.Struct(f"{_HEAD}{n_parameters}d")
 
 
-def _digest(data: bytes) -> int:
+def _hash_part(data: bytes) -> int:
     return int.from_bytes(blake2b(data, digest_size=8).digest(), "big", signed=True)

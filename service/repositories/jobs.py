@@ -8,11 +8,12 @@ from sqlalchemy import func, select, text, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
+from service.core.states import OPEN_STATES, JobState
 from service.repositories.events import EventRepository
 from service.storage.columns import Document, utc_now
-from service.storage.errors import Conflict, KeyReused, NotFound
-from service.storage.statements import IN_PLACE, Page, new_id, page_of
-from service.storage.tables import DEFAULT_PROJECT, OPEN, IdempotencyKey, Job, Run, State
+from service.storage.errors import KeyReused, RowConflict, RowNotFound
+from service.storage.statements import RETURNING_OPTIONS, RowPage, make_page, new_id
+from service.storage.tables import DEFAULT_PROJECT, IdempotencyKey, Job, Run
 
 QUEUE_CHANNEL = "lagid_queue"
 """PostgreSQL's notification channel that wakes the dispatchers."""
@@ -52,14 +53,14 @@ class JobRepository:
             When the key was used with another request.
         """
         if key is None:
-            return Submission(self._add(new), True)
-        known = self._submitted(key, request_hash)
+            return Submission(self._insert_job(new), True)
+        known = self._find_by_key(key, request_hash)
         if known is not None:
             return Submission(known, False)
         try:
             # Two requests with one key at once: the later one fails here and finds the other's.
             with self._session.begin_nested():
-                job = self._add(new)
+                job = self._insert_job(new)
                 self._session.add(
                     IdempotencyKey(
                         project_id=self._project_id, key=key, request_hash=request_hash,
@@ -67,13 +68,13 @@ class JobRepository:
                     )
                 )  # fmt: skip
         except IntegrityError:
-            known = self._submitted(key, request_hash)
+            known = self._find_by_key(key, request_hash)
             if known is None:
                 raise
             return Submission(known, False)
         return Submission(job, True)
 
-    def is_used(self, key: str) -> bool:
+    def is_key_used(self, key: str) -> bool:
         """Whether a job was submitted under this key."""
         found = select(IdempotencyKey.key).where(
             IdempotencyKey.project_id == self._project_id, IdempotencyKey.key == key
@@ -81,37 +82,37 @@ class JobRepository:
         return self._session.scalar(found) is not None
 
     def get(self, job_id: str) -> Job:
-        """A job of this project that was not deleted; `NotFound` otherwise."""
+        """A job of this project that was not deleted; `RowNotFound` otherwise."""
         job = self._session.get(Job, job_id, populate_existing=True)
         if job is None or job.project_id != self._project_id or job.deleted_at is not None:
-            raise NotFound("job", job_id)
+            raise RowNotFound("job", job_id)
         return job
 
-    def state_of(self, job_id: str) -> State:
-        """The state of such a job, without the rest of it; `NotFound` as `get` does."""
-        found = select(Job.state).where(Job.id == job_id, *self._mine())
+    def get_state(self, job_id: str) -> JobState:
+        """The state of such a job, without the rest of it; `RowNotFound` as `get` does."""
+        found = select(Job.state).where(Job.id == job_id, *self._filter_project())
         state = self._session.scalar(found)
         if state is None:
-            raise NotFound("job", job_id)
+            raise RowNotFound("job", job_id)
         return state
 
-    def page(
-        self, *, cursor: str | None = None, limit: int = 50, states: Sequence[State] = ()
-    ) -> Page[Job]:
+    def list_page(
+        self, *, cursor: str | None = None, limit: int = 50, states: Sequence[JobState] = ()
+    ) -> RowPage[Job]:
         """Jobs, latest first. The pages stay put while new jobs arrive."""
-        query = select(Job).where(*self._mine()).order_by(Job.id.desc()).limit(limit + 1)
+        query = select(Job).where(*self._filter_project()).order_by(Job.id.desc()).limit(limit + 1)
         if cursor is not None:
             query = query.where(Job.id < cursor)
         if states:
             query = query.where(Job.state.in_(states))
         found = self._session.scalars(query).all()
-        return page_of(found, limit, (job.id for job in found))
+        return make_page(found, limit, (job.id for job in found))
 
-    def counts(self) -> dict[State, int]:
+    def count_states(self) -> dict[JobState, int]:
         """How many jobs are in each state."""
-        query = select(Job.state, func.count()).where(*self._mine()).group_by(Job.state)
+        query = select(Job.state, func.count()).where(*self._filter_project()).group_by(Job.state)
         found = dict(self._session.execute(query).all())
-        return {state: found.get(state, 0) for state in State}
+        return {state: found.get(state, 0) for state in JobState}
 
     def cancel(self, job_id: str) -> Job:
         """Cancel a queued job at once, or ask the dispatcher of a running one to stop.
@@ -121,17 +122,17 @@ class JobRepository:
         Conflict
             When the job has already succeeded or failed. A cancelled one stays as it is.
         """
-        job = self._locked(job_id)
-        if job.state is State.CANCELLED:
+        job = self._lock_job(job_id)
+        if job.state is JobState.CANCELLED:
             return job
-        if job.state not in OPEN:
-            raise Conflict(
+        if job.state not in OPEN_STATES:
+            raise RowConflict(
                 f"{job_id} is {job.state}; only a queued or running job can be cancelled"
             )
         job.cancel_requested = True
-        if job.state is State.QUEUED:
-            job.state, job.finished_at = State.CANCELLED, utc_now()
-            close_runs(self._session, job_id, State.CANCELLED, None)
+        if job.state is JobState.QUEUED:
+            job.state, job.finished_at = JobState.CANCELLED, utc_now()
+            end_open_runs(self._session, job_id, JobState.CANCELLED, None)
             EventRepository(self._session).append_state(job)
         self._session.flush()
         return job
@@ -141,21 +142,21 @@ class JobRepository:
 
         The one way out of a terminal state, and only a user's wish takes it.
         """
-        job = self._locked(job_id)
-        if job.state not in (State.FAILED, State.CANCELLED):
-            raise Conflict(
+        job = self._lock_job(job_id)
+        if job.state not in (JobState.FAILED, JobState.CANCELLED):
+            raise RowConflict(
                 f"{job_id} is {job.state}; only a failed or cancelled job can be resumed"
             )
-        again = update(Run).where(Run.job_id == job_id, Run.state != State.SUCCEEDED)
+        again = update(Run).where(Run.job_id == job_id, Run.state != JobState.SUCCEEDED)
         self._session.execute(
-            again.values(state=State.QUEUED, error=None, finished_at=None, kills=0),
-            execution_options=IN_PLACE,
+            again.values(state=JobState.QUEUED, error=None, finished_at=None, kills=0),
+            execution_options=RETURNING_OPTIONS,
         )
-        job.state, job.cancel_requested = State.QUEUED, False
+        job.state, job.cancel_requested = JobState.QUEUED, False
         job.error = job.finished_at = None
         job.lost_leases = job.n_failed = 0
         job.n_done = self._session.scalar(
-            select(func.count()).where(Run.job_id == job_id, Run.state == State.SUCCEEDED)
+            select(func.count()).where(Run.job_id == job_id, Run.state == JobState.SUCCEEDED)
         ) or 0  # fmt: skip
         EventRepository(self._session).append_state(job)
         notify_queue(self._session)
@@ -163,27 +164,31 @@ class JobRepository:
 
     def delete(self, job_id: str) -> None:
         """Hide a finished job; what only it refers to becomes garbage."""
-        job = self._locked(job_id)
-        if job.state in OPEN:
-            raise Conflict(f"{job_id} is {job.state}; cancel it before deleting it")
+        job = self._lock_job(job_id)
+        if job.state in OPEN_STATES:
+            raise RowConflict(f"{job_id} is {job.state}; cancel it before deleting it")
         job.deleted_at = utc_now()
         self._session.flush()
 
-    def _mine(self) -> tuple[Any, ...]:
+    def _filter_project(self) -> tuple[Any, ...]:
         return Job.project_id == self._project_id, Job.deleted_at.is_(None)
 
-    def _locked(self, job_id: str) -> Job:
-        lock = select(Job).where(Job.id == job_id, *self._mine()).with_for_update(key_share=True)
+    def _lock_job(self, job_id: str) -> Job:
+        lock = (
+            select(Job)
+            .where(Job.id == job_id, *self._filter_project())
+            .with_for_update(key_share=True)
+        )
         job = self._session.scalar(lock, execution_options={"populate_existing": True})
         if job is None:
-            raise NotFound("job", job_id)
+            raise RowNotFound("job", job_id)
         return job
 
-    def _add(self, new: NewJob) -> Job:
+    def _insert_job(self, new: NewJob) -> Job:
         job = Job(
             id=new_id("job"), project_id=self._project_id, name=new.name, spec=new.spec,
             n_runs=new.n_runs, priority=new.priority, max_attempts=new.max_attempts,
-            state=State.QUEUED, attempt=0,
+            state=JobState.QUEUED, attempt=0,
         )  # fmt: skip
         self._session.add(job)
         self._session.flush()
@@ -191,7 +196,7 @@ class JobRepository:
         notify_queue(self._session)
         return job
 
-    def _submitted(self, key: str, request_hash: str) -> Job | None:
+    def _find_by_key(self, key: str, request_hash: str) -> Job | None:
         used = self._session.get(
             IdempotencyKey, {"project_id": self._project_id, "key": key}, populate_existing=True
         )
@@ -202,12 +207,12 @@ class JobRepository:
         return self._session.get_one(Job, used.job_id)
 
 
-def close_runs(session: Session, job_id: str, state: State, error: str | None) -> None:
+def end_open_runs(session: Session, job_id: str, state: JobState, error: str | None) -> None:
     """Move a job's unfinished runs to a terminal state."""
-    unfinished = update(Run).where(Run.job_id == job_id, Run.state.in_(OPEN))
+    unfinished = update(Run).where(Run.job_id == job_id, Run.state.in_(OPEN_STATES))
     session.execute(
         unfinished.values(state=state, error=error, finished_at=utc_now()),
-        execution_options=IN_PLACE,
+        execution_options=RETURNING_OPTIONS,
     )
 
 

@@ -23,7 +23,7 @@ Relation = Literal["derived", "merged", "estimation", "validation", "warm-start"
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Edge:
+class LineageLink:
     """`child` was made from `parent`."""
 
     child: str
@@ -37,7 +37,7 @@ class LineageRepository:
     def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
         self._session, self._project_id = session, project_id
 
-    def link(self, child: str, parents: Iterable[str], relation: Relation) -> None:
+    def add_links(self, child: str, parents: Iterable[str], relation: Relation) -> None:
         """Record that `child` was made from each of `parents`."""
         edges = (
             {"child": child, "parent": parent, "relation": relation, "project_id": self._project_id}
@@ -45,15 +45,15 @@ class LineageRepository:
         )
         insert_missing(self._session, LineageEdge, edges)
 
-    def ancestors(self, identity: str) -> list[Edge]:
+    def list_ancestors(self, identity: str) -> list[LineageLink]:
         """Every edge on the ways from the raw files to this object."""
-        return self._walk(identity, upward=True)
+        return self._walk_edges(identity, upward=True)
 
-    def descendants(self, identity: str) -> list[Edge]:
+    def list_descendants(self, identity: str) -> list[LineageLink]:
         """Every edge on the ways from this object to what was made from it."""
-        return self._walk(identity, upward=False)
+        return self._walk_edges(identity, upward=False)
 
-    def _walk(self, identity: str, *, upward: bool) -> list[Edge]:
+    def _walk_edges(self, identity: str, *, upward: bool) -> list[LineageLink]:
         near, far = LineageEdge.child, LineageEdge.parent
         if not upward:
             near, far = far, near
@@ -69,10 +69,10 @@ class LineageRepository:
             mine, or_(near == identity, near.in_(select(reached.c.id)))
         )
         found = self._session.scalars(query)
-        return sorted(Edge(one.child, one.parent, one.relation) for one in found)
+        return sorted(LineageLink(one.child, one.parent, one.relation) for one in found)
 
 
-class Reached(NamedTuple):
+class WrittenProgress(NamedTuple):
     """How far an open run is known to be, from the improvements written so far."""
 
     generation: int
@@ -80,7 +80,9 @@ class Reached(NamedTuple):
     rms: float
 
 
-def datasets_named(session: Session, name: str, project_id: str = DEFAULT_PROJECT) -> list[Dataset]:
+def find_datasets_by_name(
+    session: Session, name: str, project_id: str = DEFAULT_PROJECT
+) -> list[Dataset]:
     """Datasets of that very name, latest first."""
     query = select(Dataset).where(
         Dataset.project_id == project_id, Dataset.deleted_at.is_(None), Dataset.name == name
@@ -88,7 +90,7 @@ def datasets_named(session: Session, name: str, project_id: str = DEFAULT_PROJEC
     return list(session.scalars(query.order_by(Dataset.id.desc()).limit(10)))
 
 
-def dataset_names(session: Session, project_id: str = DEFAULT_PROJECT) -> list[str]:
+def list_dataset_names(session: Session, project_id: str = DEFAULT_PROJECT) -> list[str]:
     """Names of the latest datasets, to suggest one."""
     query = select(Dataset.name).where(
         Dataset.project_id == project_id, Dataset.deleted_at.is_(None)
@@ -96,7 +98,7 @@ def dataset_names(session: Session, project_id: str = DEFAULT_PROJECT) -> list[s
     return list(session.scalars(query.order_by(Dataset.id.desc()).limit(200)))
 
 
-def references_of(
+def list_reference_names(
     session: Session, run_id: str, project_id: str = DEFAULT_PROJECT
 ) -> list[str]:  # fmt: skip
     """Names under which a run was accepted as a reference, now or before."""
@@ -106,7 +108,7 @@ def references_of(
     return list(session.scalars(query.distinct().order_by(AcceptedReference.name)))
 
 
-def reached(session: Session, run_ids: Collection[str]) -> dict[str, Reached]:
+def read_written_progress(session: Session, run_ids: Collection[str]) -> dict[str, WrittenProgress]:
     """The furthest generation and the least RMS in the history of each run."""
     columns = (
         RunHistory.run_id,
@@ -116,4 +118,4 @@ def reached(session: Session, run_ids: Collection[str]) -> dict[str, Reached]:
     )
     query = select(*columns).where(RunHistory.run_id.in_(run_ids)).group_by(RunHistory.run_id)
     rows = session.execute(query)
-    return {run: Reached(generation, done, rms) for run, generation, done, rms in rows}
+    return {run: WrittenProgress(generation, done, rms) for run, generation, done, rms in rows}

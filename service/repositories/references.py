@@ -8,18 +8,18 @@ from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from service.storage.columns import Document
-from service.storage.errors import Conflict, NotFound
-from service.storage.statements import Page, page_of
+from service.storage.errors import RowConflict, RowNotFound
+from service.storage.statements import RowPage, make_page
 from service.storage.tables import DEFAULT_PROJECT, AcceptedReference, Run
 
-MOST_HISTORY = 1000
+MAX_HISTORY = 1000
 """Acceptances of one name that are told."""
 
-_RIVALS = 20
-_MOST_NAMES = 10_000
+_MAX_TRIES = 20
+_MAX_NAMES = 10_000
 
 
-class InUse(NamedTuple):
+class CurrentReference(NamedTuple):
     """The reference in use of a name, with what is told of its run."""
 
     accepted: AcceptedReference
@@ -34,16 +34,16 @@ class ReferenceRepository:
     def __init__(self, session: Session, project_id: str = DEFAULT_PROJECT) -> None:
         self._session, self._project_id = session, project_id
 
-    def accept(
+    def accept_run(
         self, name: str, run_id: str, accepted_by: str | None = None, note: str | None = None
     ) -> AcceptedReference:
         """Make a run the reference of a name.
 
         The one in use again changes nothing, unless by whom or why is given and is another.
         """
-        for _ in range(_RIVALS):
-            latest = self._latest(name)
-            if latest is not None and _says(latest, run_id, accepted_by, note):
+        for _ in range(_MAX_TRIES):
+            latest = self._find_latest(name)
+            if latest is not None and _is_same_acceptance(latest, run_id, accepted_by, note):
                 return latest
             new = AcceptedReference(
                 project_id=self._project_id, name=name, run_id=run_id, accepted_by=accepted_by,
@@ -57,30 +57,30 @@ class ReferenceRepository:
             except IntegrityError:
                 continue
             return new
-        raise Conflict(f"reference {name!r} is being accepted by others; try again")
+        raise RowConflict(f"reference {name!r} is being accepted by others; try again")
 
-    def latest(self, name: str) -> AcceptedReference:
-        """What is in use under a name; `NotFound` if nothing is."""
-        found = self._latest(name)
+    def get_latest(self, name: str) -> AcceptedReference:
+        """What is in use under a name; `RowNotFound` if nothing is."""
+        found = self._find_latest(name)
         if found is None:
-            raise NotFound("reference", name)
+            raise RowNotFound("reference", name)
         return found
 
-    def history(self, name: str) -> Sequence[AcceptedReference]:
-        """What was accepted under a name, the one in use first, at most `MOST_HISTORY` of them.
+    def list_history(self, name: str) -> Sequence[AcceptedReference]:
+        """What was accepted under a name, the one in use first, at most `MAX_HISTORY` of them.
 
         Raises
         ------
         NotFound
             If nothing was.
         """
-        query = select(AcceptedReference).where(*self._named(name)).limit(MOST_HISTORY)
+        query = select(AcceptedReference).where(*self._filter_name(name)).limit(MAX_HISTORY)
         found = self._session.scalars(query.order_by(AcceptedReference.number.desc())).all()
         if not found:
-            raise NotFound("reference", name)
+            raise RowNotFound("reference", name)
         return found
 
-    def page(self, *, cursor: str | None = None, limit: int = 50) -> Page[InUse]:
+    def list_page(self, *, cursor: str | None = None, limit: int = 50) -> RowPage[CurrentReference]:
         """The reference in use of every name, by name."""
         mine = AcceptedReference.project_id == self._project_id
         last = (
@@ -98,28 +98,30 @@ class ReferenceRepository:
             .join(Run, Run.id == AcceptedReference.run_id)
             .where(mine).order_by(AcceptedReference.name)
         )  # fmt: skip
-        found = [InUse(*row) for row in self._session.execute(query)]
-        return page_of(found, limit, (one.accepted.name for one in found))
+        found = [CurrentReference(*row) for row in self._session.execute(query)]
+        return make_page(found, limit, (one.accepted.name for one in found))
 
-    def names(self) -> Sequence[str]:
+    def list_names(self) -> Sequence[str]:
         """Names in use."""
         query = (
             select(AcceptedReference.name).distinct()
-            .where(AcceptedReference.project_id == self._project_id).limit(_MOST_NAMES)
+            .where(AcceptedReference.project_id == self._project_id).limit(_MAX_NAMES)
         )  # fmt: skip
         return self._session.scalars(query).all()
 
-    def _latest(self, name: str) -> AcceptedReference | None:
-        query = select(AcceptedReference).where(*self._named(name))
+    def _find_latest(self, name: str) -> AcceptedReference | None:
+        query = select(AcceptedReference).where(*self._filter_name(name))
         return self._session.scalars(
             query.order_by(AcceptedReference.number.desc()).limit(1)
         ).first()
 
-    def _named(self, name: str) -> tuple[ColumnElement[bool], ColumnElement[bool]]:
+    def _filter_name(self, name: str) -> tuple[ColumnElement[bool], ColumnElement[bool]]:
         mine = AcceptedReference.project_id == self._project_id
         return mine, AcceptedReference.name == name
 
 
-def _says(latest: AcceptedReference, run_id: str, by: str | None, note: str | None) -> bool:
+def _is_same_acceptance(
+    latest: AcceptedReference, run_id: str, by: str | None, note: str | None
+) -> bool:
     is_new_word = by not in (None, latest.accepted_by) or note not in (None, latest.note)
     return latest.run_id == run_id and not is_new_word

@@ -19,16 +19,17 @@ from sqlalchemy import (
 from sqlalchemy.dialects.postgresql import JSONB
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
-from service.repositories.history import HistoryPoint, MigrantPoint, history_of, migrants_of
+from service.core.states import JobState
+from service.repositories.history import HistoryPoint, MigrantPoint, unpack_history, unpack_migrants
 from service.storage.columns import Document, to_json
-from service.storage.errors import InvalidCursor, NotFound
-from service.storage.statements import Page, page_of
-from service.storage.tables import DEFAULT_PROJECT, MigrationLog, Run, RunHistory, State
+from service.storage.errors import InvalidCursor, RowNotFound
+from service.storage.statements import RowPage, make_page
+from service.storage.tables import DEFAULT_PROJECT, MigrationLog, Run, RunHistory
 
 RunOrder = Literal[
     "number", "best_rms", "fit_estimation", "fit_validation", "sigma", "seconds", "evaluations"
 ]
-_ORDERS: dict[RunOrder, InstrumentedAttribute[Any]] = {
+_ORDER_COLUMNS: dict[RunOrder, InstrumentedAttribute[Any]] = {
     "number": Run.number, "best_rms": Run.best_rms, "fit_estimation": Run.fit_estimation,
     "fit_validation": Run.fit_validation, "sigma": Run.sigma, "seconds": Run.seconds,
     "evaluations": Run.evaluations,
@@ -42,7 +43,7 @@ class RunRow(NamedTuple):
     number: int
     cell: Document
     labels: Document
-    state: State
+    state: JobState
     valid: bool | None
     best_rms: float | None
     fit_estimation: float | None
@@ -63,57 +64,59 @@ class RunRepository:
         self._session, self._project_id = session, project_id
 
     def get(self, run_id: str) -> Run:
-        """A run of this project; `NotFound` otherwise."""
+        """A run of this project; `RowNotFound` otherwise."""
         run = self._session.get(Run, run_id, populate_existing=True)
         if run is None or run.project_id != self._project_id:
-            raise NotFound("run", run_id)
+            raise RowNotFound("run", run_id)
         return run
 
-    def page(
+    def list_page(
         self,
         job_id: str,
         *,
         cursor: str | None = None,
         limit: int = 50,
-        states: Sequence[State] = (),
+        states: Sequence[JobState] = (),
         cell: Mapping[str, Any] | None = None,
         labels: Mapping[str, Any] | None = None,
         order: RunOrder = "number",
         descending: bool = False,
-    ) -> Page[Run]:
+    ) -> RowPage[Run]:
         """Runs of a job, by a column; runs without a value in it come last.
 
         `cell` keeps the runs whose axes have these values, such as ``{"/noise/sigma": 0.1}``.
         The pages stay put while runs finish, as far as their values in the column do.
         """
-        query = select(Run).where(*self._of(job_id)).limit(limit + 1)
+        query = select(Run).where(*self._filter_job(job_id)).limit(limit + 1)
         if states:
             query = query.where(Run.state.in_(states))
         for column, wanted in ((Run.cell, cell), (Run.labels, labels)):
             for key, value in (wanted or {}).items():
                 query = query.where(entry_equals(self._session, column, key, value))
-        found = self._session.scalars(_ordered(query, _ORDERS[order], descending, cursor)).all()
+        found = self._session.scalars(
+            _apply_order(query, _ORDER_COLUMNS[order], descending, cursor)
+        ).all()
         cursors = (json.dumps([getattr(run, order), run.number]) for run in found)
-        return page_of(found, limit, cursors)
+        return make_page(found, limit, cursors)
 
-    def n_made(self, job_id: str) -> int:
+    def count_created(self, job_id: str) -> int:
         """How many runs of a job have been made: always its first ones."""
-        last = self._session.scalar(select(func.max(Run.number)).where(*self._of(job_id)))
+        last = self._session.scalar(select(func.max(Run.number)).where(*self._filter_job(job_id)))
         return 0 if last is None else int(last) + 1
 
-    def counts(self, job_id: str) -> dict[State, int]:
+    def count_states(self, job_id: str) -> dict[JobState, int]:
         """How many runs of a job are in each state."""
-        query = select(Run.state, func.count()).where(*self._of(job_id)).group_by(Run.state)
+        query = select(Run.state, func.count()).where(*self._filter_job(job_id)).group_by(Run.state)
         found = dict(self._session.execute(query).all())
-        return {state: found.get(state, 0) for state in State}
+        return {state: found.get(state, 0) for state in JobState}
 
-    def table(self, job_id: str) -> list[RunRow]:
+    def read_table(self, job_id: str) -> list[RunRow]:
         """The columns of all runs of a job that summaries need, in the order of the sweep."""
         columns = [getattr(Run, name) for name in RunRow._fields]
-        query = select(*columns).where(*self._of(job_id)).order_by(Run.number)
+        query = select(*columns).where(*self._filter_job(job_id)).order_by(Run.number)
         return [RunRow(*row) for row in self._session.execute(query)]
 
-    def estimated(self, job_id: str) -> list[tuple[str, str]]:
+    def list_parameters(self, job_id: str) -> list[tuple[str, str]]:
         """Names and units of all parameters in the results of a job's runs, the earliest first."""
         if self._session.get_bind().dialect.name == "postgresql":
             told = func.jsonb_array_elements(Run.result["parameters"]).table_valued("value")
@@ -123,23 +126,23 @@ class RunRepository:
             each = func.json_each(Run.result, "$.parameters").table_valued("value")
             name, unit = (func.json_extract(each.c.value, f"$.{key}") for key in ("name", "unit"))
         found = select(name, unit, func.min(Run.number)).select_from(Run).join(each, true())
-        query = found.where(*self._of(job_id), Run.result.is_not(None)).group_by(name, unit)
+        query = found.where(*self._filter_job(job_id), Run.result.is_not(None)).group_by(name, unit)
         rows = sorted(self._session.execute(query), key=lambda row: row[2])
         return [(row[0], row[1]) for row in rows]
 
-    def history(self, run_id: str) -> list[HistoryPoint]:
+    def read_history(self, run_id: str) -> list[HistoryPoint]:
         """Better champions of a run, island by island, in the order they were found."""
         parts = select(RunHistory.points, RunHistory.n_parameters).where(
             RunHistory.run_id == self.get(run_id).id
         )
-        return history_of(run_id, ((row[0], row[1]) for row in self._session.execute(parts)))
+        return unpack_history(run_id, ((row[0], row[1]) for row in self._session.execute(parts)))
 
-    def migrations(self, run_id: str) -> list[MigrantPoint]:
+    def read_migrations(self, run_id: str) -> list[MigrantPoint]:
         """Migrants of a run, in order."""
         parts = select(MigrationLog.migrants).where(MigrationLog.run_id == self.get(run_id).id)
-        return migrants_of(run_id, self._session.scalars(parts))
+        return unpack_migrants(run_id, self._session.scalars(parts))
 
-    def _of(self, job_id: str) -> tuple[ColumnElement[bool], ...]:
+    def _filter_job(self, job_id: str) -> tuple[ColumnElement[bool], ...]:
         return Run.job_id == job_id, Run.project_id == self._project_id
 
 
@@ -168,7 +171,7 @@ def _sqlite_entry_equals(
     )
 
 
-def _ordered(
+def _apply_order(
     query: Select[Run],
     column: InstrumentedAttribute[Any],
     descending: bool,
@@ -181,7 +184,7 @@ def _ordered(
         query = query.order_by(column.is_(None), by, Run.number)
     if cursor is None:
         return query
-    value, number = _position(cursor)
+    value, number = _parse_cursor(cursor)
     if value is None:
         return query.where(column.is_(None), Run.number > number)
     beyond = column < value if descending else column > value
@@ -191,7 +194,7 @@ def _ordered(
     return query.where(or_(beyond, beside, column.is_(None)))
 
 
-def _position(cursor: str) -> tuple[float | None, int]:
+def _parse_cursor(cursor: str) -> tuple[float | None, int]:
     try:
         value, number = json.loads(cursor)
     except (ValueError, TypeError):

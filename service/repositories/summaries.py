@@ -19,11 +19,12 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import Session
 
+from service.core.states import JobState
 from service.repositories.runs import entry_equals
 from service.storage.columns import to_json
-from service.storage.tables import DEFAULT_PROJECT, Job, Run, State
+from service.storage.tables import DEFAULT_PROJECT, Job, Run
 
-QUANTILES = (50, 250, 500, 750, 950)
+QUANTILES_PER_MILLE = (50, 250, 500, 750, 950)
 """In thousandths: the database counts places with whole numbers."""
 
 
@@ -43,7 +44,7 @@ class GroupKey:
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class SummaryQuantity:
     """A number of each run that quantiles are wanted of."""
 
     kind: Literal[
@@ -68,23 +69,23 @@ class Quantity:
 
 
 @dataclass(slots=True)
-class Group:
+class RunGroup:
     """The runs that share the values of the grouping keys; `sigma` is the range of their noise."""
 
     key: tuple[Any, ...]
-    first: int
-    states: dict[State, int]
+    first_number: int
+    states: dict[JobState, int]
     n_valid: int
     sigma: tuple[float, float] | None
     mean_evaluations: float | None
     mean_seconds: float | None
-    quantiles: dict[Quantity, tuple[float, ...]] = field(default_factory=dict)
+    quantiles: dict[SummaryQuantity, tuple[float, ...]] = field(default_factory=dict)
 
 
-def groups(
-    session: Session, job_id: str, keys: Sequence[GroupKey], quantities: Sequence[Quantity],
+def read_groups(
+    session: Session, job_id: str, keys: Sequence[GroupKey], quantities: Sequence[SummaryQuantity],
     limit: int, project_id: str = DEFAULT_PROJECT,
-) -> list[Group]:  # fmt: skip
+) -> list[RunGroup]:  # fmt: skip
     """Groups of a job's runs in the order of the sweep, at most `limit` + 1 of them.
 
     Quantiles are those of runs that succeeded, linearly interpolated between neighbours.
@@ -93,49 +94,49 @@ def groups(
     # Once asked for the project too, SQLite searches all its runs for those of the job.
     of_project = select(Job.id).where(Job.id == job_id, Job.project_id == project_id)
     mine = (Run.job_id == of_project.scalar_subquery(),)
-    counts = [func.sum(case((Run.state == state, 1), else_=0)) for state in State]
+    counts = [func.sum(case((Run.state == state, 1), else_=0)) for state in JobState]
     query = (
         select(
             func.min(Run.number), func.sum(case((Run.valid.is_(True), 1), else_=0)),
-            func.avg(_when_succeeded(Run.evaluations)), func.avg(_when_succeeded(Run.seconds)),
+            func.avg(_restrict_to_succeeded(Run.evaluations)), func.avg(_restrict_to_succeeded(Run.seconds)),
             func.min(Run.sigma), func.max(Run.sigma), *counts, *columns,
         )
         .where(*mine).group_by(*columns).order_by(func.min(Run.number)).limit(limit + 1)
     )  # fmt: skip
-    found: dict[str, Group] = {}
+    found: dict[str, RunGroup] = {}
     for first, valid, evaluations, seconds, low, high, *rest in session.execute(query):
         key = tuple(rest[len(counts) :])
-        states = {state: int(n) for state, n in zip(State, rest, strict=False)}
+        states = {state: int(n) for state, n in zip(JobState, rest, strict=False)}
         mean = None if evaluations is None else float(evaluations)
         sigma = None if low is None else (float(low), float(high))
-        found[to_json(key)] = Group(key, int(first), states, int(valid), sigma, mean, seconds)
-    by_first = {group.first: group for group in found.values()}
-    for first, quantity, values in _quantiles(session, mine, columns, quantities):
+        found[to_json(key)] = RunGroup(key, int(first), states, int(valid), sigma, mean, seconds)
+    by_first = {group.first_number: group for group in found.values()}
+    for first, quantity, values in _read_quantiles(session, mine, columns, quantities):
         if first in by_first:  # not beyond the limit
             by_first[first].quantiles[quantity] = values
     return list(found.values())
 
 
-def quietest_run(
+def find_quietest_run(
     session: Session, job_id: str, cell: Mapping[str, Any], project_id: str = DEFAULT_PROJECT
 ) -> Run | None:
     """The best valid run of a cell among those with the least noise; None if none succeeded."""
     query = select(Run).where(
-        Run.job_id == job_id, Run.project_id == project_id, Run.state == State.SUCCEEDED,
+        Run.job_id == job_id, Run.project_id == project_id, Run.state == JobState.SUCCEEDED,
         Run.valid.is_(True), Run.best_rms.is_not(None),
         *(entry_equals(session, Run.cell, path, value) for path, value in cell.items()),
     )  # fmt: skip
     return session.scalar(query.order_by(Run.sigma, Run.best_rms, Run.number).limit(1))
 
 
-def _when_succeeded(column: Any) -> ColumnElement[Any]:
-    return case((Run.state == State.SUCCEEDED, column))
+def _restrict_to_succeeded(column: Any) -> ColumnElement[Any]:
+    return case((Run.state == JobState.SUCCEEDED, column))
 
 
-def _quantiles(
+def _read_quantiles(
     session: Session, mine: Sequence[ColumnElement[bool]], keys: Sequence[Any],
-    quantities: Sequence[Quantity],
-) -> Iterator[tuple[int, Quantity, tuple[float, ...]]]:  # fmt: skip
+    quantities: Sequence[SummaryQuantity],
+) -> Iterator[tuple[int, SummaryQuantity, tuple[float, ...]]]:  # fmt: skip
     """The first number of each group, a quantity, its quantiles: only values beside them are read.
 
     One statement takes what it needs out of each row's documents once, and then ranks numbers.
@@ -147,13 +148,14 @@ def _quantiles(
     # Also of runs that did not succeed, so that a group's first run is the same everywhere.
     wide = select(
         group.label("grp"), Run.number.label("number"),
-        *(_when_succeeded(one.column).label(name)
+        *(_restrict_to_succeeded(one.column).label(name)
           for one, name in zip(quantities, names, strict=True)),
     ).where(*mine).cte("wide")  # fmt: skip
     nothing = literal(0)
     firsts = select(literal(-1), wide.c.grp, func.min(wide.c.number), nothing, nothing)
     statement = union_all(
-        firsts.group_by(wide.c.grp), *(_beside(wide, name, i) for i, name in enumerate(names))
+        firsts.group_by(wide.c.grp),
+        *(_select_neighbours(wide, name, i) for i, name in enumerate(names)),
     )
     first: dict[int, int] = {}
     values: dict[tuple[int, int], tuple[int, dict[int, float]]] = {}
@@ -164,11 +166,11 @@ def _quantiles(
         entry = values.setdefault((int(grp), int(which)), (int(count), {}))
         entry[1][int(at)] = float(number)
     for (grp, which), (count, places) in values.items():
-        found = tuple(_interpolated(places, count, q) for q in QUANTILES)
+        found = tuple(_interpolate_quantile(places, count, q) for q in QUANTILES_PER_MILLE)
         yield first[grp], quantities[which], found
 
 
-def _beside(wide: CTE, name: str, which: int) -> Select[Any]:
+def _select_neighbours(wide: CTE, name: str, which: int) -> Select[Any]:
     """The values on both sides of each quantile of one column, group by group."""
     value = wide.c[name]
     place = func.row_number().over(partition_by=wide.c.grp, order_by=value).label("place")
@@ -178,13 +180,13 @@ def _beside(wide: CTE, name: str, which: int) -> Select[Any]:
         value.is_not(None)
     ).subquery()  # fmt: skip
     n = cast(ranked.c.n, Integer)
-    lower = [1 + (q * (n - 1)) // 1000 for q in QUANTILES]
+    lower = [1 + (q * (n - 1)) // 1000 for q in QUANTILES_PER_MILLE]
     return select(literal(which), ranked).where(
         or_(*(ranked.c.place.in_((at, at + 1)) for at in lower))
     )
 
 
-def _interpolated(places: dict[int, float], count: int, thousandths: int) -> float:
+def _interpolate_quantile(places: dict[int, float], count: int, thousandths: int) -> float:
     whole, rest = divmod(thousandths * (count - 1), 1000)
     low = places[1 + whole]
     return low if rest == 0 else low + (places[2 + whole] - low) * rest / 1000

@@ -5,10 +5,11 @@ from typing import NamedTuple
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from service.core.states import JobState
 from service.storage.columns import Document
-from service.storage.tables import DEFAULT_PROJECT, Run, State
+from service.storage.tables import DEFAULT_PROJECT, Run
 
-PARTS = ("parameters", "onset_delays", "agreement", "warnings", "correlation_times")
+RESULT_PARTS = ("parameters", "onset_delays", "agreement", "warnings", "correlation_times")
 
 
 class TrendRow(NamedTuple):
@@ -27,17 +28,18 @@ class TrendRow(NamedTuple):
     correlation_times: Document
 
 
-def trend_rows(
+def read_trend_rows(
     session: Session, job_id: str, limit: int, project_id: str = DEFAULT_PROJECT
 ) -> list[TrendRow]:
     """The runs of a job that succeeded, in the order of the sweep, at most `limit` of them."""
     names = TrendRow._fields
     columns = [
-        Run.result.expression[name] if name in PARTS else getattr(Run, name) for name in names
+        Run.result.expression[name] if name in RESULT_PARTS else getattr(Run, name)
+        for name in names
     ]
     query = (
         select(*columns)
-        .where(Run.job_id == job_id, Run.project_id == project_id, Run.state == State.SUCCEEDED)
+        .where(Run.job_id == job_id, Run.project_id == project_id, Run.state == JobState.SUCCEEDED)
         .order_by(Run.number).limit(limit)
     )  # fmt: skip
     return [TrendRow(*row) for row in session.execute(query)]
@@ -46,6 +48,6 @@ def trend_rows(
 def count_succeeded(session: Session, job_id: str, project_id: str = DEFAULT_PROJECT) -> int:
     """How many runs of a job succeeded."""
     query = select(func.count()).where(
-        Run.job_id == job_id, Run.project_id == project_id, Run.state == State.SUCCEEDED
+        Run.job_id == job_id, Run.project_id == project_id, Run.state == JobState.SUCCEEDED
     )
     return int(session.scalar(query) or 0)

@@ -11,11 +11,11 @@ from service.core.text import plain_estimate, plain_unit
 from service.jobs.results import read_noise_model
 from service.jobs.stored_run import StoredRun, load_run
 from service.runs.schemas import ComparedParameter, ComparedRun, ComparedValue, ComparisonOut
-from service.storage.errors import NotFound
+from service.storage.errors import RowNotFound
 
-Document = Mapping[str, Any]
+ResultDocument = Mapping[str, Any]
 
-_DATA = {
+_DATA_DIFFERENCES = {
     "datasets": "other datasets",
     "outputs": "other measured channels as outputs",
     "validation": "other data kept for validation",
@@ -24,7 +24,7 @@ _DATA = {
 }
 
 
-def compare(session: Session, runs: Sequence[str]) -> ComparisonOut:
+def compare_runs(session: Session, runs: Sequence[str]) -> ComparisonOut:
     """Runs side by side, the best RMS first.
 
     Raises
@@ -33,19 +33,19 @@ def compare(session: Session, runs: Sequence[str]) -> ComparisonOut:
         If a run is not there, has no result, is named twice, or was fitted to other data than
         the first.
     """
-    candidates = _candidates(session, runs)
+    candidates = _read_candidates(session, runs)
     _check_same_data(candidates)
-    ordered = sorted(candidates, key=lambda one: _or_infinite(one.result.get("rms")))
-    titles = _titles(ordered)
-    parameters = list(_parameters(ordered, titles))
+    ordered = sorted(candidates, key=lambda one: _rank_rms(one.result.get("rms")))
+    titles = _build_titles(ordered)
+    parameters = list(_compare_parameters(ordered, titles))
     return ComparisonOut(
-        unit=_unit(ordered), runs=[_row(one, titles[one.run.id]) for one in ordered],
+        unit=_find_common_unit(ordered), runs=[_to_compared_run(one, titles[one.run.id]) for one in ordered],
         parameters=parameters,
-        notes=[one.note for one in parameters if one.differs] + list(_notes(ordered)),
+        notes=[one.note for one in parameters if one.differs] + list(_list_notes(ordered)),
     )  # fmt: skip
 
 
-def _candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
+def _read_candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
     found, faults = [], []
     for number, name in enumerate(runs):
         pointer = f"/runs/{number}"
@@ -54,7 +54,7 @@ def _candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
             continue
         try:
             stored = load_run(session, name)
-        except NotFound as error:
+        except RowNotFound as error:
             faults.append(FieldError(pointer, str(error)))
             continue
         if stored.run.result is None:
@@ -68,7 +68,7 @@ def _candidates(session: Session, runs: Sequence[str]) -> list[StoredRun]:
     return found
 
 
-def _data_of(one: StoredRun) -> dict[str, Any]:
+def _collect_data_settings(one: StoredRun) -> dict[str, Any]:
     """What must be the same: else the RMS of two runs say nothing about their models."""
     body = one.body
     return {
@@ -81,11 +81,11 @@ def _data_of(one: StoredRun) -> dict[str, Any]:
 
 
 def _check_same_data(candidates: Sequence[StoredRun]) -> None:
-    first = _data_of(candidates[0])
+    first = _collect_data_settings(candidates[0])
     faults = []
     for number, one in enumerate(candidates[1:], 1):
-        other = _data_of(one)
-        apart = [text for name, text in _DATA.items() if other[name] != first[name]]
+        other = _collect_data_settings(one)
+        apart = [text for name, text in _DATA_DIFFERENCES.items() if other[name] != first[name]]
         if apart:
             faults.append(FieldError(
                 f"/runs/{number}",
@@ -96,7 +96,7 @@ def _check_same_data(candidates: Sequence[StoredRun]) -> None:
         raise InvalidRequest(faults)
 
 
-def _titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
+def _build_titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
     """Name of each run: its model, and the run's number where two have the same model."""
     names = [one.model.name for one in ordered]
     return {
@@ -105,7 +105,7 @@ def _titles(ordered: Sequence[StoredRun]) -> dict[str, str]:
     }
 
 
-def _row(one: StoredRun, title: str) -> ComparedRun:
+def _to_compared_run(one: StoredRun, title: str) -> ComparedRun:
     result = one.result
     criteria, tests, fit = result["criteria"], result["residual_tests"], result["fit_percent"]
     return ComparedRun(
@@ -119,21 +119,21 @@ def _row(one: StoredRun, title: str) -> ComparedRun:
     )  # fmt: skip
 
 
-def _parameters(
+def _compare_parameters(
     ordered: Sequence[StoredRun], titles: Mapping[str, str]
 ) -> Iterator[ComparedParameter]:
     """Parameters that have the same name and unit in two runs or more."""
-    kept: dict[tuple[str, str], list[tuple[StoredRun, Document]]] = {}
+    kept: dict[tuple[str, str], list[tuple[StoredRun, ResultDocument]]] = {}
     for one in ordered:
         for estimate in one.result["parameters"]:
             kept.setdefault((estimate["name"], estimate["unit"]), []).append((one, estimate))
     for (name, unit), found in kept.items():
         if len(found) < 2:
             continue
-        pair = _furthest([estimate for _, estimate in found])
+        pair = _find_furthest_pair([estimate for _, estimate in found])
         note = ""
         if pair is not None:
-            note = _note(name, unit, [(titles[found[i][0].run.id], found[i][1]) for i in pair],
+            note = _describe_difference(name, unit, [(titles[found[i][0].run.id], found[i][1]) for i in pair],
                          same_model=len({one.model.name for one, _ in found}) == 1)  # fmt: skip
         known = sum(_has_ends(estimate["interval95"]) for _, estimate in found)
         yield ComparedParameter(
@@ -142,7 +142,7 @@ def _parameters(
         )  # fmt: skip
 
 
-def _furthest(estimates: Sequence[Document]) -> tuple[int, int] | None:
+def _find_furthest_pair(estimates: Sequence[ResultDocument]) -> tuple[int, int] | None:
     """The two estimates whose 95 % intervals are furthest apart; None if all of them meet."""
     known = [i for i, one in enumerate(estimates) if _has_ends(one["interval95"])]
     gaps = {
@@ -158,8 +158,8 @@ def _has_ends(interval: Sequence[float | None] | None) -> bool:
     return interval is not None and all(end is not None for end in interval)
 
 
-def _note(
-    name: str, unit: str, pair: Sequence[tuple[str, Document]], *, same_model: bool
+def _describe_difference(
+    name: str, unit: str, pair: Sequence[tuple[str, ResultDocument]], *, same_model: bool
 ) -> str:  # fmt: skip
     told = ", ".join(
         f"{plain_estimate(estimate['value'], estimate['stderr'])}{plain_unit(unit)} with {title}"
@@ -168,7 +168,7 @@ def _note(
     return f"{name} depends on the {'run' if same_model else 'model'}: {told}"
 
 
-def _unit(ordered: Sequence[StoredRun]) -> str:
+def _find_common_unit(ordered: Sequence[StoredRun]) -> str:
     """Unit of the RMS of all, if it is the same: several outputs are weighted together."""
     units = set()
     for one in ordered:
@@ -178,7 +178,7 @@ def _unit(ordered: Sequence[StoredRun]) -> str:
     return units.pop() if len(units) == 1 else "1"
 
 
-def _notes(ordered: Sequence[StoredRun]) -> Iterator[str]:
+def _list_notes(ordered: Sequence[StoredRun]) -> Iterator[str]:
     """What keeps numbers of the table from being compared."""
     if len({one.body["prediction"] for one in ordered}) > 1:
         yield (
@@ -195,5 +195,5 @@ def _notes(ordered: Sequence[StoredRun]) -> Iterator[str]:
         )
 
 
-def _or_infinite(value: float | None) -> float:
+def _rank_rms(value: float | None) -> float:
     return float("inf") if value is None else value

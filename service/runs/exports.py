@@ -13,14 +13,14 @@ from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.repositories.datasets import DatasetRepository
 from service.storage.errors import StorageError
 from service.storage.tables import Dataset
-from sysid.control.linear_form import Covariance, Identified, NotLinear, Value
+from sysid.control.linear_form import Covariance, IdentifiedModel, IdentifiedValue, NotLinear
 from sysid.core.errors import InvalidSettings
 from sysid.data.records import Hold
-from sysid.export.export import Format, written
+from sysid.export.export import ExportFormat, write_export
 
-Body = Mapping[str, Any]
+JobBody = Mapping[str, Any]
 
-_KINDS: Mapping[Format, tuple[str, str]] = {
+_MEDIA_TYPES: Mapping[ExportFormat, tuple[str, str]] = {
     "json": ("application/json", ".json"),
     "python": ("text/x-python", "_model.py"),
     "c": ("text/x-c", ".c"),
@@ -28,7 +28,7 @@ _KINDS: Mapping[Format, tuple[str, str]] = {
 }
 
 
-class Exported(NamedTuple):
+class ExportFile(NamedTuple):
     """A file: its text, media type and name."""
 
     text: str
@@ -36,7 +36,7 @@ class Exported(NamedTuple):
     name: str
 
 
-def exported(session: Session, run_id: str, format: Format, pade_order: int) -> Exported:
+def export_run(session: Session, run_id: str, format: ExportFormat, pade_order: int) -> ExportFile:
     """The model of a run in one of the formats.
 
     Raises
@@ -50,28 +50,32 @@ def exported(session: Session, run_id: str, format: Format, pade_order: int) -> 
     """
     stored = load_estimated_run(session, run_id, "export")
     try:
-        text = written(_identified(session, stored), format, pade_order)
+        text = write_export(_build_identified(session, stored), format, pade_order)
     except NotLinear as error:
-        raise InvalidRequest.at("?format", f"{format!r} is not possible: {error}") from error
+        raise InvalidRequest.from_fault(
+            "?format", f"{format!r} is not possible: {error}"
+        ) from error
     except InvalidSettings as error:
         name = error.pointer.removeprefix("/")
-        raise InvalidRequest.at(f"?{name}" if name == "pade_order" else "", str(error)) from error
-    media_type, ending = _KINDS[format]
+        raise InvalidRequest.from_fault(
+            f"?{name}" if name == "pade_order" else "", str(error)
+        ) from error
+    media_type, ending = _MEDIA_TYPES[format]
     stem = re.sub(r"[^A-Za-z0-9]+", "_", stored.model.name)
-    return Exported(text, media_type, stem + ending)
+    return ExportFile(text, media_type, stem + ending)
 
 
-def _identified(session: Session, stored: StoredRun) -> Identified:
-    rows = _datasets(session, stored.body)
-    values = tuple(_values(stored))
-    return Identified(
-        stored.model, values, _covariance(stored.result, values), _period(stored, rows),
-        {one.name: _hold(one.name, stored, rows) for one in stored.model.inputs},
-        version("lagid"), _provenance(stored, rows),
+def _build_identified(session: Session, stored: StoredRun) -> IdentifiedModel:
+    rows = _read_datasets(session, stored.body)
+    values = tuple(_read_values(stored))
+    return IdentifiedModel(
+        stored.model, values, _compute_covariance(stored.result, values), _find_sample_time(stored, rows),
+        {one.name: _find_hold(one.name, stored, rows) for one in stored.model.inputs},
+        version("lagid"), _describe_provenance(stored, rows),
     )  # fmt: skip
 
 
-def _datasets(session: Session, body: Body) -> list[Dataset]:
+def _read_datasets(session: Session, body: JobBody) -> list[Dataset]:
     """The datasets of the estimation, as far as they have not been deleted since."""
     found = []
     for name in body["datasets"]:
@@ -82,12 +86,12 @@ def _datasets(session: Session, body: Body) -> list[Dataset]:
     return found
 
 
-def _values(stored: StoredRun) -> Iterator[Value]:
+def _read_values(stored: StoredRun) -> Iterator[IdentifiedValue]:
     for one in stored.estimates:
-        yield Value(one["name"], one["value"], one["unit"], one["stderr"], one["status"])
+        yield IdentifiedValue(one["name"], one["value"], one["unit"], one["stderr"], one["status"])
 
 
-def _covariance(result: Body, values: tuple[Value, ...]) -> Covariance | None:
+def _compute_covariance(result: JobBody, values: tuple[IdentifiedValue, ...]) -> Covariance | None:
     """From correlations and standard errors; ``nan`` where one of them is missing."""
     found = result.get("correlation")
     if found is None:
@@ -98,31 +102,33 @@ def _covariance(result: Body, values: tuple[Value, ...]) -> Covariance | None:
     return Covariance(tuple(found["names"]), matrix * np.outer(deviations, deviations))
 
 
-def _channels(name: str, stored: StoredRun, rows: list[Dataset]) -> Iterator[Mapping[str, Any]]:
+def _find_channels(
+    name: str, stored: StoredRun, rows: list[Dataset]
+) -> Iterator[Mapping[str, Any]]:
     """What the datasets say of the recorded channels of a signal of the model."""
     recorded = stored.channels.by_signal[name]
     for row in rows:
         yield from (one for one in row.channels if one["name"] == recorded)
 
 
-def _period(stored: StoredRun, rows: list[Dataset]) -> float | None:
+def _find_sample_time(stored: StoredRun, rows: list[Dataset]) -> float | None:
     """The sampling period that all measured outputs have; None if they have no common one."""
     periods = [
         one["sample_time"] for output in stored.model.outputs
-        for one in _channels(output.name, stored, rows)
+        for one in _find_channels(output.name, stored, rows)
     ]  # fmt: skip
     if not periods or None in periods or max(periods) - min(periods) > 1e-6 * min(periods):
         return None
     return float(periods[0])
 
 
-def _hold(name: str, stored: StoredRun, rows: list[Dataset]) -> Hold:
-    channel = next(_channels(name, stored, rows), None)
+def _find_hold(name: str, stored: StoredRun, rows: list[Dataset]) -> Hold:
+    channel = next(_find_channels(name, stored, rows), None)
     found: Hold = stored.body["hold"].get(name) or (channel or {}).get("hold", "first")
     return found
 
 
-def _provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, Any]:
+def _describe_provenance(stored: StoredRun, rows: list[Dataset]) -> dict[str, Any]:
     run, job = stored.run, stored.job
     known = {row.id: {"id": row.id, "name": row.name, "sha256": row.sha256} for row in rows}
     return {

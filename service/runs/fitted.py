@@ -9,8 +9,8 @@ from itertools import groupby
 from sqlalchemy.orm import Session
 
 from service.core.errors import NotFound
-from service.datasets.datasets import series
-from service.formats.mcap import FittedOutput, read_fit
+from service.datasets.datasets import to_series
+from service.formats.mcap import FittedOutput, read_fitted_outputs
 from service.repositories.runs import RunRepository
 from service.runs.schemas import ExperimentOut, ResponseOut
 from service.storage.objects import ObjectStore
@@ -18,10 +18,10 @@ from service.storage.tables import Run
 from sysid.data.records import Channel
 
 # An object never changes, so what was read of it stays true; a zoom asks for it again and again.
-_KEPT = 4
+_CACHE_SIZE = 4
 
 
-def fits_of(store: ObjectStore, run: Run) -> tuple[FittedOutput, ...]:
+def read_fitted_signals(store: ObjectStore, run: Run) -> tuple[FittedOutput, ...]:
     """What was measured and simulated, output by output; the run has signals.
 
     Raises
@@ -30,19 +30,21 @@ def fits_of(store: ObjectStore, run: Run) -> tuple[FittedOutput, ...]:
         If the object is not there, or cannot be read.
     """
     assert run.signals_sha256 is not None
-    return _read(store, run.signals_sha256, run.signals_start, run.signals_size)
+    return _read_object(store, run.signals_sha256, run.signals_start, run.signals_size)
 
 
-@lru_cache(maxsize=_KEPT)
-def _read(
+@lru_cache(maxsize=_CACHE_SIZE)
+def _read_object(
     store: ObjectStore, sha256: str, start: int | None, size: int | None
 ) -> tuple[FittedOutput, ...]:
     if start is None or size is None:
-        return read_fit(store.get(sha256))
-    return read_fit(store.get_range(sha256, start, size))
+        return read_fitted_outputs(store.get_bytes(sha256))
+    return read_fitted_outputs(store.get_range(sha256, start, size))
 
 
-def response(session: Session, store: ObjectStore, run_id: str, max_points: int) -> ResponseOut:
+def build_response(
+    session: Session, store: ObjectStore, run_id: str, max_points: int
+) -> ResponseOut:
     """Measured and simulated outputs of a run, reduced so that extremes stay visible.
 
     Raises
@@ -53,23 +55,23 @@ def response(session: Session, store: ObjectStore, run_id: str, max_points: int)
     run = RunRepository(session).get(run_id)
     if run.signals_sha256 is None:
         raise NotFound("response of run", run_id, f"; the run is {run.state.value}")
-    fits = fits_of(store, run)
+    fits = read_fitted_signals(store, run)
     experiments = [
-        _experiment(name, list(outputs), max_points)
+        _to_experiment_out(name, list(outputs), max_points)
         for name, outputs in groupby(fits, key=lambda fit: fit.experiment)
     ]
     return ResponseOut(id=run.id, experiments=experiments)
 
 
-def _experiment(name: str, outputs: list[FittedOutput], max_points: int) -> ExperimentOut:
+def _to_experiment_out(name: str, outputs: list[FittedOutput], max_points: int) -> ExperimentOut:
     return ExperimentOut(
         name=name,
         measured=[
-            series(Channel(fit.name, fit.times, fit.measured, fit.unit), max_points)
+            to_series(Channel(fit.name, fit.times, fit.measured, fit.unit), max_points)
             for fit in outputs
         ],
         simulated=[
-            series(Channel(fit.name, fit.times, fit.simulated, fit.unit), max_points)
+            to_series(Channel(fit.name, fit.times, fit.simulated, fit.unit), max_points)
             for fit in outputs
         ],
     )

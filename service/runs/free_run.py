@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from sqlalchemy.orm import Session
 
-from service.core.concurrency import simulating
+from service.core.concurrency import simulation_limit
 from service.core.errors import FieldError, InvalidRequest
-from service.datasets.datasets import series
+from service.datasets.datasets import to_series
 from service.datasets.recordings import read_records
 from service.datasets.signal_channels import SignalChannels, map_channels
 from service.jobs.stored_run import StoredRun, load_estimated_run
@@ -24,10 +24,10 @@ from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
 from service.storage.tables import Dataset
-from sysid.core.errors import InvalidRecord, RecordTooShort, nearest
+from sysid.core.errors import InvalidRecord, RecordTooShort, suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.models.model import initial_name, initial_parameters
+from sysid.models.model import build_initial_parameters, name_initial_state
 from sysid.models.units import SignalUnits
 from sysid.simulation.metrics import Metrics
 
@@ -56,7 +56,7 @@ class FreeRun:
     starts: dict[str, float]
 
 
-def free_run(
+def validate_run(
     database: Database, store: ObjectStore, run_id: str, body: FreeRunIn, max_points: int
 ) -> FreeRunOut:
     """Run a run's model over a dataset.
@@ -70,7 +70,7 @@ def free_run(
     InvalidRequest
         If the recording does not have what the model needs, or the simulation diverges.
     """
-    found = judged(database, store, run_id, body)
+    found = simulate_free_run(database, store, run_id, body)
     return FreeRunOut.from_source(
         found.metrics,
         id=found.run,
@@ -80,19 +80,21 @@ def free_run(
             AgreementOut.from_source(one, experiment=one.experiment + 1)
             for one in found.metrics.channels
         ],
-        experiments=list(_experiments(found, max_points)),
+        experiments=list(_to_experiments_out(found, max_points)),
     )
 
 
-@simulating.one()
-def judged(database: Database, store: ObjectStore, run_id: str, body: FreeRunIn) -> FreeRun:
-    """The same as arrays; raises as `free_run` does."""
-    with database.read() as session:
-        problem, row = _read(session, store, run_id, body)
-    return _judged(problem, run_id, row)
+@simulation_limit.acquire()
+def simulate_free_run(
+    database: Database, store: ObjectStore, run_id: str, body: FreeRunIn
+) -> FreeRun:
+    """The same as arrays; raises as `validate_run` does."""
+    with database.read_session() as session:
+        problem, row = _read_problem(session, store, run_id, body)
+    return _evaluate_free_run(problem, run_id, row)
 
 
-def _read(
+def _read_problem(
     session: Session, store: ObjectStore, run_id: str, body: FreeRunIn
 ) -> "tuple[Problem, Dataset]":
     stored = load_estimated_run(session, run_id, "simulate with")
@@ -100,29 +102,29 @@ def _read(
     named = {**stored.body["channels"], **body.channels}
     channels = map_channels(stored.model, named, stored.body["hold"])
     faults = [
-        *_channel_faults(row, named, channels),
-        *_unit_faults(session, stored, row, channels),
+        *_find_channel_faults(row, named, channels),
+        *_find_unit_faults(session, stored, row, channels),
     ]
     if faults:
         raise InvalidRequest(faults)
-    records = _records(store, row, channels)
-    return _problem(stored, records, body.skip), row
+    records = _read_records(store, row, channels)
+    return _build_problem(stored, records, body.skip), row
 
 
-def _channel_faults(
+def _find_channel_faults(
     row: Dataset, named: Mapping[str, str], channels: SignalChannels
 ) -> Iterator[FieldError]:
     signals = list(channels.by_signal)
     recorded = [str(one["name"]) for one in row.channels]
     for name in named:
         if name not in signals:
-            detail = f"the model has no signal {name!r}{nearest(name, signals)}"
+            detail = f"the model has no signal {name!r}{suggest_name(name, signals)}"
             yield FieldError(f"/channels/{name}", detail)
     for name, wanted in channels.by_signal.items():
         if wanted not in recorded:
             yield FieldError(
                 f"/channels/{name}",
-                f"{row.name!r} has no channel {wanted!r}{nearest(wanted, recorded)}; it has "
+                f"{row.name!r} has no channel {wanted!r}{suggest_name(wanted, recorded)}; it has "
                 f"{', '.join(recorded)}",
             )
     if row.n_samples > MOST_SAMPLES:
@@ -133,7 +135,7 @@ def _channel_faults(
         )
 
 
-def _unit_faults(
+def _find_unit_faults(
     session: Session, stored: StoredRun, row: Dataset, channels: SignalChannels
 ) -> Iterator[FieldError]:
     """Channels in another unit than the model's, or than what the run was fitted to."""
@@ -145,23 +147,23 @@ def _unit_faults(
     before_by_signal = stored.channels.by_signal
     for signal, name in channels.by_signal.items():
         before = before_by_signal[signal]
-        units.fault(signal, before, _unit(fitted, before), f"{fitted.name!r}")
-        fault = units.fault(signal, name, _unit(row, name), f"{row.name!r}")
+        units.describe_mismatch(signal, before, _get_unit(fitted, before), f"{fitted.name!r}")
+        fault = units.describe_mismatch(signal, name, _get_unit(row, name), f"{row.name!r}")
         if fault:
             yield FieldError(f"/channels/{signal}", fault)
 
 
-def _unit(row: Dataset, channel: str) -> str | None:
+def _get_unit(row: Dataset, channel: str) -> str | None:
     return next((str(one["unit"]) for one in row.channels if one["name"] == channel), None)
 
 
-def _records(store: ObjectStore, row: Dataset, channels: SignalChannels) -> tuple[Record, ...]:
+def _read_records(store: ObjectStore, row: Dataset, channels: SignalChannels) -> tuple[Record, ...]:
     try:
         records = read_records(store, [row], channels)
     except InvalidRecord as error:
-        raise InvalidRequest.at("/dataset", str(error)) from None
+        raise InvalidRequest.from_fault("/dataset", str(error)) from None
     if len(records) > MOST_RECORDS:
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "/dataset",
             f"{row.name!r} has {len(records)} segments; at most {MOST_RECORDS} are simulated for a "
             "request: derive a recording of some of them with 'select' or 'trim'",
@@ -169,7 +171,7 @@ def _records(store: ObjectStore, row: Dataset, channels: SignalChannels) -> tupl
     return records
 
 
-def _problem(stored: StoredRun, records: tuple[Record, ...], skip: int) -> "Problem":
+def _build_problem(stored: StoredRun, records: tuple[Record, ...], skip: int) -> "Problem":
     """All that was identified fixed, so that at most starts of states are free."""
     # The compiler comes with this import, and most requests never need it.
     from sysid.simulation.problem import Problem
@@ -177,18 +179,18 @@ def _problem(stored: StoredRun, records: tuple[Record, ...], skip: int) -> "Prob
     model, request = stored.model, stored.body
     own = {one.name for one in model.parameters}
     values = {one["name"]: one for one in stored.estimates if one["name"] in own}
-    starts = {one.name for one in initial_parameters(model, len(records))}
+    starts = {one.name for one in build_initial_parameters(model, len(records))}
     changes = {name: f for name, f in request["parameters"].items() if name in starts}
-    fixed = {name: _fixed(one) for name, one in values.items()}
+    fixed = {name: _fix_estimate(one) for name, one in values.items()}
     try:
         return Problem.build(
             model, records, parameters={**changes, **fixed}, weights=request["weights"], skip=skip
         )
     except (InvalidRecord, RecordTooShort) as error:
-        raise InvalidRequest.at("/dataset", str(error)) from None
+        raise InvalidRequest.from_fault("/dataset", str(error)) from None
 
 
-def _fixed(estimate: Mapping[str, Any]) -> dict[str, Any]:
+def _fix_estimate(estimate: Mapping[str, Any]) -> dict[str, Any]:
     """An estimate as a fixed value; that of a tie may lie outside its parameter's bounds."""
     value = float(estimate["value"])
     known = [float(estimate[k]) for k in ("lower", "upper") if estimate.get(k) is not None]
@@ -198,7 +200,7 @@ def _fixed(estimate: Mapping[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _starts(problem: "Problem") -> FloatArray:
+def _search_starts(problem: "Problem") -> FloatArray:
     """The starts (D,) that fit best.
 
     Those of a record touch no other, so each record is searched alone: all at once the effort
@@ -207,47 +209,50 @@ def _starts(problem: "Problem") -> FloatArray:
     most = max(LEAST_SIMULATIONS, MOST_STEPS // problem.n_steps)
     changes = problem.settings.parameters
     if len(problem.records) == 1 or any("tied" in fields for fields in changes.values()):
-        return _searched(problem, most)
-    return np.concatenate([_searched(one, most) for one in _alone(problem)])
+        return _refine_starts(problem, most)
+    return np.concatenate([_refine_starts(one, most) for one in _split_by_record(problem)])
 
 
-def _alone(problem: "Problem") -> "Iterator[Problem]":
+def _split_by_record(problem: "Problem") -> "Iterator[Problem]":
     """Each record of a problem by itself, its starts by the names of the first."""
     model, changes = problem.untied_model, problem.settings.parameters
     fixed = {one.name: changes[one.name] for one in model.parameters if one.name in changes}
     for number, record in enumerate(problem.records):
-        names = {initial_name(one.name, 0): initial_name(one.name, number) for one in model.states}
+        names = {
+            name_initial_state(one.name, 0): name_initial_state(one.name, number)
+            for one in model.states
+        }
         starts = {own: changes[name] for own, name in names.items() if name in changes}
         yield problem.rebuild(
             records=[record], parameters=fixed | starts, weights=problem.output_weights
         )
 
 
-def _searched(problem: "Problem", simulations: int) -> FloatArray:
-    from sysid.search.refine import refine
+def _refine_starts(problem: "Problem", simulations: int) -> FloatArray:
+    from sysid.search.refine import refine_candidates
 
-    if not problem.space:
+    if not problem.free_parameters:
         return np.zeros(0)
-    work = problem.evaluator.n_measured * len(problem.space)
+    work = problem.evaluator.n_measured * len(problem.free_parameters)
     if work > MOST_WORK:
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "/dataset",
-            f"{len(problem.space)} starts are to be found on {problem.evaluator.n_measured} "
+            f"{len(problem.free_parameters)} starts are to be found on {problem.evaluator.n_measured} "
             f"measured values: their product may be {MOST_WORK:.3g}; derive a shorter recording",
         )
     middle: FloatArray = 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
-    found = refine(problem, [middle], simulations)[0]
+    found = refine_candidates(problem, [middle], simulations)[0]
     return middle if found is None else found.theta
 
 
-def _judged(problem: "Problem", run_id: str, row: Dataset) -> FreeRun:
-    from sysid.simulation.problem import metrics_of
+def _evaluate_free_run(problem: "Problem", run_id: str, row: Dataset) -> FreeRun:
+    from sysid.simulation.problem import compute_metrics
 
-    theta = _starts(problem)
-    predicted = problem.predictions(theta[None])[0]
-    metrics = _in_units(metrics_of(problem, predicted), problem.records)
+    theta = _search_starts(problem)
+    predicted = problem.predict(theta[None])[0]
+    metrics = _apply_recorded_units(compute_metrics(problem, predicted), problem.records)
     if not isfinite(metrics.rms):
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "/dataset",
             f"over {row.name!r} the simulation of {run_id} diverges: the recording goes beyond "
             "what the model was identified for",
@@ -255,13 +260,13 @@ def _judged(problem: "Problem", run_id: str, row: Dataset) -> FreeRun:
     names = [one.name for one in problem.model.outputs]
     return FreeRun(
         run=run_id, dataset=row.id, records=problem.records,
-        simulated=tuple(tuple(p[name] for name in names) for p in problem.split(predicted)),
+        simulated=tuple(tuple(p[name] for name in names) for p in problem.split_by_output(predicted)),
         metrics=metrics,
         starts=dict(zip(problem.free_names, theta.tolist(), strict=True)),
     )  # fmt: skip
 
 
-def _in_units(metrics: Metrics, records: Sequence[Record]) -> Metrics:
+def _apply_recorded_units(metrics: Metrics, records: Sequence[Record]) -> Metrics:
     """Of an output that may be in any unit, in that of the recording."""
     known = {one.name: one.unit for one in records[0].outputs}
     channels = tuple(
@@ -271,7 +276,7 @@ def _in_units(metrics: Metrics, records: Sequence[Record]) -> Metrics:
     return replace(metrics, channels=channels, unit=channels[0].unit if alone else metrics.unit)
 
 
-def _experiments(found: FreeRun, max_points: int) -> Iterator[ExperimentOut]:
+def _to_experiments_out(found: FreeRun, max_points: int) -> Iterator[ExperimentOut]:
     for number, (record, outputs) in enumerate(zip(found.records, found.simulated, strict=True), 1):
         simulated = [
             Channel(one.name, one.times, values, one.unit)
@@ -279,6 +284,6 @@ def _experiments(found: FreeRun, max_points: int) -> Iterator[ExperimentOut]:
         ]
         yield ExperimentOut(
             name=f"record {number}",
-            measured=[series(one, max_points) for one in record.outputs],
-            simulated=[series(one, max_points) for one in simulated],
+            measured=[to_series(one, max_points) for one in record.outputs],
+            simulated=[to_series(one, max_points) for one in simulated],
         )

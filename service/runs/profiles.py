@@ -16,7 +16,7 @@ from service.jobs.stored_run import StoredRun, load_estimated_run
 from service.runs.schemas import ProfileIn, ProfileOut, Profiles
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from sysid.core.errors import nearest
+from sysid.core.errors import suggest_name
 from sysid.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -24,13 +24,17 @@ if TYPE_CHECKING:
 
 
 MOST_WORK = 300_000_000  # measured values times parameters, points and profiles
-SECONDS = 45.0  # a client waits a minute
-QUANTILE = 3.841458820694124  # as in sysid.uncertainty.profile_likelihood, which needs a compiler
+LIMIT_SECONDS = 45.0  # a client waits a minute
+CHI_SQUARED_95 = (
+    3.841458820694124  # as in sysid.uncertainty.profile_likelihood, which needs a compiler
+)
 
-_one_at_a_time = Lock()
+_profile_lock = Lock()
 
 
-def profiles(database: Database, store: ObjectStore, run_id: str, body: ProfileIn) -> Profiles:
+def compute_profiles(
+    database: Database, store: ObjectStore, run_id: str, body: ProfileIn
+) -> Profiles:
     """Profiles of some parameters of a run, of all free ones if none is named.
 
     Raises
@@ -42,53 +46,53 @@ def profiles(database: Database, store: ObjectStore, run_id: str, body: ProfileI
     InvalidRequest
         If a name is not that of a free parameter, or the work is too much.
     """
-    with database.read() as session:
+    with database.read_session() as session:
         stored = load_estimated_run(session, run_id, "profile")
         problem = stored.problem(session, store)
-    theta = _estimate(problem, stored)
-    names = _names(problem, body)
-    work = problem.evaluator.n_measured * len(problem.space) * body.points * len(names)
+    theta = _read_estimate(problem, stored)
+    names = _choose_parameters(problem, body)
+    work = problem.evaluator.n_measured * len(problem.free_parameters) * body.points * len(names)
     if work > MOST_WORK:
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "/parameters",
             f"{len(names)} profiles of {body.points} points are too much for this run: samples "
             f"times parameters, points and profiles is {work:.3g}; need at most {MOST_WORK:.3g}. "
-            "Ask for fewer, or use sysid.uncertainty.profile_likelihood.profile",
+            "Ask for fewer, or use sysid.uncertainty.profile_likelihood.compute_profile",
         )
-    if not _one_at_a_time.acquire(blocking=False):
+    if not _profile_lock.acquire(blocking=False):
         raise Conflict("another profile is being computed; ask again when it is done")
     try:
-        found = list(_computed(problem, theta, names, body.points))
+        found = list(_profile_parameters(problem, theta, names, body.points))
     finally:
-        _one_at_a_time.release()
-    return Profiles(id=run_id, threshold=QUANTILE, profiles=found)
+        _profile_lock.release()
+    return Profiles(id=run_id, threshold=CHI_SQUARED_95, profiles=found)
 
 
-def _names(problem: "Problem", body: ProfileIn) -> list[str]:
+def _choose_parameters(problem: "Problem", body: ProfileIn) -> list[str]:
     free = problem.free_names
     for place, name in enumerate(body.parameters or ()):
         if name not in free:
-            raise InvalidRequest.at(
+            raise InvalidRequest.from_fault(
                 f"/parameters/{place}", f"the run has no free parameter {name!r}"
-                f"{nearest(name, free)}",
+                f"{suggest_name(name, free)}",
             )  # fmt: skip
     return list(dict.fromkeys(body.parameters or free))
 
 
-def _computed(
+def _profile_parameters(
     problem: "Problem", theta: FloatArray, names: list[str], points: int
 ) -> Iterator[ProfileOut]:
     # The compiler comes with this import, and most requests never need it.
-    from sysid.uncertainty.profile_likelihood import profile
+    from sysid.uncertainty.profile_likelihood import compute_profile
 
-    end = monotonic() + SECONDS
+    end = monotonic() + LIMIT_SECONDS
     for name in names:
-        found = profile(problem, theta, name, points, lambda: monotonic() > end)
+        found = compute_profile(problem, theta, name, points, lambda: monotonic() > end)
         if not found.is_complete:
-            raise InvalidRequest.at(
+            raise InvalidRequest.from_fault(
                 "/parameters",
-                f"the profiles took more than {SECONDS:g} s and were stopped at {name!r}; ask for "
-                "fewer parameters or points, or use sysid.uncertainty.profile_likelihood.profile",
+                f"the profiles took more than {LIMIT_SECONDS:g} s and were stopped at {name!r}; ask for "
+                "fewer parameters or points, or use sysid.uncertainty.profile_likelihood.compute_profile",
             )
         others = [free for free in problem.free_names if free != name]
         yield ProfileOut.from_source(
@@ -100,6 +104,6 @@ def _computed(
         )
 
 
-def _estimate(problem: "Problem", stored: StoredRun) -> FloatArray:
+def _read_estimate(problem: "Problem", stored: StoredRun) -> FloatArray:
     values = {one["name"]: one["value"] for one in stored.estimates}
     return np.array([values[name] for name in problem.free_names])

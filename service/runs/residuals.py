@@ -14,41 +14,41 @@ from sqlalchemy.orm import Session
 from service.core.errors import NotFound, ServiceError
 from service.formats.mcap import FittedOutput
 from service.jobs.stored_run import StoredRun, load_run
-from service.runs.fitted import fits_of
-from service.runs.result import test_document
+from service.runs.fitted import read_fitted_signals
+from service.runs.result import to_test_document
 from service.runs.schemas import CorrelationOut, ResidualsOut
 from service.storage.errors import StorageError
 from service.storage.objects import ObjectStore
 from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel
-from sysid.residuals.past_outputs import coefficients_on_past_outputs
+from sysid.residuals.past_outputs import count_past_output_coefficients
 from sysid.residuals.residual_tests import (
-    LEVEL,
-    Correlation,
+    TEST_LEVEL,
+    CorrelationFunction,
+    ResidualSeries,
     ResidualTests,
-    Series,
-    correlations,
-    series,
-    verdict,
+    compute_correlations,
+    judge_tests,
+    make_residual_series,
 )
 
-Body = Mapping[str, Any]
+JobBody = Mapping[str, Any]
 
 
-class Tested(NamedTuple):
+class ResidualAnalysis(NamedTuple):
     """Correlation functions of a run's residuals and the verdict on them.
 
     `names` are those of the experiments; `missing` says which inputs could not be read.
     """
 
-    names: list[str]
-    found: list[Correlation]
+    experiments: list[str]
+    correlations: list[CorrelationFunction]
     verdict: ResidualTests
-    missing: str
+    input_note: str
 
 
-def residuals(session: Session, store: ObjectStore, run_id: str) -> ResidualsOut:
+def get_residuals(session: Session, store: ObjectStore, run_id: str) -> ResidualsOut:
     """Correlation functions of a run's residuals.
 
     Raises
@@ -57,89 +57,93 @@ def residuals(session: Session, store: ObjectStore, run_id: str) -> ResidualsOut
         If the run has no signals: it has not succeeded, or not yet.
     """
     stored = load_run(session, run_id)
-    tested = residuals_of(session, store, stored)
+    tested = analyse_residuals(session, store, stored)
     if tested is None:
         raise NotFound("residuals of run", run_id, f"; the run is {stored.run.state.value}")
     return ResidualsOut(
-        id=run_id, data=tested.verdict.data, passed=tested.verdict.passed, level=LEVEL,
-        note=tested.missing, tests=[_out(one) for one in tested.found],
+        id=run_id, data=tested.verdict.data, passed=tested.verdict.passed, level=TEST_LEVEL,
+        note=tested.input_note, tests=[_to_correlation_out(one) for one in tested.correlations],
     )  # fmt: skip
 
 
-def residuals_of(session: Session, store: ObjectStore, stored: StoredRun) -> Tested | None:
+def analyse_residuals(
+    session: Session, store: ObjectStore, stored: StoredRun
+) -> ResidualAnalysis | None:
     """The same as values; None as long as no signals are stored."""
     if stored.run.signals_sha256 is None:
         return None
-    fits = fits_of(store, stored.run)
+    fits = read_fitted_signals(store, stored.run)
     kept = [fit for fit in fits if fit.role == "validation"]
-    inputs, missing = _inputs(session, store, stored, bool(kept))
-    counts = {} if kept else _coefficients(session, stored)
+    inputs, missing = _read_inputs(session, store, stored, bool(kept))
+    counts = {} if kept else _count_past_coefficients(session, stored)
     times = stored.result.get("correlation_times") or {}
-    found = correlations(
+    found = compute_correlations(
         [
             one._replace(coefficients=counts.get(one.output, 0))
-            for one in _series(stored.body, kept or list(fits), fits, inputs, times)
+            for one in _build_series(stored.body, kept or list(fits), fits, inputs, times)
         ]
     )
     names = [name for name, _ in groupby(fit.experiment for fit in kept or fits)]
     data = "validation" if kept else "estimation"
-    return Tested(names, found, verdict(found, data), missing)  # type: ignore[arg-type]
+    return ResidualAnalysis(names, found, judge_tests(found, data), missing)  # type: ignore[arg-type]
 
 
-def _coefficients(session: Session, stored: StoredRun) -> dict[str, int]:
+def _count_past_coefficients(session: Session, stored: StoredRun) -> dict[str, int]:
     """Of each output, the coefficients on past outputs of a prediction one step ahead."""
     if stored.body["prediction"] != "one-step":
         return {}
-    return coefficients_on_past_outputs(stored.model, stored.parameters(session))
+    return count_past_output_coefficients(stored.model, stored.parameters(session))
 
 
-def _out(one: Correlation) -> CorrelationOut:
+def _to_correlation_out(one: CorrelationFunction) -> CorrelationOut:
     functions = {
         name: getattr(one, name).tolist() for name in ("lags", "values", "band95", "band99")
     }
     return CorrelationOut.model_validate(
-        {**test_document(one.test), "period": one.period, **functions}
+        {**to_test_document(one.test), "period": one.period, **functions}
     )
 
 
-def _series(
-    body: Body, tested: Sequence[FittedOutput], fits: Sequence[FittedOutput],
+def _build_series(
+    body: JobBody, tested: Sequence[FittedOutput], fits: Sequence[FittedOutput],
     inputs: Sequence[tuple[Channel, ...]], times: Mapping[str, float],
-) -> Iterator[Series]:  # fmt: skip
+) -> Iterator[ResidualSeries]:  # fmt: skip
     """Residuals of the tested outputs as the loss saw them, less those that were skipped."""
     loss = body["loss"]
     scale = float(loss["scale"]) if loss["kind"] == "soft-l1" else 0.0
-    weights = _weights(body, fits)
-    before = _earlier(body, fits)
+    weights = _compute_weights(body, fits)
+    before = _count_earlier_samples(body, fits)
     for fit in tested:
         number = fit.number - 1
         first = before.get((fit.number, fit.name), 0)
         scored = np.arange(first, first + fit.times.size) >= body["skip"]
         weight = weights[fit.name]
-        yield series(
+        yield make_residual_series(
             number, fit.name, fit.times, weight * fit.measured, weight * fit.simulated,
             scored & np.isfinite(fit.measured), inputs[number] if number < len(inputs) else (),
             scale, times.get(fit.name, 0.0),
         )  # fmt: skip
 
 
-def _earlier(body: Body, fits: Sequence[FittedOutput]) -> dict[tuple[int, str], int]:
+def _count_earlier_samples(
+    body: JobBody, fits: Sequence[FittedOutput]
+) -> dict[tuple[int, str], int]:
     """Samples of a record that lie before the part that was kept for validation."""
     if (body["validation"] or {}).get("fraction") is None:
         return {}
     return {(f.number, f.name): f.times.size for f in fits if f.role == "estimation"}
 
 
-def _weights(body: Body, fits: Sequence[FittedOutput]) -> dict[str, float]:
+def _compute_weights(body: JobBody, fits: Sequence[FittedOutput]) -> dict[str, float]:
     """Weights of the outputs as the problem had them: they matter to a loss with a scale."""
     names = {fit.name for fit in fits}
     if len(names) == 1:
         return dict.fromkeys(names, 1.0)
-    return {name: (body["weights"] or {}).get(name) or _reciprocal(body, fits, name)
+    return {name: (body["weights"] or {}).get(name) or _compute_default_weight(body, fits, name)
             for name in names}  # fmt: skip
 
 
-def _reciprocal(body: Body, fits: Sequence[FittedOutput], name: str) -> float:
+def _compute_default_weight(body: JobBody, fits: Sequence[FittedOutput], name: str) -> float:
     parts = [
         fit.measured[body["skip"] :]
         for fit in fits
@@ -150,7 +154,7 @@ def _reciprocal(body: Body, fits: Sequence[FittedOutput], name: str) -> float:
     return 1.0 / deviation if deviation > 0 else 1.0
 
 
-def _inputs(
+def _read_inputs(
     session: Session, store: ObjectStore, stored: StoredRun, is_validation: bool
 ) -> tuple[list[tuple[Channel, ...]], str]:
     """Inputs of every tested record, and a note if they are not to be had any more."""

@@ -11,24 +11,24 @@ import numpy as np
 from service.core.documents import to_finite
 from sysid.identification.result import Identification
 from sysid.residuals.onset_delay import OnsetDelay
-from sysid.residuals.residual_tests import LEVEL, ResidualTest, ResidualTests
+from sysid.residuals.residual_tests import TEST_LEVEL, ResidualTest, ResidualTests
 from sysid.simulation.metrics import ChannelMetrics
 from sysid.uncertainty.estimates import Criteria, Estimate, Uncertainty
 
 
-def residual_document(found: ResidualTests | None) -> dict[str, Any]:
+def to_residual_document(found: ResidualTests | None) -> dict[str, Any]:
     """Verdicts and statistics, without the correlation functions; empty if there was no test."""
     if found is None:
         return {}
     return {
         "data": found.data,
-        "level": LEVEL,
+        "level": TEST_LEVEL,
         "passed": found.passed,
-        "tests": [test_document(one) for one in found.tests],
+        "tests": [to_test_document(one) for one in found.tests],
     }
 
 
-def test_document(one: ResidualTest) -> dict[str, Any]:
+def to_test_document(one: ResidualTest) -> dict[str, Any]:
     """One test; what was not tested has null for its numbers, and says why."""
     return {
         **_read(one, "experiment", "output"),
@@ -39,7 +39,7 @@ def test_document(one: ResidualTest) -> dict[str, Any]:
     }
 
 
-def onset_document(found: Sequence[OnsetDelay]) -> list[dict[str, Any]]:
+def to_onset_document(found: Sequence[OnsetDelay]) -> list[dict[str, Any]]:
     """Onset delays in seconds; one that cannot be told is null and says why."""
     return [
         {
@@ -51,11 +51,11 @@ def onset_document(found: Sequence[OnsetDelay]) -> list[dict[str, Any]]:
     ]
 
 
-def result_document(found: Identification, seconds: float) -> dict[str, Any]:
+def to_result_document(found: Identification, seconds: float) -> dict[str, Any]:
     """The result as the interface tells it; numbers that are not finite become null."""
     return {
         "valid": found.valid,
-        "parameters": [_estimate(one) for one in found.estimates],
+        "parameters": [_to_estimate_document(one) for one in found.estimates],
         "rms": to_finite(found.rms),
         "rms_validation": to_finite(found.rms_validation),
         "fit_percent": {
@@ -63,8 +63,8 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
             "validation": to_finite(found.fit_percent_validation),
         },
         "agreement": {
-            "estimation": [_agreement(one) for one in found.agreement],
-            "validation": [_agreement(one) for one in found.agreement_validation],
+            "estimation": [_to_agreement_document(one) for one in found.agreement],
+            "validation": [_to_agreement_document(one) for one in found.agreement_validation],
         },
         "evaluations": found.evaluations,
         "generations": found.generations,
@@ -73,15 +73,15 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
             _read(island, "champion_rms", "refined_rms", "evaluations", "parameters")
             for island in found.islands
         ],
-        "identifiability": _identifiability(found.uncertainty),
-        "criteria": _criteria(found.criteria),
-        "correlation": _correlation(found.uncertainty),
+        "identifiability": _to_identifiability_document(found.uncertainty),
+        "criteria": _to_criteria_document(found.criteria),
+        "correlation": _to_correlation_document(found.uncertainty),
         "noise_sd": None if found.uncertainty is None else to_finite(found.uncertainty.noise_sd),
         "noise_colour": None if found.uncertainty is None else found.uncertainty.noise_colour,
         "noise_model": found.noise_model,
         "correlation_times": dict(found.correlation_times),
-        "residual_tests": residual_document(found.residual_tests),
-        "onset_delays": onset_document(found.onset_delays),
+        "residual_tests": to_residual_document(found.residual_tests),
+        "onset_delays": to_onset_document(found.onset_delays),
         "known_before": {
             "estimation": list(found.known_before),
             "validation": list(found.known_before_validation),
@@ -91,17 +91,17 @@ def result_document(found: Identification, seconds: float) -> dict[str, Any]:
     }
 
 
-def _estimate(one: Estimate) -> dict[str, Any]:
+def _to_estimate_document(one: Estimate) -> dict[str, Any]:
     return _read(
         one, "name", "unit", "value", "lower", "upper", "stderr", "interval95", "status", "reason"
     )
 
 
-def _agreement(one: ChannelMetrics) -> dict[str, Any]:
+def _to_agreement_document(one: ChannelMetrics) -> dict[str, Any]:
     return _read(one, "experiment", "output", "unit", "samples", "rms", "fit_percent", "span")
 
 
-def _identifiability(uncertainty: Uncertainty | None) -> dict[str, Any]:
+def _to_identifiability_document(uncertainty: Uncertainty | None) -> dict[str, Any]:
     if uncertainty is None:
         return {"condition": None, "groups": [], "singular_values": []}
     groups = [_read(one, "members", "expression", "value", "stderr") for one in uncertainty.groups]
@@ -112,11 +112,11 @@ def _identifiability(uncertainty: Uncertainty | None) -> dict[str, Any]:
     }
 
 
-def _criteria(one: Criteria) -> dict[str, Any]:
+def _to_criteria_document(one: Criteria) -> dict[str, Any]:
     return _read(one, "aic", "aicc", "bic", "samples", "parameters")
 
 
-def _correlation(uncertainty: Uncertainty | None) -> dict[str, Any] | None:
+def _to_correlation_document(uncertainty: Uncertainty | None) -> dict[str, Any] | None:
     if uncertainty is None:
         return None
     return {"names": list(uncertainty.names), "matrix": _to_json(uncertainty.correlation)}

@@ -8,59 +8,60 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
-from service.core.json_pointer import body_of
+from service.core.json_pointer import build_run_body
+from service.core.states import JobState
 from service.core.wire import Page
 from service.jobs.results import is_free
 from service.jobs.stored_run import StoredRun, load_run
 from service.repositories.jobs import JobRepository
-from service.repositories.lineage import Reached, reached
+from service.repositories.lineage import WrittenProgress, read_written_progress
 from service.repositories.runs import RunOrder, RunRepository
 from service.runs.schemas import HistoryOut, ImprovementOut, MigrantOut, MigrationsOut, RunOut
-from service.storage.tables import Job, Run, State
+from service.storage.tables import Job, Run
 from sysid.models.parameters import Parameter
 
-ALMOST = 0.99  # what a run that is not over shows at most: refinement is still to come
+MOST_OPEN_PROGRESS = 0.99  # what a run that is not over shows at most: refinement is still to come
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
+class RunQuery:
     """Which runs of a job are wanted, and in which order."""
 
-    states: Sequence[State] = ()
+    states: Sequence[JobState] = ()
     cell: Sequence[str] = ()
     labels: Sequence[str] = ()
     order: RunOrder = "number"
     descending: bool = False
 
 
-def page(
-    session: Session, job_id: str, cursor: str | None, limit: int, choice: Choice
+def list_runs(
+    session: Session, job_id: str, cursor: str | None, limit: int, choice: RunQuery
 ) -> Page[RunOut]:
     """Runs of a job."""
     job = JobRepository(session).get(job_id)
-    found = RunRepository(session).page(
+    found = RunRepository(session).list_page(
         job.id, cursor=cursor, limit=limit, states=choice.states,
-        cell=wanted("cell", choice.cell), labels=wanted("label", choice.labels),
+        cell=parse_filters("cell", choice.cell), labels=parse_filters("label", choice.labels),
         order=choice.order, descending=choice.descending,
     )  # fmt: skip
-    known = reached(session, [run.id for run in found.items if run.result is None])
-    items = [told(run, job, known.get(run.id)) for run in found.items]
+    known = read_written_progress(session, [run.id for run in found.items if run.result is None])
+    items = [to_run_out(run, job, known.get(run.id)) for run in found.items]
     return Page(items=items, next=found.next)
 
 
-def one(session: Session, run_id: str) -> RunOut:
+def get_run(session: Session, run_id: str) -> RunOut:
     """One run with its result document."""
     stored = load_run(session, run_id)
     run = stored.run
-    known = reached(session, [run.id]) if run.result is None else {}
-    answer = told(run, stored.job, known.get(run.id))
+    known = read_written_progress(session, [run.id]) if run.result is None else {}
+    answer = to_run_out(run, stored.job, known.get(run.id))
     answer = answer.model_copy(update={"rms_unit": stored.rms_unit(session)})
     if run.result is not None or not run.state.is_terminal:
         return answer
-    return answer.model_copy(update={"parameters": _best_so_far(session, stored)})
+    return answer.model_copy(update={"parameters": _list_best_parameters(session, stored)})
 
 
-def told(run: Run, job: Job, known: Reached | None = None) -> RunOut:
+def to_run_out(run: Run, job: Job, known: WrittenProgress | None = None) -> RunOut:
     """A run as it is told: its result document, or how far it is."""
     so_far: dict[str, Any] = {
         "rms": run.best_rms, "evaluations": run.evaluations, "generations": run.generations,
@@ -73,33 +74,33 @@ def told(run: Run, job: Job, known: Reached | None = None) -> RunOut:
         {
             **so_far, **(run.result or {}), "id": run.id, "job": run.job_id,
             "number": run.number, "cell": run.cell, "labels": run.labels,
-            "state": run.state.value, "progress": _progress(run, job, known), "error": run.error,
+            "state": run.state.value, "progress": _compute_progress(run, job, known), "error": run.error,
             "created_at": run.created_at, "started_at": run.started_at,
             "finished_at": run.finished_at, "has_signals": run.signals_sha256 is not None,
         }
     )  # fmt: skip
 
 
-def history(session: Session, run_id: str) -> HistoryOut:
+def get_history(session: Session, run_id: str) -> HistoryOut:
     """Improvements of every island's champion, in the order in which they were found."""
     stored = load_run(session, run_id)
     islands: list[list[ImprovementOut]] = []
-    for row in RunRepository(session).history(run_id):
+    for row in RunRepository(session).read_history(run_id):
         while len(islands) <= row.island:
             islands.append([])
         islands[row.island].append(ImprovementOut.from_source(row))
-    return HistoryOut(id=stored.run.id, names=_free_names(session, stored), islands=islands)
+    return HistoryOut(id=stored.run.id, names=_list_free_names(session, stored), islands=islands)
 
 
-def migrations(session: Session, run_id: str) -> MigrationsOut:
+def get_migrations(session: Session, run_id: str) -> MigrationsOut:
     """The migration log."""
-    rows = RunRepository(session).migrations(run_id)
+    rows = RunRepository(session).read_migrations(run_id)
     return MigrationsOut(id=run_id, migrants=[MigrantOut.from_source(row) for row in rows])
 
 
-def _best_so_far(session: Session, stored: StoredRun) -> list[dict[str, Any]]:
+def _list_best_parameters(session: Session, stored: StoredRun) -> list[dict[str, Any]]:
     """What a run that ended without a result had found, without standard errors."""
-    points = RunRepository(session).history(stored.run.id)
+    points = RunRepository(session).read_history(stored.run.id)
     if not points:
         return []
     best = min(points, key=lambda point: point.rms)
@@ -110,34 +111,34 @@ def _best_so_far(session: Session, stored: StoredRun) -> list[dict[str, Any]]:
             "upper": one.upper, "stderr": None, "interval95": None, "status": "unfinished",
             "reason": reason,
         }
-        for one, value in zip(_sought(session, stored), best.parameters, strict=False)
+        for one, value in zip(_list_free_parameters(session, stored), best.parameters, strict=False)
     ]  # fmt: skip
 
 
-def _free_names(session: Session, stored: StoredRun) -> list[str]:
+def _list_free_names(session: Session, stored: StoredRun) -> list[str]:
     if stored.run.result is not None:
         return [one["name"] for one in stored.estimates if is_free(one)]
-    return [one.name for one in _sought(session, stored)]
+    return [one.name for one in _list_free_parameters(session, stored)]
 
 
-def _sought(session: Session, stored: StoredRun) -> list[Parameter]:
+def _list_free_parameters(session: Session, stored: StoredRun) -> list[Parameter]:
     """The free parameters of a run, in the order of its history's columns."""
     if stored.model.rule is not None:  # which of its candidates are sought the result tells
         return []
     return [one for one in stored.parameters(session) if one.is_free]
 
 
-def _progress(run: Run, job: Job, known: Reached | None) -> float:
+def _compute_progress(run: Run, job: Job, known: WrittenProgress | None) -> float:
     if run.state.is_terminal:
         return 1.0
     # A single run's generation is the job's; the history lags behind where nothing gets better.
     of_job = job.generation if job.n_runs == 1 else 0
     reached_so_far = max(of_job, known.generation if known is not None else 0)
-    generations: int = body_of(job.spec, run.cell)["algorithm"]["generations"]
-    return min(reached_so_far / generations, ALMOST)
+    generations: int = build_run_body(job.spec, run.cell)["algorithm"]["generations"]
+    return min(reached_so_far / generations, MOST_OPEN_PROGRESS)
 
 
-def wanted(name: str, filters: Sequence[str]) -> Mapping[str, Any]:
+def parse_filters(name: str, filters: Sequence[str]) -> Mapping[str, Any]:
     """Values asked for as ``key=value``; a value that is not JSON is a text.
 
     Raises
@@ -149,7 +150,7 @@ def wanted(name: str, filters: Sequence[str]) -> Mapping[str, Any]:
     for text in filters:
         key, equals, value = text.partition("=")
         if not equals:
-            raise InvalidRequest.at(f"?{name}", f"found {text!r}; need path=value")
+            raise InvalidRequest.from_fault(f"?{name}", f"found {text!r}; need path=value")
         try:
             found[key] = json.loads(value)
         except ValueError:

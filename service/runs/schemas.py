@@ -14,7 +14,7 @@ from pydantic import ConfigDict, Field
 
 from service.core.states import StateName
 from service.core.wire import Answer, Body, Finite
-from service.datasets.schemas import Series
+from service.datasets.schemas import SeriesOut
 
 
 class RunOut(Answer):
@@ -73,8 +73,8 @@ class ExperimentOut(Answer):
     """Measured and simulated outputs of one experiment."""
 
     name: str
-    measured: list[Series]
-    simulated: list[Series]
+    measured: list[SeriesOut]
+    simulated: list[SeriesOut]
 
 
 class ResponseOut(Answer):

@@ -9,24 +9,24 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.core.text import append_unit
-from service.datasets.rms_unit import unit_of
+from service.datasets.rms_unit import find_rms_unit
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
 from service.storage.tables import Run
 
-AT_ONCE = 500
-FORMULA = (*"=+-@\t\r\n", *"\uff1d\uff0b\uff0d\uff20")  # the last: in full width
+RUNS_PER_PART = 500
+FORMULA_STARTS = (*"=+-@\t\r\n", *"\uff1d\uff0b\uff0d\uff20")  # the last: in full width
 """What a formula begins with, in one spreadsheet or another."""
 _NUMBER = re.compile(r"[+-]?[0-9]*\.?[0-9]+([eE][+-]?[0-9]+)?")
 COLUMNS = ("number", "id", "state", "valid", "best_rms", "fit_estimation", "fit_validation",
            "evaluations", "generations", "seconds", "error")  # fmt: skip
-UNITS = {"fit_estimation": "%", "fit_validation": "%"}
+COLUMN_UNITS = {"fit_estimation": "%", "fit_validation": "%"}
 """Of columns that do not have it in their name, and not from the job."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Layout:
+class _TableLayout:
     """What the columns of a job's table are; `parameters` are names with their units."""
 
     paths: tuple[str, ...]
@@ -34,12 +34,12 @@ class _Layout:
     parameters: tuple[tuple[str, str], ...]
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def parameter_names(self) -> tuple[str, ...]:
         """The parameters, those of several units once."""
         return tuple(dict.fromkeys(name for name, _ in self.parameters))
 
 
-def table(database: Database, job_id: str) -> Iterator[str]:
+def stream_table(database: Database, job_id: str) -> Iterator[str]:
     """Lines of the table, some hundred runs at a time, each part read in a session of its own.
 
     One row a run in the order of the sweep: its columns, the values of the axes by their paths,
@@ -53,21 +53,21 @@ def table(database: Database, job_id: str) -> Iterator[str]:
     NotFound
         If there is no such job; at the call, before the first line.
     """
-    with database.read() as session:
+    with database.read_session() as session:
         spec = JobRepository(session).get(job_id).spec
         runs = RunRepository(session)
-        best = runs.page(job_id, limit=1, order="best_rms").items
-        first = [(one["name"], one["unit"]) for run in best for one in _told(run)]
-        parameters = tuple(dict.fromkeys([*first, *runs.estimated(job_id)]))
-        units = {**UNITS, "best_rms": unit_of(session, spec)}
+        best = runs.list_page(job_id, limit=1, order="best_rms").items
+        first = [(one["name"], one["unit"]) for run in best for one in _get_estimates(run)]
+        parameters = tuple(dict.fromkeys([*first, *runs.list_parameters(job_id)]))
+        units = {**COLUMN_UNITS, "best_rms": find_rms_unit(session, spec)}
     axes = spec["sweep"]["axes"]
     labels = dict.fromkeys(name for axis in axes for one in axis["labels"] or [] for name in one)
-    layout = _Layout(tuple(axis["path"] for axis in axes), tuple(labels), parameters)
-    return _parts(database, job_id, layout, units)
+    layout = _TableLayout(tuple(axis["path"] for axis in axes), tuple(labels), parameters)
+    return _stream_parts(database, job_id, layout, units)
 
 
-def _parts(
-    database: Database, job_id: str, layout: _Layout, units: Mapping[str, str]
+def _stream_parts(
+    database: Database, job_id: str, layout: _TableLayout, units: Mapping[str, str]
 ) -> Iterator[str]:
     fixed = [append_unit(name, units.get(name, "1")) for name in COLUMNS]
     estimates = [
@@ -75,51 +75,51 @@ def _parts(
         for name, unit in layout.parameters
         for what in ("", "stderr of ")
     ]
-    statuses = [f"status of {name}" for name in layout.names]
-    yield _lines([[*fixed, *layout.paths, *layout.labels, *estimates, *statuses]])
+    statuses = [f"status of {name}" for name in layout.parameter_names]
+    yield _to_csv_lines([[*fixed, *layout.paths, *layout.labels, *estimates, *statuses]])
     cursor: str | None = None
     while True:
-        with database.read() as session:
-            page = RunRepository(session).page(job_id, cursor=cursor, limit=AT_ONCE)
-            rows = [_row(run, layout) for run in page.items]
-        yield _lines(rows)
+        with database.read_session() as session:
+            page = RunRepository(session).list_page(job_id, cursor=cursor, limit=RUNS_PER_PART)
+            rows = [_build_row(run, layout) for run in page.items]
+        yield _to_csv_lines(rows)
         cursor = page.next
         if cursor is None:
             return
 
 
-def _row(run: Run, layout: _Layout) -> list[Any]:
-    told = {(one["name"], one["unit"]): one for one in _told(run)}
-    statuses = {one["name"]: one["status"] for one in _told(run)}
+def _build_row(run: Run, layout: _TableLayout) -> list[Any]:
+    told = {(one["name"], one["unit"]): one for one in _get_estimates(run)}
+    statuses = {one["name"]: one["status"] for one in _get_estimates(run)}
     found = [told.get(key) or {} for key in layout.parameters]
     return [
         run.number, run.id, run.state.value, *(getattr(run, name) for name in COLUMNS[3:]),
-        *(_plain(run.cell.get(path)) for path in layout.paths),
-        *(_plain(run.labels.get(name)) for name in layout.labels),
+        *(_to_csv_value(run.cell.get(path)) for path in layout.paths),
+        *(_to_csv_value(run.labels.get(name)) for name in layout.labels),
         *(one.get(what) for one in found for what in ("value", "stderr")),
-        *(statuses.get(name) for name in layout.names),
+        *(statuses.get(name) for name in layout.parameter_names),
     ]  # fmt: skip
 
 
-def _told(run: Run) -> list[dict[str, Any]]:
+def _get_estimates(run: Run) -> list[dict[str, Any]]:
     """The estimates of a run's result."""
     found: list[dict[str, Any]] = (run.result or {}).get("parameters", [])
     return found
 
 
-def _plain(value: object) -> object:
+def _to_csv_value(value: object) -> object:
     return json.dumps(value) if isinstance(value, dict | list) else value
 
 
-def _lines(rows: Iterable[Sequence[Any]]) -> str:
+def _to_csv_lines(rows: Iterable[Sequence[Any]]) -> str:
     sink = io.StringIO()
-    csv.writer(sink, lineterminator="\n").writerows(map(_inert, row) for row in rows)
+    csv.writer(sink, lineterminator="\n").writerows(map(_escape_formula, row) for row in rows)
     return sink.getvalue()
 
 
-def _inert(value: object) -> object:
+def _escape_formula(value: object) -> object:
     """A value that no spreadsheet carries out, and no reader takes for two lines."""
     if not isinstance(value, str):
         return value
-    is_formula = value.startswith(FORMULA) and not _NUMBER.fullmatch(value)
+    is_formula = value.startswith(FORMULA_STARTS) and not _NUMBER.fullmatch(value)
     return ("'" if is_formula else "") + value.replace("\r", " ")

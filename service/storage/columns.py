@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 from sqlalchemy import JSON, BigInteger, DateTime, Dialect, Enum, Integer, String, TypeDecorator
 from sqlalchemy.dialects.postgresql import JSONB
 
-from service.core.text_checks import fault_in_json, fault_of
+from service.core.text_checks import find_json_fault, find_text_fault
 from service.storage.errors import UnstorableValue
 
 Document: TypeAlias = dict[str, Any]
@@ -16,7 +16,7 @@ Document: TypeAlias = dict[str, Any]
 
 DocumentType = JSON(none_as_null=True).with_variant(JSONB(none_as_null=True), "postgresql")
 """JSON text on SQLite, JSONB on PostgreSQL; None is NULL."""
-WrittenType = JSON(none_as_null=True)
+OrderedJsonType = JSON(none_as_null=True)
 """JSON as it was written: JSONB sorts keys, and a search draws parameters in their order."""
 
 _ENCODER = json.JSONEncoder(allow_nan=False, ensure_ascii=False, separators=(",", ":"))
@@ -52,7 +52,7 @@ class UtcDateTime(TypeDecorator[datetime]):
         return value.replace(tzinfo=UTC) if value.tzinfo is None else value.astimezone(UTC)
 
 
-class Text(TypeDecorator[str]):
+class TextT(TypeDecorator[str]):
     """A text that both databases can keep: no NUL, no half of a surrogate pair."""
 
     impl = String
@@ -60,7 +60,7 @@ class Text(TypeDecorator[str]):
 
     def process_bind_param(self, value: str | None, dialect: Dialect) -> str | None:
         """The same text, once it is known to be storable."""
-        fault = None if value is None else fault_of(value)
+        fault = None if value is None else find_text_fault(value)
         if fault is not None:
             raise UnstorableValue(fault)
         return value
@@ -72,13 +72,13 @@ def to_json(value: object) -> str:
         text = _ENCODER.encode(value)
     except ValueError as error:
         raise UnstorableValue(f"a document holds NaN or an infinite number: {error}") from error
-    fault = fault_in_json(text)
+    fault = find_json_fault(text)
     if fault is not None:
         raise UnstorableValue(fault)
     return text
 
 
-def state_type(states: type[StrEnum]) -> Enum:
+def make_state_type(states: type[StrEnum]) -> Enum:
     """Column type of a state: its text, without a database type that a migration must alter."""
     return Enum(
         states,

@@ -26,7 +26,7 @@ class StorageError(Exception):
     status: ClassVar[int] = 500
 
 
-class NotFound(StorageError, LookupError):
+class RowNotFound(StorageError, LookupError):
     """There is no such row, or it belongs to another project, or it was deleted."""
 
     status = 404
@@ -36,13 +36,13 @@ class NotFound(StorageError, LookupError):
         self.kind, self.identity = kind, identity
 
 
-class Conflict(StorageError):
+class RowConflict(StorageError):
     """The row's state does not allow the change."""
 
     status = 409
 
 
-class KeyReused(Conflict):
+class KeyReused(RowConflict):
     """An idempotency key came again with another request."""
 
     status = 422

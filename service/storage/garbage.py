@@ -10,11 +10,11 @@ from service.storage.columns import utc_now
 from service.storage.objects import ObjectStore, StoredObject
 from service.storage.tables import Dataset, Job, Run
 
-YOUNG = timedelta(hours=1)
+MINIMUM_AGE = timedelta(hours=1)
 """An object may be this much older than the row that is about to name it."""
 
 
-def named(session: Session) -> set[str]:
+def list_named_hashes(session: Session) -> set[str]:
     """Hashes of the objects that the rows which were not deleted name."""
     datasets = select(Dataset.sha256).where(Dataset.deleted_at.is_(None))
     runs = (
@@ -27,25 +27,27 @@ def named(session: Session) -> set[str]:
     return found
 
 
-def orphans(
-    session: Session, store: ObjectStore, older_than: timedelta = YOUNG
+def find_orphans(
+    session: Session, store: ObjectStore, older_than: timedelta = MINIMUM_AGE
 ) -> Iterator[StoredObject]:
     """Objects that no row names and that are too old to be waiting for one."""
-    keep, limit = named(session), utc_now() - older_than
-    for one in store.objects():
+    keep, limit = list_named_hashes(session), utc_now() - older_than
+    for one in store.list_objects():
         if one.sha256 not in keep and (one.modified_at is None or one.modified_at < limit):
             yield one
 
 
-def lost(session: Session, store: ObjectStore) -> set[str]:
+def find_lost_hashes(session: Session, store: ObjectStore) -> set[str]:
     """Hashes that rows name but the store does not have."""
-    return named(session) - {one.sha256 for one in store.objects()}
+    return list_named_hashes(session) - {one.sha256 for one in store.list_objects()}
 
 
-def collect(session: Session, store: ObjectStore, older_than: timedelta = YOUNG) -> int:
+def delete_orphans(
+    session: Session, store: ObjectStore, older_than: timedelta = MINIMUM_AGE
+) -> int:
     """Delete the orphans; how many bytes that freed."""
     freed = 0
-    for one in list(orphans(session, store, older_than)):
+    for one in list(find_orphans(session, store, older_than)):
         store.delete(one.sha256)
         freed += one.size
     return freed

@@ -55,63 +55,63 @@ class ObjectStore(ABC):
     def put_file(self, path: Path) -> StoredObject:
         """Store a copy of a file."""
         with path.open("rb") as file:
-            return self.put_stream(_blocks(file))
+            return self.put_stream(_read_blocks(file))
 
     def put_stream(self, blocks: Iterable[bytes]) -> StoredObject:
         """Store blocks of bytes as they come; they are never in memory all at once."""
         digest, size = hashlib.sha256(), 0
-        with _failures("write an object"), self._new_file() as file:
+        with _translate_errors("write an object"), self._open_temporary_file() as file:
             for block in blocks:
                 digest.update(block)
                 size += file.write(block)
             file.flush()
             os.fsync(file.fileno())
             sha256 = digest.hexdigest()
-            self._publish(Path(file.name), _name(sha256), size)
+            self._publish(Path(file.name), _build_object_name(sha256), size)
         return StoredObject(sha256, size)
 
-    def get(self, sha256: str) -> bytes:
+    def get_bytes(self, sha256: str) -> bytes:
         """A whole object; `ObjectMissing` when there is none."""
-        with _failures("read an object", sha256):
-            return bytes(obstore.get(self._backend, _name(sha256)).bytes())
+        with _translate_errors("read an object", sha256):
+            return bytes(obstore.get(self._backend, _build_object_name(sha256)).bytes())
 
     def get_range(self, sha256: str, start: int, length: int) -> bytes:
         """`length` bytes from `start`; fewer at the end of the object."""
-        length = min(length, self.size(sha256) - start)
+        length = min(length, self.get_size(sha256) - start)
         if length <= 0:
             return b""
-        with _failures("read an object", sha256):
-            name = _name(sha256)
+        with _translate_errors("read an object", sha256):
+            name = _build_object_name(sha256)
             return bytes(obstore.get_range(self._backend, name, start=start, length=length))
 
-    def stream(self, sha256: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
+    def get_stream(self, sha256: str, start: int = 0, length: int | None = None) -> Iterator[bytes]:
         """The object's bytes from `start`, in blocks."""
-        end = self.size(sha256) if length is None else start + length
+        end = self.get_size(sha256) if length is None else start + length
         while start < end and (block := self.get_range(sha256, start, min(_BLOCK, end - start))):
             yield block
             start += len(block)
 
-    def size(self, sha256: str) -> int:
+    def get_size(self, sha256: str) -> int:
         """Size in bytes; `ObjectMissing` when there is none."""
-        with _failures("look up an object", sha256):
-            return int(obstore.head(self._backend, _name(sha256))["size"])
+        with _translate_errors("look up an object", sha256):
+            return int(obstore.head(self._backend, _build_object_name(sha256))["size"])
 
     def exists(self, sha256: str) -> bool:
         """Whether there is such an object."""
         try:
-            self.size(sha256)
+            self.get_size(sha256)
         except ObjectMissing:
             return False
         return True
 
     def delete(self, sha256: str) -> None:
         """Delete an object; nothing when there is none."""
-        with suppress(ObjectMissing), _failures("delete an object", sha256):
-            obstore.delete(self._backend, _name(sha256))
+        with suppress(ObjectMissing), _translate_errors("delete an object", sha256):
+            obstore.delete(self._backend, _build_object_name(sha256))
 
-    def objects(self) -> Iterator[StoredObject]:
+    def list_objects(self) -> Iterator[StoredObject]:
         """Every object, in no order."""
-        with _failures("list the objects"):
+        with _translate_errors("list the objects"):
             for chunk in obstore.list(self._backend, prefix=_ROOT):
                 for entry in chunk:
                     sha256 = Path(entry["path"]).stem
@@ -127,8 +127,10 @@ class ObjectStore(ABC):
         """Make a finished, synced file an object, without replacing one of the same name."""
 
     @contextmanager
-    def _new_file(self) -> Iterator[BinaryIO]:
-        with tempfile.NamedTemporaryFile(dir=self._temporary, prefix=temporary.prefix()) as file:
+    def _open_temporary_file(self) -> Iterator[BinaryIO]:
+        with tempfile.NamedTemporaryFile(
+            dir=self._temporary, prefix=temporary.make_temporary_prefix()
+        ) as file:
             yield file  # type: ignore[misc]  # the wrapper has all of BinaryIO, undeclared
 
 
@@ -144,14 +146,14 @@ class FolderStore(ObjectStore):
         self._folder = folder.absolute()
         self._synced: set[Path] = set()  # folders that this process has seen on the disk
         unfinished = self._folder / "tmp"
-        with _failures("create its folder"):
+        with _translate_errors("create its folder"):
             unfinished.mkdir(parents=True, exist_ok=True)
-            temporary.clear(unfinished, "*")
+            temporary.remove_leftovers(unfinished, "*")
             super().__init__(LocalStore(self._folder), unfinished)
 
     def check_writable(self) -> None:
         """Nothing, when an object could be written now; else `ObjectStoreFailed`."""
-        with _failures("write"), self._new_file() as file:
+        with _translate_errors("write"), self._open_temporary_file() as file:
             file.write(b"probe")
 
     def _publish(self, source: Path, name: str, size: int) -> None:
@@ -177,12 +179,12 @@ class BucketStore(ObjectStore):
         try:
             backend = S3Store.from_url(url, retry_config=_RETRIES, **options)
         except (BaseError, ValueError) as error:
-            raise InvalidStoreUrl(url, _first_line(error)) from error
+            raise InvalidStoreUrl(url, _take_first_line(error)) from error
         super().__init__(backend, Path(tempfile.gettempdir()))
 
     def check_writable(self) -> None:
         """Nothing, when an object could be written now; else `ObjectStoreFailed`."""
-        with _failures("write"):
+        with _translate_errors("write"):
             obstore.put(self._backend, "probe", b"probe")
             obstore.delete(self._backend, "probe")
 
@@ -207,34 +209,34 @@ def open_store(url: str, **options: Any) -> ObjectStore:
     raise InvalidStoreUrl(url, "use file:///folder or s3://bucket/prefix")
 
 
-def _name(sha256: str) -> str:
+def _build_object_name(sha256: str) -> str:
     if not _HASH.fullmatch(sha256):
         raise ObjectMissing(sha256)
     return f"{_ROOT}/{sha256[:2]}/{sha256}.mcap"
 
 
-def _blocks(file: BinaryIO) -> Iterator[bytes]:
+def _read_blocks(file: BinaryIO) -> Iterator[bytes]:
     while block := file.read(_BLOCK):
         yield block
 
 
 @contextmanager
-def _failures(doing: str, sha256: str = "") -> Iterator[None]:
+def _translate_errors(doing: str, sha256: str = "") -> Iterator[None]:
     try:
         yield
     except (NotFoundError, FileNotFoundError) as error:
         if not sha256:
-            raise ObjectStoreFailed(_cannot(doing, error)) from error
+            raise ObjectStoreFailed(_describe_failure(doing, error)) from error
         raise ObjectMissing(sha256) from error
     except (BaseError, OSError) as error:
-        raise ObjectStoreFailed(_cannot(doing, error)) from error
+        raise ObjectStoreFailed(_describe_failure(doing, error)) from error
 
 
-def _cannot(doing: str, error: Exception) -> str:
-    return f"the object store cannot {doing}: {_first_line(error)}"
+def _describe_failure(doing: str, error: Exception) -> str:
+    return f"the object store cannot {doing}: {_take_first_line(error)}"
 
 
-def _first_line(error: Exception) -> str:
+def _take_first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0].strip()
 
 

@@ -20,8 +20,8 @@ def open_storage(settings: Settings) -> tuple[Database, ObjectStore]:
     SQLAlchemyError
         If the database cannot be opened.
     """
-    settings.prepare_folder()
-    temporary.clear(Path(tempfile.gettempdir()))
-    database = Database(settings.database)
-    migrate.upgrade(database)
-    return database, open_store(settings.store)
+    settings.prepare_data_folder()
+    temporary.remove_leftovers(Path(tempfile.gettempdir()))
+    database = Database(settings.resolved_database_url)
+    migrate.upgrade_database(database)
+    return database, open_store(settings.resolved_store_url)

@@ -11,37 +11,37 @@ from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 _log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-PASSING = (OperationalError, InterfaceError)
+TRANSIENT_ERRORS = (OperationalError, InterfaceError)
 """What SQLAlchemy raises when the database is to blame, and by some drivers for mistakes too."""
 
-_SQLITE = frozenset((
+_SQLITE_CODES = frozenset((
     sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED, sqlite3.SQLITE_NOMEM, sqlite3.SQLITE_INTERRUPT,
     sqlite3.SQLITE_IOERR, sqlite3.SQLITE_FULL, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PROTOCOL,
 ))  # fmt: skip
-_POSTGRESQL = ("08", "40", "53", "55P03", "57", "58")
+_POSTGRESQL_STATES = ("08", "40", "53", "55P03", "57", "58")
 """Connection, deadlock, resources such as disk and memory, a lock not got, shutdown, I/O."""
 
 PAUSE_SECONDS = 0.3
-LONGEST_SECONDS = 60.0
+GIVE_UP_SECONDS = 60.0
 
 
-def is_passing(error: DBAPIError) -> bool:
+def is_transient(error: DBAPIError) -> bool:
     """Whether an error of the database may pass by itself; a mistake in a statement does not.
 
     SQLite calls both an operational error, and tells them apart by its result code; PostgreSQL by
     SQLSTATE, which an error of the connection itself does not have.
     """
-    if not isinstance(error, PASSING):
+    if not isinstance(error, TRANSIENT_ERRORS):
         return False
     cause = error.orig
     if isinstance(cause, sqlite3.Error):
         code = getattr(cause, "sqlite_errorcode", None)  # its low byte is the primary code
-        return code is not None and code & 0xFF in _SQLITE
+        return code is not None and code & 0xFF in _SQLITE_CODES
     state = getattr(cause, "sqlstate", None)
-    return state is None or str(state).startswith(_POSTGRESQL)
+    return state is None or str(state).startswith(_POSTGRESQL_STATES)
 
 
-def patiently(work: Callable[[], T]) -> T:
+def retry_transient(work: Callable[[], T]) -> T:
     """Do work that may be done again from its beginning, until the database lets it.
 
     A transaction that failed has left nothing; one whose commit was not answered may have been
@@ -51,15 +51,15 @@ def patiently(work: Callable[[], T]) -> T:
     Raises
     ------
     OperationalError, InterfaceError
-        After `LONGEST_SECONDS`.
+        After `GIVE_UP_SECONDS`.
     """
     begun = time.monotonic()
     is_told = False
     while True:
         try:
             done = work()
-        except PASSING as error:
-            if not is_passing(error) or time.monotonic() - begun > LONGEST_SECONDS:
+        except TRANSIENT_ERRORS as error:
+            if not is_transient(error) or time.monotonic() - begun > GIVE_UP_SECONDS:
                 raise
             if not is_told:
                 _log.warning("the database does not answer: %s", str(error).splitlines()[0])

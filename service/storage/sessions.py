@@ -16,8 +16,8 @@ from service.storage.columns import to_json
 
 BUSY_SECONDS = 30.0
 CONNECT_SECONDS = 5
-_READ = {"lagid_reads": True, "postgresql_readonly": True}
-_BUSY = "lagid_busy_seconds"
+_READ_OPTIONS = {"lagid_reads": True, "postgresql_readonly": True}
+_BUSY_OPTION = "lagid_busy_seconds"
 
 
 class Database:
@@ -29,10 +29,10 @@ class Database:
     """
 
     def __init__(self, url: str, **options: Any) -> None:
-        self.engine = _engine(url, **options)
+        self.engine = _create_engine(url, **options)
         self._write = sessionmaker(self.engine, expire_on_commit=False)
         self._read = sessionmaker(
-            self.engine.execution_options(**_READ), expire_on_commit=False, autoflush=False
+            self.engine.execution_options(**_READ_OPTIONS), expire_on_commit=False, autoflush=False
         )
 
     @property
@@ -41,7 +41,7 @@ class Database:
         return self.engine.dialect.name == "sqlite"
 
     @contextmanager
-    def write(self, busy_seconds: float | None = None) -> Iterator[Session]:
+    def write_session(self, busy_seconds: float | None = None) -> Iterator[Session]:
         """A session that commits when the block ends well.
 
         Parameters
@@ -52,32 +52,32 @@ class Database:
         """
         make = self._write
         if busy_seconds is not None:
-            hasty = self.engine.execution_options(**{_BUSY: min(busy_seconds, BUSY_SECONDS)})
+            hasty = self.engine.execution_options(**{_BUSY_OPTION: min(busy_seconds, BUSY_SECONDS)})
             make = sessionmaker(hasty, expire_on_commit=False)
         with make.begin() as session:
             yield session
 
     @contextmanager
-    def read(self) -> Iterator[Session]:
+    def read_session(self) -> Iterator[Session]:
         """A session that only reads."""
         with self._read.begin() as session:
             yield session
 
-    def waiting(self, seconds: float) -> Engine:
+    def get_waiting_engine(self, seconds: float) -> Engine:
         """The engine for transactions that wait so long (s) for what others have locked."""
-        return self.engine.execution_options(**{_BUSY: seconds})
+        return self.engine.execution_options(**{_BUSY_OPTION: seconds})
 
     def dispose(self) -> None:
         """Close every pooled connection."""
         self.engine.dispose()
 
 
-def sqlite_url(path: Path) -> str:
+def make_sqlite_url(path: Path) -> str:
     """The address of a SQLite file."""
     return f"sqlite:///{path.absolute()}"
 
 
-def _engine(url: str, **options: Any) -> Engine:
+def _create_engine(url: str, **options: Any) -> Engine:
     address = make_url(url)
     if address.get_backend_name() == "sqlite":
         settings = {"timeout": BUSY_SECONDS, "check_same_thread": False}
@@ -100,12 +100,12 @@ def _prepare_sqlite(connection: DBAPIConnection, _entry: ConnectionPoolEntry) ->
     assert isinstance(connection, sqlite3.Connection)
     connection.isolation_level = None  # sqlite3 must not begin transactions of its own kind
     connection.execute(f"PRAGMA busy_timeout = {int(1000 * BUSY_SECONDS)}")
-    _enter_wal(connection)
+    _enable_wal(connection)
     connection.execute("PRAGMA synchronous = NORMAL")
     connection.execute("PRAGMA foreign_keys = ON")
 
 
-def _enter_wal(connection: sqlite3.Connection) -> None:
+def _enable_wal(connection: sqlite3.Connection) -> None:
     """Switch the file to a write-ahead log, unless it is one already.
 
     The switch does not honour the busy timeout when two processes open a new file at once.
@@ -123,13 +123,13 @@ def _enter_wal(connection: sqlite3.Connection) -> None:
 def _begin_sqlite(connection: Connection) -> None:
     options = connection.get_execution_options()
     reads = options.get("lagid_reads", False)
-    busy = int(1000 * options.get(_BUSY, BUSY_SECONDS))
+    busy = int(1000 * options.get(_BUSY_OPTION, BUSY_SECONDS))
     connection.exec_driver_sql(f"PRAGMA busy_timeout = {busy}")
     connection.exec_driver_sql(f"PRAGMA query_only = {'ON' if reads else 'OFF'}")
     connection.exec_driver_sql("BEGIN" if reads else "BEGIN IMMEDIATE")
 
 
 def _begin_postgresql(connection: Connection) -> None:
-    busy = connection.get_execution_options().get(_BUSY)
+    busy = connection.get_execution_options().get(_BUSY_OPTION)
     if busy is not None:
         connection.exec_driver_sql(f"SET LOCAL lock_timeout = {int(1000 * busy)}")

@@ -26,69 +26,69 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
-CHUNK = 1000
+CHUNK_ROWS = 1000
 """Rows of one bulk statement: below PostgreSQL's 65,535 parameters for every table here."""
 
-_KEY = "key_of_row"
+_ID_PARAMETER = "key_of_row"
 
-IN_PLACE = {"synchronize_session": False, "populate_existing": True}
+RETURNING_OPTIONS = {"synchronize_session": False, "populate_existing": True}
 """For UPDATE … RETURNING: the rows come back as the database has them."""
 
 
 @dataclass(frozen=True, slots=True)
-class Page(Generic[T]):
+class RowPage(Generic[T]):
     """Some of a list. `next` is the cursor of the page after it; None at the end."""
 
     items: tuple[T, ...]
     next: str | None
 
 
-def chunks(rows: Iterable[T], size: int = CHUNK) -> Iterable[list[T]]:
+def split_chunks(rows: Iterable[T], size: int = CHUNK_ROWS) -> Iterable[list[T]]:
     """The same rows in lists of `size`, the last one shorter."""
     left = iter(rows)
     while chunk := list(islice(left, size)):
         yield chunk
 
 
-def page_of(found: Sequence[T], limit: int, cursor: Iterable[object]) -> Page[T]:
+def make_page(found: Sequence[T], limit: int, cursor: Iterable[object]) -> RowPage[T]:
     """A page of at most `limit` of the rows found by a query that asked for one more.
 
     `cursor` are the cursors of the found rows, in their order.
     """
     if len(found) <= limit:
-        return Page(tuple(found), None)
-    return Page(tuple(found[:limit]), str(list(cursor)[limit - 1]))
+        return RowPage(tuple(found), None)
+    return RowPage(tuple(found[:limit]), str(list(cursor)[limit - 1]))
 
 
 def insert_missing(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]]) -> None:
     """Insert rows in bulk; those whose key is there already stay as they are."""
-    for chunk in chunks(rows):
-        _execute(session, table, _insert(session, table).on_conflict_do_nothing(), chunk)
+    for chunk in split_chunks(rows):
+        _execute_bulk(session, table, _build_insert(session, table).on_conflict_do_nothing(), chunk)
 
 
 def upsert(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]]) -> None:
     """Insert rows in bulk; those whose primary key is there already are replaced."""
     keys = [column.name for column in table.__table__.primary_key]
-    for chunk in chunks(rows):
-        statement = _insert(session, table)
+    for chunk in split_chunks(rows):
+        statement = _build_insert(session, table)
         changes = {name: statement.excluded[name] for name in chunk[0] if name not in keys}
         statement = statement.on_conflict_do_update(index_elements=keys, set_=changes)
-        _execute(session, table, statement, chunk)
+        _execute_bulk(session, table, statement, chunk)
 
 
 def update_by_id(session: Session, table: type[Base], rows: Iterable[Mapping[str, Any]]) -> None:
     """Change rows in bulk, each found by its `id`; all rows name the same columns."""
     target = cast(Table, table.__table__)
-    for chunk in chunks(rows):
-        statement = update_of(target).where(target.c.id == bindparam(_KEY))
-        _execute(session, table, statement, [_keyed(row) for row in chunk])
+    for chunk in split_chunks(rows):
+        statement = update_of(target).where(target.c.id == bindparam(_ID_PARAMETER))
+        _execute_bulk(session, table, statement, [_rename_id(row) for row in chunk])
 
 
-def _keyed(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {_KEY if name == "id" else name: value for name, value in row.items()}
+def _rename_id(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {_ID_PARAMETER if name == "id" else name: value for name, value in row.items()}
 
 
-def _execute(
+def _execute_bulk(
     session: Session,
     table: type[Base],
     statement: "sqlite.Insert | postgresql.Insert | Update",
@@ -104,14 +104,14 @@ def _execute(
     dialect, columns = connection.dialect, cast(Table, table.__table__).c
     names = list(rows[0])
     compiled = statement.compile(
-        dialect=dialect, column_keys=[name for name in names if name != _KEY]
+        dialect=dialect, column_keys=[name for name in names if name != _ID_PARAMETER]
     )
     if compiled.insert_prefetch or compiled.update_prefetch:  # defaults that are made row by row
         session.execute(statement, rows)
         return
     values = []
     for name in names:
-        kind = columns["id" if name == _KEY else name].type.dialect_impl(dialect)
+        kind = columns["id" if name == _ID_PARAMETER else name].type.dialect_impl(dialect)
         convert = kind.bind_processor(dialect)
         column = [row[name] for row in rows]
         values.append(column if convert is None else [convert(one) for one in column])
@@ -123,7 +123,7 @@ def _execute(
     connection.exec_driver_sql(str(compiled), given)
 
 
-def _insert(session: Session, table: type[Base]) -> "sqlite.Insert | postgresql.Insert":
+def _build_insert(session: Session, table: type[Base]) -> "sqlite.Insert | postgresql.Insert":
     # The two dialects share ON CONFLICT, but SQLAlchemy has no common form of it.
     # The table, not the class: the ORM's way through bulk rows costs more than the database.
     name = session.get_bind().dialect.name
@@ -138,14 +138,14 @@ _RANDOM_BITS = 80
 _LENGTH = 26
 
 
-class _Sequence:
+class _IdSequence:
     """Strictly increasing 128-bit numbers, led by the time."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._last = 0
 
-    def take(self, n: int) -> range:
+    def take_numbers(self, n: int) -> range:
         """The next `n` numbers, consecutive from the second on."""
         with self._lock:
             fresh = time.time_ns() // 1_000_000 << _RANDOM_BITS | secrets.randbits(_RANDOM_BITS)
@@ -154,7 +154,7 @@ class _Sequence:
             return range(first, first + n)
 
 
-_sequence = _Sequence()
+_id_sequence = _IdSequence()
 
 
 def new_id(prefix: IdPrefix) -> str:
@@ -164,9 +164,9 @@ def new_id(prefix: IdPrefix) -> str:
 
 def new_ids(prefix: IdPrefix, n: int) -> list[str]:
     """`n` new identifiers, ascending."""
-    return [f"{prefix}_{_encode(number)}" for number in _sequence.take(n)]
+    return [f"{prefix}_{_encode_base32(number)}" for number in _id_sequence.take_numbers(n)]
 
 
-def _encode(number: int) -> str:
+def _encode_base32(number: int) -> str:
     shifts = range(5 * (_LENGTH - 1), -1, -5)
     return "".join(_ALPHABET[number >> shift & 31] for shift in shifts)

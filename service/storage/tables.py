@@ -6,16 +6,15 @@ from typing import Any
 from sqlalchemy import ForeignKey, Index, LargeBinary, MetaData, UniqueConstraint, text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
-from service.core.states import OPEN as OPEN
-from service.core.states import State as State
+from service.core.states import JobState
 from service.storage.columns import (
     Document,
     DocumentType,
     LargeInteger,
-    Text,
+    OrderedJsonType,
+    TextT,
     UtcDateTime,
-    WrittenType,
-    state_type,
+    make_state_type,
     utc_now,
 )
 
@@ -35,11 +34,11 @@ class Base(DeclarativeBase):
         }
     )
     type_annotation_map = {  # noqa: RUF012 - SQLAlchemy's declaration
-        str: Text,
+        str: TextT,
         datetime: UtcDateTime,
         dict[str, Any]: DocumentType,
         list[Any]: DocumentType,
-        State: state_type(State),
+        JobState: make_state_type(JobState),
     }
 
 
@@ -114,7 +113,7 @@ class LineageEdge(Base):
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
 
 
-class Model(Base):
+class ModelVersion(Base):
     """One version of a user's own model document."""
 
     __tablename__ = "models"
@@ -124,7 +123,7 @@ class Model(Base):
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
     name: Mapped[str]
     version: Mapped[int]
-    document: Mapped[Document] = mapped_column(WrittenType)
+    document: Mapped[Document] = mapped_column(OrderedJsonType)
     document_hash: Mapped[str]
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
     deleted_at: Mapped[datetime | None]
@@ -151,8 +150,8 @@ class Job(Base):
     id: Mapped[str] = mapped_column(primary_key=True)
     project_id: Mapped[str] = mapped_column(ForeignKey("projects.id"))
     name: Mapped[str]
-    state: Mapped[State] = mapped_column(default=State.QUEUED)
-    spec: Mapped[Document] = mapped_column(WrittenType)
+    state: Mapped[JobState] = mapped_column(default=JobState.QUEUED)
+    spec: Mapped[Document] = mapped_column(OrderedJsonType)
     priority: Mapped[int] = mapped_column(default=0)
     max_attempts: Mapped[int] = mapped_column(default=3)
     attempt: Mapped[int] = mapped_column(default=0)
@@ -205,7 +204,7 @@ class Run(Base):
     method: Mapped[str | None]
     seed: Mapped[int | None] = mapped_column(LargeInteger)
     sigma: Mapped[float | None]
-    state: Mapped[State] = mapped_column(default=State.QUEUED)
+    state: Mapped[JobState] = mapped_column(default=JobState.QUEUED)
     attempt: Mapped[int] = mapped_column(default=0)
     kills: Mapped[int] = mapped_column(default=0)
     valid: Mapped[bool | None]
@@ -310,7 +309,7 @@ class IdempotencyKey(Base):
     created_at: Mapped[datetime] = mapped_column(default=utc_now)
 
 
-class Dispatcher(Base):
+class DispatcherHeartbeat(Base):
     """A dispatcher that has shown itself, so that health can say whether one is alive."""
 
     __tablename__ = "dispatchers"

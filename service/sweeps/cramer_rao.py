@@ -3,10 +3,10 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-Document = Mapping[str, Any]
+BoundsDocument = Mapping[str, Any]
 
 
-class Floors:
+class StoredBounds:
     """Finds the problem that all runs of a group share; they may share none.
 
     Parameters
@@ -15,12 +15,12 @@ class Floors:
         As `service.dispatch.cramer_rao` makes it; None as long as the job runs, and without noise.
     """
 
-    def __init__(self, stored: Document | None) -> None:
+    def __init__(self, stored: BoundsDocument | None) -> None:
         self._axes: Sequence[str] = (stored or {}).get("axes", ())
         self._note: str = (stored or {}).get("note", "")
-        self.problems: Sequence[Document] = (stored or {}).get("problems", ())
+        self.problems: Sequence[BoundsDocument] = (stored or {}).get("problems", ())
 
-    def problem_of(self, key: Mapping[str, Any]) -> Document | None:
+    def find_problem(self, key: Mapping[str, Any]) -> BoundsDocument | None:
         """The problem of a group, by the values of its keys."""
         if len(self.problems) == 1:
             return self.problems[0]
@@ -29,7 +29,7 @@ class Floors:
         cell = {path: key[path] for path in self._axes}
         return next((one for one in self.problems if one["cell"] == cell), None)
 
-    def notes(self) -> Iterator[str]:
+    def list_notes(self) -> Iterator[str]:
         """What the reader of errors and floors must know, each once."""
         if not self.problems:
             return
@@ -41,7 +41,7 @@ class Floors:
                 "the true values are not known: errors of parameters are from the estimate of the "
                 "best run with the least noise, and floors are those at that estimate"
             )
-        if any(_is_as_measured(one["reference"] or {}) for one in self.problems):
+        if any(_is_measured_record(one["reference"] or {}) for one in self.problems):
             yield (
                 "σ = 0 is the record as it was measured, to which no noise was added; it is run "
                 "for that estimate even where it was not asked for"
@@ -51,11 +51,11 @@ class Floors:
             yield self._note
 
 
-def _is_as_measured(reference: Mapping[str, Any]) -> bool:
+def _is_measured_record(reference: Mapping[str, Any]) -> bool:
     return reference.get("kind") == "estimate" and reference.get("sigma") == 0
 
 
-def at_sigma(per_sigma: float | None, sigma: tuple[float, float] | None) -> float | None:
+def scale_to_sigma(per_sigma: float | None, sigma: tuple[float, float] | None) -> float | None:
     """A floor at the σ of a group; None where its runs have several."""
     if per_sigma is None or sigma is None or sigma[0] != sigma[1]:
         return None

@@ -17,43 +17,48 @@ from typing import Any, NamedTuple
 
 from sqlalchemy.orm import Session
 
-from service.jobs.axes import Cell, Steps, positions_of
-from service.jobs.stored_cells import stored_groups
+from service.core.states import JobState
+from service.jobs.axes import AxisGroup, SweepCell, locate_cell
+from service.jobs.stored_cells import read_axis_groups
 from service.repositories.runs import RunRepository
-from service.repositories.summaries import Group, GroupKey, Quantity, groups
+from service.repositories.summaries import GroupKey, RunGroup, SummaryQuantity, read_groups
 from service.storage.columns import to_json
-from service.storage.tables import Job, State
+from service.storage.tables import Job
 
-SIGMA = "/noise/sigma"
+SIGMA_PATH = "/noise/sigma"
 
 
-def all_groups(
-    session: Session, job: Job, keys: Sequence[GroupKey], quantities: Sequence[Quantity], limit: int
-) -> list[Group]:
+def group_all_runs(
+    session: Session,
+    job: Job,
+    keys: Sequence[GroupKey],
+    quantities: Sequence[SummaryQuantity],
+    limit: int,
+) -> list[RunGroup]:
     """Groups of all runs of a job in the order of the sweep, at most `limit` + 1 of them.
 
     A run that has not been made counts as queued; in a job that ended without it, as ended alike.
     """
-    found = groups(session, job.id, keys, quantities, limit, job.project_id)
-    made = RunRepository(session, job.project_id).n_made(job.id)
+    found = read_groups(session, job.id, keys, quantities, limit, job.project_id)
+    made = RunRepository(session, job.project_id).count_created(job.id)
     if made >= job.n_runs or len(found) > limit:
         return found
-    sweep = _Sweep(job.spec, keys)
+    sweep = _GroupedSweep(job.spec, keys)
     # By their first runs: a database may round the numbers in a key.
-    known = {to_json(sweep.key_of(group.first)): group for group in found}
-    state = job.state if job.state.is_terminal else State.QUEUED
-    for part in sweep.parts(made):
+    known = {to_json(sweep.find_key(group.first_number)): group for group in found}
+    state = job.state if job.state.is_terminal else JobState.QUEUED
+    for part in sweep.iterate_pending(made):
         text = to_json(part.key)
         if text not in known:
             if len(found) > limit:
                 break
-            known[text] = _empty(part, keys)
+            known[text] = _build_empty_group(part, keys)
             found.append(known[text])
         known[text].states[state] += part.size
     return found
 
 
-class Part(NamedTuple):
+class PendingGroup(NamedTuple):
     """Runs that are not made and have one position in each group of axes that the keys ask for."""
 
     key: tuple[Any, ...]
@@ -61,39 +66,41 @@ class Part(NamedTuple):
     size: int
 
 
-class _Sweep:
+class _GroupedSweep:
     """The crossed groups of axes of a job, seen by the keys that its runs are grouped by."""
 
     def __init__(self, spec: Mapping[str, Any], keys: Sequence[GroupKey]) -> None:
         self._keys = keys
-        self._groups = stored_groups(spec)
+        self._groups = read_axis_groups(spec)
         self._lengths = [len(steps) for steps in self._groups]
         self._places = [place for place, steps in enumerate(self._groups)
-                        if any(_decides(steps, key) for key in keys)]  # fmt: skip
+                        if any(_sets_key(steps, key) for key in keys)]  # fmt: skip
 
-    def key_of(self, number: int) -> tuple[Any, ...]:
+    def find_key(self, number: int) -> tuple[Any, ...]:
         """The key of the group that a run belongs to."""
-        positions = positions_of(number, self._lengths)
-        return self._key([positions[place] for place in self._places])
+        positions = locate_cell(number, self._lengths)
+        return self._build_key([positions[place] for place in self._places])
 
-    def parts(self, start: int) -> Iterator[Part]:
+    def iterate_pending(self, start: int) -> Iterator[PendingGroup]:
         """The runs from number `start` on, part by part in the order of the sweep."""
         lengths = self._lengths
         total = prod(lengths)
         for positions in product(*(range(lengths[place]) for place in self._places)):
             fixed = dict(zip(self._places, positions, strict=True))
-            size = below(total, lengths, fixed) - below(start, lengths, fixed)
+            size = count_cells_below(total, lengths, fixed) - count_cells_below(
+                start, lengths, fixed
+            )
             if size:
                 first = sum(at * prod(lengths[place + 1 :]) for place, at in fixed.items())
-                yield Part(self._key(positions), first, size)
+                yield PendingGroup(self._build_key(positions), first, size)
 
-    def _key(self, positions: Sequence[int]) -> tuple[Any, ...]:
+    def _build_key(self, positions: Sequence[int]) -> tuple[Any, ...]:
         cells = [self._groups[place][position].cell
                  for place, position in zip(self._places, positions, strict=True)]  # fmt: skip
-        return tuple(_value(cells, key) for key in self._keys)
+        return tuple(_get_key_value(cells, key) for key in self._keys)
 
 
-def below(end: int, lengths: Sequence[int], fixed: Mapping[int, int]) -> int:
+def count_cells_below(end: int, lengths: Sequence[int], fixed: Mapping[int, int]) -> int:
     """How many cells before number `end` have the `fixed` positions, given by place."""
     count = 0
     for place, _ in enumerate(lengths):
@@ -108,13 +115,13 @@ def below(end: int, lengths: Sequence[int], fixed: Mapping[int, int]) -> int:
     return count + end  # without axes there is one cell
 
 
-def _decides(steps: Steps, key: GroupKey) -> bool:
+def _sets_key(steps: AxisGroup, key: GroupKey) -> bool:
     if key.kind == "axis":
         return any(axis.path == key.name for _, axis, _ in steps.columns)
     return any(key.name in labels for _, axis, _ in steps.columns for labels in axis.labels or [])
 
 
-def _value(cells: Sequence[Cell], key: GroupKey) -> Any:
+def _get_key_value(cells: Sequence[SweepCell], key: GroupKey) -> Any:
     """As the cell of the run would have it: of two labels of one name the later one counts."""
     value = None
     for cell in cells:
@@ -122,56 +129,60 @@ def _value(cells: Sequence[Cell], key: GroupKey) -> Any:
     return value
 
 
-def _empty(part: Part, keys: Sequence[GroupKey]) -> Group:
-    swept = dict(zip((key.name for key in keys), part.key, strict=True)).get(SIGMA)
+def _build_empty_group(part: PendingGroup, keys: Sequence[GroupKey]) -> RunGroup:
+    swept = dict(zip((key.name for key in keys), part.key, strict=True)).get(SIGMA_PATH)
     sigma = None if swept is None else (float(swept), float(swept))
-    return Group(
-        key=part.key, first=part.first, states=dict.fromkeys(State, 0), n_valid=0, sigma=sigma,
+    return RunGroup(
+        key=part.key, first_number=part.first, states=dict.fromkeys(JobState, 0), n_valid=0, sigma=sigma,
         mean_evaluations=None, mean_seconds=None,
     )  # fmt: skip
 
 
-KEPT = 32
-MOST_GROUPS = 2_000
+CACHE_SIZE = 32
+MOST_CACHED_GROUPS = 2_000
 """Groups of more than so many are not kept."""
 
 
-class _Kept:
+class _GroupCache:
     """What was asked for last."""
 
     def __init__(self) -> None:
         self._lock = Lock()
-        self._found: OrderedDict[Hashable, list[Group]] = OrderedDict()
+        self._found: OrderedDict[Hashable, list[RunGroup]] = OrderedDict()
 
-    def get(self, key: Hashable) -> list[Group] | None:
+    def get(self, key: Hashable) -> list[RunGroup] | None:
         with self._lock:
             if key in self._found:
                 self._found.move_to_end(key)
             return self._found.get(key)
 
-    def put(self, key: Hashable, groups: list[Group]) -> None:
+    def put(self, key: Hashable, groups: list[RunGroup]) -> None:
         with self._lock:
             self._found[key] = groups
-            while len(self._found) > KEPT:
+            while len(self._found) > CACHE_SIZE:
                 self._found.popitem(last=False)
 
 
-_kept = _Kept()
+_cache = _GroupCache()
 
 
-def groups_of(
-    session: Session, job: Job, keys: Sequence[GroupKey], quantities: Sequence[Quantity], limit: int
-) -> list[Group]:
-    """`service.sweeps.groups.all_groups`, from memory where the job has ended since.
+def get_groups(
+    session: Session,
+    job: Job,
+    keys: Sequence[GroupKey],
+    quantities: Sequence[SummaryQuantity],
+    limit: int,
+) -> list[RunGroup]:
+    """`service.sweeps.groups.group_all_runs`, from memory where the job has ended since.
 
     A job that is resumed ends at another time; then its groups are made anew.
     """
     if not job.state.is_terminal:
-        return all_groups(session, job, keys, quantities, limit)
+        return group_all_runs(session, job, keys, quantities, limit)
     asked = (job.id, job.attempt, job.finished_at, tuple(keys), tuple(quantities), limit)
-    found = _kept.get(asked)
+    found = _cache.get(asked)
     if found is None:
-        found = all_groups(session, job, keys, quantities, limit)
-        if len(found) <= MOST_GROUPS:
-            _kept.put(asked, found)
+        found = group_all_runs(session, job, keys, quantities, limit)
+        if len(found) <= MOST_CACHED_GROUPS:
+            _cache.put(asked, found)
     return found

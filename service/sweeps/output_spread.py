@@ -5,13 +5,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from service.core.errors import FieldError, InvalidRequest
-from service.datasets.recordings import recording_of
+from service.datasets.recordings import load_recording
 from service.storage.objects import ObjectStore
 from service.storage.tables import Dataset
 from sysid.data.records import Recording
 from sysid.models.model import Model
 
-MOST_VALUES = 10_000_000
+MOST_READ_VALUES = 10_000_000
 """Values that are read for it, over all channels: a request must not take minutes."""
 
 
@@ -25,15 +25,15 @@ def relative_faults(model: Model, rows: Sequence[Dataset]) -> Iterator[FieldErro
             "give σ in their unit, with relative: false",
         )
     count = sum(row.n_samples * row.n_channels for row in rows)
-    if count > MOST_VALUES:
+    if count > MOST_READ_VALUES:
         yield FieldError(
             "/relative",
-            f"the datasets have {count} values in all, and at most {MOST_VALUES} are read to find "
+            f"the datasets have {count} values in all, and at most {MOST_READ_VALUES} are read to find "
             "what σ is relative to; give σ in the output's unit, with relative: false",
         )
 
 
-def spread(
+def compute_spread(
     store: ObjectStore, rows: Sequence[Dataset], channel: str, made: Recording | None = None
 ) -> float:
     """Standard deviation of a channel about its mean in each dataset, over all of them.
@@ -50,7 +50,7 @@ def spread(
     """
     squares, count, largest = 0.0, 0, 0.0
     for row in rows:
-        recording = recording_of(store, row.sha256) if made is None else made
+        recording = load_recording(store, row.sha256) if made is None else made
         values = recording.channel(channel).values
         known = values[np.isfinite(values)]
         if known.size:
@@ -59,7 +59,7 @@ def spread(
             largest = max(largest, float(np.max(np.abs(known))))
     found = float(np.sqrt(squares / count)) if count else 0.0
     if not found > 1e-12 * largest:
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "/relative",
             f"the output {channel!r} does not vary (its standard deviation is {found:g}), so "
             "that there is nothing σ could be relative to; give σ in its unit",

@@ -5,18 +5,18 @@ from typing import Any
 
 from service.core.errors import FieldError, InvalidRequest
 from service.core.settings import Settings
-from service.core.text_checks import fault_of
+from service.core.text_checks import find_text_fault
 from service.jobs import submit as jobs
-from service.jobs.schemas import PREVIOUS, REFERENCE, RUN, JobIn, JobOut
+from service.jobs.schemas import PREVIOUS, REFERENCE_PREFIX, RUN_PREFIX, JobIn, JobOut
 from service.storage.sessions import Database
 from service.sweeps.schemas import ReidentifyIn
 
-FIRST_AXIS = "/sweep/axes/0"
-IN_DATASETS = re.compile(r"/datasets(?P<place>/\d+): ")
+AXIS_POINTER = "/sweep/axes/0"
+DATASET_FAULT = re.compile(r"/datasets(?P<place>/\d+): ")
 """How the fault of a value of the axis begins that is one of its recordings'."""
 
 
-def submit(
+def submit_reidentification(
     database: Database, body: ReidentifyIn, settings: Settings, key: str | None = None
 ) -> JobOut:
     """Queue the batch as an ordinary job.
@@ -28,27 +28,27 @@ def submit(
     KeyReused
         If the idempotency key was used with another body.
     """
-    order = order_of(body)
-    job = job_of(body, order)
+    order = sort_batch(body)
+    job = build_job(body, order)
     faults = []
     if body.warm_start == "reference" and body.reference is None:
         faults.append(FieldError("/warm_start", "'reference' needs one: name the reference too"))
     try:
         if not faults:
-            return jobs.submit_to(database, job, settings, key)
-        with database.read() as session:
-            jobs.check(session, job, settings)
+            return jobs.submit_job(database, job, settings, key)
+        with database.read_session() as session:
+            jobs.check_job(session, job, settings)
     except InvalidRequest as error:
-        faults += [_at_home(one, order) for one in error.errors]
+        faults += [_move_fault(one, order) for one in error.errors]
     raise InvalidRequest(dict.fromkeys(faults))
 
 
-def order_of(body: ReidentifyIn) -> list[int]:
+def sort_batch(body: ReidentifyIn) -> list[int]:
     """Places in the batch, in the order of x."""
     return sorted(range(len(body.batch)), key=lambda number: body.batch[number].x)
 
 
-def job_of(body: ReidentifyIn, order: list[int]) -> JobIn:
+def build_job(body: ReidentifyIn, order: list[int]) -> JobIn:
     """The job, its cells in the order of x: neighbours begin where their neighbours ended."""
     chosen = [body.batch[number] for number in order]
     axis = {
@@ -56,55 +56,55 @@ def job_of(body: ReidentifyIn, order: list[int]) -> JobIn:
         "values": [one.datasets for one in chosen],
         "labels": [{body.label: one.x} for one in chosen],
     }
-    reference = _reference(body.reference)
+    reference = _to_job_reference(body.reference)
     trend = {
         "x": body.label, "parameters": body.look_at, "predict": body.predict,
         "reference": reference,
     }  # fmt: skip
     return JobIn.model_validate({
-        "name": f"{_model_name(body.model)} over {body.label}"[:200],
-        **body.shared,
+        "name": f"{_choose_model_name(body.model)} over {body.label}"[:200],
+        **body.job_fields,
         "datasets": chosen[0].datasets,
         "sweep": {"axes": [axis]},
-        "warm_start": _warm_start(body, reference),
+        "warm_start": _choose_warm_start(body, reference),
         "trend": trend,
     })  # fmt: skip
 
 
-def _model_name(model: Any) -> str:
+def _choose_model_name(model: Any) -> str:
     """What a batch of this model is called; a text that no text is, is told with the model."""
     name = model.get("name") if isinstance(model, dict) else model
-    return name if isinstance(name, str) and fault_of(name) is None else "model"
+    return name if isinstance(name, str) and find_text_fault(name) is None else "model"
 
 
-def _reference(given: str | None) -> str | None:
+def _to_job_reference(given: str | None) -> str | None:
     """As a job names it: runs by their id, all else is the name of an accepted reference."""
-    if given is None or given.startswith((RUN, REFERENCE)):
+    if given is None or given.startswith((RUN_PREFIX, REFERENCE_PREFIX)):
         return given
-    return REFERENCE + given
+    return REFERENCE_PREFIX + given
 
 
-def _warm_start(body: ReidentifyIn, reference: str | None) -> str | None:
+def _choose_warm_start(body: ReidentifyIn, reference: str | None) -> str | None:
     wanted = body.warm_start or ("previous" if reference is None else "reference")
     if wanted == "reference":
         return reference
     return PREVIOUS if wanted == "previous" else None
 
 
-def _at_home(error: FieldError, order: list[int]) -> FieldError:
+def _move_fault(error: FieldError, order: list[int]) -> FieldError:
     """The fault of the job at the place of this body that it comes from."""
-    place = _place(error.pointer, order)
-    inner = IN_DATASETS.match(error.detail)
+    place = _move_pointer(error.pointer, order)
+    inner = DATASET_FAULT.match(error.detail)
     if inner and place.startswith("/batch/"):
         return FieldError(place + inner["place"], error.detail[inner.end() :], error.column)
     return FieldError(place, error.detail, error.column)
 
 
-def _place(pointer: str, order: list[int]) -> str:
+def _move_pointer(pointer: str, order: list[int]) -> str:
     parts: list[Any] = pointer.split("/")
-    if pointer.startswith(f"{FIRST_AXIS}/values/"):
+    if pointer.startswith(f"{AXIS_POINTER}/values/"):
         return f"/batch/{order[int(parts[5])]}/datasets"
-    if pointer.startswith(f"{FIRST_AXIS}/labels/"):
+    if pointer.startswith(f"{AXIS_POINTER}/labels/"):
         return "/label"
     if pointer.startswith("/datasets"):
         return "/".join([f"/batch/{order[0]}", *parts[1:]])

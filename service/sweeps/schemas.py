@@ -12,14 +12,14 @@ from pydantic_core import PydanticCustomError
 
 from service.core.wire import Answer, Body, Seed, Sigma
 from service.datasets.schemas import MAX_SIMULATED_SAMPLES, InputIn, SampleTime
-from service.jobs.schemas import IdentificationIn, PlaceIn, ValidationIn
+from service.jobs.schemas import IdentificationIn, TrendX, ValidationIn
 from sysid.core.settings import SearchMethod
 
 MOST_REPLICATES = 1_000_000
 """Seeds of replicate r are `seed` times this plus r, so that no two sweeps share one by chance."""
 
 
-def _distinct(found: list[Any]) -> list[Any]:
+def _check_distinct(found: list[Any]) -> list[Any]:
     seen: set[Any] = set()
     for one in found:
         if one in seen:
@@ -50,17 +50,17 @@ class NoiseSweepIn(IdentificationIn):
     truth: TruthIn | None = None
     datasets: list[str] | None = Field(default=None, min_length=1, max_length=1000)
     sigma: Annotated[
-        list[Sigma], Field(min_length=1, max_length=100_000), AfterValidator(_distinct)
+        list[Sigma], Field(min_length=1, max_length=100_000), AfterValidator(_check_distinct)
     ]
     relative: bool = False
     replicates: int = Field(default=20, ge=1, lt=MOST_REPLICATES)
-    methods: Annotated[list[SearchMethod], AfterValidator(_distinct)] = Field(
+    methods: Annotated[list[SearchMethod], AfterValidator(_check_distinct)] = Field(
         default=["simple", "improved"], min_length=1
     )
     seed: int = Field(default=1, ge=0, lt=2**32)
 
     @model_validator(mode="after")
-    def _one_source(self) -> Self:
+    def _check_one_source(self) -> Self:
         if (self.truth is None) == (self.datasets is None):
             raise PydanticCustomError(
                 "one_of",
@@ -69,15 +69,15 @@ class NoiseSweepIn(IdentificationIn):
         return self
 
     @property
-    def shared(self) -> dict[str, Any]:
+    def job_fields(self) -> dict[str, Any]:
         """The fields that the job has as well, as they were given."""
-        return self.given()
+        return self.dump_set_fields()
 
 
-class ExperimentsIn(Body):
+class BatchEntryIn(Body):
     """What was measured at one value of the label: `datasets` are fitted together, as one run."""
 
-    x: PlaceIn
+    x: TrendX
     datasets: list[str] = Field(min_length=1, max_length=1000)
 
 
@@ -94,18 +94,18 @@ class ReidentifyIn(IdentificationIn):
     """
 
     label: str = Field(min_length=1, max_length=64)
-    batch: list[ExperimentsIn] = Field(min_length=1, max_length=5000)
+    batch: list[BatchEntryIn] = Field(min_length=1, max_length=5000)
     reference: str | None = Field(default=None, min_length=1, max_length=200)
     warm_start: Literal["reference", "previous", "none"] | None = None
     look_at: list[str] = Field(default=[], max_length=100)
-    predict: list[PlaceIn] = Field(default=[], max_length=100)
+    predict: list[TrendX] = Field(default=[], max_length=100)
     validation: ValidationIn | None = None
     seed: Seed = 1
 
     @property
-    def shared(self) -> dict[str, Any]:
+    def job_fields(self) -> dict[str, Any]:
         """The fields that the job has as well, as they were given."""
-        return self.given("validation", "seed")
+        return self.dump_set_fields("validation", "seed")
 
 
 class ParameterSummaryOut(Answer):
@@ -150,7 +150,7 @@ class GroupOut(Answer):
     parameters: list[ParameterSummaryOut]
 
 
-class ReferenceOut(Answer):
+class ErrorReferenceOut(Answer):
     """What the errors of the runs with these values of the axes are told against.
 
     `kind` is ``truth`` (the data were simulated from these values) or ``estimate``: that of `run`,
@@ -180,5 +180,5 @@ class SummaryOut(Answer):
     rms_unit: str | None = Field(
         default=None, description="of each RMS; σ: of several outputs together"
     )
-    references: list[ReferenceOut] = Field(default=[])
+    references: list[ErrorReferenceOut] = Field(default=[])
     notes: list[str] = Field(default=[], description="what the numbers mean")

@@ -6,31 +6,38 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from service.core.errors import InvalidRequest
-from service.datasets.rms_unit import unit_of
+from service.core.states import JobState
+from service.datasets.rms_unit import find_rms_unit
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
-from service.repositories.summaries import QUANTILES, Group, GroupKey, Quantity, groups
-from service.storage.tables import Job, Run, State
-from service.sweeps.cramer_rao import Floors, at_sigma
-from service.sweeps.groups import groups_of
-from service.sweeps.schemas import GroupOut, ParameterSummaryOut, ReferenceOut, SummaryOut
-from sysid.core.errors import nearest
+from service.repositories.summaries import (
+    QUANTILES_PER_MILLE,
+    GroupKey,
+    RunGroup,
+    SummaryQuantity,
+    read_groups,
+)
+from service.storage.tables import Job, Run
+from service.sweeps.cramer_rao import StoredBounds, scale_to_sigma
+from service.sweeps.groups import get_groups
+from service.sweeps.schemas import ErrorReferenceOut, GroupOut, ParameterSummaryOut, SummaryOut
+from sysid.core.errors import suggest_name
 
 MOST_GROUPS = 2_000
-MIDDLE = QUANTILES.index(500)
-RMS, NOISE_FREE, ESTIMATION, VALIDATION = (
-    Quantity("rms"), Quantity("rms_noise_free"), Quantity("fit_estimation"),
-    Quantity("fit_validation"),
+MEDIAN = QUANTILES_PER_MILLE.index(500)
+RMS, RMS_NOISE_FREE, FIT_ESTIMATION, FIT_VALIDATION = (
+    SummaryQuantity("rms"), SummaryQuantity("rms_noise_free"), SummaryQuantity("fit_estimation"),
+    SummaryQuantity("fit_validation"),
 )  # fmt: skip
-SUCCESS = "a run succeeds if it ends with a finite simulation"
-SAFE = "a run succeeds if it ends with an RMS within the safe limit"
-FLOOR = (
+SUCCESS_NOTE = "a run succeeds if it ends with a finite simulation"
+SAFE_LIMIT_NOTE = "a run succeeds if it ends with an RMS within the safe limit"
+BOUND_NOTE = (
     "floors are Cramér–Rao bounds of the added noise alone; bounds on the parameters and a search "
     "that stops early may hold errors below them"
 )
 
 
-def summary(
+def summarise_job(
     session: Session, job_id: str, by: Sequence[str] | None, *, errors_only: bool = False
 ) -> SummaryOut:
     """Aggregates over the values of some axes or labels of a job.
@@ -49,47 +56,47 @@ def summary(
         If a key is neither, or the keys part the runs into too many groups.
     """
     job = JobRepository(session).get(job_id)
-    keys = _keys(job, by)
-    units = _units(session, job)
-    floors = Floors(job.floors)
-    quantities = [NOISE_FREE, *(Quantity("estimate", name) for name in units)]
+    keys = _choose_keys(job, by)
+    units = _read_units(session, job)
+    floors = StoredBounds(job.floors)
+    quantities = [RMS_NOISE_FREE, *(SummaryQuantity("estimate", name) for name in units)]
     if not errors_only:
-        quantities += [RMS, ESTIMATION, VALIDATION]
-        quantities += [Quantity("stderr", name) for name in units]
-    found = groups_of(session, job, keys, quantities, MOST_GROUPS)
+        quantities += [RMS, FIT_ESTIMATION, FIT_VALIDATION]
+        quantities += [SummaryQuantity("stderr", name) for name in units]
+    found = get_groups(session, job, keys, quantities, MOST_GROUPS)
     if len(found) > MOST_GROUPS:
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "?by", f"gives more than {MOST_GROUPS} groups; name fewer axes, such as no seed"
         )
     return SummaryOut(
         job=job.id,
         by=[key.name for key in keys],
-        quantiles=[q / 1000 for q in QUANTILES],
-        groups=[_told(group, keys, units, floors) for group in found],
+        quantiles=[q / 1000 for q in QUANTILES_PER_MILLE],
+        groups=[_to_group_out(group, keys, units, floors) for group in found],
         runs=job.n_runs,
         reused=job.n_reused,
-        rms_unit=unit_of(session, job.spec),
-        references=[_reference(one) for one in floors.problems],
-        notes=list(_notes(job, floors)),
+        rms_unit=find_rms_unit(session, job.spec),
+        references=[_to_reference_out(one) for one in floors.problems],
+        notes=list(_list_notes(job, floors)),
     )
 
 
-def _notes(job: Job, floors: Floors) -> Iterator[str]:
-    yield SUCCESS if job.spec["algorithm"]["safe_limit"] is None else SAFE
+def _list_notes(job: Job, floors: StoredBounds) -> Iterator[str]:
+    yield SUCCESS_NOTE if job.spec["algorithm"]["safe_limit"] is None else SAFE_LIMIT_NOTE
     if floors.problems:
-        yield from floors.notes()
-        yield FLOOR
+        yield from floors.list_notes()
+        yield BOUND_NOTE
 
 
-def _reference(problem: Mapping[str, Any]) -> ReferenceOut:
+def _to_reference_out(problem: Mapping[str, Any]) -> ErrorReferenceOut:
     known = problem["reference"] or {}
     none = {"kind": None, "run": None, "sigma": None}
-    return ReferenceOut.model_validate(
+    return ErrorReferenceOut.model_validate(
         {**none, **known, **problem, "parameters": known.get("values", {})}
     )
 
 
-def _keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
+def _choose_keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
     axes = job.spec["sweep"]["axes"]
     paths = [axis["path"] for axis in axes]
     labels = {name for axis in axes for one in axis["labels"] or [] for name in one}
@@ -100,24 +107,24 @@ def _keys(job: Job, by: Sequence[str] | None) -> list[GroupKey]:
         if name not in paths and name not in labels:
             known = [*paths, *sorted(labels)]
             there = f"; there are {', '.join(known)}" if known else "; the job has no axes"
-            raise InvalidRequest.at(
-                "?by", f"the job has no axis or label {name!r}{nearest(name, known)}{there}"
+            raise InvalidRequest.from_fault(
+                "?by", f"the job has no axis or label {name!r}{suggest_name(name, known)}{there}"
             )
         keys.append(GroupKey("axis" if name in paths else "label", name))
     return keys
 
 
-def _units(session: Session, job: Job) -> dict[str, str]:
+def _read_units(session: Session, job: Job) -> dict[str, str]:
     """Parameters that some run has estimated, with their units: by what the first ones told.
 
     Where an axis changes the model, its first run of every value may know others.
     """
     runs = RunRepository(session)
-    heads: list[Run] = list(runs.page(job.id, limit=1, states=[State.SUCCEEDED]).items)
+    heads: list[Run] = list(runs.list_page(job.id, limit=1, states=[JobState.SUCCEEDED]).items)
     if any(axis["path"] == "/model" for axis in job.spec["sweep"]["axes"]):
-        for group in groups(session, job.id, [GroupKey("axis", "/model")], [], MOST_GROUPS):
+        for group in read_groups(session, job.id, [GroupKey("axis", "/model")], [], MOST_GROUPS):
             cell = {"/model": group.key[0]}
-            heads += runs.page(job.id, limit=1, states=[State.SUCCEEDED], cell=cell).items
+            heads += runs.list_page(job.id, limit=1, states=[JobState.SUCCEEDED], cell=cell).items
     return {
         one["name"]: one["unit"]
         for run in heads
@@ -126,51 +133,51 @@ def _units(session: Session, job: Job) -> dict[str, str]:
     }
 
 
-def _told(
-    group: Group, keys: Sequence[GroupKey], units: dict[str, str], floors: Floors
+def _to_group_out(
+    group: RunGroup, keys: Sequence[GroupKey], units: dict[str, str], floors: StoredBounds
 ) -> GroupOut:
-    ended = group.states[State.SUCCEEDED] + group.states[State.FAILED]
+    ended = group.states[JobState.SUCCEEDED] + group.states[JobState.FAILED]
     named = {key.name: value for key, value in zip(keys, group.key, strict=True)}
-    problem = floors.problem_of(named) or {}
+    problem = floors.find_problem(named) or {}
     same = group.sigma is not None and group.sigma[0] == group.sigma[1]
     return GroupOut(
         key=named,
         runs=sum(group.states.values()),
-        succeeded=group.states[State.SUCCEEDED],
-        failed=group.states[State.FAILED],
+        succeeded=group.states[JobState.SUCCEEDED],
+        failed=group.states[JobState.FAILED],
         sigma=group.sigma[0] if group.sigma is not None and same else None,
         success_rate=group.n_valid / ended if ended else 0.0,
         evaluations=group.mean_evaluations,
         seconds=group.mean_seconds,
-        rms=_list(group, RMS),
-        rms_noise_free=_list(group, NOISE_FREE),
-        rms_floor=at_sigma(problem.get("rms"), group.sigma),
+        rms=_list_quantiles(group, RMS),
+        rms_noise_free=_list_quantiles(group, RMS_NOISE_FREE),
+        rms_floor=scale_to_sigma(problem.get("rms"), group.sigma),
         fit_percent={
-            "estimation": _list(group, ESTIMATION), "validation": _list(group, VALIDATION),
+            "estimation": _list_quantiles(group, FIT_ESTIMATION), "validation": _list_quantiles(group, FIT_VALIDATION),
         },
-        parameters=list(_parameters(group, units, problem)),
+        parameters=list(_summarise_parameters(group, units, problem)),
     )  # fmt: skip
 
 
-def _parameters(
-    group: Group, units: dict[str, str], problem: Mapping[str, Any]
+def _summarise_parameters(
+    group: RunGroup, units: dict[str, str], problem: Mapping[str, Any]
 ) -> Iterator[ParameterSummaryOut]:
     known = (problem.get("reference") or {}).get("values", {})
     floors = problem.get("stderr", {})
     for name, unit in units.items():
-        values = _list(group, Quantity("estimate", name))
-        errors = _list(group, Quantity("stderr", name))
+        values = _list_quantiles(group, SummaryQuantity("estimate", name))
+        errors = _list_quantiles(group, SummaryQuantity("stderr", name))
         if values is not None:
             reference = known.get(name)
             yield ParameterSummaryOut(
                 name=name, unit=unit, value=values,
-                stderr=None if errors is None else errors[MIDDLE],
+                stderr=None if errors is None else errors[MEDIAN],
                 reference=reference,
                 error=None if reference is None else [value - reference for value in values],
-                floor=at_sigma(floors.get(name), group.sigma),
+                floor=scale_to_sigma(floors.get(name), group.sigma),
             )  # fmt: skip
 
 
-def _list(group: Group, quantity: Quantity) -> Any:
+def _list_quantiles(group: RunGroup, quantity: SummaryQuantity) -> Any:
     found = group.quantiles.get(quantity)
     return None if found is None else list(found)

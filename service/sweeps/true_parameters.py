@@ -7,10 +7,10 @@ from sqlalchemy.orm import Session
 
 from service.models import models
 from service.storage.tables import Dataset
-from sysid.models.model import EstimatedInitial, Model, initial_name
+from sysid.models.model import EstimatedInitial, Model, name_initial_state
 
 
-def truth_of(session: Session, reference: Any, datasets: Sequence[Dataset]) -> (
+def find_true_parameters(session: Session, reference: Any, datasets: Sequence[Dataset]) -> (
     dict[str, float] | None
 ):  # fmt: skip
     """True values of a model's parameters and starts, by their names in a result.
@@ -18,8 +18,10 @@ def truth_of(session: Session, reference: Any, datasets: Sequence[Dataset]) -> (
     None unless every dataset was simulated from this very model with the same parameters: another
     model's parameters may have the same names and mean something else.
     """
-    model, stored = models.resolve(session, reference)
-    truths = [_of_one(model, stored, row, number) for number, row in enumerate(datasets)]
+    model, stored = models.resolve_model(session, reference)
+    truths = [
+        _read_true_parameters(model, stored, row, number) for number, row in enumerate(datasets)
+    ]
     if not truths or any(one is None for one in truths):
         return None
     known: dict[str, float] = {}
@@ -30,7 +32,9 @@ def truth_of(session: Session, reference: Any, datasets: Sequence[Dataset]) -> (
     return known
 
 
-def _of_one(model: Model, stored: Any, row: Dataset, number: int) -> dict[str, float] | None:
+def _read_true_parameters(
+    model: Model, stored: Any, row: Dataset, number: int
+) -> dict[str, float] | None:
     source = row.details.get("simulation") if row.kind == "simulate" else None
     if not isinstance(source, Mapping) or source.get("model") != stored:
         return None
@@ -40,5 +44,5 @@ def _of_one(model: Model, stored: Any, row: Dataset, number: int) -> dict[str, f
     own |= {name: float(value) for name, value in given.items() if name in names}
     for state, start in zip(model.states, model.initial, strict=True):
         if isinstance(start, EstimatedInitial):
-            own[initial_name(state.name, number)] = float(given.get(f"{state.name}(0)", 0.0))
+            own[name_initial_state(state.name, number)] = float(given.get(f"{state.name}(0)", 0.0))
     return own

@@ -8,13 +8,13 @@ from typing import Any, Literal
 import numpy as np
 
 from service.storage.tables import Run
-from service.trends.points import Quantity, onset_estimates
+from service.trends.points import TrendQuantity, read_onset_estimates
 from service.trends.schemas import DriftOut
-from sysid.trends.trend import Drift, Estimate, Trend, drift, drifts_from_law
+from sysid.trends.trend import Drift, Trend, TrendEstimate, compute_drift, compute_law_drifts
 
 
 @dataclass(frozen=True, slots=True)
-class Reference:
+class BatchReference:
     """The run a batch is compared with, and the trend of its job, quantity by quantity.
 
     Attributes
@@ -29,11 +29,11 @@ class Reference:
 
     run: Run
     x: float | None
-    trends: Mapping[str, tuple[Trend, Quantity]] = field(default_factory=dict)
+    trends: Mapping[str, tuple[Trend, TrendQuantity]] = field(default_factory=dict)
     why_no_trend: str = ""
     names: tuple[str, ...] = ()
 
-    def note(self, x: str, places: Mapping[float, Any]) -> str:
+    def explain_gaps(self, x: str, places: Mapping[float, Any]) -> str:
         """What a reader needs to know where less is compared than may be expected."""
         if self.trends:
             return ""
@@ -46,42 +46,42 @@ class Reference:
         return f"{where}, and {self.why_no_trend}: nothing to compare with"
 
 
-def drifts_of(
-    one: Quantity, reference: Reference | None, comparisons: int
+def compare_with_reference(
+    one: TrendQuantity, reference: BatchReference | None, comparisons: int
 ) -> dict[float, list[DriftOut]]:
     """What is told of each point, by its x."""
     found: dict[float, list[DriftOut]] = {}
     if reference is None:
         return found
     new = [(point.x, point.estimate) for point in one.points if point.estimate is not None]
-    old = _estimate(reference.run, one.name)
+    old = _read_estimate(reference.run, one.name)
     for x, estimate in new:
         if x == reference.x and old is not None:
-            found[x] = [_told("run", old.value, drift(estimate, old, comparisons))]
+            found[x] = [_to_drift_out("run", old.value, compute_drift(estimate, old, comparisons))]
     fitted, theirs = reference.trends.get(one.name, (None, None))
-    if fitted is None or theirs is None or fitted.chosen is None:
+    if fitted is None or theirs is None or fitted.best_law is None:
         return found
     used = [(p.x, p.estimate.stderr) for p in theirs.points if p.estimate is not None]
     places, errors = np.array([x for x, _ in used]), np.array([error for _, error in used])
     at = np.array([x for x, _ in new])
-    moved = drifts_from_law(
-        [estimate for _, estimate in new], fitted.chosen, places, errors, at, comparisons
+    moved = compute_law_drifts(
+        [estimate for _, estimate in new], fitted.best_law, places, errors, at, comparisons
     )
     for (x, estimate), so_far in zip(new, moved, strict=True):
         if isfinite(so_far.difference):
             expected = estimate.value - so_far.difference
-            found.setdefault(x, []).append(_told("trend", expected, so_far))
+            found.setdefault(x, []).append(_to_drift_out("trend", expected, so_far))
     return found
 
 
-def _estimate(run: Run, name: str) -> Estimate | None:
+def _read_estimate(run: Run, name: str) -> TrendEstimate | None:
     """Of a parameter or an onset delay, with its standard error."""
     one: Any = (run.estimates or {}).get(name)
     if one is None:
-        return onset_estimates((run.result or {}).get("onset_delays") or []).get(name)
-    return Estimate(one["value"], one["stderr"]) if one["stderr"] else None
+        return read_onset_estimates((run.result or {}).get("onset_delays") or []).get(name)
+    return TrendEstimate(one["value"], one["stderr"]) if one["stderr"] else None
 
 
-def _told(kind: Literal["run", "trend"], expected: float, moved: Drift) -> DriftOut:
+def _to_drift_out(kind: Literal["run", "trend"], expected: float, moved: Drift) -> DriftOut:
     z = max(min(moved.z, 1e300), -1e300)
     return DriftOut.from_source(moved, kind=kind, expected=expected, z=z, drifted=moved.has_drifted)

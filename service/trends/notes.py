@@ -4,19 +4,25 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from service.jobs.results import read_noise_model
 from service.repositories.trends import TrendRow
-from service.trends.points import Quantity
+from service.trends.points import TrendQuantity
 from sysid.core.units import format_unit
-from sysid.trends.trend import Place, Trend
+from sysid.trends.trend import Trend, TrendPoint
 
-REAL_SCATTER = 1.5  # Birge ratios below that happen by chance in small batches
+BIRGE_LIMIT = 1.5  # Birge ratios below that happen by chance in small batches
 
 
-def quantity_notes(one: Quantity, fitted: Trend) -> list[str]:
+def describe_quantity(one: TrendQuantity, fitted: Trend) -> list[str]:
     """All of them: of the points, of the laws, of what is predicted."""
-    return [*_of_points(one), *_of_laws(one, fitted), *_of_predictions(one, fitted)]
+    return [
+        *_describe_points(one),
+        *_describe_laws(one, fitted),
+        *_describe_predictions(one, fitted),
+    ]
 
 
-def noise_model_note(x: str, places: Mapping[float, Sequence[TrendRow]], reference: str) -> str:
+def describe_noise_models(
+    x: str, places: Mapping[float, Sequence[TrendRow]], reference: str
+) -> str:
     """Which estimates are of another noise model than others; empty where all are of one.
 
     Parameters
@@ -40,28 +46,28 @@ def noise_model_note(x: str, places: Mapping[float, Sequence[TrendRow]], referen
     )
 
 
-def _of_points(one: Quantity) -> Iterator[str]:
+def _describe_points(one: TrendQuantity) -> Iterator[str]:
     without = [f"{point.x:g}" for point in one.points if point.estimate is None]
     if without:
         yield f"no standard error at {', '.join(without)}: the laws leave this out"
-    if one.between is not None and one.between > 1:
+    if one.between_runs is not None and one.between_runs > 1:
         yield (
-            f"runs of one label differ by {one.between:.2g} times what their standard errors say; "
+            f"runs of one label differ by {one.between_runs:.2g} times what their standard errors say; "
             "the errors shown hold that"
         )
 
 
-def _of_laws(one: Quantity, fitted: Trend) -> Iterator[str]:
-    chosen = fitted.chosen
+def _describe_laws(one: TrendQuantity, fitted: Trend) -> Iterator[str]:
+    chosen = fitted.best_law
     if chosen is None:
         return
-    if chosen.birge > REAL_SCATTER:
+    if chosen.birge_ratio > BIRGE_LIMIT:
         yield (
-            f"the points scatter about the law by {chosen.birge:.2g} times their errors "
+            f"the points scatter about the law by {chosen.birge_ratio:.2g} times their errors "
             "(Birge ratio); band and intervals are wider by that"
         )
     if all(law.kind != "power" for law in fitted.laws):
-        wrong = [f"{x:g}" for x in _used(one) if not x > 0]
+        wrong = [f"{x:g}" for x in _list_used_x(one) if not x > 0]
         yield "no power law: " + (
             f"it needs x above 0, found {', '.join(wrong)}" if wrong
             else "these points do not determine one"
@@ -75,23 +81,23 @@ def _of_laws(one: Quantity, fitted: Trend) -> Iterator[str]:
         )
 
 
-def _of_predictions(one: Quantity, fitted: Trend) -> Iterator[str]:
+def _describe_predictions(one: TrendQuantity, fitted: Trend) -> Iterator[str]:
     outside = [f"{at.x:g}" for at in fitted.predictions if at.is_outside]
     if outside:
         yield f"{', '.join(outside)} is outside the measured range: an extrapolation"
-    used = _used(one)
+    used = _list_used_x(one)
     beyond = [f"{at.x:g}" for at in fitted.predictions if not at.x > 0]
     if beyond and used and min(used) > 0:
         yield f"{', '.join(beyond)} is not above 0, as all that was measured is"
     for at in fitted.predictions:
-        yield from _against_bounds(one, at)
+        yield from _compare_with_bounds(one, at)
 
 
-def _used(one: Quantity) -> list[float]:
+def _list_used_x(one: TrendQuantity) -> list[float]:
     return [point.x for point in one.points if point.estimate is not None]
 
 
-def _against_bounds(one: Quantity, at: Place) -> Iterator[str]:
+def _compare_with_bounds(one: TrendQuantity, at: TrendPoint) -> Iterator[str]:
     """Predictions that no run could have given, or that lack part of their interval."""
     lower, upper = one.bounds
     unit = format_unit(one.unit)

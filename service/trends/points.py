@@ -7,45 +7,45 @@ from typing import Any, Literal
 
 from service.jobs.results import is_free
 from service.repositories.trends import TrendRow
-from service.trends.schemas import BatchPlaceOut, SpanOut
-from sysid.trends.trend import Estimate, pooled
+from service.trends.schemas import BatchLabelOut, SpanOut
+from sysid.trends.trend import TrendEstimate, pool_estimates
 
-Channels = Mapping[str, Mapping[str, Any]]
+DatasetChannels = Mapping[str, Mapping[str, Any]]
 """For each dataset, its channels by name."""
 
-Kind = Literal["parameter", "onset delay"]
-DATA = ("/datasets", "/noise", "/channels", "/hold", "/skip", "/validation")
+QuantityKind = Literal["parameter", "onset delay"]
+DATA_FIELDS = ("/datasets", "/noise", "/channels", "/hold", "/skip", "/validation")
 """Fields of a job that decide which data a run sees."""
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class TrendPoint:
     """What the runs of one label say of one quantity; `estimate` is None where none has errors."""
 
     x: float
     runs: tuple[str, ...]
     status: str
-    estimate: Estimate | None
+    estimate: TrendEstimate | None
     value: float | None
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
-    """A parameter or an onset delay over the labels; `between` as of `sysid.trends.trend.pooled`.
+class TrendQuantity:
+    """A parameter or an onset delay over the labels; `between` as of `sysid.trends.trend.pool_estimates`.
 
     `bounds` are the widest of its runs.
     """
 
     name: str
     unit: str
-    kind: Kind
-    points: tuple[Point, ...]
-    between: float | None
+    kind: QuantityKind
+    points: tuple[TrendPoint, ...]
+    between_runs: float | None
     bounds: tuple[float, float] = (-inf, inf)
 
 
 @dataclass(slots=True)
-class _Entry:
+class _RunEstimate:
     run: str
     value: float | None
     stderr: float | None
@@ -53,69 +53,75 @@ class _Entry:
 
 
 @dataclass(slots=True)
-class _Column:
+class _QuantityEstimates:
     """Entries of one quantity by label; its bounds are the widest of its runs."""
 
     unit: str
-    kind: Kind
+    kind: QuantityKind
     lower: float = inf
     upper: float = -inf
-    entries: dict[float, list[_Entry]] = field(default_factory=dict)
+    entries: dict[float, list[_RunEstimate]] = field(default_factory=dict)
 
-    def widen(self, lower: float | None, upper: float | None) -> None:
+    def widen_bounds(self, lower: float | None, upper: float | None) -> None:
         """Take in the bounds of a run; None: there is none."""
         self.lower = min(self.lower, -inf if lower is None else lower)
         self.upper = max(self.upper, inf if upper is None else upper)
 
 
-def by_label(rows: Sequence[TrendRow], x: str) -> dict[float, list[TrendRow]]:
+def group_by_label(rows: Sequence[TrendRow], x: str) -> dict[float, list[TrendRow]]:
     """Runs of each label, ascending. Of runs on the same data, which tell nothing new, the best."""
     found: dict[float, dict[str, TrendRow]] = {}
     for row in rows:
         at = float(row.labels[x])
-        data = repr({path: value for path, value in row.cell.items() if path.startswith(DATA)})
+        data = repr(
+            {path: value for path, value in row.cell.items() if path.startswith(DATA_FIELDS)}
+        )
         one = found.setdefault(at, {}).setdefault(data, row)
-        if _loss(row) < _loss(one):
+        if _rank_rms(row) < _rank_rms(one):
             found[at][data] = row
     return {at: list(found[at].values()) for at in sorted(found)}
 
 
-def _loss(row: TrendRow) -> float:
+def _rank_rms(row: TrendRow) -> float:
     return float("inf") if row.best_rms is None else row.best_rms
 
 
-def quantities(places: Mapping[float, Sequence[TrendRow]], names: Sequence[str]) -> list[Quantity]:
+def build_quantities(
+    places: Mapping[float, Sequence[TrendRow]], names: Sequence[str]
+) -> list[TrendQuantity]:
     """The parameters (all that are estimated, if none is named), then the onset delays."""
-    columns: dict[str, _Column] = {}
+    columns: dict[str, _QuantityEstimates] = {}
     for x, rows in places.items():
         for row in rows:
             for one in row.parameters:
                 if one["name"] in names or (not names and is_free(one)):
-                    entry = _Entry(row.id, one["value"], one["stderr"], one["status"])
-                    column = _add(columns, one["name"], one["unit"], "parameter", x, entry)
-                    column.widen(one["lower"], one["upper"])
-            for name, unit, entry in _onsets(row.id, row.onset_delays):
-                _add(columns, name, unit, "onset delay", x, entry).widen(0.0, None)
+                    entry = _RunEstimate(row.id, one["value"], one["stderr"], one["status"])
+                    column = _add_estimate(columns, one["name"], one["unit"], "parameter", x, entry)
+                    column.widen_bounds(one["lower"], one["upper"])
+            for name, unit, entry in _average_onsets(row.id, row.onset_delays):
+                _add_estimate(columns, name, unit, "onset delay", x, entry).widen_bounds(0.0, None)
     order = {name: number for number, name in enumerate(names)}
     named = sorted(columns.items(), key=lambda one: order.get(one[0], len(order)))
-    return [_quantity(name, column) for name, column in named]
+    return [_build_quantity(name, column) for name, column in named]
 
 
-def _add(
-    columns: dict[str, _Column], name: str, unit: str, kind: Kind, x: float, entry: _Entry
-) -> _Column:  # fmt: skip
-    column = columns.setdefault(name, _Column(unit, kind))
+def _add_estimate(
+    columns: dict[str, _QuantityEstimates], name: str, unit: str, kind: QuantityKind, x: float, entry: _RunEstimate
+) -> _QuantityEstimates:  # fmt: skip
+    column = columns.setdefault(name, _QuantityEstimates(unit, kind))
     column.entries.setdefault(x, []).append(entry)
     return column
 
 
-def onset_estimates(told: Sequence[Mapping[str, Any]]) -> dict[str, Estimate]:
+def read_onset_estimates(told: Sequence[Mapping[str, Any]]) -> dict[str, TrendEstimate]:
     """The onset delays of a result that have standard errors, by the names of a trend."""
-    known = {name: _estimate(entry) for name, _, entry in _onsets("", told)}
+    known = {name: _to_estimate(entry) for name, _, entry in _average_onsets("", told)}
     return {name: one for name, one in known.items() if one is not None}
 
 
-def _onsets(run: str, told: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, _Entry]]:
+def _average_onsets(
+    run: str, told: Sequence[Mapping[str, Any]]
+) -> list[tuple[str, str, _RunEstimate]]:
     """Onset delays of a run; the mean over its experiments, and what they differ by."""
     pairs: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for one in told:
@@ -125,17 +131,17 @@ def _onsets(run: str, told: Sequence[Mapping[str, Any]]) -> list[tuple[str, str,
         known = [one for one in several if one["delay"] is not None]
         name = "onset delay" if len(pairs) == 1 else f"onset delay {first} → {then}"
         if not known:
-            found.append((name, several[0]["unit"], _Entry(run, None, None, "not told")))
+            found.append((name, several[0]["unit"], _RunEstimate(run, None, None, "not told")))
             continue
         n = len(known)
         value = sum(one["delay"] for one in known) / n
-        errors = [_onset_error(one) for one in known]
+        errors = [_compute_onset_error(one) for one in known]
         error = None if None in errors else sum(e**2 for e in errors if e is not None) ** 0.5 / n
-        found.append((name, known[0]["unit"], _Entry(run, value, error, "measured")))
+        found.append((name, known[0]["unit"], _RunEstimate(run, value, error, "measured")))
     return found
 
 
-def _onset_error(one: Mapping[str, Any]) -> float | None:
+def _compute_onset_error(one: Mapping[str, Any]) -> float | None:
     """Standard error of a median of n events that scatter by `spread`."""
     if not one["spread"] or one["events"] < 2:
         return None
@@ -143,38 +149,42 @@ def _onset_error(one: Mapping[str, Any]) -> float | None:
     return float(median_over_mean * one["spread"] / one["events"] ** 0.5)
 
 
-def _quantity(name: str, column: _Column) -> Quantity:
-    groups = {x: [_estimate(one) for one in many] for x, many in column.entries.items()}
+def _build_quantity(name: str, column: _QuantityEstimates) -> TrendQuantity:
+    groups = {x: [_to_estimate(one) for one in many] for x, many in column.entries.items()}
     known = {x: [one for one in many if one is not None] for x, many in groups.items()}
     used = [x for x, many in known.items() if many]
-    means, ratio = pooled([known[x] for x in used])
+    means, ratio = pool_estimates([known[x] for x in used])
     estimates = dict(zip(used, means, strict=True))
     several = any(len(known[x]) > 1 for x in used)
-    points = tuple(_point(x, column.entries[x], estimates.get(x)) for x in sorted(column.entries))
+    points = tuple(
+        _build_point(x, column.entries[x], estimates.get(x)) for x in sorted(column.entries)
+    )
     bounds = column.lower, column.upper
-    return Quantity(name, column.unit, column.kind, points, ratio if several else None, bounds)
+    return TrendQuantity(name, column.unit, column.kind, points, ratio if several else None, bounds)
 
 
-def _estimate(one: _Entry) -> Estimate | None:
+def _to_estimate(one: _RunEstimate) -> TrendEstimate | None:
     if one.value is None or not one.stderr or not one.stderr > 0:
         return None
-    return Estimate(float(one.value), float(one.stderr))
+    return TrendEstimate(float(one.value), float(one.stderr))
 
 
-def _point(x: float, entries: Sequence[_Entry], estimate: Estimate | None) -> Point:
+def _build_point(
+    x: float, entries: Sequence[_RunEstimate], estimate: TrendEstimate | None
+) -> TrendPoint:
     states = list(dict.fromkeys(one.status for one in entries))
     values = [one.value for one in entries if one.value is not None]
     value = sum(values) / len(values) if values else None
-    return Point(
+    return TrendPoint(
         x, tuple(one.run for one in entries), ", ".join(states), estimate,
         value if estimate is None else estimate.value,
     )  # fmt: skip
 
 
-def place(
-    x: float, rows: Sequence[TrendRow], datasets: Mapping[str, Sequence[str]], known: Channels,
+def to_label_out(
+    x: float, rows: Sequence[TrendRow], datasets: Mapping[str, Sequence[str]], known: DatasetChannels,
     channels: Mapping[str, str],
-) -> BatchPlaceOut:  # fmt: skip
+) -> BatchLabelOut:  # fmt: skip
     """All runs of a label; `datasets` of each run, `channels` of the model's signals."""
     spans: dict[str, SpanOut] = {}
     for row in rows:
@@ -183,20 +193,22 @@ def place(
             if low is None or high is None:
                 continue
             channel = channels.get(one["output"], one["output"])
-            unit = _unit(known, datasets.get(row.id, ()), channel, one["unit"])
+            unit = _find_unit(known, datasets.get(row.id, ()), channel, one["unit"])
             before = spans.get(one["output"])
             if before is not None:
                 low, high = min(low, before.lower), max(high, before.upper)
             spans[one["output"]] = SpanOut(
                 output=one["output"], channel=channel, unit=unit, lower=low, upper=high
             )
-    return BatchPlaceOut(
+    return BatchLabelOut(
         x=x, runs=[row.id for row in rows], evaluations=sum(row.evaluations for row in rows),
         spans=list(spans.values()),
         warnings=list(dict.fromkeys(text for row in rows for text in row.warnings)),
     )  # fmt: skip
 
 
-def _unit(known: Channels, datasets: Sequence[str], channel: str, otherwise: str) -> str:
+def _find_unit(
+    known: DatasetChannels, datasets: Sequence[str], channel: str, otherwise: str
+) -> str:
     units = [known[one][channel]["unit"] for one in datasets if channel in known.get(one, {})]
     return next((unit for unit in units if unit != "1"), otherwise)

@@ -5,23 +5,25 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from service.jobs.record_checks import signals_of
+from service.jobs.record_checks import list_signals
 from service.jobs.stored_run import load_run
 from service.models import models
 from service.repositories.datasets import DatasetRepository
 from service.storage.tables import Run
-from service.trends.points import Channels
+from service.trends.points import DatasetChannels
 from sysid.core.errors import UnknownModel
 from sysid.models.model import Model
-from sysid.models.parameters import override
+from sysid.models.parameters import override_parameters
 
-Body = Mapping[str, Any]
-Facts = Mapping[str, str]
+JobBody = Mapping[str, Any]
+RunFacts = Mapping[str, str]
 
-_NONE = "none"
+_NO_VALUE = "none"
 
 
-def differences(session: Session, run: Run, bodies: Sequence[Body], known: Channels) -> str:
+def describe_differences(
+    session: Session, run: Run, bodies: Sequence[JobBody], known: DatasetChannels
+) -> str:
     """What a reference run was made with that the runs of a batch were not; empty if nothing.
 
     Parameters
@@ -32,27 +34,29 @@ def differences(session: Session, run: Run, bodies: Sequence[Body], known: Chann
         Channels of the datasets of these.
     """
     body = load_run(session, run.id).body
-    theirs = _facts(session, body, channels_of(session, set(body["datasets"])))
+    theirs = _collect_facts(session, body, read_channels(session, set(body["datasets"])))
     told: dict[str, None] = {}
-    for ours in _different(session, bodies, known):
+    for ours in _list_distinct_facts(session, bodies, known):
         for name in dict.fromkeys([*theirs, *ours]):
-            one, other = theirs.get(name, _NONE), ours.get(name, _NONE)
+            one, other = theirs.get(name, _NO_VALUE), ours.get(name, _NO_VALUE)
             if one != other:
                 told[f"{name} = {one} (here {other})"] = None
     return f"the reference was made with {', '.join(told)}" if told else ""
 
 
-def channels_of(session: Session, datasets: set[str]) -> Channels:
+def read_channels(session: Session, datasets: set[str]) -> DatasetChannels:
     """The channels of datasets, by name."""
     found = DatasetRepository(session).get_all(sorted(datasets)) if datasets else ()
     return {one.id: {channel["name"]: channel for channel in one.channels} for one in found}
 
 
-def _different(session: Session, bodies: Sequence[Body], known: Channels) -> Iterator[Facts]:
+def _list_distinct_facts(
+    session: Session, bodies: Sequence[JobBody], known: DatasetChannels
+) -> Iterator[RunFacts]:
     """The facts of a batch, each set of them once."""
     told: set[str] = set()
     for body in bodies:
-        settings = {name: body[name] for name in _SETTINGS}
+        settings = {name: body[name] for name in _COMPARED_FIELDS}
         kinds = [
             sorted((one["name"], one["unit"], one["hold"])
                    for one in known.get(dataset, {}).values())
@@ -61,39 +65,43 @@ def _different(session: Session, bodies: Sequence[Body], known: Channels) -> Ite
         key = repr((settings, kinds))
         if key not in told:
             told.add(key)
-            yield _facts(session, body, known)
+            yield _collect_facts(session, body, known)
 
 
-_SETTINGS = (
+_COMPARED_FIELDS = (
     "model", "channels", "hold", "loss", "weights", "prediction", "skip", "noise", "parameters",
 )  # fmt: skip
 
 
-def _facts(session: Session, body: Body, known: Channels) -> Facts:
+def _collect_facts(session: Session, body: JobBody, known: DatasetChannels) -> RunFacts:
     """What an estimate depends on besides the data, in words."""
     try:
-        model, _ = models.resolve(session, body["model"])
+        model, _ = models.resolve_model(session, body["model"])
     except UnknownModel:
         return {}  # the catalogue does not have it any more
-    inputs, outputs = signals_of(model)
+    inputs, outputs = list_signals(model)
     found = {"model": model.name}
     for signal in (*inputs, *outputs):
         channel = body["channels"].get(signal, signal)
         stored = [known[one][channel] for one in body["datasets"] if channel in known.get(one, {})]
         found[signal] = channel
-        found[f"unit of {signal}"] = ", ".join(_each(one["unit"] for one in stored))
+        found[f"unit of {signal}"] = ", ".join(_list_distinct(one["unit"] for one in stored))
         if signal in inputs:
             given = body["hold"].get(signal)
             held = [given or one["hold"] for one in stored]
-            found[f"hold of {signal}"] = ", ".join(_each(held))
-    return {**found, **dict(_settings(body)), **dict(_given(model, body))}
+            found[f"hold of {signal}"] = ", ".join(_list_distinct(held))
+    return {
+        **found,
+        **dict(_describe_settings(body)),
+        **dict(_describe_fixed_parameters(model, body)),
+    }
 
 
-def _each(words: Any) -> list[str]:
+def _list_distinct(words: Any) -> list[str]:
     return list(dict.fromkeys(words)) or ["unknown"]
 
 
-def _settings(body: Body) -> Iterator[tuple[str, str]]:
+def _describe_settings(body: JobBody) -> Iterator[tuple[str, str]]:
     loss, weights = body["loss"], body["weights"]
     scale = "" if loss["kind"] == "squares" else f" of scale {loss['scale']:g}"
     yield "loss", loss["kind"] + scale
@@ -106,11 +114,11 @@ def _settings(body: Body) -> Iterator[tuple[str, str]]:
     yield "added noise", f"{body['noise']['sigma']:g}"
 
 
-def _given(model: Model, body: Body) -> Iterator[tuple[str, str]]:
+def _describe_fixed_parameters(model: Model, body: JobBody) -> Iterator[tuple[str, str]]:
     """Parameters that are not sought."""
     own = {one.name for one in model.parameters}
     changes = {name: one for name, one in body["parameters"].items() if name in own}
-    for one in override(model.parameters, changes):
+    for one in override_parameters(model.parameters, changes):
         if one.fixed is not None:
             yield one.name, f"{one.fixed:g}, fixed"
         elif one.tied is not None:

@@ -70,7 +70,7 @@ class LawOut(Answer):
     aicc: Finite = Field(description="null with too few points for it")
 
 
-class PlaceOut(Answer):
+class LawPointOut(Answer):
     """A law at one x with its 95 % interval."""
 
     x: float
@@ -93,12 +93,14 @@ class QuantityOut(Answer):
     )
     laws: list[LawOut]
     reason: str = Field(default="", description="why there is no law")
-    band: list[PlaceOut] = Field(default=[], description="confidence band of the chosen law")
-    predictions: list[PlaceOut] = Field(default=[], description="with intervals for a new estimate")
+    band: list[LawPointOut] = Field(default=[], description="confidence band of the chosen law")
+    predictions: list[LawPointOut] = Field(
+        default=[], description="with intervals for a new estimate"
+    )
     notes: list[str] = Field(default=[])
 
 
-class BatchPlaceOut(Answer):
+class BatchLabelOut(Answer):
     """All runs of one label."""
 
     x: float
@@ -116,7 +118,7 @@ class TrendOut(Answer):
     reference: str | None = Field(default=None, description="run that the batch is compared with")
     reference_x: float | None = None
     reference_names: list[str] = Field(default=[], description="under which it was accepted")
-    places: list[BatchPlaceOut]
+    places: list[BatchLabelOut]
     quantities: list[QuantityOut]
     missing: int = Field(default=0, description="runs that failed or are not over")
     notes: list[str] = Field(default=[])

@@ -16,9 +16,9 @@ from service.core.text import (
     plain_unit,
 )
 
-Quantity = dict[str, Any]
+QuantityDocument = dict[str, Any]
 
-USUAL = ("identified", "group", "measured", "not told")
+USUAL_STATUSES = ("identified", "group", "measured", "not told")
 """Statuses that need no second look."""
 
 
@@ -83,7 +83,7 @@ class TrendTables(NamedTuple):
 
 def build_tables(trend: dict[str, Any], style: Style) -> TrendTables:
     """The tables of a trend; quantities without any value are left out."""
-    shown: list[Quantity] = [
+    shown: list[QuantityDocument] = [
         one for one in trend["quantities"] if any(p["value"] is not None for p in one["points"])
     ]
     return TrendTables(
@@ -92,7 +92,7 @@ def build_tables(trend: dict[str, Any], style: Style) -> TrendTables:
         laws=[
             LawRow(
                 one["name"],
-                law_text(one["name"], law, trend["x"], style),
+                format_law(one["name"], law, trend["x"], style),
                 law["aic"],
                 law["birge"],
                 law["is_chosen"],
@@ -105,7 +105,7 @@ def build_tables(trend: dict[str, Any], style: Style) -> TrendTables:
     )
 
 
-def _place_row(place: dict[str, Any], quantities: list[Quantity], style: Style) -> PlaceRow:
+def _place_row(place: dict[str, Any], quantities: list[QuantityDocument], style: Style) -> PlaceRow:
     points = [next((p for p in one["points"] if p["x"] == place["x"]), None) for one in quantities]
     return PlaceRow(
         x_text=style.label(place["x"]),
@@ -113,14 +113,14 @@ def _place_row(place: dict[str, Any], quantities: list[Quantity], style: Style) 
             DASH if p is None or p["value"] is None else style.estimate(p["value"], p["stderr"])
             for p in points
         ],
-        span_text="; ".join(map(span_text, place["spans"])) or DASH,
+        span_text="; ".join(map(format_span, place["spans"])) or DASH,
         evaluations=place["evaluations"],
-        flags=flags(place, quantities),
+        flags=list_flags(place, quantities),
         runs=place["runs"],
     )
 
 
-def _prediction_row(one: Quantity, at: dict[str, Any], style: Style) -> PredictionRow:
+def _prediction_row(one: QuantityDocument, at: dict[str, Any], style: Style) -> PredictionRow:
     name, x = str(one["name"]), style.label(at["x"])
     if at["value"] is None or at["lower"] is None:
         return PredictionRow(name, x, DASH, DASH, "the law has no value here")
@@ -130,19 +130,19 @@ def _prediction_row(one: Quantity, at: dict[str, Any], style: Style) -> Predicti
     return PredictionRow(name, x, style.number(at["value"]) + unit, interval + unit, remark)
 
 
-def flags(place: dict[str, Any], quantities: list[Quantity]) -> list[str]:
+def list_flags(place: dict[str, Any], quantities: list[QuantityDocument]) -> list[str]:
     """What is to be looked at in the runs of one label."""
     found = []
     for one in quantities:
         for point in one["points"]:
             if point["x"] == place["x"]:
-                found += [f"{one['name']} {text}" for text in _flags(point)]
+                found += [f"{one['name']} {text}" for text in _list_point_flags(point)]
     separable = [text for text in place["warnings"] if "not separable" in text]
     return found + [text.partition(":")[0].partition(" (")[0] for text in separable]
 
 
-def _flags(point: dict[str, Any]) -> list[str]:
-    found = [word for word in point["status"].split(", ") if word not in USUAL]
+def _list_point_flags(point: dict[str, Any]) -> list[str]:
+    found = [word for word in point["status"].split(", ") if word not in USUAL_STATUSES]
     if point["is_outlier"]:
         found.append(f"outlier (p = {point['p_value']:.2g})")
     for drift in point["drifts"]:
@@ -152,7 +152,7 @@ def _flags(point: dict[str, Any]) -> list[str]:
     return found
 
 
-def limit_text(quantities: list[Quantity]) -> str:
+def format_limits(quantities: list[QuantityDocument]) -> str:
     """From how many standard errors on drift is flagged; empty where nothing is compared."""
     found: dict[str, dict[str, None]] = {}
     for one in quantities:
@@ -163,20 +163,20 @@ def limit_text(quantities: list[Quantity]) -> str:
     return f"drift is flagged where z, in standard errors, is beyond {told}" if told else ""
 
 
-def reference_text(trend: dict[str, Any]) -> str:
+def format_reference(trend: dict[str, Any]) -> str:
     """Names and label of the reference: ``'tube' (length_m = 40)``; empty where it has none."""
     names = ", ".join(f"{name!r}" for name in trend["reference_names"])
     label = "" if trend["reference_x"] is None else f"{trend['x']} = {trend['reference_x']:g}"
     return " ".join(filter(None, (names, f"({label})" if label else "")))
 
 
-def span_text(one: dict[str, Any]) -> str:
+def format_span(one: dict[str, Any]) -> str:
     """From where to where an output went; the channel's name where it has no unit."""
     unit = plain_unit(one["unit"]) or f" ({one['channel']})"
     return f"{one['lower']:.6g} to {one['upper']:.6g}{unit}"
 
 
-def law_text(name: str, law: dict[str, Any], x: str, style: Style) -> str:
+def format_law(name: str, law: dict[str, Any], x: str, style: Style) -> str:
     """A law with its coefficients and their standard errors."""
     known = {
         one["name"]: f"({style.estimate(one['value'], one['stderr'])})"
@@ -187,7 +187,7 @@ def law_text(name: str, law: dict[str, Any], x: str, style: Style) -> str:
     return f"{name} = {text}"
 
 
-def notes(trend: dict[str, Any]) -> list[str]:
+def list_notes(trend: dict[str, Any]) -> list[str]:
     """All that the numbers need beside them."""
     found = [f"{one['name']}: {text}" for one in trend["quantities"] for text in one["notes"]]
     by_text: dict[str, list[str]] = {}
@@ -197,5 +197,5 @@ def notes(trend: dict[str, Any]) -> list[str]:
     found += [f"{trend['x']} {', '.join(at)}: {text}" for text, at in by_text.items()]
     if trend["missing"]:
         found.append(f"{trend['missing']} runs failed or are not over: they are not in the table")
-    limits = limit_text(trend["quantities"])
+    limits = format_limits(trend["quantities"])
     return [*found, *trend["notes"], *([limits] if limits else [])]

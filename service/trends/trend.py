@@ -5,26 +5,32 @@ from collections.abc import Sequence
 from sqlalchemy.orm import Session
 
 from service.core.errors import Conflict, InvalidRequest
-from service.core.json_pointer import body_of
+from service.core.json_pointer import build_run_body
 from service.jobs.results import read_noise_model
 from service.repositories.jobs import JobRepository
-from service.repositories.lineage import references_of
+from service.repositories.lineage import list_reference_names
 from service.repositories.runs import RunRepository
-from service.repositories.trends import TrendRow, count_succeeded, trend_rows
+from service.repositories.trends import TrendRow, count_succeeded, read_trend_rows
 from service.storage.tables import Job
-from service.trends.drift import Reference, drifts_of
-from service.trends.notes import noise_model_note, quantity_notes
-from service.trends.points import Point, Quantity, by_label, place, quantities
-from service.trends.reference_differences import channels_of, differences
+from service.trends.drift import BatchReference, compare_with_reference
+from service.trends.notes import describe_noise_models, describe_quantity
+from service.trends.points import (
+    TrendPoint,
+    TrendQuantity,
+    build_quantities,
+    group_by_label,
+    to_label_out,
+)
+from service.trends.reference_differences import describe_differences, read_channels
 from service.trends.schemas import (
     DriftOut,
     LawOut,
-    PlaceOut,
+    LawPointOut,
     PointOut,
     QuantityOut,
     TrendOut,
 )
-from sysid.trends.laws import FORMULAS, Law
+from sysid.trends.laws import FORMULAS, TrendLaw
 from sysid.trends.trend import Influence, Trend, fit_trend
 
 MOST_RUNS = 5_000
@@ -35,7 +41,7 @@ def has_trend(job: Job) -> bool:
     return job.spec["trend"] is not None
 
 
-def trend(session: Session, job_id: str) -> TrendOut:
+def compute_trend(session: Session, job_id: str) -> TrendOut:
     """The trend that a job asks for, from the runs that have succeeded so far.
 
     Raises
@@ -53,18 +59,20 @@ def trend(session: Session, job_id: str) -> TrendOut:
             f'{job.id} has no trend; submit it with "trend": {{"x": …}}, the name of a label'
         )
     asked = job.spec["trend"]
-    places, found = _gathered(session, job)
-    bodies = {row.id: body_of(job.spec, row.cell) for rows in places.values() for row in rows}
+    places, found = _collect_quantities(session, job)
+    bodies = {
+        row.id: build_run_body(job.spec, row.cell) for rows in places.values() for row in rows
+    }
     datasets = {run: body["datasets"] for run, body in bodies.items()}
-    known = channels_of(session, {one for many in datasets.values() for one in many})
-    reference = _reference(session, job, asked.get("reference"))
-    told = [_told(one, asked["predict"], reference, found) for one in found]
+    known = read_channels(session, {one for many in datasets.values() for one in many})
+    reference = _load_reference(session, job, asked.get("reference"))
+    told = [_to_quantity_out(one, asked["predict"], reference, found) for one in found]
     theirs = "" if reference is None else read_noise_model(reference.run.result or {})
-    notes = [noise_model_note(asked["x"], places, theirs)]
+    notes = [describe_noise_models(asked["x"], places, theirs)]
     if reference is not None:
         notes += [
-            reference.note(asked["x"], places),
-            differences(session, reference.run, list(bodies.values()), known),
+            reference.explain_gaps(asked["x"], places),
+            describe_differences(session, reference.run, list(bodies.values()), known),
         ]
     return TrendOut(
         job=job.id, x=asked["x"],
@@ -72,7 +80,7 @@ def trend(session: Session, job_id: str) -> TrendOut:
         reference_x=None if reference is None else reference.x,
         reference_names=[] if reference is None else list(reference.names),
         places=[
-            place(x, rows, datasets, known, bodies[rows[0].id]["channels"])
+            to_label_out(x, rows, datasets, known, bodies[rows[0].id]["channels"])
             for x, rows in places.items()
         ],
         quantities=told, missing=job.n_runs - count_succeeded(session, job.id),
@@ -80,17 +88,19 @@ def trend(session: Session, job_id: str) -> TrendOut:
     )  # fmt: skip
 
 
-def _gathered(session: Session, job: Job) -> tuple[dict[float, list[TrendRow]], list[Quantity]]:
+def _collect_quantities(
+    session: Session, job: Job
+) -> tuple[dict[float, list[TrendRow]], list[TrendQuantity]]:
     if job.n_runs > MOST_RUNS:
-        raise InvalidRequest.at(
+        raise InvalidRequest.from_fault(
             "", f"{job.id} has {job.n_runs} runs; a trend is made of at most {MOST_RUNS}"
         )
     asked = job.spec["trend"]
-    places = by_label(trend_rows(session, job.id, MOST_RUNS), asked["x"])
-    return places, quantities(places, asked["parameters"])
+    places = group_by_label(read_trend_rows(session, job.id, MOST_RUNS), asked["x"])
+    return places, build_quantities(places, asked["parameters"])
 
 
-def _reference(session: Session, job: Job, run_id: str | None) -> Reference | None:
+def _load_reference(session: Session, job: Job, run_id: str | None) -> BatchReference | None:
     """The reference of a batch, and the laws of its job where that asks for the same trend."""
     if run_id is None:
         return None
@@ -99,16 +109,16 @@ def _reference(session: Session, job: Job, run_id: str | None) -> Reference | No
     x = job.spec["trend"]["x"]
     label = run.labels.get(x)
     at = float(label) if isinstance(label, int | float) else None
-    names = tuple(references_of(session, run.id))
-    why = _why_no_trend(theirs, x)
+    names = tuple(list_reference_names(session, run.id))
+    why = _explain_missing_trend(theirs, x)
     if why:
-        return Reference(run, at, why_no_trend=why, names=names)
-    _, known = _gathered(session, theirs)
-    trends = {one.name: (_fitted(one, ()), one) for one in known}
-    return Reference(run, at, trends, names=names)
+        return BatchReference(run, at, why_no_trend=why, names=names)
+    _, known = _collect_quantities(session, theirs)
+    trends = {one.name: (_fit_quantity(one, ()), one) for one in known}
+    return BatchReference(run, at, trends, names=names)
 
 
-def _why_no_trend(theirs: Job, x: str) -> str:
+def _explain_missing_trend(theirs: Job, x: str) -> str:
     """Why there is none over the axis x to compare with; empty if there is."""
     if not has_trend(theirs):
         return "its job has no trend"
@@ -122,39 +132,42 @@ def _why_no_trend(theirs: Job, x: str) -> str:
     return ""
 
 
-def _fitted(one: Quantity, predict: Sequence[float]) -> Trend:
+def _fit_quantity(one: TrendQuantity, predict: Sequence[float]) -> Trend:
     used = [(point.x, point.estimate) for point in one.points if point.estimate is not None]
     return fit_trend(
         [x for x, _ in used], [e.value for _, e in used], [e.stderr for _, e in used], predict
     )
 
 
-def _told(
-    one: Quantity, predict: Sequence[float], reference: Reference | None, all_: Sequence[Quantity]
+def _to_quantity_out(
+    one: TrendQuantity,
+    predict: Sequence[float],
+    reference: BatchReference | None,
+    all_: Sequence[TrendQuantity],
 ) -> QuantityOut:
-    fitted = _fitted(one, predict)
+    fitted = _fit_quantity(one, predict)
     influences = iter(fitted.influences)
     n = sum(point.estimate is not None for other in all_ for point in other.points)
-    drifts = drifts_of(one, reference, n)
+    drifts = compare_with_reference(one, reference, n)
     points = [
-        _point(point, next(influences, None) if point.estimate is not None else None,
+        _to_point_out(point, next(influences, None) if point.estimate is not None else None,
                drifts.get(point.x, []), bool(fitted.laws))
         for point in one.points
     ]  # fmt: skip
     return QuantityOut.from_source(
         one,
         points=points,
-        between_runs=one.between,
-        laws=[_law(law, law is fitted.chosen) for law in fitted.laws],
+        between_runs=one.between_runs,
+        laws=[_to_law_out(law, law is fitted.best_law) for law in fitted.laws],
         reason=fitted.reason,
-        band=[PlaceOut.from_source(at) for at in fitted.band],
-        predictions=[PlaceOut.from_source(at) for at in fitted.predictions],
-        notes=quantity_notes(one, fitted),
+        band=[LawPointOut.from_source(at) for at in fitted.band],
+        predictions=[LawPointOut.from_source(at) for at in fitted.predictions],
+        notes=describe_quantity(one, fitted),
     )
 
 
-def _point(
-    point: Point, influence: Influence | None, drifts: list[DriftOut], has_laws: bool
+def _to_point_out(
+    point: TrendPoint, influence: Influence | None, drifts: list[DriftOut], has_laws: bool
 ) -> PointOut:
     judged = {} if influence is None else influence._asdict()
     return PointOut.from_source(
@@ -166,7 +179,7 @@ def _point(
     )
 
 
-def _law(law: Law, is_chosen: bool) -> LawOut:
+def _to_law_out(law: TrendLaw, is_chosen: bool) -> LawOut:
     names = ("name", "value", "stderr")
     return LawOut.from_source(
         law,

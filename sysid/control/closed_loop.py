@@ -17,15 +17,15 @@ from math import isfinite
 
 import numpy as np
 
-from sysid.control.control_law import Filter
+from sysid.control.control_law import DerivativeFilter
 from sysid.control.controllers import PidControl
-from sysid.control.loop_document import LoopDocument, free_name
+from sysid.control.loop_document import LoopDocumentBuilder, choose_free_name
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
-from sysid.language.evaluation import value as value_of
+from sysid.language.evaluation import evaluate_expression as value_of
 from sysid.language.transform import substitute
-from sysid.language.tree import Expression, Number, Past, Symbol
-from sysid.models.model import FixedInitial, Model, initial_name
+from sysid.language.tree import Expression, Number, PastValue, Symbol
+from sysid.models.model import FixedInitial, Model, name_initial_state
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
 
@@ -57,13 +57,13 @@ class ClosedLoop:
     reference: str
     input: str
     command: str
-    steps_late: int
-    renamed: Mapping[str, str]
-    filter: Filter | None = None
+    controller_delay_steps: int
+    new_names: Mapping[str, str]
+    derivative_filter: DerivativeFilter | None = None
 
-    def values(self, values: Mapping[str, float]) -> dict[str, float]:
+    def rename_values(self, values: Mapping[str, float]) -> dict[str, float]:
         """Values of the plant's parameters as those of the closed loop."""
-        return {self.renamed.get(name, name): value for name, value in values.items()}
+        return {self.new_names.get(name, name): value for name, value in values.items()}
 
     def simulate(
         self, inputs: Sequence[Channel], values: Mapping[str, float], *, times: FloatArray
@@ -79,34 +79,37 @@ class ClosedLoop:
         values : mapping of str to float
             The plant's parameters and starts, by the plant's names.
         """
-        known = self.values(values)
+        known = self.rename_values(values)
         return simulate(
-            self.model, inputs, self._filter_start(inputs, known, times) | known, times=times
+            self.model,
+            inputs,
+            self._compute_filter_start(inputs, known, times) | known,
+            times=times,
         )
 
-    def _filter_start(
+    def _compute_filter_start(
         self, inputs: Sequence[Channel], values: Mapping[str, float], times: FloatArray
     ) -> dict[str, float]:
         """Where the derivative's filter is at rest: a reference that steps first comes after."""
-        if self.filter is None:
+        if self.derivative_filter is None:
             return {}
-        name, followed, lag = self.filter
+        name, followed, lag = self.derivative_filter
         is_sampled = self.model.form != "differential"
         begins = [times[0]] if is_sampled else [times[0], *(one.times[0] for one in inputs)]
         start = float(min(begins))
-        before = self._standing(followed, inputs, values, start, "left")
+        before = self._evaluate_start(followed, inputs, values, start, "left")
         if is_sampled:  # its first value is that of a first step, not of the time before
             period = float(times[1] - times[0]) / self.model.solver.substeps
-            now = self._standing(followed, inputs, values, start, "right")
+            now = self._evaluate_start(followed, inputs, values, start, "right")
             before += period / (lag + period) * (now - before)
-        return {initial_name(name, 0): before if isfinite(before) else 0.0}
+        return {name_initial_state(name, 0): before if isfinite(before) else 0.0}
 
-    def _standing(
+    def _evaluate_start(
         self, tree: Expression, inputs: Sequence[Channel], values: Mapping[str, float],
         at: float, side: str,
     ) -> float:  # fmt: skip
         """Value of an expression where the loop starts, just before or just after."""
-        given = {one.name: _value_at(one, at, side) for one in inputs}
+        given = {one.name: _interpolate_channel(one, at, side) for one in inputs}
         starts = {
             state.name: start.value
             for state, start in zip(self.model.states, self.model.initial, strict=True)
@@ -115,8 +118,8 @@ class ClosedLoop:
 
         def known(node: Expression) -> Expression | None:
             match node:
-                case Past(name):
-                    start = values.get(initial_name(name, 0), starts.get(name, 0.0))
+                case PastValue(name):
+                    start = values.get(name_initial_state(name, 0), starts.get(name, 0.0))
                     return Number(given.get(name, start))
                 case Symbol(_, "time" | "index"):
                     return Number(at if node.kind == "time" else 0.0)
@@ -150,25 +153,27 @@ def close_loop(model: Model, control: PidControl, period: float | None = None) -
     InvalidModel
         If the closed loop is too long to be a model.
     """
-    renamed = _renamed(model)
-    loop = LoopDocument(_called(model, renamed), control, period)
-    document = loop.differential() if model.form == "differential" else loop.difference()
+    renamed = _choose_parameter_names(model)
+    loop = LoopDocumentBuilder(_rename_parameters(model, renamed), control, period)
+    document = (
+        loop.build_differential() if model.form == "differential" else loop.build_difference()
+    )
     closed = parse_model(document)
     return ClosedLoop(
-        closed, loop.reference, control.input, loop.command, loop.steps_late, renamed,
+        closed, loop.reference, control.input, loop.command, loop.controller_delay_steps, renamed,
         loop.law.filter,
     )  # fmt: skip
 
 
-def _renamed(model: Model) -> dict[str, str]:
+def _choose_parameter_names(model: Model) -> dict[str, str]:
     """Names for parameters whose own are none in the language, such as ``a[y(k-1)]``."""
     taken = {q.name for group in (model.inputs, model.states, model.outputs) for q in group}
     taken |= {p.name for p in model.parameters}
     odd = [p.name for p in model.parameters if not p.name.isidentifier()]
-    return {name: free_name(f"a_{i}", taken) for i, name in enumerate(odd, 1)}
+    return {name: choose_free_name(f"a_{i}", taken) for i, name in enumerate(odd, 1)}
 
 
-def _called(model: Model, renamed: Mapping[str, str]) -> Model:
+def _rename_parameters(model: Model, renamed: Mapping[str, str]) -> Model:
     """The model with parameters of other names."""
 
     def other(node: Expression) -> Expression | None:
@@ -185,9 +190,9 @@ def _called(model: Model, renamed: Mapping[str, str]) -> Model:
     return replace(model, parameters=parameters, equations=trees)
 
 
-def _value_at(channel: Channel, at: float, side: str) -> float:
+def _interpolate_channel(channel: Channel, at: float, side: str) -> float:
     """Value of a signal just before ("left") or just after ("right") a time."""
-    times, values = channel.whole.times, channel.whole.values
+    times, values = channel.history_and_samples.times, channel.history_and_samples.values
     if channel.hold != "zero":
         return float(np.interp(at, times, values))
     last = int(np.searchsorted(times, at, side=side)) - 1  # type: ignore[call-overload]

@@ -15,31 +15,31 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from sysid.control.controllers import PidControl
-from sysid.language.transform import shifted
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.language.transform import shift_expression
+from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
-_PERIOD = Symbol("h", "period")
+_PERIOD_SYMBOL = Symbol("h", "period")
 
 
 @dataclass(frozen=True, slots=True)
-class LawState:
+class ControllerState:
     """A state of the controller: its name, whether its unit is the input's, and its equation."""
 
     name: str
-    is_of_input: bool
+    has_input_unit: bool
     equation: Expression
 
 
-class Filter(NamedTuple):
+class DerivativeFilter(NamedTuple):
     """The derivative's filter: its state, what it follows, and its time constant in s."""
 
     state: str
-    followed: Expression
-    time: float
+    followed_signal: Expression
+    time_constant: float
 
 
 @dataclass(frozen=True, slots=True)
-class Law:
+class ControlLaw:
     """A controller whose reference and output are signals of a model.
 
     Attributes
@@ -51,18 +51,18 @@ class Law:
     """
 
     command: Expression
-    states: tuple[LawState, ...]
-    filter: Filter | None
+    states: tuple[ControllerState, ...]
+    filter: DerivativeFilter | None
 
 
-Fixed = Callable[..., Symbol]
+ParameterFactory = Callable[..., Symbol]
 """Gives the parameter of a name, a value and, if it has one, a unit."""
 
 
-def law_of(
+def build_control_law(
     control: PidControl, reference: str, output: Expression, *,
-    is_sampled: bool, fixed: Fixed, state: Callable[[str], str],
-) -> Law:  # fmt: skip
+    is_sampled: bool, fixed: ParameterFactory, state: Callable[[str], str],
+) -> ControlLaw:  # fmt: skip
     """The law of a controller.
 
     Parameters
@@ -78,93 +78,95 @@ def law_of(
     state : callable
         Makes the name of a state that nothing else has.
     """
-    return _Writer(control, reference, output, is_sampled, fixed, state).law()
+    return _ControlLawBuilder(control, reference, output, is_sampled, fixed, state).build()
 
 
-class _Writer:
+class _ControlLawBuilder:
     def __init__(
         self, control: PidControl, reference: str, output: Expression, is_sampled: bool,
-        fixed: Fixed, state: Callable[[str], str],
+        fixed: ParameterFactory, state: Callable[[str], str],
     ) -> None:  # fmt: skip
         self.control, self.output, self.is_sampled = control, output, is_sampled
-        self.fixed, self.state = fixed, state
-        self.reference = Past(reference, "input", 0, None)
+        self.add_parameter, self.choose_state_name = fixed, state
+        self.reference = PastValue(reference, "input", 0, None)
         self.error = Binary("-", self.reference, output)
         self.gain = fixed("gain", control.gain)
-        low, high = control.range
+        low, high = control.output_limits
         self.limit = None if control.limit is None else fixed("limit", control.limit)
         self.lower = self.upper = None
         if self.limit is None:
             self.lower = None if low is None else fixed("lower_limit", low)
             self.upper = None if high is None else fixed("upper_limit", high)
 
-    def law(self) -> Law:
-        wanted, states, filter_ = self._proportional(), [], None
+    def build(self) -> ControlLaw:
+        wanted, states, filter_ = self._build_proportional(), [], None
         integral = None
-        if self.control.integrates:
-            integral = Past(self.state("integral"), "state", 0, None)
+        if self.control.has_integral_action:
+            integral = PastValue(self.choose_state_name("integral"), "state", 0, None)
             wanted = Binary("+", wanted, integral)
-        if self.control.differentiates:
-            action, lag, filter_ = self._derivative()
+        if self.control.has_derivative_action:
+            action, lag, filter_ = self._build_derivative()
             wanted = Binary("+", wanted, action)
             states.append(lag)
         if integral is not None:
-            states.insert(0, self._integral(integral, wanted))
-        return Law(self._limited(wanted), tuple(states), filter_)
+            states.insert(0, self._build_integral(integral, wanted))
+        return ControlLaw(self._limit_signal(wanted), tuple(states), filter_)
 
-    def _proportional(self) -> Expression:
+    def _build_proportional(self) -> Expression:
         if self.control.setpoint_weight == 1.0:
             return Binary("*", self.gain, self.error)
-        weight = self.fixed("setpoint_weight", self.control.setpoint_weight)
+        weight = self.add_parameter("setpoint_weight", self.control.setpoint_weight)
         weighted = Binary("*", weight, self.reference)
         return Binary("*", self.gain, Binary("-", weighted, self.output))
 
-    def _derivative(self) -> tuple[Expression, LawState, Filter]:
+    def _build_derivative(self) -> tuple[Expression, ControllerState, DerivativeFilter]:
         """K N (d - z), the equation of z, and its filter."""
         control = self.control
-        divisor = self.fixed("derivative_filter", control.derivative_filter)
-        time = self.fixed("derivative_time", control.derivative_time, "s")
+        divisor = self.add_parameter("derivative_filter", control.derivative_filter)
+        time = self.add_parameter("derivative_time", control.derivative_time, "s")
         is_of_error = control.derivative_on == "error"
         followed = self.error if is_of_error else Unary("-", self.output)
-        z = Past(self.state("filtered"), "state", 0, None)
+        z = PastValue(self.choose_state_name("filtered"), "state", 0, None)
         action = Binary("*", Binary("*", self.gain, divisor), Binary("-", followed, z))
         lag = Binary("/", time, divisor)
         equation: Expression
         if self.is_sampled:
-            before = Past(z.name, "state", 1, None)
-            part = Binary("/", _PERIOD, Binary("+", lag, _PERIOD))
+            before = PastValue(z.name, "state", 1, None)
+            part = Binary("/", _PERIOD_SYMBOL, Binary("+", lag, _PERIOD_SYMBOL))
             equation = Binary("+", before, Binary("*", part, Binary("-", followed, before)))
         else:
             equation = Binary("/", Binary("-", followed, z), lag)
-        filter_ = Filter(z.name, followed, control.filter_time)
-        return action, LawState(z.name, False, equation), filter_
+        filter_ = DerivativeFilter(z.name, followed, control.filter_time)
+        return action, ControllerState(z.name, False, equation), filter_
 
-    def _integral(self, integral: Past, wanted: Expression) -> LawState:
+    def _build_integral(self, integral: PastValue, wanted: Expression) -> ControllerState:
         control = self.control
         assert control.integral_time is not None
-        time = self.fixed("integral_time", control.integral_time, "s")
+        time = self.add_parameter("integral_time", control.integral_time, "s")
         rate: Expression = Binary("*", Binary("/", self.gain, time), self.error)
         if self.is_sampled:
-            rate = Binary("*", _PERIOD, rate)
-        if control.tracking is not None:
-            tracking = self.fixed("tracking_time", control.tracking, "s")
-            excess = Binary("-", self._limited(wanted), wanted)
+            rate = Binary("*", _PERIOD_SYMBOL, rate)
+        if control.active_tracking_time is not None:
+            tracking = self.add_parameter("tracking_time", control.active_tracking_time, "s")
+            excess = Binary("-", self._limit_signal(wanted), wanted)
             back: Expression = Binary("/", excess, tracking)
             if self.is_sampled:
-                part = Call("min", (Number(1.0), Binary("/", _PERIOD, tracking)))
+                part = FunctionCall("min", (Number(1.0), Binary("/", _PERIOD_SYMBOL, tracking)))
                 back = Binary("*", part, excess)
             rate = Binary("+", rate, back)
         if self.is_sampled:
             rate = Binary("+", integral, rate)
-            return LawState(integral.name, True, shifted(rate, 1, None, counts=True))
-        return LawState(integral.name, True, rate)
+            return ControllerState(
+                integral.name, True, shift_expression(rate, 1, None, counts=True)
+            )
+        return ControllerState(integral.name, True, rate)
 
-    def _limited(self, wanted: Expression) -> Expression:
+    def _limit_signal(self, wanted: Expression) -> Expression:
         if self.limit is not None:
-            least = Call("min", (self.limit, wanted))
-            return Call("max", (Unary("-", self.limit), least))
+            least = FunctionCall("min", (self.limit, wanted))
+            return FunctionCall("max", (Unary("-", self.limit), least))
         if self.upper is not None:
-            wanted = Call("min", (self.upper, wanted))
+            wanted = FunctionCall("min", (self.upper, wanted))
         if self.lower is not None:
-            wanted = Call("max", (self.lower, wanted))
+            wanted = FunctionCall("max", (self.lower, wanted))
         return wanted

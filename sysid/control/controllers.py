@@ -13,7 +13,7 @@ from typing import Literal
 
 from sysid.core.errors import InvalidSettings
 
-LARGEST = 1e300
+LARGEST_NUMBER = 1e300
 """What is as large is no number of a model; a time is infinite."""
 
 DerivativeOn = Literal["measurement", "error"]
@@ -37,7 +37,7 @@ class Transport:
 
     def __post_init__(self) -> None:
         if not _is_number(self.gain):
-            raise InvalidSettings("/transport/gain", _not_finite(self.gain))
+            raise InvalidSettings("/transport/gain", _describe_not_finite(self.gain))
         for name in ("time_constant", "delay"):
             value = getattr(self, name)
             if not _is_number(value) or value < 0:
@@ -95,7 +95,7 @@ class PidControl:
     def __post_init__(self) -> None:
         for name in ("gain", "setpoint_weight"):
             if not _is_number(getattr(self, name)):
-                raise InvalidSettings(f"/{name}", _not_finite(getattr(self, name)))
+                raise InvalidSettings(f"/{name}", _describe_not_finite(getattr(self, name)))
         for name in ("limit", "tracking_time", "derivative_filter"):
             value = getattr(self, name)
             if value is not None and not (_is_number(value) and value > 0):
@@ -114,7 +114,7 @@ class PidControl:
         for name in ("lower", "upper"):
             value = getattr(self, name)
             if value is not None and not _is_number(value):
-                raise InvalidSettings(f"/{name}", _not_finite(value))
+                raise InvalidSettings(f"/{name}", _describe_not_finite(value))
             if value is not None and self.limit is not None:
                 raise InvalidSettings(
                     f"/{name}", "the limit ± is given too; give that or lower and upper"
@@ -125,12 +125,12 @@ class PidControl:
             )
 
     @property
-    def integrates(self) -> bool:
+    def has_integral_action(self) -> bool:
         """Whether there is integral action."""
-        return self.integral_time is not None and self.integral_time < LARGEST
+        return self.integral_time is not None and self.integral_time < LARGEST_NUMBER
 
     @property
-    def differentiates(self) -> bool:
+    def has_derivative_action(self) -> bool:
         """Whether there is derivative action."""
         return self.derivative_time > 0
 
@@ -140,29 +140,29 @@ class PidControl:
         return self.derivative_time / self.derivative_filter
 
     @property
-    def range(self) -> tuple[float | None, float | None]:
+    def output_limits(self) -> tuple[float | None, float | None]:
         """Least and largest value that the controller gives; None where there is no limit."""
         if self.limit is not None:
             return -self.limit, self.limit
         return self.lower, self.upper
 
     @property
-    def tracking(self) -> float | None:
+    def active_tracking_time(self) -> float | None:
         """T_t in s; None where nothing winds up, or nothing is done about it."""
-        is_limited = any(one is not None for one in self.range)
-        if not (self.integrates and is_limited and self.anti_windup == "back-calculation"):
+        is_limited = any(one is not None for one in self.output_limits)
+        if not (self.has_integral_action and is_limited and self.anti_windup == "back-calculation"):
             return None
         if self.tracking_time is not None:
             return self.tracking_time
         assert self.integral_time is not None
-        if not self.differentiates:
+        if not self.has_derivative_action:
             return self.integral_time
         return sqrt(self.integral_time) * sqrt(self.derivative_time)
 
 
-def _not_finite(value: float) -> str:
-    return f"{value!r} is not a finite number between ±{LARGEST:g}"
+def _describe_not_finite(value: float) -> str:
+    return f"{value!r} is not a finite number between ±{LARGEST_NUMBER:g}"
 
 
 def _is_number(value: float) -> bool:
-    return -LARGEST < value < LARGEST
+    return -LARGEST_NUMBER < value < LARGEST_NUMBER

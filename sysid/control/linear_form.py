@@ -11,15 +11,24 @@ from sysid.core.errors import SysidError
 from sysid.core.types import FloatArray
 from sysid.data.records import Hold
 from sysid.kernels.reads import is_difference
-from sysid.language.evaluation import value as number_of
-from sysid.language.printer import text
+from sysid.language.evaluation import evaluate_expression as number_of
+from sysid.language.printer import format_expression
 from sysid.language.transform import substitute
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary, walk
+from sysid.language.tree import (
+    Binary,
+    Expression,
+    FunctionCall,
+    Number,
+    PastValue,
+    Symbol,
+    Unary,
+    walk,
+)
 from sysid.models.model import Model
 
 
 @dataclass(frozen=True, slots=True)
-class Value:
+class IdentifiedValue:
     """One parameter, or initial state of an experiment, as found; `stderr` in `unit`."""
 
     name: str
@@ -38,7 +47,7 @@ class Covariance:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Identified:
+class IdentifiedModel:
     """A model with values for all its parameters.
 
     Attributes
@@ -58,7 +67,7 @@ class Identified:
     """
 
     model: Model
-    values: tuple[Value, ...]
+    values: tuple[IdentifiedValue, ...]
     covariance: Covariance | None = None
     sample_time: float | None = None
     holds: Mapping[str, Hold] = field(default_factory=dict)
@@ -66,15 +75,15 @@ class Identified:
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def numbers(self) -> dict[str, float]:
+    def value_by_name(self) -> dict[str, float]:
         """Value of each name."""
         return {one.name: one.value for one in self.values}
 
-    def find(self, name: str) -> Value | None:
+    def find_value(self, name: str) -> IdentifiedValue | None:
         """The value of that name, if there is one."""
         return next((one for one in self.values if one.name == name), None)
 
-    def hold(self, signal: str) -> Hold:
+    def get_hold(self, signal: str) -> Hold:
         """How an input was held between its samples."""
         return self.holds.get(signal, "first")
 
@@ -83,7 +92,7 @@ class NotLinear(SysidError, ValueError):
     """A model has no transfer function; the message says which term is in the way."""
 
 
-class Signal(NamedTuple):
+class DelayedSignal(NamedTuple):
     """A state or an input, `delay` s (differential form) or samples (difference) ago."""
 
     name: str
@@ -92,34 +101,34 @@ class Signal(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Affine:
+class AffineForm:
     """Σ coefficient · signal + constant."""
 
-    terms: Mapping[Signal, float]
+    terms: Mapping[DelayedSignal, float]
     constant: float = 0.0
 
-    def plus(self, other: "Affine", factor: float = 1.0) -> "Affine":
+    def add_scaled(self, other: "AffineForm", factor: float = 1.0) -> "AffineForm":
         """Sum with a multiple of another."""
         terms = dict(self.terms)
         for signal, coefficient in other.terms.items():
             terms[signal] = terms.get(signal, 0.0) + factor * coefficient
         found = {signal: value for signal, value in terms.items() if value != 0.0}
-        return Affine(found, self.constant + factor * other.constant)
+        return AffineForm(found, self.constant + factor * other.constant)
 
-    def times(self, factor: float) -> "Affine":
+    def scale_by(self, factor: float) -> "AffineForm":
         """Product with a number."""
-        return Affine({}).plus(self, factor)
+        return AffineForm({}).add_scaled(self, factor)
 
 
 @dataclass(frozen=True, slots=True)
-class Linear:
+class LinearForm:
     """Equations and outputs of a model as affine forms, in the model's order."""
 
-    equations: tuple[Affine, ...]
-    outputs: tuple[Affine, ...]
+    equations: tuple[AffineForm, ...]
+    outputs: tuple[AffineForm, ...]
 
 
-def linear_form(identified: Identified, period: float | None) -> Linear:
+def to_linear_form(identified: IdentifiedModel, period: float | None) -> LinearForm:
     """The model as a linear one.
 
     Parameters
@@ -135,7 +144,7 @@ def linear_form(identified: Identified, period: float | None) -> Linear:
     """
     model = identified.model
     clock = "k" if is_difference(model) else "t"
-    numbers = identified.numbers
+    numbers = identified.value_by_name
 
     def known(node: Expression) -> Expression | None:
         match node:
@@ -145,81 +154,87 @@ def linear_form(identified: Identified, period: float | None) -> Linear:
                 return Number(period)
         return None
 
-    return Linear(
+    return LinearForm(
         tuple(
-            _Reader(f"the equation of {state.name}", clock, known).affine(tree)
+            _AffineReader(f"the equation of {state.name}", clock, known).to_affine(tree)
             for state, tree in zip(model.states, model.equations, strict=True)
         ),
         tuple(
-            _Reader(f"the output {one.name}", clock, known).affine(one.expression)
+            _AffineReader(f"the output {one.name}", clock, known).to_affine(one.expression)
             for one in model.outputs
         ),
     )
 
 
 @dataclass(frozen=True, slots=True)
-class _Reader:
-    where: str
+class _AffineReader:
+    description: str
     clock: str
-    known: Callable[[Expression], Expression | None]
+    substitute_known: Callable[[Expression], Expression | None]
 
-    def affine(self, tree: Expression) -> Affine:
+    def to_affine(self, tree: Expression) -> AffineForm:
         """The tree as an affine form; what it says of parameters is computed."""
         if not self._has_signals(tree):
-            return Affine({}, self._number(tree))
+            return AffineForm({}, self._evaluate_constant(tree))
         match tree:
-            case Past(name, kind, offset, lag):
-                delay = offset + (0.0 if lag is None else max(self._number(lag), 0.0))
-                return Affine({Signal(name, kind, float(delay)): 1.0})
+            case PastValue(name, kind, offset, lag):
+                delay = offset + (0.0 if lag is None else max(self._evaluate_constant(lag), 0.0))
+                return AffineForm({DelayedSignal(name, kind, float(delay)): 1.0})
             case Unary("-", operand):
-                return self.affine(operand).times(-1.0)
+                return self.to_affine(operand).scale_by(-1.0)
             case Binary("+" | "-" as sign, left, right):
-                return self.affine(left).plus(self.affine(right), 1.0 if sign == "+" else -1.0)
+                return self.to_affine(left).add_scaled(
+                    self.to_affine(right), 1.0 if sign == "+" else -1.0
+                )
             case Binary("*", left, right):
-                return self._product(tree, left, right)
+                return self._read_product(tree, left, right)
             case Binary("/", left, right) if not self._has_signals(right):
-                return self._quotient(tree, left, right)
-        return self._other(tree)
+                return self._read_quotient(tree, left, right)
+        return self._read_other(tree)
 
-    def _other(self, tree: Expression) -> Affine:
+    def _read_other(self, tree: Expression) -> AffineForm:
         """A first power, or a choice that numbers decide; nothing else is linear."""
         match tree:
             case Binary("**", base, Number(1.0)):
-                return self.affine(base)
-            case Call("where", (condition, first, second)) if not self._has_signals(condition):
-                return self.affine(first if self._number(condition) else second)
-        raise self._refusal(tree)
+                return self.to_affine(base)
+            case FunctionCall("where", (condition, first, second)) if not self._has_signals(
+                condition
+            ):
+                return self.to_affine(first if self._evaluate_constant(condition) else second)
+        raise self._make_refusal(tree)
 
-    def _number(self, tree: Expression) -> float:
-        return number_of(substitute(tree, self.known), {})
+    def _evaluate_constant(self, tree: Expression) -> float:
+        return number_of(substitute(tree, self.substitute_known), {})
 
-    def _product(self, tree: Expression, left: Expression, right: Expression) -> Affine:
+    def _read_product(self, tree: Expression, left: Expression, right: Expression) -> AffineForm:
         """A factor that is 0 takes its term away, whatever that is."""
         for one, other in ((left, right), (right, left)):
             if not self._has_signals(one):
-                factor = self._number(one)
-                return self.affine(other).times(factor) if factor != 0.0 else Affine({})
-        raise self._refusal(tree)
+                factor = self._evaluate_constant(one)
+                return self.to_affine(other).scale_by(factor) if factor != 0.0 else AffineForm({})
+        raise self._make_refusal(tree)
 
-    def _quotient(self, tree: Expression, left: Expression, right: Expression) -> Affine:
-        divisor = self._number(right)
+    def _read_quotient(self, tree: Expression, left: Expression, right: Expression) -> AffineForm:
+        divisor = self._evaluate_constant(right)
         if divisor == 0.0:
-            raise NotLinear(f"{self.where} divides by zero in {text(tree, self.clock)}")
-        return self.affine(left).times(1.0 / divisor)
+            raise NotLinear(
+                f"{self.description} divides by zero in {format_expression(tree, self.clock)}"
+            )
+        return self.to_affine(left).scale_by(1.0 / divisor)
 
     def _has_signals(self, tree: Expression) -> bool:
         for node in walk(tree):
             match node:
-                case Past():
+                case PastValue():
                     return True
                 case Symbol(name, "time" | "index"):
                     raise NotLinear(
-                        f"{self.where} changes with {name}, so it has no transfer function"
+                        f"{self.description} changes with {name}, so it has no transfer function"
                     )
         return False
 
-    def _refusal(self, tree: Expression) -> NotLinear:
+    def _make_refusal(self, tree: Expression) -> NotLinear:
         return NotLinear(
-            f"{self.where} is not linear in states and inputs: {text(tree, self.clock)}; "
+            f"{self.description} is not linear in states and inputs: {format_expression(tree, self.clock)}; "
             "only a linear model has a transfer function"
         )

@@ -8,104 +8,110 @@ from collections.abc import Callable, Mapping
 from math import ceil, floor, inf, log2
 from typing import Any
 
-from sysid.control.control_law import law_of
+from sysid.control.control_law import build_control_law
 from sysid.control.controllers import PidControl, Transport
-from sysid.core.errors import InvalidSettings, nearest
-from sysid.language.delays import past_values
-from sysid.language.intervals import bounds
-from sysid.language.printer import text
-from sysid.language.transform import in_series, shifted, substitute
-from sysid.language.tree import Binary, Expression, Past, Symbol
-from sysid.models.model import EstimatedInitial, FixedInitial, Initial, Model
+from sysid.core.errors import InvalidSettings, suggest_name
+from sysid.language.delays import collect_past_values
+from sysid.language.intervals import bound_expression
+from sysid.language.printer import format_expression
+from sysid.language.transform import add_delays, shift_expression, substitute
+from sysid.language.tree import Binary, Expression, PastValue, Symbol
+from sysid.models.model import EstimatedInitial, FixedInitial, InitialState, Model
 from sysid.models.parameters import Parameter
-from sysid.models.sections import interval
+from sysid.models.sections import get_interval
 
-_PERIOD = Symbol("h", "period")
-_ROUNDING = 1e-9  # of a step: a delay of so much less than a whole step is one
-_STEPS = 2.0  # integration steps, at least, in each time constant of the controller
-_MOST_SUBSTEPS = 1000
+_PERIOD_SYMBOL = Symbol("h", "period")
+_STEP_ROUNDING = 1e-9  # of a step: a delay of so much less than a whole step is one
+_MIN_STEPS_PER_TIME_CONSTANT = (
+    2.0  # integration steps, at least, in each time constant of the controller
+)
+_MAX_SUBSTEPS = 1000
 
 
-class LoopDocument:
+class LoopDocumentBuilder:
     """A model and its controller, on the way to the document of the closed loop."""
 
     def __init__(self, model: Model, control: PidControl, period: float | None) -> None:
         self.model, self.control, self.period = model, control, period
         self.transport = control.transport or Transport()
         self.clock = "t" if model.form == "differential" else "k"
-        self.output = _named(model.outputs, control.output, "output")
-        self.input = _named(model.inputs, control.input, "input")
+        self.output = _find_signal(model.outputs, control.output, "output")
+        self.input = _find_signal(model.inputs, control.input, "input")
         taken = {q.name for group in (model.inputs, model.states, model.outputs) for q in group}
         taken |= {p.name for p in model.parameters}
-        self.reference = free_name("reference", taken)
-        self.command = free_name("command", taken)
+        self.reference = choose_free_name("reference", taken)
+        self.command = choose_free_name("command", taken)
         self.taken = taken
-        self.own: dict[str, dict[str, Any]] = {}
-        self.law = law_of(
+        self.new_parameters: dict[str, dict[str, Any]] = {}
+        self.law = build_control_law(
             control, self.reference, self.output.expression,
-            is_sampled=self.clock == "k", fixed=self._fixed, state=self._state,
+            is_sampled=self.clock == "k", fixed=self._add_parameter, state=self._reserve_state_name,
         )  # fmt: skip
         self.transport_gain = (
             None
             if control.transport is None
-            else self._fixed("transport_gain", self.transport.gain)
+            else self._add_parameter("transport_gain", self.transport.gain)
         )
-        self.delay = self._delay()
-        self.steps = self.steps_late = 0
+        self.delay = self._add_delay()
+        self.steps = self.controller_delay_steps = 0
 
-    def _fixed(self, name: str, value: float, unit: str = "1") -> Symbol:
+    def _add_parameter(self, name: str, value: float, unit: str = "1") -> Symbol:
         """A number of the controller or the transport as a parameter of the closed loop."""
-        name = free_name(name, self.taken)
+        name = choose_free_name(name, self.taken)
         self.taken.add(name)
-        self.own[name] = {
+        self.new_parameters[name] = {
             "lower": min(value, 0.0), "upper": max(value, 0.0) or 1.0, "unit": unit, "fixed": value,
         }  # fmt: skip
         return Symbol(name, "parameter")
 
-    def _state(self, name: str) -> str:
+    def _reserve_state_name(self, name: str) -> str:
         """A name for a state of the controller."""
-        name = free_name(name, self.taken)
+        name = choose_free_name(name, self.taken)
         self.taken.add(name)
         return name
 
-    def differential(self) -> dict[str, Any]:
+    def build_differential(self) -> dict[str, Any]:
         """Document of a closed loop in the differential form."""
         if self.transport.time_constant > 0:
-            delayed = self._given(0, self.delay)
-            entered = f"{text(delayed, self.clock)} - {self.input.name}"
-            return self._document(f"({entered})/{self._time_constant()}", None)
-        if any(past.name == self.input.name for past in past_values(self.output.expression)):
+            delayed = self._build_plant_input(0, self.delay)
+            entered = f"{format_expression(delayed, self.clock)} - {self.input.name}"
+            return self._build_document(f"({entered})/{self._add_time_constant()}", None)
+        if any(
+            past.name == self.input.name for past in collect_past_values(self.output.expression)
+        ):
             raise InvalidSettings(
                 "/output",
                 f"output {self.output.name!r} contains the input {self.input.name!r} itself, so "
                 "the controller would depend on its own present value (an algebraic loop); "
                 "control another output, or give a transport with a time constant",
             )
-        return self._document(None, self._fed_back)
+        return self._build_document(None, self._replace_plant_input)
 
-    def difference(self) -> dict[str, Any]:
+    def build_difference(self) -> dict[str, Any]:
         """Document of a closed loop in the difference form (a polynomial becomes one)."""
         if self.transport.time_constant > 0:
-            kept = f"exp(-h/{self._time_constant()})"
-            drive = text(self._given(1, self.delay))
+            kept = f"exp(-h/{self._add_time_constant()})"
+            drive = format_expression(self._build_plant_input(1, self.delay))
             before = f"{self.input.name}(k-1)"
-            return self._document(f"{drive} + {kept}*({before} - ({drive}))", None)
-        if self._is_circular():
-            self.steps, self.delay = self._whole_steps()
-            self.steps_late = int(self.steps == 0)
-        return self._document(None, self._fed_back)
+            return self._build_document(f"{drive} + {kept}*({before} - ({drive}))", None)
+        if self._has_algebraic_loop():
+            self.steps, self.delay = self._split_whole_steps()
+            self.controller_delay_steps = int(self.steps == 0)
+        return self._build_document(None, self._replace_plant_input)
 
-    def _time_constant(self) -> str:
-        return self._fixed("transport_time_constant", self.transport.time_constant, "s").name
+    def _add_time_constant(self) -> str:
+        return self._add_parameter(
+            "transport_time_constant", self.transport.time_constant, "s"
+        ).name
 
-    def _delay(self) -> Expression | None:
+    def _add_delay(self) -> Expression | None:
         """The transport's delay as a lag: in seconds, or in steps in the difference form."""
         if self.transport.delay == 0:
             return None
-        delay = self._fixed("transport_delay", self.transport.delay, "s")
-        return Binary("/", delay, _PERIOD) if self.clock == "k" else delay
+        delay = self._add_parameter("transport_delay", self.transport.delay, "s")
+        return Binary("/", delay, _PERIOD_SYMBOL) if self.clock == "k" else delay
 
-    def _whole_steps(self) -> tuple[int, Expression | None]:
+    def _split_whole_steps(self) -> tuple[int, Expression | None]:
         """The transport's delay as a whole step and a rest in steps, if a step or more is in it.
 
         Such a delay cuts the circle: the plant's input is one of an earlier sample.
@@ -113,40 +119,42 @@ class LoopDocument:
         if self.period is None:
             return 0, self.delay
         steps = self.transport.delay / self.period
-        whole = floor(steps + _ROUNDING)
+        whole = floor(steps + _STEP_ROUNDING)
         if not whole:
             return 0, self.delay
-        return 1, self._fixed("transport_steps", whole - 1 + max(steps - whole, 0.0))
+        return 1, self._add_parameter("transport_steps", whole - 1 + max(steps - whole, 0.0))
 
-    def _given(self, steps: int, lag: Expression | None) -> Expression:
+    def _build_plant_input(self, steps: int, lag: Expression | None) -> Expression:
         """What leaves the transport but for its time constant, some steps and a lag ago."""
-        command = self._command(steps, lag)
+        command = self._build_command(steps, lag)
         gain = self.transport_gain
         return command if gain is None else Binary("*", gain, command)
 
-    def _command(self, steps: int, lag: Expression | None) -> Expression:
+    def _build_command(self, steps: int, lag: Expression | None) -> Expression:
         """What the controller gives, some steps and a lag ago."""
-        return shifted(self.law.command, steps, lag, counts=self.clock == "k")
+        return shift_expression(self.law.command, steps, lag, counts=self.clock == "k")
 
-    def _fed_back(self, node: Expression) -> Expression | None:
+    def _replace_plant_input(self, node: Expression) -> Expression | None:
         """The controller's signal where the plant reads its input."""
         match node:
-            case Past(self.input.name, "input", offset, own):
-                lag = in_series(self.delay, own)
-                return self._given(offset + self.steps + self.steps_late, lag)
+            case PastValue(self.input.name, "input", offset, own):
+                lag = add_delays(self.delay, own)
+                return self._build_plant_input(
+                    offset + self.steps + self.controller_delay_steps, lag
+                )
             case _:
                 return None
 
-    def _is_circular(self) -> bool:
+    def _has_algebraic_loop(self) -> bool:
         """Whether the controlled output at a sample depends on the plant's input at that sample."""
-        spans = {p.name: interval(p) for p in self.model.parameters}
+        spans = {p.name: get_interval(p) for p in self.model.parameters}
         trees = dict(zip((s.name for s in self.model.states), self.model.equations, strict=True))
         reached: set[str] = set()
         waiting = [self.output.expression]
         while waiting:
-            for past in past_values(waiting.pop()):
-                lag = past.lag
-                is_now = past.offset == 0 and (lag is None or bounds(lag, spans)[0] < 1)
+            for past in collect_past_values(waiting.pop()):
+                lag = past.delay
+                is_now = past.offset == 0 and (lag is None or bound_expression(lag, spans)[0] < 1)
                 if is_now and past.name == self.input.name:
                     return True
                 if is_now and past.kind == "state" and past.name not in reached:
@@ -154,29 +162,34 @@ class LoopDocument:
                     waiting.append(trees[past.name])
         return False
 
-    def _document(
+    def _build_document(
         self, equation: str | None, change: Callable[[Expression], Expression | None] | None
     ) -> dict[str, Any]:
         """The closed loop, with an equation of the plant's input or with its reads replaced."""
         model, name = self.model, self.input.name
 
         def written(tree: Expression) -> str:
-            return text(tree if change is None else substitute(tree, change), self.clock)
+            return format_expression(
+                tree if change is None else substitute(tree, change), self.clock
+            )
 
         states = {state.name: state.unit for state in model.states}
         equations = {
             state.name: written(tree)
             for state, tree in zip(model.states, model.equations, strict=True)
         }
-        initial = {s.name: _start(one) for s, one in zip(model.states, model.initial, strict=True)}
+        initial = {
+            s.name: _to_initial_value(one)
+            for s, one in zip(model.states, model.initial, strict=True)
+        }
         if equation is not None:
             states[name], equations[name], initial[name] = self.input.unit, equation, 0.0
         for own in self.law.states:
-            states[own.name] = self.input.unit if own.is_of_input else self.output.unit
+            states[own.name] = self.input.unit if own.has_input_unit else self.output.unit
             equations[own.name], initial[own.name] = written(own.equation), 0.0
         inputs = {q.name: q.unit for q in model.inputs if q.name != name}
-        command = text(self._command(0, None), self.clock)
-        entering = name if equation is not None else written(Past(name, "input"))
+        command = format_expression(self._build_command(0, None), self.clock)
+        entering = name if equation is not None else written(PastValue(name, "input"))
         outputs = {o.name: (written(o.expression), o.unit) for o in model.outputs}
         outputs |= {name: (entering, self.input.unit), self.command: (command, self.input.unit)}
         return {
@@ -184,14 +197,15 @@ class LoopDocument:
             "form": "differential" if model.form == "differential" else "difference",
             "inputs": {self.reference: self.output.unit, **inputs},
             "states": states,
-            "parameters": {p.name: _declared(p) for p in model.parameters} | self.own,
+            "parameters": {p.name: _to_declaration(p) for p in model.parameters}
+            | self.new_parameters,
             "equations": equations,
             "outputs": {k: {"expression": e, "unit": unit} for k, (e, unit) in outputs.items()},
             "initial": initial,
-            "solver": dict(model.document["solver"]) | self._substeps(),
+            "solver": dict(model.document["solver"]) | self._choose_substeps(),
         }
 
-    def _substeps(self) -> dict[str, int]:
+    def _choose_substeps(self) -> dict[str, int]:
         """Substeps by which the controller's own time constants are resolved, if that takes more.
 
         By a power of two more than the model's: every number of them has a kernel of its own.
@@ -199,44 +213,48 @@ class LoopDocument:
         control, substeps = self.control, self.model.solver.substeps
         if self.clock == "k" or self.period is None:
             return {}
-        shortest = [(control.filter_time, "derivative_filter")] if control.differentiates else []
-        if control.tracking is not None:
-            shortest.append((control.tracking, "tracking_time"))
+        shortest = (
+            [(control.filter_time, "derivative_filter")] if control.has_derivative_action else []
+        )
+        if control.active_tracking_time is not None:
+            shortest.append((control.active_tracking_time, "tracking_time"))
         for time, name in shortest:
-            wanted = _STEPS * self.period / time if time > 0 else inf
-            if wanted * self.model.solver.substeps > _MOST_SUBSTEPS:
-                raise InvalidSettings(f"/{name}", self._too_short(name, time))
+            wanted = _MIN_STEPS_PER_TIME_CONSTANT * self.period / time if time > 0 else inf
+            if wanted * self.model.solver.substeps > _MAX_SUBSTEPS:
+                raise InvalidSettings(f"/{name}", self._describe_short_time(name, time))
             if wanted > 1:
                 more = self.model.solver.substeps * 2 ** ceil(log2(wanted))
-                substeps = max(substeps, min(more, _MOST_SUBSTEPS))
+                substeps = max(substeps, min(more, _MAX_SUBSTEPS))
         return {"substeps": substeps} if substeps > self.model.solver.substeps else {}
 
-    def _too_short(self, name: str, time: float) -> str:
+    def _describe_short_time(self, name: str, time: float) -> str:
         sampling = (self.period or 0.0) * self.model.solver.substeps
         told = "the filter's time constant T_d/N is" if name == "derivative_filter" else "T_t is"
         right = "a smaller N" if name == "derivative_filter" else "a longer one"
         return (
             f"{told} {time:.4g} s, too short for steps of {sampling:.4g} s even if each is "
-            f"divided into {_MOST_SUBSTEPS}; give {right}, or a shorter sampling period"
+            f"divided into {_MAX_SUBSTEPS}; give {right}, or a shorter sampling period"
         )
 
 
-def _named(signals: Any, name: str, role: str) -> Any:
+def _find_signal(signals: Any, name: str, role: str) -> Any:
     for signal in signals:
         if signal.name == name:
             return signal
     known = [signal.name for signal in signals]
-    raise InvalidSettings(f"/{role}", f"the model has no {role} {name!r}{nearest(name, known)}")
+    raise InvalidSettings(
+        f"/{role}", f"the model has no {role} {name!r}{suggest_name(name, known)}"
+    )
 
 
-def free_name(name: str, taken: set[str]) -> str:
+def choose_free_name(name: str, taken: set[str]) -> str:
     """The name, or with underscores behind it until nothing else has it."""
     while name in taken:
         name += "_"
     return name
 
 
-def _declared(parameter: Parameter) -> dict[str, Any]:
+def _to_declaration(parameter: Parameter) -> dict[str, Any]:
     fields = {
         name: getattr(parameter, name)
         for name in ("lower", "upper", "unit", "scale", "fixed", "tied")
@@ -244,7 +262,7 @@ def _declared(parameter: Parameter) -> dict[str, Any]:
     return {name: value for name, value in fields.items() if value is not None}
 
 
-def _start(initial: Initial) -> Mapping[str, float] | float:
+def _to_initial_value(initial: InitialState) -> Mapping[str, float] | float:
     """A start that needs no measurement: what is estimated or measured is given as a value."""
     if isinstance(initial, FixedInitial):
         return initial.value

@@ -7,23 +7,30 @@ from math import ceil, inf, pi
 import numpy as np
 
 from sysid.control.controllers import PidControl, Transport
-from sysid.control.linear_form import Identified, NotLinear
-from sysid.control.transfer import Quasi, Transfer, by_delay, transfers
+from sysid.control.linear_form import IdentifiedModel, NotLinear
+from sysid.control.transfer import (
+    QuasiPolynomial,
+    TransferFunction,
+    compute_transfer_functions,
+    group_by_delay,
+)
 from sysid.core.types import BoolArray, ComplexArray, FloatArray
 from sysid.kernels.reads import is_difference
 
-_DECADES = 3  # below the slowest and above the fastest part of the loop
-_FARTHEST = 1e8  # from the middle of what is in the loop: beyond, nothing of it is told
-_A_DECADE = 400  # frequencies
-_TURN = 0.05  # rad that dead times turn from one frequency to the next
-_LOUD = 0.1  # loop gain below which they may turn farther: only gain margins are left there
-_MOST = 200_000
-_SMALL = 1e-3  # loop gain beyond which nothing is looked for: a gain margin of a thousand
-_SECANTS = 12  # that leaves nothing of steps of a hundredth, at sharp resonances too
-_ROUNDING = 1e-6  # rad
-_FAR = 0.5  # rad: what turns farther from one frequency to the next may be missed
-_ROUNDS, _PARTS = 8, 10  # in which such a step is divided
-_FEW = 1000  # steps: where all turn far it is no root, but a dead time at frequencies of no account
+_OUTER_DECADES = 3  # below the slowest and above the fastest part of the loop
+_MAX_FREQUENCY_RATIO = 1e8  # from the middle of what is in the loop: beyond, nothing of it is told
+_POINTS_PER_DECADE = 400  # frequencies
+_MAX_TURN = 0.05  # rad that dead times turn from one frequency to the next
+_LOUD_GAIN = 0.1  # loop gain below which they may turn farther: only gain margins are left there
+_MAX_FREQUENCIES = 200_000
+_NEGLIGIBLE_GAIN = 1e-3  # loop gain beyond which nothing is looked for: a gain margin of a thousand
+_SECANT_STEPS = 12  # that leaves nothing of steps of a hundredth, at sharp resonances too
+_PHASE_ROUNDING = 1e-6  # rad
+_UNRESOLVED_TURN = 0.5  # rad: what turns farther from one frequency to the next may be missed
+_MAX_REFINEMENTS, _REFINEMENT_PARTS = 8, 10  # in which such a step is divided
+_MAX_UNRESOLVED_STEPS = (
+    1000  # steps: where all turn far it is no root, but a dead time at frequencies of no account
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +65,7 @@ class Margins:
     sensitivity_peak: float
 
 
-def margins(identified: Identified, control: PidControl) -> Margins:
+def compute_margins(identified: IdentifiedModel, control: PidControl) -> Margins:
     """Margins of the loop that a controller closes around a model, its limits left out.
 
     Raises
@@ -69,35 +76,35 @@ def margins(identified: Identified, control: PidControl) -> Margins:
     if is_difference(identified.model):
         raise NotLinear("margins are of models in the differential form; this one is a recursion")
     signals = (control.input, control.output)
-    pairs = transfers(identified).pairs
+    pairs = compute_transfer_functions(identified).pairs
     [pair] = [one for one in pairs if (one.input, one.output) == signals]
-    loop = _Loop(pair, control)
-    omega, end = _frequencies(loop, pair, control)
-    return _margins(loop, omega[omega <= end], is_stable=_is_stable(loop, omega))
+    loop = _LoopGain(pair, control)
+    omega, end = _choose_frequencies(loop, pair, control)
+    return _measure_margins(loop, omega[omega <= end], is_stable=_is_stable(loop, omega))
 
 
-class _Loop:
+class _LoopGain:
     """L(s) on the imaginary axis; weights of the reference are outside the loop."""
 
-    def __init__(self, pair: Transfer, control: PidControl) -> None:
+    def __init__(self, pair: TransferFunction, control: PidControl) -> None:
         self._pair, self._control = pair, control
         self._transport = control.transport or Transport()
         self.order = max(power for power, _ in pair.denominator)
-        self.order += control.integrates + control.differentiates
+        self.order += control.has_integral_action + control.has_derivative_action
         self.order += self._transport.time_constant > 0
 
-    def gain(self, omega: FloatArray) -> ComplexArray:
+    def evaluate_gain(self, omega: FloatArray) -> ComplexArray:
         """L(iω): controller, transport and plant in a row."""
-        above, below = self.parts(omega)
+        above, below = self.evaluate_fraction(omega)
         return above / below
 
-    def at_rest(self) -> FloatArray:
+    def evaluate_static_gain(self) -> FloatArray:
         """L(0), (1,), a real number; (0,) where something integrates."""
-        above, below = self.parts(np.zeros(1))
-        found: FloatArray = (above[below != 0] / below[below != 0]).real
+        above, below = self.evaluate_fraction(np.zeros(1))
+        found: FloatArray = (above[below != 0] / below[below != 0]).write_float
         return found[np.isfinite(found)]
 
-    def parts(self, omega: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    def evaluate_fraction(self, omega: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Numerator and denominator of L(iω), without the poles that they have."""
         control, transport = self._control, self._transport
         s: ComplexArray = np.asarray(1j * omega, dtype=np.complex128)
@@ -105,105 +112,120 @@ class _Loop:
         below: ComplexArray = 1.0 + s * transport.time_constant
         filtered: ComplexArray = 1.0 + s * control.filter_time
         actions = filtered + s * control.derivative_time
-        if control.integrates and control.integral_time is not None:
+        if control.has_integral_action and control.integral_time is not None:
             actions = actions * s + filtered / control.integral_time
             below = below * s
         given = control.gain * transport.gain * late * actions
-        above: ComplexArray = given * _value(self._pair.numerator, s)
-        return above, below * filtered * _value(self._pair.denominator, s)
+        above: ComplexArray = given * _evaluate_quasi_polynomial(self._pair.numerator, s)
+        return above, below * filtered * _evaluate_quasi_polynomial(self._pair.denominator, s)
 
 
-def _value(quasi: Quasi, s: ComplexArray) -> ComplexArray:
+def _evaluate_quasi_polynomial(quasi: QuasiPolynomial, s: ComplexArray) -> ComplexArray:
     total = np.zeros_like(s)
-    for delay, powers in by_delay(quasi):
+    for delay, powers in group_by_delay(quasi):
         total += np.polyval(powers, s) * np.exp(-s * delay)
     return total
 
 
-def _is_stable(loop: _Loop, omega: FloatArray) -> bool:
+def _is_stable(loop: _LoopGain, omega: FloatArray) -> bool:
     """By Mikhailov's criterion: the sum of both parts turns by a quarter for each of its roots.
 
     Divided by as many stable roots it does not turn at all if all roots are stable, and by half a
     turn back for each that is not.
     """
-    above, below = loop.parts(omega)
+    above, below = loop.evaluate_fraction(omega)
     middle = float(np.sqrt(omega[0] * omega[-1]))
     turned = np.unwrap(np.angle((above + below) / (1j * omega / middle + 1.0) ** loop.order))
     return bool(abs(turned[-1] - turned[0]) < pi / 2)
 
 
-def _frequencies(loop: _Loop, pair: Transfer, control: PidControl) -> tuple[FloatArray, float]:
+def _choose_frequencies(
+    loop: _LoopGain, pair: TransferFunction, control: PidControl
+) -> tuple[FloatArray, float]:
     """Angular frequencies around all that the loop has, and beyond which its gain is gone."""
-    scales = sorted(_scales(pair, control)) or [1.0]
+    scales = sorted(_find_corner_frequencies(pair, control)) or [1.0]
     middle = scales[len(scales) // 2]
-    scales = [min(max(one, middle / _FARTHEST), middle * _FARTHEST) for one in scales]
-    low, high = scales[0] / 10**_DECADES, scales[-1] * 10**_DECADES
+    scales = [
+        min(max(one, middle / _MAX_FREQUENCY_RATIO), middle * _MAX_FREQUENCY_RATIO)
+        for one in scales
+    ]
+    low, high = scales[0] / 10**_OUTER_DECADES, scales[-1] * 10**_OUTER_DECADES
     decades = np.log10(high / low)
-    coarse: FloatArray = np.geomspace(low, high, ceil(_A_DECADE * decades))
-    size = np.abs(loop.gain(coarse))
-    loud, end = _last(coarse, size > _LOUD, low), _last(coarse, size > _SMALL, high)
+    coarse: FloatArray = np.geomspace(low, high, ceil(_POINTS_PER_DECADE * decades))
+    size = np.abs(loop.evaluate_gain(coarse))
+    loud, end = (
+        _find_last_frequency(coarse, size > _LOUD_GAIN, low),
+        _find_last_frequency(coarse, size > _NEGLIGIBLE_GAIN, high),
+    )
     delays = sum(
         max((d for _, d in one), default=0.0) for one in (pair.numerator, pair.denominator)
     )
     delays += control.transport.delay if control.transport else 0.0
     fine = (
-        [_turning(0.0, loud, _TURN / delays), _turning(loud, end, _FAR / delays)] if delays else []
+        [
+            _space_frequencies(0.0, loud, _MAX_TURN / delays),
+            _space_frequencies(loud, end, _UNRESOLVED_TURN / delays),
+        ]
+        if delays
+        else []
     )
-    return _resolved(loop, np.unique(np.concatenate([coarse, *fine]))), end
+    return _refine_frequencies(loop, np.unique(np.concatenate([coarse, *fine]))), end
 
 
-def _last(omega: FloatArray, where: BoolArray, otherwise: float) -> float:
+def _find_last_frequency(omega: FloatArray, where: BoolArray, otherwise: float) -> float:
     """The frequency behind the last one where something holds."""
     found = np.flatnonzero(where)
     return float(omega[min(int(found[-1]) + 2, omega.size - 1)]) if found.size else otherwise
 
 
-def _turning(start: float, stop: float, step: float) -> FloatArray:
-    count = min(ceil((stop - start) / step), _MOST) if stop > start else 0
+def _space_frequencies(start: float, stop: float, step: float) -> FloatArray:
+    count = min(ceil((stop - start) / step), _MAX_FREQUENCIES) if stop > start else 0
     return np.linspace(stop, start, count, endpoint=False)
 
 
-def _resolved(loop: _Loop, omega: FloatArray) -> FloatArray:
+def _refine_frequencies(loop: _LoopGain, omega: FloatArray) -> FloatArray:
     """With more frequencies where a root near the axis turns the loop, or its border, at once.
 
     A root on the axis is never resolved, and one right of it by less than the last step is taken
     for one left of it as often as not.
     """
-    for _ in range(_ROUNDS):
-        above, below = loop.parts(omega)
+    for _ in range(_MAX_REFINEMENTS):
+        above, below = loop.evaluate_fraction(omega)
         steps = [np.diff(np.unwrap(np.angle(one))) for one in (below, above + below)]
-        far = np.flatnonzero(np.max(np.abs(steps), axis=0) > _FAR)
-        if not 0 < far.size <= _FEW:
+        far = np.flatnonzero(np.max(np.abs(steps), axis=0) > _UNRESOLVED_TURN)
+        if not 0 < far.size <= _MAX_UNRESOLVED_STEPS:
             break
-        parts = np.linspace(0.0, 1.0, _PARTS, endpoint=False)[1:, None]
+        parts = np.linspace(0.0, 1.0, _REFINEMENT_PARTS, endpoint=False)[1:, None]
         more = omega[far] + parts * (omega[far + 1] - omega[far])
         omega = np.unique(np.concatenate([omega, more.ravel()]))
     return omega
 
 
-def _scales(pair: Transfer, control: PidControl) -> Iterable[float]:
+def _find_corner_frequencies(pair: TransferFunction, control: PidControl) -> Iterable[float]:
     """Frequencies in rad/s at which something changes."""
     for quasi in (pair.numerator, pair.denominator):
-        for delay, powers in by_delay(quasi):
+        for delay, powers in group_by_delay(quasi):
             yield from (abs(root) for root in np.roots(powers) if root != 0)
             if delay > 0:
                 yield 1.0 / delay
     transport = control.transport or Transport()
     times = [transport.delay, transport.time_constant, control.filter_time, control.derivative_time]
-    if control.integrates and control.integral_time is not None:
+    if control.has_integral_action and control.integral_time is not None:
         times.append(control.integral_time)
     yield from (1.0 / time for time in times if time > 0)
 
 
-def _margins(loop: _Loop, omega: FloatArray, *, is_stable: bool) -> Margins:
-    gains = loop.gain(omega)
-    crossings = _roots(lambda w: np.abs(loop.gain(w)) - 1.0, omega, np.abs(gains) - 1.0)
-    lefts = np.angle(-loop.gain(crossings))
+def _measure_margins(loop: _LoopGain, omega: FloatArray, *, is_stable: bool) -> Margins:
+    gains = loop.evaluate_gain(omega)
+    crossings = _find_sign_changes(
+        lambda w: np.abs(loop.evaluate_gain(w)) - 1.0, omega, np.abs(gains) - 1.0
+    )
+    lefts = np.angle(-loop.evaluate_gain(crossings))
     if is_stable:  # past half a turn it is stable since the next border is a turn away
-        lefts = np.where(lefts < -_ROUNDING, lefts + 2 * pi, lefts)
+        lefts = np.where(lefts < -_PHASE_ROUNDING, lefts + 2 * pi, lefts)
     nearest = int(np.argmin(np.abs(lefts))) if lefts.size else None
-    turned = _roots(lambda w: loop.gain(w).imag, omega, gains.imag)
-    at_turned = np.append(loop.gain(turned).real, loop.at_rest())
+    turned = _find_sign_changes(lambda w: loop.evaluate_gain(w).imag, omega, gains.imag)
+    at_turned = np.append(loop.evaluate_gain(turned).real, loop.evaluate_static_gain())
     factors = -1.0 / at_turned[at_turned < 0]
     bears = float(np.min(np.maximum(lefts, 0.0) / crossings, initial=inf))
     return Margins(
@@ -216,13 +238,13 @@ def _margins(loop: _Loop, omega: FloatArray, *, is_stable: bool) -> Margins:
     )
 
 
-def _roots(
+def _find_sign_changes(
     function: Callable[[FloatArray], FloatArray], omega: FloatArray, values: FloatArray
 ) -> FloatArray:
     """Where a function changes its sign, by secants of the steps in which it does."""
     at = np.flatnonzero(values[:-1] * values[1:] < 0)
     low, high, below, above = omega[at], omega[at + 1], values[at], values[at + 1]
-    for _ in range(_SECANTS):
+    for _ in range(_SECANT_STEPS):
         middle = low - below * (high - low) / (above - below)
         value = function(middle)
         is_before = value * below > 0

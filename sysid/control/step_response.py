@@ -8,16 +8,16 @@ import numpy as np
 from sysid.core.errors import InvalidRecord
 from sysid.core.types import FloatArray
 
-_RISE = (0.1, 0.9)
-_BAND = 0.02
-_TAIL = 0.1
-_WINDOWS = 3  # the last quarters of the record: what comes first, the step itself makes
-_GROWTH = 1.03  # a limit cycle's peaks differ by less, by where the samples lie
+_RISE_LEVELS = (0.1, 0.9)
+_SETTLING_BAND = 0.02
+_TAIL_SHARE = 0.1
+_N_WINDOWS = 3  # the last quarters of the record: what comes first, the step itself makes
+_PEAK_GROWTH = 1.03  # a limit cycle's peaks differ by less, by where the samples lie
 _SWING_GROWTH = 1.01  # the same of swings between turning points that are interpolated
-_LASTING = 0.9  # of the swing two quarters before: one that decays faster will settle
-_STEADY = 0.99  # of the last increment: from there on, growth does not slow down
-_ROUNDING = 1e-9  # of the step: an output that moves less has not answered
-_BEYOND = 1e100  # steps away from the reference: not to be squared
+_LASTING_SHARE = 0.9  # of the swing two quarters before: one that decays faster will settle
+_STEADY_GROWTH = 0.99  # of the last increment: from there on, growth does not slow down
+_RESPONSE_ROUNDING = 1e-9  # of the step: an output that moves less has not answered
+_DIVERGENCE_LIMIT = 1e100  # steps away from the reference: not to be squared
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class StepMetrics:
     swing_period: float = nan
 
 
-def step_metrics(
+def measure_step_response(
     times: FloatArray, values: FloatArray, *, at: float, before: float, after: float
 ) -> StepMetrics:
     """Judge the response to a reference that steps once.
@@ -99,22 +99,22 @@ def step_metrics(
     if height == 0:
         raise InvalidRecord(f"the reference does not change at {at:g} s")
     t, y = times[later] - at, values[later]
-    band = _BAND * abs(height)
+    band = _SETTLING_BAND * abs(height)
     if _runs_away(t, y - after, abs(height)):
         return StepMetrics(nan, nan, nan, nan, band, nan, nan, runs_away=True, is_settled=False)
-    tail = t >= t[-1] - _TAIL * (t[-1] - t[0])
+    tail = t >= t[-1] - _TAIL_SHARE * (t[-1] - t[0])
     final = float(np.mean(y[tail]))
     # A steady error keeps the output from the reference before the step as after it.
     start = float(values[~later][-1]) if not later.all() else float(y[0])
-    if abs(final - start) <= _ROUNDING * abs(height):
+    if abs(final - start) <= _RESPONSE_ROUNDING * abs(height):
         start = final
-    settling = _settled(t, np.abs(y - final), band, float(t[tail][0]))
+    settling = _measure_settling_time(t, np.abs(y - final), band, float(t[tail][0]))
     error = np.abs(after - y)
-    swing, period = (nan, nan) if isfinite(settling) else _lasting_swing(t, y - after, band)
+    swing, period = (nan, nan) if isfinite(settling) else _measure_limit_cycle(t, y - after, band)
     return StepMetrics(
-        rise_time=_rise_time(t, y, start, final),
-        overshoot_percent=_overshoot(y, before, after),
-        overshoot_of_final_percent=_overshoot(y, start, final),
+        rise_time=_measure_rise_time(t, y, start, final),
+        overshoot_percent=_measure_overshoot(y, before, after),
+        overshoot_of_final_percent=_measure_overshoot(y, start, final),
         settling_time=settling,
         band=band,
         steady_error=after - final,
@@ -127,14 +127,16 @@ def step_metrics(
     )
 
 
-def _rise_time(t: FloatArray, y: FloatArray, before: float, final: float) -> float:
+def _measure_rise_time(t: FloatArray, y: FloatArray, before: float, final: float) -> float:
     if final == before:
         return nan
-    low, high = (_first_passing(t, (y - before) / (final - before), level) for level in _RISE)
+    low, high = (
+        _find_level_crossing(t, (y - before) / (final - before), level) for level in _RISE_LEVELS
+    )
     return high - low
 
 
-def _overshoot(y: FloatArray, before: float, end: float) -> float:
+def _measure_overshoot(y: FloatArray, before: float, end: float) -> float:
     """Farthest way beyond `end` in per cent of the way there; ``nan`` if there is no way."""
     if end == before:
         return nan
@@ -148,48 +150,48 @@ def _runs_away(t: FloatArray, deviation: FloatArray, height: float) -> bool:
     """
     with np.errstate(over="ignore"):
         away = np.abs(deviation)
-    if not np.all(away < _BEYOND * height):
+    if not np.all(away < _DIVERGENCE_LIMIT * height):
         return True
-    edges = _edges(t)
-    farthest = _greatest(t, away, edges)
+    edges = _compute_window_edges(t)
+    farthest = _find_window_maxima(t, away, edges)
     before = max(float(np.max(away[t <= edges[-2]])), height)
-    if float(farthest[-1]) > _GROWTH * before and _grows(farthest, 1.0):
+    if float(farthest[-1]) > _PEAK_GROWTH * before and _is_growing(farthest, 1.0):
         return True
-    swings = _greatest(*_swings(t, deviation), edges)
-    return float(swings[-1]) > _BAND * height and _grows(swings, _SWING_GROWTH)
+    swings = _find_window_maxima(*_measure_swings(t, deviation), edges)
+    return float(swings[-1]) > _SETTLING_BAND * height and _is_growing(swings, _SWING_GROWTH)
 
 
-def _lasting_swing(t: FloatArray, deviation: FloatArray, band: float) -> tuple[float, float]:
+def _measure_limit_cycle(t: FloatArray, deviation: FloatArray, band: float) -> tuple[float, float]:
     """Size and period of a swing that neither grows nor decays; ``nan`` if there is none."""
-    ends, sizes = _swings(t, deviation)
-    first, *_, last = _greatest(ends, sizes, _edges(t))
-    if not last > 2.0 * band or not last > _LASTING * first > 0.0:
+    ends, sizes = _measure_swings(t, deviation)
+    first, *_, last = _find_window_maxima(ends, sizes, _compute_window_edges(t))
+    if not last > 2.0 * band or not last > _LASTING_SHARE * first > 0.0:
         return nan, nan
     later = ends[ends > 0.5 * (t[0] + t[-1])]
     return (float(last), 2.0 * float(np.mean(np.diff(later)))) if later.size > 2 else (nan, nan)
 
 
-def _edges(t: FloatArray) -> FloatArray:
+def _compute_window_edges(t: FloatArray) -> FloatArray:
     """Ends of the quarters of the record, from that of the first on."""
-    edges: FloatArray = t[0] + (t[-1] - t[0]) * np.arange(1, _WINDOWS + 2) / (_WINDOWS + 1)
+    edges: FloatArray = t[0] + (t[-1] - t[0]) * np.arange(1, _N_WINDOWS + 2) / (_N_WINDOWS + 1)
     return edges
 
 
-def _greatest(t: FloatArray, values: FloatArray, edges: FloatArray) -> FloatArray:
+def _find_window_maxima(t: FloatArray, values: FloatArray, edges: FloatArray) -> FloatArray:
     """The greatest value in each window (_WINDOWS,); 0 where there is none."""
     which = np.searchsorted(edges, t, side="left")  # 0: before the first window
-    return np.array([np.max(values[which == i], initial=0.0) for i in range(1, _WINDOWS + 1)])
+    return np.array([np.max(values[which == i], initial=0.0) for i in range(1, _N_WINDOWS + 1)])
 
 
-def _grows(sizes: FloatArray, least: float) -> bool:
+def _is_growing(sizes: FloatArray, least: float) -> bool:
     """Whether each of the sizes is `least` times the one before, and growth does not slow down."""
     if not np.all(sizes[:-1] > 0.0) or not np.all(sizes[1:] > least * sizes[:-1]):
         return False
     more = np.diff(sizes)
-    return bool(np.all(more[1:] >= _STEADY * more[:-1]))
+    return bool(np.all(more[1:] >= _STEADY_GROWTH * more[:-1]))
 
 
-def _swings(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _measure_swings(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     """When each way from a turning point to the next ends, and how long it is.
 
     The values there are those of parabolas through three samples: of the samples alone, those of
@@ -202,7 +204,7 @@ def _swings(t: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
     return t[at[1:]], np.abs(np.diff(peaks))
 
 
-def _first_passing(t: FloatArray, way: FloatArray, level: float) -> float:
+def _find_level_crossing(t: FloatArray, way: FloatArray, level: float) -> float:
     """When the way first reaches a level, on a line between samples."""
     reached = np.flatnonzero(way >= level)
     if reached.size == 0:
@@ -214,7 +216,7 @@ def _first_passing(t: FloatArray, way: FloatArray, level: float) -> float:
     return float(t[i - 1] + part * (t[i] - t[i - 1]))
 
 
-def _settled(t: FloatArray, away: FloatArray, band: float, latest: float) -> float:
+def _measure_settling_time(t: FloatArray, away: FloatArray, band: float, latest: float) -> float:
     """From when on it stays inside the band; ``nan`` if that is later than `latest`."""
     outside = np.flatnonzero(away > band)
     if outside.size == 0:

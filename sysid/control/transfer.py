@@ -9,58 +9,71 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import floor, prod
 from typing import NamedTuple, TypeAlias
 
-from sysid.control.linear_form import Affine, Identified, Linear, NotLinear, Signal, linear_form
-from sysid.data.interpolation import DENSE, MOST_POINTS
-from sysid.kernels.reads import averaged_inputs, is_difference
+from sysid.control.linear_form import (
+    AffineForm,
+    DelayedSignal,
+    IdentifiedModel,
+    LinearForm,
+    NotLinear,
+    to_linear_form,
+)
+from sysid.data.interpolation import MAX_POINTS_PER_STEP, POINTS_PER_SAMPLE
+from sysid.kernels.reads import find_averaged_inputs, is_difference
 
-Quasi: TypeAlias = Mapping[tuple[int, float], float]
+QuasiPolynomial: TypeAlias = Mapping[tuple[int, float], float]
 """(p, d): coefficient."""
 
-_CANCELLED = 1e-13
+_CANCELLATION_TOLERANCE = 1e-13
 
 
-def added(first: Quasi, second: Quasi, factor: float = 1.0) -> Quasi:
+def add_polynomials(
+    first: QuasiPolynomial, second: QuasiPolynomial, factor: float = 1.0
+) -> QuasiPolynomial:
     """Sum with a multiple of another; what is left of terms that cancel is left out."""
     found = dict(first)
     for key, value in second.items():
         before, change = found.get(key, 0.0), factor * value
         total = before + change
-        if abs(total) > _CANCELLED * (abs(before) + abs(change)):
+        if abs(total) > _CANCELLATION_TOLERANCE * (abs(before) + abs(change)):
             found[key] = total
         else:
             found.pop(key, None)
     return found
 
 
-def product(first: Quasi, second: Quasi) -> Quasi:
+def multiply_polynomials(first: QuasiPolynomial, second: QuasiPolynomial) -> QuasiPolynomial:
     """Product of two."""
-    found: Quasi = {}
+    found: QuasiPolynomial = {}
     for (power, delay), value in first.items():
         shifted = {(power + p, delay + d): value * v for (p, d), v in second.items()}
-        found = added(found, shifted)
+        found = add_polynomials(found, shifted)
     return found
 
 
-def determinant(matrix: Sequence[Sequence[Quasi]]) -> Quasi:
+def compute_determinant(matrix: Sequence[Sequence[QuasiPolynomial]]) -> QuasiPolynomial:
     """Determinant of a small square matrix, by its first row."""
     if not matrix:
         return {(0, 0.0): 1.0}
-    found: Quasi = {}
+    found: QuasiPolynomial = {}
     for j, entry in enumerate(matrix[0]):
         if entry:
             minor = [[*row[:j], *row[j + 1 :]] for row in matrix[1:]]
-            found = added(found, product(entry, determinant(minor)), -1.0 if j % 2 else 1.0)
+            found = add_polynomials(
+                found,
+                multiply_polynomials(entry, compute_determinant(minor)),
+                -1.0 if j % 2 else 1.0,
+            )
     return found
 
 
-def replaced(
-    matrix: Sequence[Sequence[Quasi]], j: int, column: Sequence[Quasi]
-) -> list[list[Quasi]]:
+def replace_column(
+    matrix: Sequence[Sequence[QuasiPolynomial]], j: int, column: Sequence[QuasiPolynomial]
+) -> list[list[QuasiPolynomial]]:
     """The matrix with another column j."""
     return [[*row[:j], one, *row[j + 1 :]] for row, one in zip(matrix, column, strict=True)]
 
 
-def by_delay(found: Quasi) -> list[tuple[float, list[float]]]:
+def group_by_delay(found: QuasiPolynomial) -> list[tuple[float, list[float]]]:
     """Coefficients of falling powers for each dead time, the shortest dead time first."""
     parts: dict[float, dict[int, float]] = {}
     for (power, delay), value in found.items():
@@ -71,8 +84,8 @@ def by_delay(found: Quasi) -> list[tuple[float, list[float]]]:
     ]
 
 
-def taps(
-    identified: Identified, signal: Signal, *, finished: int, updated: bool
+def compute_taps(
+    identified: IdentifiedModel, signal: DelayedSignal, *, finished: int, updated: bool
 ) -> dict[int, float]:
     """Weights of whole samples that give a signal between them, as the simulation reads it.
 
@@ -87,47 +100,55 @@ def taps(
         Whether a state's present sample is known; if not, the one before stands for it.
     """
     if signal.kind == "input":
-        found = _input_taps(identified, signal)
+        found = _compute_input_taps(identified, signal)
     else:
-        found = _state_taps(identified, signal.delay, finished)
+        found = _compute_state_taps(identified, signal.delay, finished)
     if signal.kind == "state" and not updated and 0 in found:
         found[1] = found.get(1, 0.0) + found.pop(0)
     return {back: weight for back, weight in found.items() if weight != 0.0}
 
 
-def _input_taps(identified: Identified, signal: Signal) -> dict[int, float]:
+def _compute_input_taps(identified: IdentifiedModel, signal: DelayedSignal) -> dict[int, float]:
     delay = signal.delay
     if identified.model.solver.interpolation == "nearest":
         return {floor(delay + 0.5): 1.0}
-    if identified.hold(signal.name) == "zero" and signal.name in averaged_inputs(identified.model):
-        return _held_taps(delay, 0.5 / identified.model.solver.substeps)
-    if identified.hold(signal.name) == "zero":
-        return _held_taps(delay, 1.0 / min(max(_even(identified), 4), MOST_POINTS))
-    return _through(delay, (0, 1))
+    if identified.get_hold(signal.name) == "zero" and signal.name in find_averaged_inputs(
+        identified.model
+    ):
+        return _compute_held_taps(delay, 0.5 / identified.model.solver.substeps)
+    if identified.get_hold(signal.name) == "zero":
+        return _compute_held_taps(
+            delay, 1.0 / min(max(_count_fine_points(identified), 4), MAX_POINTS_PER_STEP)
+        )
+    return _interpolate_polynomial(delay, (0, 1))
 
 
-def _even(identified: Identified) -> int:
+def _count_fine_points(identified: IdentifiedModel) -> int:
     """Fine points in a step of the simulation; half of one is where a jump is read."""
-    return 2 * -(-DENSE // (2 * identified.model.solver.substeps))
+    return 2 * -(-POINTS_PER_SAMPLE // (2 * identified.model.solver.substeps))
 
 
-def _held_taps(delay: float, ramp: float) -> dict[int, float]:
+def _compute_held_taps(delay: float, ramp: float) -> dict[int, float]:
     place = -delay + ramp
     nearest = floor(place + 0.5)
     part = min(max((place - nearest + ramp) / (2 * ramp), 0.0), 1.0)
     return {1 - nearest: 1.0 - part, -nearest: part}
 
 
-def _state_taps(identified: Identified, delay: float, finished: int) -> dict[int, float]:
+def _compute_state_taps(
+    identified: IdentifiedModel, delay: float, finished: int
+) -> dict[int, float]:
     interpolation = identified.model.solver.interpolation
     if interpolation == "nearest":
         return {floor(delay + 0.5): 1.0}
     if interpolation == "linear" or delay < finished:
-        return _through(delay, (0, 1))
-    return _through(delay, (-1, 0, 1, 2) if floor(finished - delay) <= -2 else (-1, 0, 1))
+        return _interpolate_polynomial(delay, (0, 1))
+    return _interpolate_polynomial(
+        delay, (-1, 0, 1, 2) if floor(finished - delay) <= -2 else (-1, 0, 1)
+    )
 
 
-def _through(delay: float, nodes: tuple[int, ...]) -> dict[int, float]:
+def _interpolate_polynomial(delay: float, nodes: tuple[int, ...]) -> dict[int, float]:
     """The polynomial through the samples at these places beside the one before."""
     i = floor(-delay)
     part = -delay - i
@@ -136,27 +157,27 @@ def _through(delay: float, nodes: tuple[int, ...]) -> dict[int, float]:
     return {-(i + a): prod((part - b) / (a - b) for b in nodes if b != a) for a in nodes}
 
 
-MOST_STATES = 8
+MAX_STATES = 8
 
 
-class Transfer(NamedTuple):
+class TransferFunction(NamedTuple):
     """From `input` to `output`: numerator and denominator."""
 
     input: str
     output: str
-    numerator: Quasi
-    denominator: Quasi
+    numerator: QuasiPolynomial
+    denominator: QuasiPolynomial
 
 
-class Transfers(NamedTuple):
+class TransferFunctions(NamedTuple):
     """All pairs of a model; `period` (s) of a recursion, None in continuous time."""
 
-    pairs: tuple[Transfer, ...]
-    linear: Linear
+    pairs: tuple[TransferFunction, ...]
+    linear_form: LinearForm
     period: float | None
 
 
-def transfers(identified: Identified) -> Transfers:
+def compute_transfer_functions(identified: IdentifiedModel) -> TransferFunctions:
     """Transfer functions from the equations, with all lags as they are.
 
     Raises
@@ -168,29 +189,31 @@ def transfers(identified: Identified) -> Transfers:
     model = identified.model
     if not model.inputs:
         raise NotLinear("the model has no input, so it has no transfer function")
-    period = _period(identified)
-    linear = linear_form(identified, period)
-    if len(model.states) > MOST_STATES:
+    period = _find_integration_step(identified)
+    linear = to_linear_form(identified, period)
+    if len(model.states) > MAX_STATES:
         raise NotLinear(
             f"the model has {len(model.states)} states; transfer functions are written of up to "
-            f"{MOST_STATES}"
+            f"{MAX_STATES}"
         )
-    matrix, columns = _equations(identified, linear)
-    denominator = determinant(matrix)
+    matrix, columns = _build_equations(identified, linear)
+    denominator = compute_determinant(matrix)
     inside = {
-        name: [determinant(replaced(matrix, j, column)) for j in range(len(model.states))]
+        name: [
+            compute_determinant(replace_column(matrix, j, column)) for j in range(len(model.states))
+        ]
         for name, column in columns.items()
     }
     pairs = tuple(
-        Transfer(name, output.name, _numerator(identified, form, name, states, denominator),
+        TransferFunction(name, output.name, _compute_numerator(identified, form, name, states, denominator),
                  denominator)
         for output, form in zip(model.outputs, linear.outputs, strict=True)
         for name, states in inside.items()
     )  # fmt: skip
-    return Transfers(pairs, linear, period)
+    return TransferFunctions(pairs, linear, period)
 
 
-def _period(identified: Identified) -> float | None:
+def _find_integration_step(identified: IdentifiedModel) -> float | None:
     if not is_difference(identified.model):
         return None
     if identified.sample_time is None:
@@ -201,39 +224,49 @@ def _period(identified: Identified) -> float | None:
     return identified.sample_time / identified.model.solver.substeps
 
 
-def _equations(
-    identified: Identified, linear: Linear
-) -> tuple[list[list[Quasi]], Mapping[str, list[Quasi]]]:
+def _build_equations(
+    identified: IdentifiedModel, linear: LinearForm
+) -> tuple[list[list[QuasiPolynomial]], Mapping[str, list[QuasiPolynomial]]]:
     """M X = Σ b U: the matrix M, and b of every input."""
     states = [one.name for one in identified.model.states]
     power = 0 if is_difference(identified.model) else 1
     matrix = []
-    columns: dict[str, list[Quasi]] = {one.name: [] for one in identified.model.inputs}
+    columns: dict[str, list[QuasiPolynomial]] = {one.name: [] for one in identified.model.inputs}
     for i, form in enumerate(linear.equations):
-        read = _reader(identified, i)
+        read = _make_coefficient_reader(identified, i)
         row = [read(form, "state", name) for name in states]
-        own: Quasi = {(power, 0.0): 1.0}
-        matrix.append([added(own if i == j else {}, one, -1.0) for j, one in enumerate(row)])
+        own: QuasiPolynomial = {(power, 0.0): 1.0}
+        matrix.append(
+            [add_polynomials(own if i == j else {}, one, -1.0) for j, one in enumerate(row)]
+        )
         for name, column in columns.items():
             column.append(read(form, "input", name))
     return matrix, columns
 
 
-def _numerator(
-    identified: Identified, form: Affine, name: str, states: Sequence[Quasi], denominator: Quasi
-) -> Quasi:
-    read = _reader(identified, None)
-    found = product(read(form, "input", name), denominator)
+def _compute_numerator(
+    identified: IdentifiedModel,
+    form: AffineForm,
+    name: str,
+    states: Sequence[QuasiPolynomial],
+    denominator: QuasiPolynomial,
+) -> QuasiPolynomial:
+    read = _make_coefficient_reader(identified, None)
+    found = multiply_polynomials(read(form, "input", name), denominator)
     for state, inside in zip(identified.model.states, states, strict=True):
-        found = added(found, product(read(form, "state", state.name), inside))
+        found = add_polynomials(
+            found, multiply_polynomials(read(form, "state", state.name), inside)
+        )
     return found
 
 
-def _reader(identified: Identified, equation: int | None) -> Callable[[Affine, str, str], Quasi]:
+def _make_coefficient_reader(
+    identified: IdentifiedModel, equation: int | None
+) -> Callable[[AffineForm, str, str], QuasiPolynomial]:
     """What one signal contributes to an affine form, in an equation or in an output (None)."""
     model = identified.model
 
-    def weights(signal: Signal) -> Iterable[tuple[float, float]]:
+    def weights(signal: DelayedSignal) -> Iterable[tuple[float, float]]:
         if not is_difference(model):
             return [(signal.delay, 1.0)]
         updated = equation is None or signal.kind == "input" or signal.delay == 0.0
@@ -241,15 +274,15 @@ def _reader(identified: Identified, equation: int | None) -> Callable[[Affine, s
             at = [state.name for state in model.states].index(signal.name)
             updated = model.order.index(at) < model.order.index(equation or 0)
         finished = 0 if equation is None else 1
-        found = taps(identified, signal, finished=finished, updated=updated)
+        found = compute_taps(identified, signal, finished=finished, updated=updated)
         return [(float(back), weight) for back, weight in found.items()]
 
-    def read(form: Affine, kind: str, name: str) -> Quasi:
-        found: Quasi = {}
+    def read(form: AffineForm, kind: str, name: str) -> QuasiPolynomial:
+        found: QuasiPolynomial = {}
         for signal, coefficient in form.terms.items():
             if (signal.kind, signal.name) == (kind, name):
                 parts = {(0, delay): weight * coefficient for delay, weight in weights(signal)}
-                found = added(found, parts)
+                found = add_polynomials(found, parts)
         return found
 
     return read

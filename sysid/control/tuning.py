@@ -12,31 +12,38 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from sysid.control.controllers import LARGEST, Transport
-from sysid.control.linear_form import Identified, NotLinear
-from sysid.control.transfer import Quasi, Transfer, by_delay, transfers
+from sysid.control.controllers import LARGEST_NUMBER, Transport
+from sysid.control.linear_form import IdentifiedModel, NotLinear
+from sysid.control.transfer import (
+    QuasiPolynomial,
+    TransferFunction,
+    compute_transfer_functions,
+    group_by_delay,
+)
 from sysid.core.errors import InvalidSettings
 from sysid.core.types import ComplexArray
 from sysid.kernels.reads import is_difference
 
-Rule = Literal["simc", "amigo"]
-Kind = Literal["PI", "PID"]
-RULES: tuple[Rule, ...] = get_args(Rule)
-CONTROLLERS: tuple[Kind, ...] = get_args(Kind)
+TuningRule = Literal["simc", "amigo"]
+ControllerKind = Literal["PI", "PID"]
+RULES: tuple[TuningRule, ...] = get_args(TuningRule)
+CONTROLLERS: tuple[ControllerKind, ...] = get_args(ControllerKind)
 
-REFERENCES: Mapping[Rule, str] = {
+REFERENCES: Mapping[TuningRule, str] = {
     "simc": "S. Skogestad, Simple analytic rules for model reduction and PID controller tuning, "
     "J. Process Control 13 (2003) 291-309",
     "amigo": "K. J. Åström and T. Hägglund, Revisiting the Ziegler-Nichols step response method "
     "for PID control, J. Process Control 14 (2004) 635-650",
 }
-_SAME = 1e-6  # of a root: a zero so close to a pole takes it away
-_AT_ZERO = 1e-9  # of the fastest root: a pole there integrates
-_REAL = 1e-3  # of a root: the parts of a fourfold pole are less far apart by rounding
+_CANCELLATION_TOLERANCE = 1e-6  # of a root: a zero so close to a pole takes it away
+_INTEGRATOR_TOLERANCE = 1e-9  # of the fastest root: a pole there integrates
+_REAL_POLE_TOLERANCE = (
+    1e-3  # of a root: the parts of a fourfold pole are less far apart by rounding
+)
 
 
 @dataclass(frozen=True, slots=True)
-class Process:
+class ProcessModel:
     """k e^(-θs)/((T1 s + 1)(T2 s + 1)), or k' e^(-θs)/(s (T2 s + 1)).
 
     Attributes
@@ -57,7 +64,7 @@ class Process:
     second_time_constant: float = 0.0
 
     @property
-    def rate(self) -> float:
+    def initial_slope(self) -> float:
         """k/T1, or k': what the slope of the step response begins with."""
         return self.gain / self.time_constant if isfinite(self.time_constant) else self.gain
 
@@ -77,12 +84,12 @@ class Tuning:
     formulas : tuple of str
     """
 
-    rule: Rule
-    controller: Kind
+    rule: TuningRule
+    controller: ControllerKind
     gain: float
     integral_time: float
     derivative_time: float
-    process: Process
+    process: ProcessModel
     closed_loop_time_constant: float | None
     formulas: tuple[str, ...]
 
@@ -92,9 +99,9 @@ class Tuning:
         return REFERENCES[self.rule]
 
 
-def tuned(
-    identified: Identified, input: str, output: str, *, rule: Rule = "simc",
-    controller: Kind = "PI", closed_loop_time_constant: float | None = None,
+def tune_controller(
+    identified: IdentifiedModel, input: str, output: str, *, rule: TuningRule = "simc",
+    controller: ControllerKind = "PI", closed_loop_time_constant: float | None = None,
     transport: Transport | None = None,
 ) -> Tuning:  # fmt: skip
     """A controller of one output by one input by a rule.
@@ -119,21 +126,21 @@ def tuned(
         raise InvalidSettings(
             "/tuning/closed_loop_time_constant", f"rule {rule!r} has none; leave it out"
         )
-    factors = factors_of(identified, input, output, transport)
-    process = factors.reduced(2 if controller == "PID" and rule == "simc" else 1)
+    factors = factor_transfer_function(identified, input, output, transport)
+    process = factors.reduce_order(2 if controller == "PID" and rule == "simc" else 1)
     try:
         found = (
-            _amigo(process, controller) if rule == "amigo"
-            else _simc(process, controller, closed_loop_time_constant)
+            _tune_amigo(process, controller) if rule == "amigo"
+            else _tune_simc(process, controller, closed_loop_time_constant)
         )  # fmt: skip
     except ZeroDivisionError:  # of numbers whose product is too small to be one
-        raise _refusal(_no_gain(inf, process)) from None
-    if not 0.0 < abs(found.gain) < LARGEST:
-        raise _refusal(_no_gain(found.gain, process))
+        raise _make_refusal(_describe_impossible_gain(inf, process)) from None
+    if not 0.0 < abs(found.gain) < LARGEST_NUMBER:
+        raise _make_refusal(_describe_impossible_gain(found.gain, process))
     return found
 
 
-def _no_gain(found: float, process: Process) -> str:
+def _describe_impossible_gain(found: float, process: ProcessModel) -> str:
     return (
         f"the rule gives a gain of {found:g}, which no controller can have; the process has a gain "
         f"of {process.gain:g} and a dead time of {process.delay:g} s"
@@ -141,30 +148,30 @@ def _no_gain(found: float, process: Process) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Factors:
+class TransferFactors:
     """gain · e^(-delay s) / Π (T s + 1), over s where it integrates."""
 
     gain: float
     delay: float
     time_constants: tuple[float, ...]
-    integrates: bool
+    is_integrating: bool
 
-    def reduced(self, order: int) -> Process:
+    def reduce_order(self, order: int) -> ProcessModel:
         """The process of first or second order by the half rule."""
-        times = [inf, *self.time_constants] if self.integrates else list(self.time_constants)
+        times = [inf, *self.time_constants] if self.is_integrating else list(self.time_constants)
         times += [0.0] * (order + 1 - len(times))
         kept, lost = times[:order], times[order:]
         half = lost[0] / 2
         last = kept[-1] + half
         delay = self.delay + half + sum(lost[1:])
         if order == 1:
-            return Process(self.gain, delay, last)
-        return Process(self.gain, delay, kept[0], last)
+            return ProcessModel(self.gain, delay, last)
+        return ProcessModel(self.gain, delay, kept[0], last)
 
 
-def factors_of(
-    identified: Identified, input: str, output: str, transport: Transport | None
-) -> Factors:
+def factor_transfer_function(
+    identified: IdentifiedModel, input: str, output: str, transport: Transport | None
+) -> TransferFactors:
     """The transfer function from the controller to the output as gain, lags and dead time.
 
     Raises
@@ -173,36 +180,44 @@ def factors_of(
         If it is not of that form.
     """
     if is_difference(identified.model):
-        raise _refusal(
+        raise _make_refusal(
             "a tuning rule needs a model in the differential form; this one is a recursion, so "
             "give gain, integral_time and derivative_time yourself"
         )
     try:
-        pairs = transfers(identified).pairs
+        pairs = compute_transfer_functions(identified).pairs
     except NotLinear as error:
-        raise _refusal(f"a tuning rule needs a linear model: {error}") from None
+        raise _make_refusal(f"a tuning rule needs a linear model: {error}") from None
     [pair] = [one for one in pairs if (one.input, one.output) == (input, output)]
-    return _factors(pair, transport or Transport())
+    return _factor_pair(pair, transport or Transport())
 
 
-def _factors(pair: Transfer, transport: Transport) -> Factors:
+def _factor_pair(pair: TransferFunction, transport: Transport) -> TransferFactors:
     if not pair.numerator or transport.gain == 0.0:
-        raise _refusal(f"{pair.input!r} has no effect on {pair.output!r}")
-    delay, above = _one_delay(pair.numerator, "the model has more than one dead time in a row")
-    _, below = _one_delay(pair.denominator, "the model has a dead time inside a loop of its own")
-    zeros, poles = _without_common(_roots(above), _roots(below))
+        raise _make_refusal(f"{pair.input!r} has no effect on {pair.output!r}")
+    delay, above = _require_single_delay(
+        pair.numerator, "the model has more than one dead time in a row"
+    )
+    _, below = _require_single_delay(
+        pair.denominator, "the model has a dead time inside a loop of its own"
+    )
+    zeros, poles = _cancel_common_roots(_find_roots(above), _find_roots(below))
     if zeros.size:
         where = ", ".join(f"{zero:.4g}" for zero in np.sort_complex(zeros))
-        raise _refusal(f"the model has a zero at s = {where}; the rules are of models without one")
+        raise _make_refusal(
+            f"the model has a zero at s = {where}; the rules are of models without one"
+        )
     scale = max((abs(pole) for pole in poles), default=0.0)
-    integrators = [pole for pole in poles if abs(pole) <= _AT_ZERO * scale or pole == 0]
-    others = [pole for pole in poles if abs(pole) > _AT_ZERO * scale and pole != 0]
+    integrators = [
+        pole for pole in poles if abs(pole) <= _INTEGRATOR_TOLERANCE * scale or pole == 0
+    ]
+    others = [pole for pole in poles if abs(pole) > _INTEGRATOR_TOLERANCE * scale and pole != 0]
     if len(integrators) > 1:
-        raise _refusal("the model integrates twice; the rules are of models that do so once")
-    if any(pole.real > 0 for pole in others):
-        raise _refusal("the model is unstable by itself; the rules are of stable models")
-    if any(abs(pole.imag) > _REAL * abs(pole) for pole in others):
-        raise _refusal(
+        raise _make_refusal("the model integrates twice; the rules are of models that do so once")
+    if any(pole.write_float > 0 for pole in others):
+        raise _make_refusal("the model is unstable by itself; the rules are of stable models")
+    if any(abs(pole.imag) > _REAL_POLE_TOLERANCE * abs(pole) for pole in others):
+        raise _make_refusal(
             "the model oscillates by itself (a pair of complex poles); the rules are of models "
             "with real time constants"
         )
@@ -212,28 +227,34 @@ def _factors(pair: Transfer, transport: Transport) -> Factors:
     if transport.time_constant > 0:
         times.append(transport.time_constant)
     if not times and not integrators:
-        raise _refusal("the model has no time constant; the rules are of models with one")
+        raise _make_refusal("the model has no time constant; the rules are of models with one")
     ordered = tuple(sorted(times, reverse=True))
-    return Factors(gain, delay + transport.delay, ordered, bool(integrators))
+    return TransferFactors(gain, delay + transport.delay, ordered, bool(integrators))
 
 
-def _one_delay(quasi: Quasi, fault: str) -> tuple[float, list[float]]:
-    parts = by_delay(quasi)
+def _require_single_delay(quasi: QuasiPolynomial, fault: str) -> tuple[float, list[float]]:
+    parts = group_by_delay(quasi)
     if len(parts) > 1:
-        raise _refusal(f"{fault}; the rules know one between input and output")
+        raise _make_refusal(f"{fault}; the rules know one between input and output")
     delay, powers = parts[0]
     return delay, powers
 
 
-def _roots(powers: list[float]) -> ComplexArray:
+def _find_roots(powers: list[float]) -> ComplexArray:
     return np.asarray(np.roots(powers), dtype=np.complex128)
 
 
-def _without_common(zeros: ComplexArray, poles: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+def _cancel_common_roots(
+    zeros: ComplexArray, poles: ComplexArray
+) -> tuple[ComplexArray, ComplexArray]:
     """Roots without those that numerator and denominator share: of states that have no effect."""
     left, kept = list(poles), []
     for zero in zeros:
-        near = [i for i, pole in enumerate(left) if abs(pole - zero) <= _SAME * abs(pole)]
+        near = [
+            i
+            for i, pole in enumerate(left)
+            if abs(pole - zero) <= _CANCELLATION_TOLERANCE * abs(pole)
+        ]
         if near:
             left.pop(near[0])
         else:
@@ -241,7 +262,7 @@ def _without_common(zeros: ComplexArray, poles: ComplexArray) -> tuple[ComplexAr
     return np.array(kept, dtype=np.complex128), np.array(left, dtype=np.complex128)
 
 
-def _simc(process: Process, controller: Kind, wanted: float | None) -> Tuning:
+def _tune_simc(process: ProcessModel, controller: ControllerKind, wanted: float | None) -> Tuning:
     theta = process.delay
     if wanted is None and theta == 0.0:
         raise InvalidSettings(
@@ -253,7 +274,7 @@ def _simc(process: Process, controller: Kind, wanted: float | None) -> Tuning:
         raise InvalidSettings(
             "/tuning/closed_loop_time_constant", f"{tau!r} is not a time above 0 s"
         )
-    series_gain = 1.0 / (process.rate * (tau + theta))
+    series_gain = 1.0 / (process.initial_slope * (tau + theta))
     series_time = min(process.time_constant, 4.0 * (tau + theta))
     derivative = process.second_time_constant
     # From the series form, in which the rule is written, to the standard one.
@@ -269,10 +290,10 @@ def _simc(process: Process, controller: Kind, wanted: float | None) -> Tuning:
     )  # fmt: skip
 
 
-def _amigo(process: Process, controller: Kind) -> Tuning:
-    theta, t, rate = process.delay, process.time_constant, process.rate
+def _tune_amigo(process: ProcessModel, controller: ControllerKind) -> Tuning:
+    theta, t, rate = process.delay, process.time_constant, process.initial_slope
     if theta == 0.0:
-        raise _refusal("AMIGO needs a dead time, and the model has none; take rule 'simc'")
+        raise _make_refusal("AMIGO needs a dead time, and the model has none; take rule 'simc'")
     ratio = theta / t  # 0 of an integrating process
     if controller == "PI":
         part = 0.35 - ratio / (1.0 + ratio) ** 2
@@ -295,5 +316,5 @@ def _amigo(process: Process, controller: Kind) -> Tuning:
     return Tuning("amigo", controller, gain, integral, derivative, process, None, formulas)
 
 
-def _refusal(detail: str) -> InvalidSettings:
+def _make_refusal(detail: str) -> InvalidSettings:
     return InvalidSettings("/tuning", detail)

@@ -14,17 +14,17 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
-Kind = Literal["o", "loop"]
+CodeKind = Literal["o", "loop"]
 """Object code of kernels, or loops that Numba compiled."""
 
 _MAGIC = b"lagid-kernel-1\n"
 _DIGEST_SIZE = 32
-_MOST_FILES = 2_000
+_MAX_FILES = 2_000
 """Each update of lagid leaves some fifty behind; those not used for the longest time go."""
-_OURS = re.compile(r"[0-9a-f]{64}\.(o|loop)")
+_CACHE_FILE_NAME = re.compile(r"[0-9a-f]{64}\.(o|loop)")
 _ADVICE = "set LAGID_CACHE_DIR to a folder that this user alone can write to"
 _log = logging.getLogger(__name__)
-_told: list[str] = []
+_logged_reasons: list[str] = []
 
 
 def digest_files(paths: Iterable[Path], root: Path) -> str:
@@ -42,7 +42,7 @@ def digest_files(paths: Iterable[Path], root: Path) -> str:
     return digest.hexdigest()
 
 
-def cache_folder() -> Path:
+def find_cache_folder() -> Path:
     """Folder of compiled code: `LAGID_CACHE_DIR`, or ``~/.cache/lagid``.
 
     Raises
@@ -62,17 +62,17 @@ def cache_folder() -> Path:
         raise OSError("this user has no home folder") from error
 
 
-def _folder(kind: Kind) -> Path:
+def _find_code_folder(kind: CodeKind) -> Path:
     """Where a kind is kept: as Numba's own cache, loops follow `NUMBA_CACHE_DIR` if it is set."""
     chosen = os.environ.get("NUMBA_CACHE_DIR")
-    return Path(chosen) if chosen and kind == "loop" else cache_folder()
+    return Path(chosen) if chosen and kind == "loop" else find_cache_folder()
 
 
-def stored(key: str, kind: Kind = "o") -> bytes | None:
+def load_code(key: str, kind: CodeKind = "o") -> bytes | None:
     """Code kept under a key; None if there is none that can be trusted."""
     name = f"{key}.{kind}"
     try:
-        folder = _folder(kind)
+        folder = _find_code_folder(kind)
         if not _is_private(folder):
             return None
         with (folder / name).open("rb") as file:
@@ -84,48 +84,50 @@ def stored(key: str, kind: Kind = "o") -> bytes | None:
     except OSError:
         return None
     start = len(_MAGIC) + _DIGEST_SIZE
-    if content[:start] == _MAGIC + _digest(name, content[start:]):
+    if content[:start] == _MAGIC + _compute_digest(name, content[start:]):
         return content[start:]
     with contextlib.suppress(OSError):
         (folder / name).unlink()
     return None
 
 
-def store(key: str, code: bytes, kind: Kind = "o") -> None:
+def store_code(key: str, code: bytes, kind: CodeKind = "o") -> None:
     """Keep code under a key, whole or not at all; a folder that cannot be used is no error."""
     folder = None
     try:
-        folder = _folder(kind)
+        folder = _find_code_folder(kind)
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not _is_private(folder):
-            tell(f"{folder} belongs to another user, or others may write to it; {_ADVICE}")
+            warn_not_cached(
+                f"{folder} belongs to another user, or others may write to it; {_ADVICE}"
+            )
             return
-        _write(folder, f"{key}.{kind}", code)
-        _prune(folder)
+        _write_file(folder, f"{key}.{kind}", code)
+        _prune_files(folder)
     except OSError as error:
         why = error if folder is None else f"{folder}: {error.strerror}"
-        tell(f"{why}; {_ADVICE}")
+        warn_not_cached(f"{why}; {_ADVICE}")
 
 
-def _write(folder: Path, name: str, code: bytes) -> None:
+def _write_file(folder: Path, name: str, code: bytes) -> None:
     handle, temporary = tempfile.mkstemp(dir=folder)
     try:
         with os.fdopen(handle, "wb") as file:
-            file.write(_MAGIC + _digest(name, code) + code)
+            file.write(_MAGIC + _compute_digest(name, code) + code)
         os.replace(temporary, folder / name)
     except OSError:
         os.unlink(temporary)
         raise
 
 
-def tell(why: str) -> None:
+def warn_not_cached(why: str) -> None:
     """Log why compiled code is not kept, once in a process."""
-    if not _told:
-        _told.append(why)
+    if not _logged_reasons:
+        _logged_reasons.append(why)
         _log.warning("compiled code is not kept, so every process compiles it anew: %s", why)
 
 
-def _digest(name: str, code: bytes) -> bytes:
+def _compute_digest(name: str, code: bytes) -> bytes:
     return hashlib.sha256(name.encode() + code).digest()
 
 
@@ -141,15 +143,15 @@ def _is_private(folder: Path) -> bool:
     return not _belongs_to_another(status) and not status.st_mode & 0o022
 
 
-def _prune(folder: Path) -> None:
+def _prune_files(folder: Path) -> None:
     """Remove the files beyond the most that are kept; other processes may do so meanwhile."""
-    files = [one.path for one in os.scandir(folder) if _OURS.fullmatch(one.name)]
-    if len(files) <= _MOST_FILES:
+    files = [one.path for one in os.scandir(folder) if _CACHE_FILE_NAME.fullmatch(one.name)]
+    if len(files) <= _MAX_FILES:
         return
     used = []
     for path in files:
         with contextlib.suppress(FileNotFoundError):
             used.append((os.stat(path).st_mtime_ns, path))
-    for _, path in sorted(used)[: len(used) - _MOST_FILES]:
+    for _, path in sorted(used)[: len(used) - _MAX_FILES]:
         with contextlib.suppress(FileNotFoundError):
             os.unlink(path)

@@ -18,7 +18,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-_MOST_NAMES = 30
+_MAX_NAMES = 30
 """Known names that a message lists at most: of datasets there may be thousands."""
 
 
@@ -70,7 +70,7 @@ class UnknownModel(SysidError, LookupError):
     """No built-in model has that name."""
 
     def __init__(self, name: str, known: Iterable[str]) -> None:
-        super().__init__(f"there is no model {name!r}{nearest(name, known)}")
+        super().__init__(f"there is no model {name!r}{suggest_name(name, known)}")
         self.name = name
 
 
@@ -121,15 +121,15 @@ class NothingIdentifiable(SysidError, ValueError):
         )
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def suggest_name(name: str, known: Iterable[str]) -> str:
     """Suggestion to add to a message about an unknown name: the nearest known one, or the first."""
     names = sorted(known)
     close = get_close_matches(name, names, n=1)
     if close:
         return f"; did you mean {close[0]!r}?"
-    left = len(names) - _MOST_NAMES
+    left = len(names) - _MAX_NAMES
     more = f", and {left} more" if left > 0 else ""
-    return f"; known are {', '.join(names[:_MOST_NAMES])}{more}" if names else ""
+    return f"; known are {', '.join(names[:_MAX_NAMES])}{more}" if names else ""
 
 
 def join_pointer(*parts: str | int) -> str:

@@ -21,37 +21,37 @@ import llvmlite
 import numba
 import numpy as np
 
-from sysid.core.code_cache import digest_files, store, stored, tell
+from sysid.core.code_cache import digest_files, load_code, store_code, warn_not_cached
 
-_SOURCES = (
+_SOURCE_PATTERNS = (
     "search/*.py", "islands/*.py", "kernels/*.py", "plants/*.py", "simulation/*.py",
     "uncertainty/sensitivities.py",
 )  # fmt: skip
 _VERSIONS = (numba.__version__, llvmlite.__version__, np.__version__, sys.version)
-_PARTS = 9  # of a compiled function; the last are environments
-_UNEXPECTED = (
+_REDUCED_PARTS = 9  # of a compiled function; the last are environments
+_CACHE_ERRORS = (
     ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError,
     OSError, RuntimeError, TypeError, ValueError, pickle.PickleError,
 )  # fmt: skip
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def _digest_of_sources() -> str:
+def _digest_sources() -> str:
     package = Path(__file__).parents[1]
-    return digest_files((f for pattern in _SOURCES for f in package.glob(pattern)), package)
+    return digest_files((f for pattern in _SOURCE_PATTERNS for f in package.glob(pattern)), package)
 
 
 # Read before any module with a compiled function is loaded, all of which load this one first.
-_AT_START = _digest_of_sources()
+_SOURCES_DIGEST = _digest_sources()
 
 
-def fingerprint() -> str:
+def get_sources_digest() -> str:
     """Digest of the sources of all compiled functions, as this process began with them."""
-    return _AT_START
+    return _SOURCES_DIGEST
 
 
 @cache
-def _digest_of(source: str) -> str | None:
+def _digest_file(source: str) -> str | None:
     """Digest of a file, None if there is none."""
     try:
         return digest_files([Path(source)], Path(source).parent)
@@ -59,7 +59,7 @@ def _digest_of(source: str) -> str | None:
         return None
 
 
-class _Kept:
+class _FunctionCache:
     """What Numba asks of the cache of one function, by its dispatcher."""
 
     cache_path = None
@@ -67,15 +67,15 @@ class _Kept:
     def __init__(self, function: Callable[..., Any]) -> None:
         self._code = function.__code__
         self._name = f"{function.__module__}.{function.__qualname__}"
-        self._source = _digest_of(self._code.co_filename)
+        self._source = _digest_file(self._code.co_filename)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The function for some types of arguments, None if none is kept that can be used."""
         try:
-            content = stored(self._key(sig, target_context), "loop")
-            return None if content is None else _rebuilt(content, target_context)
-        except _UNEXPECTED as error:
-            tell(f"{self._name} is not loaded ({error!r})")
+            content = load_code(self._compute_key(sig, target_context), "loop")
+            return None if content is None else _rebuild_function(content, target_context)
+        except _CACHE_ERRORS as error:
+            warn_not_cached(f"{self._name} is not loaded ({error!r})")
             return None
 
     def save_overload(self, sig: Any, compiled_: Any) -> None:
@@ -85,27 +85,31 @@ class _Kept:
         have loaded some of them before and some after, and the others take what lies here.
         """
         try:
-            if _digest_of_sources() != _AT_START:
-                tell(f"{self._name}: sources have changed since this process began")
+            if _digest_sources() != _SOURCES_DIGEST:
+                warn_not_cached(f"{self._name}: sources have changed since this process began")
             elif not compiled_.library.has_dynamic_globals:
-                store(self._key(sig, compiled_.target_context), _reduced(compiled_), "loop")
-        except _UNEXPECTED as error:
-            tell(f"{self._name} is not saved ({error!r})")
+                store_code(
+                    self._compute_key(sig, compiled_.target_context),
+                    _serialize_function(compiled_),
+                    "loop",
+                )
+        except _CACHE_ERRORS as error:
+            warn_not_cached(f"{self._name} is not saved ({error!r})")
 
     def flush(self) -> None:
         """Nothing: what is compiled anew replaces what was kept."""
 
-    def _key(self, sig: Any, target_context: Any) -> str:
+    def _compute_key(self, sig: Any, target_context: Any) -> str:
         if self._source is None:
             raise OSError(f"{self._code.co_filename} cannot be read")
         parts = (
-            fingerprint(), _VERSIONS, target_context.codegen().magic_tuple(), self._name,
+            get_sources_digest(), _VERSIONS, target_context.codegen().magic_tuple(), self._name,
             self._code.co_firstlineno, self._source, str(sig),
         )  # fmt: skip
         return sha256(repr(parts).encode()).hexdigest()
 
 
-def _reduced(compiled_: Any) -> bytes:
+def _serialize_function(compiled_: Any) -> bytes:
     """The function without empty environments of others, and the names that it defines.
 
     An environment holds a function's Python constants, and to make it again imports the
@@ -114,7 +118,7 @@ def _reduced(compiled_: Any) -> bytes:
     from numba.core.serialize import dumps
 
     parts = compiled_._reduce()
-    if len(parts) == _PARTS:
+    if len(parts) == _REDUCED_PARTS:
         parts = (*parts[:-1], tuple(one for one in parts[-1] if one.consts))
     module = compiled_.library._get_module_for_linking()
     defined = (*module.functions, *module.global_variables)
@@ -122,7 +126,7 @@ def _reduced(compiled_: Any) -> bytes:
     return bytes(dumps((names, *parts)))  # type: ignore[no-untyped-call]
 
 
-def _rebuilt(content: bytes, target_context: Any) -> Any:
+def _rebuild_function(content: bytes, target_context: Any) -> Any:
     """The function in this process.
 
     Numba's own cache first registers all that could be compiled, a quarter of a second; what is
@@ -147,11 +151,11 @@ def _rebuilt(content: bytes, target_context: Any) -> Any:
     target_context.codegen()._engine._defined_symbols.update(names)
     without = (name, kind, (machine_code, parse_assembly("").as_bitcode()))
     rebuilt = inside._rebuild(target_context, without, *others)
-    rebuilt.library._get_module_for_linking = partial(_linked, rebuilt.library, bitcode)
+    rebuilt.library._get_module_for_linking = partial(_link_module, rebuilt.library, bitcode)
     return rebuilt
 
 
-def _linked(library: Any, bitcode: bytes) -> Any:
+def _link_module(library: Any, bitcode: bytes) -> Any:
     """The module of a loaded function, read where another is compiled that calls it."""
     from llvmlite.binding import parse_bitcode
 
@@ -160,14 +164,16 @@ def _linked(library: Any, bitcode: bytes) -> Any:
     return library._shared_module
 
 
-def compiled(function: _Function) -> _Function:
+def jit_compile(function: _Function) -> _Function:
     """Compile with Numba: cached on disk, the GIL released, division as in IEEE 754.
 
     No `fastmath`: ``isfinite`` must work, and a run must give the same bits on every worker.
     """
     made: Any = numba.njit(nogil=True, error_model="numpy")(function)
     if hasattr(made, "_cache"):
-        made._cache = _Kept(function)
+        made._cache = _FunctionCache(function)
     elif made is not function:  # as it is where NUMBA_DISABLE_JIT is set
-        tell(f"Numba {numba.__version__} keeps no cache of functions where it is looked for")
+        warn_not_cached(
+            f"Numba {numba.__version__} keeps no cache of functions where it is looked for"
+        )
     return cast(_Function, made)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.types import RANK, BoolArray, FloatArray
+from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 
 
 class TruncatedSvd(NamedTuple):
@@ -23,5 +23,5 @@ def truncated_svd(columns: FloatArray) -> TruncatedSvd:
     """Singular value decomposition of columns (N, D)."""
     left, singular, rows = np.linalg.svd(columns, full_matrices=False)
     return TruncatedSvd(
-        left, singular, rows, singular > RANK * max(singular[0], np.finfo(float).tiny)
+        left, singular, rows, singular > RANK_TOLERANCE * max(singular[0], np.finfo(float).tiny)
     )

@@ -13,13 +13,13 @@ from sysid.core.errors import InvalidSettings
 SearchMethod = Literal["simple", "improved-paper", "improved"]
 TopologyName = Literal["one-way-ring", "ring", "fully-connected", "star", "unconnected"]
 SequenceKind = Literal["paper", "adaptive"]
-Prediction = Literal["simulation", "one-step"]
+PredictionKind = Literal["simulation", "one-step"]
 LossKind = Literal["squares", "soft-l1"]
 NoiseModel = Literal["auto", "white", "ar1"]
-METHODS: tuple[SearchMethod, ...] = get_args(SearchMethod)
+SEARCH_METHODS: tuple[SearchMethod, ...] = get_args(SearchMethod)
 TOPOLOGIES: tuple[TopologyName, ...] = get_args(TopologyName)
 SEQUENCE_KINDS: tuple[SequenceKind, ...] = get_args(SequenceKind)
-PREDICTION_KINDS: tuple[Prediction, ...] = get_args(Prediction)
+PREDICTION_KINDS: tuple[PredictionKind, ...] = get_args(PredictionKind)
 LOSS_KINDS: tuple[LossKind, ...] = get_args(LossKind)
 NOISE_MODELS: tuple[NoiseModel, ...] = get_args(NoiseModel)
 MIN_POPULATION = 4
@@ -27,9 +27,9 @@ MIN_POPULATION = 4
 MAX_BITS = 32
 """Bits of a coded parameter at most."""
 # What the compiled search counts in 64 bits, with room to add; no run of years comes near them.
-MOST_GENERATIONS = 10**9
-MOST_EVALUATIONS = 10**12
-Schedule = tuple[tuple[int, float], ...]
+MAX_GENERATIONS = 10**9
+MAX_EVALUATIONS = 10**12
+MutationSchedule = tuple[tuple[int, float], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +62,8 @@ class Migration:
         _require_count(self.every, "migration/every")
         _require(self.topology in TOPOLOGIES, "migration/topology", self.topology,
                  ", ".join(TOPOLOGIES))  # fmt: skip
-        _require(0 <= self.migrants <= MOST_GENERATIONS, "migration/migrants", self.migrants,
-                 f"0 to {MOST_GENERATIONS}")  # fmt: skip
+        _require(0 <= self.migrants <= MAX_GENERATIONS, "migration/migrants", self.migrants,
+                 f"0 to {MAX_GENERATIONS}")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +87,8 @@ class Stop:
         for name in ("evaluations", "seconds", "rms", "settled"):
             value = getattr(self, name)
             _require(value is None or value > 0, f"stop/{name}", value, "positive")
-        _require(self.evaluations is None or self.evaluations <= MOST_EVALUATIONS,
-                 "stop/evaluations", self.evaluations, f"1 to {MOST_EVALUATIONS}")  # fmt: skip
+        _require(self.evaluations is None or self.evaluations <= MAX_EVALUATIONS,
+                 "stop/evaluations", self.evaluations, f"1 to {MAX_EVALUATIONS}")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ class IslandChange:
 
     method: SearchMethod | None = None
     bits: int | None = None
-    mutation: Schedule | None = None
+    mutation: MutationSchedule | None = None
 
     def __post_init__(self) -> None:
         if self.mutation is not None:
@@ -128,7 +128,7 @@ class GeneticAlgorithm:
     generations: int = 400
     bits: int = 24
     selection_rate: float = 0.5
-    mutation: Schedule = ((0, 0.2), (50, 0.8))
+    mutation: MutationSchedule = ((0, 0.2), (50, 0.8))
     stagnation: int = 30
     sequence: SequenceSearch = field(default_factory=SequenceSearch)
     islands: int | tuple[IslandChange, ...] | None = None
@@ -138,7 +138,7 @@ class GeneticAlgorithm:
     stop: Stop = field(default_factory=Stop)
 
     def __post_init__(self) -> None:
-        _require(self.method in METHODS, "method", self.method, ", ".join(METHODS))
+        _require(self.method in SEARCH_METHODS, "method", self.method, ", ".join(SEARCH_METHODS))
         _require(self.population >= MIN_POPULATION, "population", self.population,
                  f"{MIN_POPULATION} or more")  # fmt: skip
         _require_count(self.generations, "generations")
@@ -216,7 +216,7 @@ class FitSettings:
     """
 
     parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    prediction: Prediction = "simulation"
+    prediction: PredictionKind = "simulation"
     loss: Loss = field(default_factory=Loss)
     weights: Mapping[str, float] | None = None
     skip: int = 0
@@ -247,17 +247,17 @@ def _require(holds: bool, pointer: str, found: object, right: str) -> None:
 
 
 def _require_count(found: int, pointer: str) -> None:
-    _require(1 <= found <= MOST_GENERATIONS, pointer, found, f"1 to {MOST_GENERATIONS}")
+    _require(1 <= found <= MAX_GENERATIONS, pointer, found, f"1 to {MAX_GENERATIONS}")
 
 
-def _require_schedule(found: Schedule, pointer: str) -> None:
+def _require_schedule(found: MutationSchedule, pointer: str) -> None:
     generations = [generation for generation, _ in found]
     holds = (
-        bool(generations) and generations[0] == 0 and generations[-1] <= MOST_GENERATIONS
+        bool(generations) and generations[0] == 0 and generations[-1] <= MAX_GENERATIONS
         and generations == sorted(set(generations))
         and all(0 <= rate <= 1 for _, rate in found)
     )  # fmt: skip
-    right = f"[generation, rate] pairs from generation 0 up to {MOST_GENERATIONS}, rates 0 to 1"
+    right = f"[generation, rate] pairs from generation 0 up to {MAX_GENERATIONS}, rates 0 to 1"
     _require(holds, pointer, found, right)
 
 

@@ -19,7 +19,7 @@ WordArray: TypeAlias = NDArray[np.uint32]
 Interval: TypeAlias = tuple[float, float]
 """Lower and upper end."""
 
-RANK = 1e-7  # of the largest singular value: below, the differences are rounding
+RANK_TOLERANCE = 1e-7  # of the largest singular value: below, the differences are rounding
 
 
 def make_record_dtype(fields: type) -> np.dtype[Any]:

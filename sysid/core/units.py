@@ -17,31 +17,33 @@ from functools import lru_cache
 from math import pi
 from typing import NamedTuple
 
-_Powers = tuple[int, int, int, int, int, int, int]
-_NONE: _Powers = (0, 0, 0, 0, 0, 0, 0)  # of m, kg, s, A, K, mol, cd
+_BasePowers = tuple[int, int, int, int, int, int, int]
+_DIMENSIONLESS: _BasePowers = (0, 0, 0, 0, 0, 0, 0)  # of m, kg, s, A, K, mol, cd
 
-_BLANK = ("", "1", "-", "–")
-_LONGEST = 80  # characters of a text that is looked at
-_FARTHEST = 1e300  # a factor beyond it, or its inverse, is none
+_BLANK_UNITS = ("", "1", "-", "–")
+_MAX_CHARACTERS = 80  # characters of a text that is looked at
+_MAX_FACTOR = 1e300  # a factor beyond it, or its inverse, is none
 
 
 class _Unit(NamedTuple):
-    """`factor` base units.
+    """`find_conversion_factor` base units.
 
     `pi` is the power of π in it, so that factors stay exact; `around` are those of radians,
     revolutions and hertz; `scale` names a unit with an offset.
     """
 
-    powers: _Powers
+    powers: _BasePowers
     factor: Fraction = Fraction(1)
     pi: int = 0
-    around: tuple[int, int, int] = (0, 0, 0)
-    scale: str = ""
+    angle_powers: tuple[int, int, int] = (0, 0, 0)
+    offset_scale: str = ""
 
-    def times(self, other: "_Unit", power: int) -> "_Unit":
+    def multiply_power(self, other: "_Unit", power: int) -> "_Unit":
         """Multiply by a power of another."""
         powers = tuple(a + power * b for a, b in zip(self.powers, other.powers, strict=True))
-        around = tuple(a + power * b for a, b in zip(self.around, other.around, strict=True))
+        around = tuple(
+            a + power * b for a, b in zip(self.angle_powers, other.angle_powers, strict=True)
+        )
         return _Unit(
             powers,  # type: ignore[arg-type]
             self.factor * other.factor**power,
@@ -59,7 +61,7 @@ _PREFIXED = {
     "K": _Unit((0, 0, 0, 0, 1, 0, 0)),
     "mol": _Unit((0, 0, 0, 0, 0, 1, 0)),
     "cd": _Unit((0, 0, 0, 0, 0, 0, 1)),
-    "Hz": _Unit((0, 0, -1, 0, 0, 0, 0), around=_HERTZ),
+    "Hz": _Unit((0, 0, -1, 0, 0, 0, 0), angle_powers=_HERTZ),
     "N": _Unit((1, 1, -2, 0, 0, 0, 0)),
     "Pa": _Unit((-1, 1, -2, 0, 0, 0, 0)),
     "bar": _Unit((-1, 1, -2, 0, 0, 0, 0), Fraction(100_000)),
@@ -75,7 +77,7 @@ _PREFIXED = {
     "H": _Unit((2, 1, -2, -2, 0, 0, 0)),
     "L": _Unit((3, 0, 0, 0, 0, 0, 0), Fraction(1, 1000)),
     "l": _Unit((3, 0, 0, 0, 0, 0, 0), Fraction(1, 1000)),
-    "rad": _Unit(_NONE, around=_RADIANS),
+    "rad": _Unit(_DIMENSIONLESS, angle_powers=_RADIANS),
     "S": _Unit((-2, -1, 3, 2, 0, 0, 0)),
     "Wb": _Unit((2, 1, -2, -1, 0, 0, 0)),
     "sec": _Unit((0, 0, 1, 0, 0, 0, 0)),
@@ -86,14 +88,14 @@ _PREFIXED = {
     "Ah": _Unit((0, 0, 1, 1, 0, 0, 0), Fraction(3600)),
     "Vs": _Unit((2, 1, -2, -1, 0, 0, 0)),
 }
-_ALONE = {
-    "deg": _Unit(_NONE, Fraction(1, 180), 1, _RADIANS),
-    "°": _Unit(_NONE, Fraction(1, 180), 1, _RADIANS),
-    "rev": _Unit(_NONE, around=_REVOLUTIONS),
-    "rpm": _Unit((0, 0, -1, 0, 0, 0, 0), Fraction(1, 60), around=_REVOLUTIONS),
-    "RPM": _Unit((0, 0, -1, 0, 0, 0, 0), Fraction(1, 60), around=_REVOLUTIONS),
-    "rps": _Unit((0, 0, -1, 0, 0, 0, 0), around=_REVOLUTIONS),
-    "%": _Unit(_NONE, Fraction(1, 100)),
+_UNPREFIXED = {
+    "deg": _Unit(_DIMENSIONLESS, Fraction(1, 180), 1, _RADIANS),
+    "°": _Unit(_DIMENSIONLESS, Fraction(1, 180), 1, _RADIANS),
+    "rev": _Unit(_DIMENSIONLESS, angle_powers=_REVOLUTIONS),
+    "rpm": _Unit((0, 0, -1, 0, 0, 0, 0), Fraction(1, 60), angle_powers=_REVOLUTIONS),
+    "RPM": _Unit((0, 0, -1, 0, 0, 0, 0), Fraction(1, 60), angle_powers=_REVOLUTIONS),
+    "rps": _Unit((0, 0, -1, 0, 0, 0, 0), angle_powers=_REVOLUTIONS),
+    "%": _Unit(_DIMENSIONLESS, Fraction(1, 100)),
     "min": _Unit((0, 0, 1, 0, 0, 0, 0), Fraction(60)),
     "h": _Unit((0, 0, 1, 0, 0, 0, 0), Fraction(3600)),
     "hr": _Unit((0, 0, 1, 0, 0, 0, 0), Fraction(3600)),
@@ -111,31 +113,31 @@ _ALONE = {
     "mph": _Unit((1, 0, -1, 0, 0, 0, 0), Fraction(44_704, 10**5)),
     "d": _Unit((0, 0, 1, 0, 0, 0, 0), Fraction(86_400)),
     "day": _Unit((0, 0, 1, 0, 0, 0, 0), Fraction(86_400)),
-    "ppm": _Unit(_NONE, Fraction(1, 10**6)),
-    "ppb": _Unit(_NONE, Fraction(1, 10**9)),
+    "ppm": _Unit(_DIMENSIONLESS, Fraction(1, 10**6)),
+    "ppb": _Unit(_DIMENSIONLESS, Fraction(1, 10**9)),
 }
 _PREFIXES = {"p": -12, "n": -9, "µ": -6, "u": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3,
              "M": 6, "G": 9, "T": 12}  # fmt: skip
 
-_SCALES = {
+_OFFSET_SCALES = {
     "°C": "°C", "℃": "°C", "degC": "°C", "Celsius": "°C", "celsius": "°C",
     "°F": "°F", "℉": "°F", "degF": "°F", "Fahrenheit": "°F", "fahrenheit": "°F",
 }  # fmt: skip
 
-_OPEN = ("dB", "dBm", "pH", "count", "counts", "px")
+_UNCONVERTIBLE = ("dB", "dBm", "pH", "count", "counts", "px")
 """Units that many have and no factor leads to: known, and compared with nothing."""
 
-_SPELLED = {
+_SPELLED_OUT = {
     "second": "s", "minute": "min", "hour": "h", "metre": "m", "meter": "m", "gram": "g",
     "ampere": "A", "amp": "A", "volt": "V", "watt": "W", "joule": "J", "newton": "N",
     "pascal": "Pa", "bars": "bar", "hertz": "Hz", "kelvin": "K", "liter": "L", "litre": "L",
     "degree": "deg", "radian": "rad", "percent": "%", "pct": "%", "foot": "ft", "feet": "ft",
     "mol": "mol", "mole": "mol", "none": "1", "unitless": "1", "dimensionless": "1",
 }  # fmt: skip
-_COMMON = "µmckMh"  # prefixes of what is suggested
-_CLOSE = 0.6  # of the letters of a name, for which another is suggested
+_COMMON_PREFIXES = "µmckMh"  # prefixes of what is suggested
+_MIN_LIKENESS = 0.6  # of the letters of a name, for which another is suggested
 
-_RAISED = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+_SUPERSCRIPTS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _TOKEN = re.compile(
     r"\s*(?:(?P<name>[A-Za-zµΩ]+|°(?!\s*[A-Za-zµΩ])|%)"
     r"|(?P<power>(?:\^|\*\*)\s*[-−]?\d{1,2}|[⁻]?[⁰¹²³⁴⁵⁶⁷⁸⁹]{1,2}"
@@ -144,9 +146,9 @@ _TOKEN = re.compile(
 )
 
 
-def is_blank(unit: str | None) -> bool:
+def is_blank_unit(unit: str | None) -> bool:
     """Whether nothing is said by it: a channel without a unit, or a plain number."""
-    return unit is None or unit.strip() in _BLANK
+    return unit is None or unit.strip() in _BLANK_UNITS
 
 
 def format_unit(unit: str) -> str:
@@ -154,98 +156,104 @@ def format_unit(unit: str) -> str:
     return "" if unit in ("", "1") else f" {unit}"
 
 
-def is_read(unit: str) -> bool:
+def is_readable_unit(unit: str) -> bool:
     """Whether it is known what a unit means."""
-    return _read(unit) is not None
+    return _parse_unit(unit) is not None
 
 
-def is_known(unit: str) -> bool:
+def is_known_unit(unit: str) -> bool:
     """Whether a unit can be read, or is one of those that no factor leads to, such as ``dB``."""
-    return unit.strip() in _OPEN or is_read(unit)
+    return unit.strip() in _UNCONVERTIBLE or is_readable_unit(unit)
 
 
-def factor(unit: str, other: str) -> float | None:
+def find_conversion_factor(unit: str, other: str) -> float | None:
     """By what a value in `unit` is multiplied to be in `other`; None if no such number is known.
 
     Two equal texts give 1, whatever they mean.
     """
     if unit.strip() == other.strip():
         return 1.0
-    a, b = _read(unit), _read(other)
-    if a is None or b is None or not _are_of_a_kind(a, b):
+    a, b = _parse_unit(unit), _parse_unit(other)
+    if a is None or b is None or not _have_same_dimension(a, b):
         return None
-    turned = _radians_of_revolutions(a, b)
+    turned = _count_revolutions(a, b)
     if turned is None:
         return None
     try:
         times = float(a.factor / b.factor * Fraction(2) ** turned) * pi ** (a.pi - b.pi + turned)
     except OverflowError:
         return None
-    return times if 1 / _FARTHEST < times < _FARTHEST else None
+    return times if 1 / _MAX_FACTOR < times < _MAX_FACTOR else None
 
 
-def difference(unit: str | None, other: str | None) -> str:
+def describe_difference(unit: str | None, other: str | None) -> str:
     """What to say of two units that are not one: empty where they are, or where they may be.
 
     They may where one is blank, or cannot be read.
     """
-    if unit is None or other is None or is_blank(unit) or is_blank(other):
+    if unit is None or other is None or is_blank_unit(unit) or is_blank_unit(other):
         return ""
-    times = factor(unit, other)
+    times = find_conversion_factor(unit, other)
     if times == 1.0:
         return ""
     if times is not None:
         return f"1 {unit} is {times:.12g} {other}"
-    a, b = _read(unit), _read(other)
+    a, b = _parse_unit(unit), _parse_unit(other)
     if a is None or b is None:
         return ""
-    if _are_of_a_kind(a, b) and _radians_of_revolutions(a, b) is None:
+    if _have_same_dimension(a, b) and _count_revolutions(a, b) is None:
         return f"between {unit} and {other} it is open whether cycles or radians are meant"
     return f"{unit} is not {other}, and no number makes one of the other"
 
 
-def multiplied(unit: str, other: str) -> str:
+def multiply_units(unit: str, other: str) -> str:
     """Product of two units as a text; of a number without dimension the other one."""
     return other if unit in ("1", "") else f"{unit}·{other}"
 
 
-def suggestion(unit: str) -> str:
+def suggest_unit(unit: str) -> str:
     """What may be meant by a text that is no known unit, to be added to a message about it.
 
     Empty of a known unit, and where none is written alike.
     """
-    if is_known(unit):
+    if is_known_unit(unit):
         return ""
-    parts = re.split(r"([A-Za-zµΩ]+)", unit[:_LONGEST].strip())
-    names = [part if at % 2 == 0 or _named(part) else _nearest(part)
+    parts = re.split(r"([A-Za-zµΩ]+)", unit[:_MAX_CHARACTERS].strip())
+    names = [part if at % 2 == 0 or _find_named_unit(part) else _find_nearest_unit(part)
              for at, part in enumerate(parts)]  # fmt: skip
     meant = "".join(names)
-    return f"; did you mean {meant!r}?" if meant and is_read(meant) else ""
+    return f"; did you mean {meant!r}?" if meant and is_readable_unit(meant) else ""
 
 
-def _nearest(name: str) -> str:
+def _find_nearest_unit(name: str) -> str:
     """The known unit whose symbol is written most alike; empty if none is."""
     spelled = name.lower()
-    if found := _SPELLED.get(spelled) or _SPELLED.get(spelled.removesuffix("s")):
+    if found := _SPELLED_OUT.get(spelled) or _SPELLED_OUT.get(spelled.removesuffix("s")):
         return found
-    known = [*_PREFIXED, *_ALONE, *(a + b for b in _PREFIXED for a in _COMMON if len(b) < 4)]
-    best = max(known, key=lambda one: _likeness(name, one))
-    return best if _likeness(name, best)[0] >= _CLOSE else ""
+    known = [
+        *_PREFIXED,
+        *_UNPREFIXED,
+        *(a + b for b in _PREFIXED for a in _COMMON_PREFIXES if len(b) < 4),
+    ]
+    best = max(known, key=lambda one: _measure_likeness(name, one))
+    return best if _measure_likeness(name, best)[0] >= _MIN_LIKENESS else ""
 
 
-def _likeness(name: str, known: str) -> tuple[float, float]:
+def _measure_likeness(name: str, known: str) -> tuple[float, float]:
     """How many letters two names share, whatever their case, and how many in the same case."""
     alike = SequenceMatcher(None, name.lower(), known.lower(), autojunk=False).ratio()
     return alike, SequenceMatcher(None, name, known, autojunk=False).ratio()
 
 
-def _are_of_a_kind(a: _Unit, b: _Unit) -> bool:
-    return a.powers == b.powers and a.scale == b.scale
+def _have_same_dimension(a: _Unit, b: _Unit) -> bool:
+    return a.powers == b.powers and a.offset_scale == b.offset_scale
 
 
-def _radians_of_revolutions(a: _Unit, b: _Unit) -> int | None:
+def _count_revolutions(a: _Unit, b: _Unit) -> int | None:
     """How many revolutions of `a` are radians in `b`, each of 2π; None if that is open."""
-    radians, revolutions, hertz = (x - y for x, y in zip(a.around, b.around, strict=True))
+    radians, revolutions, hertz = (
+        x - y for x, y in zip(a.angle_powers, b.angle_powers, strict=True)
+    )
     if revolutions == -radians and hertz == 0:
         return revolutions
     if radians == 0:
@@ -256,21 +264,21 @@ def _radians_of_revolutions(a: _Unit, b: _Unit) -> int | None:
 
 
 @lru_cache(maxsize=256)
-def _read(text: str) -> _Unit | None:
+def _parse_unit(text: str) -> _Unit | None:
     """The unit that a text means; None if it is no product of powers of known ones."""
-    scale = _SCALES.get(text.replace(" ", ""))
+    scale = _OFFSET_SCALES.get(text.replace(" ", ""))
     if scale is not None:
-        return _Unit(_NONE, scale=scale)
-    tokens = _tokens(text.replace("μ", "µ").replace("Ω", "Ω").strip())
+        return _Unit(_DIMENSIONLESS, offset_scale=scale)
+    tokens = _tokenize_unit(text.replace("μ", "µ").replace("Ω", "Ω").strip())
     if tokens is None:
         return None
-    reader = _Reader(tokens)
-    found = reader.product()
+    reader = _UnitParser(tokens)
+    found = reader.parse_product()
     return None if reader.tokens else found
 
 
-def _tokens(text: str) -> list[tuple[str, str]] | None:
-    if len(text) > _LONGEST:
+def _tokenize_unit(text: str) -> list[tuple[str, str]] | None:
+    if len(text) > _MAX_CHARACTERS:
         return None
     tokens: list[tuple[str, str]] = []
     place = 0
@@ -283,47 +291,47 @@ def _tokens(text: str) -> list[tuple[str, str]] | None:
     return tokens
 
 
-class _Reader:
+class _UnitParser:
     """Products and quotients from left to right: ``m/s·kg`` is ``(m/s)·kg``."""
 
     def __init__(self, tokens: list[tuple[str, str]]) -> None:
         self.tokens = tokens
 
-    def product(self) -> _Unit | None:
+    def parse_product(self) -> _Unit | None:
         """Factors up to a closing parenthesis or the end."""
-        found = self._power()
+        found = self._parse_power()
         while found is not None and self.tokens and self.tokens[0] != ("sign", ")"):
             sign = -1 if self.tokens[0] == ("sign", "/") else 1
             if self.tokens[0][0] == "sign" and self.tokens[0][1] != "(":
                 self.tokens.pop(0)
-            other = self._power()
-            found = None if other is None else found.times(other, sign)
+            other = self._parse_power()
+            found = None if other is None else found.multiply_power(other, sign)
         return found
 
-    def _power(self) -> _Unit | None:
-        base = self._base()
+    def _parse_power(self) -> _Unit | None:
+        base = self._parse_base()
         if base is None or not self.tokens or self.tokens[0][0] != "power":
             return base
-        digits = self.tokens.pop(0)[1].translate(_RAISED).replace("−", "-")
-        return _Unit(_NONE).times(base, int(digits.lstrip("^* ")))
+        digits = self.tokens.pop(0)[1].translate(_SUPERSCRIPTS).replace("−", "-")
+        return _Unit(_DIMENSIONLESS).multiply_power(base, int(digits.lstrip("^* ")))
 
-    def _base(self) -> _Unit | None:
+    def _parse_base(self) -> _Unit | None:
         kind, text = self.tokens.pop(0) if self.tokens else ("", "")
         if kind == "name":
-            return _named(text)
+            return _find_named_unit(text)
         if kind == "one":
-            return _Unit(_NONE)
+            return _Unit(_DIMENSIONLESS)
         if text != "(":
             return None
-        inside = self.product()
+        inside = self.parse_product()
         if not self.tokens or self.tokens.pop(0)[1] != ")":
             return None
         return inside
 
 
-def _named(name: str) -> _Unit | None:
+def _find_named_unit(name: str) -> _Unit | None:
     """A unit by its symbol, with or without a prefix; without goes first, so ``min`` is one."""
-    known = _ALONE.get(name) or _PREFIXED.get(name)
+    known = _UNPREFIXED.get(name) or _PREFIXED.get(name)
     if known is not None:
         return known
     for prefix, power in _PREFIXES.items():

@@ -10,20 +10,26 @@ from typing import Any
 
 import numpy as np
 
-from sysid.core.errors import InvalidRecord, InvalidSettings, nearest
-from sysid.core.units import difference, factor, is_blank, is_read, suggestion
-from sysid.data.arguments import Arguments
-from sysid.data.history import changed, with_history, without_history
-from sysid.data.noise import NOISE_KINDS, Noise, noise_samples
-from sysid.data.pooling import pool, select
+from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
+from sysid.core.units import (
+    describe_difference,
+    find_conversion_factor,
+    is_blank_unit,
+    is_readable_unit,
+    suggest_unit,
+)
+from sysid.data.arguments import StepArguments
+from sysid.data.history import attach_history, change_values, drop_history
+from sysid.data.noise import NOISE_KINDS, Noise, draw_noise
+from sysid.data.pooling import pool_segments, select_segments
 from sysid.data.records import HOLDS, Channel, Recording, Segment
-from sysid.data.resampling import resample
-from sysid.data.splitting import time_of_cut
+from sysid.data.resampling import resample_recording
+from sysid.data.splitting import find_cut_time
 
-Step = Callable[[Recording, Arguments], Recording]
+StepFunction = Callable[[Recording, StepArguments], Recording]
 
 
-def derive(recording: Recording, steps: Sequence[Mapping[str, Any]]) -> Recording:
+def derive_recording(recording: Recording, steps: Sequence[Mapping[str, Any]]) -> Recording:
     """Take all steps.
 
     Raises
@@ -41,74 +47,76 @@ def derive(recording: Recording, steps: Sequence[Mapping[str, Any]]) -> Recordin
         ((name, value),) = step.items()
         pointer = f"/steps/{place}/{name}"
         if name not in STEPS:
-            raise InvalidSettings(pointer, f"there is no such step{nearest(str(name), STEPS)}")
+            raise InvalidSettings(pointer, f"there is no such step{suggest_name(str(name), STEPS)}")
         try:
-            recording = STEPS[name](recording, Arguments(pointer, value))
+            recording = STEPS[name](recording, StepArguments(pointer, value))
         except InvalidRecord as error:
             raise InvalidSettings(pointer, str(error)) from None
     return recording
 
 
-def add_noise(recording: Recording, given: Arguments) -> Recording:
+def add_noise(recording: Recording, given: StepArguments) -> Recording:
     """Add noise of standard deviation `sigma` (in the channel's unit) to the named channels.
 
     The draw depends on the seed and on the channel's place in the list, as the noise of a job
     depends on the output's place: the same numbers either way.
     """
-    given.only("sigma", "seed", "channels", "kind", "terms", "mean")
-    names = given.texts("channels")
+    given.reject_others("sigma", "seed", "channels", "kind", "terms", "mean")
+    names = given.read_texts("channels")
     try:
         noise = Noise(
-            given.number("sigma"),
-            given.whole("seed", 0),
-            given.choice("kind", NOISE_KINDS, "gaussian"),
-            given.whole("terms", 12, most=1000),
-            given.number("mean", 0.0),
+            given.read_number("sigma"),
+            given.read_whole_number("seed", 0),
+            given.read_choice("kind", NOISE_KINDS, "gaussian"),
+            given.read_whole_number("terms", 12, most=1000),
+            given.read_number("mean", 0.0),
         )
     except InvalidSettings as error:
         given.fail(error.pointer.rpartition("/")[2], error.detail)
-    return _with_channels(recording, names, lambda one: _noisy(one, noise, names.index(one.name)))
+    return _change_channels(
+        recording, names, lambda one: _add_channel_noise(one, noise, names.index(one.name))
+    )
 
 
-def _noisy(channel: Channel, noise: Noise, stream: int) -> Channel:
+def _add_channel_noise(channel: Channel, noise: Noise, stream: int) -> Channel:
     """Noise on the samples first, so that their draw is the same with a history and without."""
     size, history = channel.values.size, channel.history
     if history is None:
-        return replace(channel, values=channel.values + noise_samples(noise, size, stream))
-    drawn = noise_samples(noise, size + history.values.size, stream)
+        return replace(channel, values=channel.values + draw_noise(noise, size, stream))
+    drawn = draw_noise(noise, size + history.values.size, stream)
     return replace(
         channel, values=channel.values + drawn[:size],
         history=history._replace(values=history.values + drawn[size:]),
     )  # fmt: skip
 
 
-def trim(recording: Recording, given: Arguments) -> Recording:
+def trim_recording(recording: Recording, given: StepArguments) -> Recording:
     """Keep a span of time (`start` to `stop`, s) or of samples (`rows`: [first, last + 1]).
 
     What was recorded before the span goes with it as history, unless `history` is false.
     """
-    given.only("start", "stop", "rows", "history")
-    if given.has("rows"):
-        if given.has("start") or given.has("stop"):
+    given.reject_others("start", "stop", "rows", "history")
+    if given.has_argument("rows"):
+        if given.has_argument("start") or given.has_argument("stop"):
             given.fail("rows", "is given together with a time; give rows, or start and stop")
-        return _cut_out(_rows(recording, given), recording, given)
-    if not given.has("start") and not given.has("stop"):
+        return _attach_or_drop_history(_cut_rows(recording, given), recording, given)
+    if not given.has_argument("start") and not given.has_argument("stop"):
         given.fail("", "need start, stop (seconds), or rows")
-    start = given.number("start", recording.start)
-    stop = given.number("stop", recording.stop)
+    start = given.read_number("start", recording.start)
+    stop = given.read_number("stop", recording.stop)
     if stop <= start:
         given.fail("stop", f"found {stop!r}; need more than the start, {start!r}")
-    return _cut_out(_span(recording, start, stop), recording, given)
+    return _attach_or_drop_history(_cut_span(recording, start, stop), recording, given)
 
 
-def _cut_out(part: Recording, whole: Recording, given: Arguments) -> Recording:
-    if given.flag("history", default=True):
-        return with_history(part, whole)
-    return without_history(part)
+def _attach_or_drop_history(part: Recording, whole: Recording, given: StepArguments) -> Recording:
+    if given.read_flag("history", default=True):
+        return attach_history(part, whole)
+    return drop_history(part)
 
 
-def _rows(recording: Recording, given: Arguments) -> Recording:
-    first, last = given.pair("rows")
+def _cut_rows(recording: Recording, given: StepArguments) -> Recording:
+    first, last = given.read_range("rows")
     times = recording.channels[0].times
     if any(not np.array_equal(one.times, times) for one in recording.channels):
         given.fail("rows", "the channels have different times; give start and stop in seconds")
@@ -118,15 +126,15 @@ def _rows(recording: Recording, given: Arguments) -> Recording:
         replace(one, times=one.times[first:last], values=one.values[first:last], history=None)
         for one in recording.channels
     )
-    return Recording(channels, _clipped(recording.segments, times[first], times[last - 1]))
+    return Recording(channels, _clip_segments(recording.segments, times[first], times[last - 1]))
 
 
-def _span(recording: Recording, start: float, stop: float) -> Recording:
-    channels = tuple(one.between(start, stop) for one in recording.channels)
-    return Recording(channels, _clipped(recording.segments, start, stop))
+def _cut_span(recording: Recording, start: float, stop: float) -> Recording:
+    channels = tuple(one.slice_time(start, stop) for one in recording.channels)
+    return Recording(channels, _clip_segments(recording.segments, start, stop))
 
 
-def _clipped(segments: tuple[Segment, ...], start: float, stop: float) -> tuple[Segment, ...]:
+def _clip_segments(segments: tuple[Segment, ...], start: float, stop: float) -> tuple[Segment, ...]:
     return tuple(
         replace(
             one,
@@ -139,76 +147,86 @@ def _clipped(segments: tuple[Segment, ...], start: float, stop: float) -> tuple[
     )
 
 
-def split(recording: Recording, given: Arguments) -> Recording:
+def split_recording(recording: Recording, given: StepArguments) -> Recording:
     """Keep one part: the last `fraction` of the samples (``validation``) or what comes before.
 
     What was recorded before the part goes with it as history, unless `history` is false.
     """
-    given.only("fraction", "part", "history")
-    part = given.choice("part", ("estimation", "validation"))
+    given.reject_others("fraction", "part", "history")
+    part = given.read_choice("part", ("estimation", "validation"))
     longest = max((one.times for one in recording.channels), key=len)
-    cut = time_of_cut(longest, given.number("fraction"), f"{given.pointer}/fraction")
+    cut = find_cut_time(longest, given.read_number("fraction"), f"{given.pointer}/fraction")
     if part == "validation":
-        return _cut_out(_span(recording, cut, np.inf), recording, given)
-    before = _span(recording, -np.inf, float(np.nextafter(cut, -np.inf)))
-    return _cut_out(before, recording, given)
+        return _attach_or_drop_history(_cut_span(recording, cut, np.inf), recording, given)
+    before = _cut_span(recording, -np.inf, float(np.nextafter(cut, -np.inf)))
+    return _attach_or_drop_history(before, recording, given)
 
 
-def detrend(recording: Recording, given: Arguments) -> Recording:
+def detrend_channels(recording: Recording, given: StepArguments) -> Recording:
     """Subtract the mean or the straight line of least squares; missing values do not count."""
-    given.only("kind", "channels")
-    degree = ("mean", "linear").index(given.choice("kind", ("mean", "linear"), "mean"))
-    names = given.texts("channels") if given.has("channels") else list(recording.names)
+    given.reject_others("kind", "channels")
+    degree = ("mean", "linear").index(given.read_choice("kind", ("mean", "linear"), "mean"))
+    names = (
+        given.read_texts("channels") if given.has_argument("channels") else list(recording.names)
+    )
 
     def flat(channel: Channel) -> Channel:
         known = np.isfinite(channel.values)
         if np.count_nonzero(known) <= degree:
             given.fail("", f"channel {channel.name!r} has too few values")
         trend = np.polynomial.Polynomial.fit(channel.times[known], channel.values[known], degree)
-        return changed(channel, lambda times, values: np.asarray(values - trend(times)))
+        return change_values(channel, lambda times, values: np.asarray(values - trend(times)))
 
-    return _with_channels(recording, names, flat)
+    return _change_channels(recording, names, flat)
 
 
-def subtract_offset(recording: Recording, given: Arguments) -> Recording:
+def subtract_offset(recording: Recording, given: StepArguments) -> Recording:
     """Subtract a number from each named channel."""
-    offsets = {name: given.number(name) for name, _ in given.items()}
-    return _with_channels(
+    offsets = {name: given.read_number(name) for name, _ in given.get_items()}
+    return _change_channels(
         recording,
         list(offsets),
-        lambda one: changed(one, lambda _, values: values - offsets[one.name]),
+        lambda one: change_values(one, lambda _, values: values - offsets[one.name]),
     )
 
 
-def set_hold(recording: Recording, given: Arguments) -> Recording:
+def set_hold(recording: Recording, given: StepArguments) -> Recording:
     """Say what named channels do between their samples, when they are inputs."""
-    return recording.held({name: given.choice(name, HOLDS) for name, _ in given.items()})
+    return recording.replace_holds(
+        {name: given.read_choice(name, HOLDS) for name, _ in given.get_items()}
+    )
 
 
-def set_unit(recording: Recording, given: Arguments) -> Recording:
+def set_unit(recording: Recording, given: StepArguments) -> Recording:
     """Convert named channels to other units; of one that has none the unit is only written down."""
-    units = {name: given.text(name) for name, _ in given.items()}
+    units = {name: given.read_text(name) for name, _ in given.get_items()}
     made = {}
     for name, unit in units.items():
         channel = recording.channel(name)
-        times = 1.0 if is_blank(channel.unit) or is_blank(unit) else factor(channel.unit, unit)
+        times = (
+            1.0
+            if is_blank_unit(channel.unit) or is_blank_unit(unit)
+            else find_conversion_factor(channel.unit, unit)
+        )
         if times is None:
-            unread = [f"{one!r}" for one in (channel.unit, unit) if not is_read(one)]
-            told = difference(channel.unit, unit) or f"{' and '.join(unread)} cannot be read"
+            unread = [f"{one!r}" for one in (channel.unit, unit) if not is_readable_unit(one)]
+            told = (
+                describe_difference(channel.unit, unit) or f"{' and '.join(unread)} cannot be read"
+            )
             need = f"need a unit of the same quantity as {channel.unit}"
-            given.fail(name, f"{told}; {need}{suggestion(unit)}")
-        made[name] = replace(_scaled(channel, times), unit=unit.strip() or "1")
+            given.fail(name, f"{told}; {need}{suggest_unit(unit)}")
+        made[name] = replace(_scale_channel(channel, times), unit=unit.strip() or "1")
     channels = tuple(made.get(one.name, one) for one in recording.channels)
     return replace(recording, channels=channels)
 
 
-def _scaled(channel: Channel, by: float) -> Channel:
-    return channel if by == 1.0 else changed(channel, lambda _, values: values * by)
+def _scale_channel(channel: Channel, by: float) -> Channel:
+    return channel if by == 1.0 else change_values(channel, lambda _, values: values * by)
 
 
-def rename(recording: Recording, given: Arguments) -> Recording:
+def rename_channels(recording: Recording, given: StepArguments) -> Recording:
     """Give channels other names."""
-    names = {old: given.text(old) for old, _ in given.items()}
+    names = {old: given.read_text(old) for old, _ in given.get_items()}
     for old in names:
         recording.channel(old)
     renamed = [names.get(name, name) for name in recording.names]
@@ -223,7 +241,7 @@ def rename(recording: Recording, given: Arguments) -> Recording:
     )
 
 
-def _with_channels(
+def _change_channels(
     recording: Recording, names: Sequence[str], change: Callable[[Channel], Channel]
 ) -> Recording:
     for name in names:
@@ -234,16 +252,16 @@ def _with_channels(
     )
 
 
-STEPS: Mapping[str, Step] = {
+STEPS: Mapping[str, StepFunction] = {
     "noise": add_noise,
-    "resample": resample,
-    "trim": trim,
-    "detrend": detrend,
+    "resample": resample_recording,
+    "trim": trim_recording,
+    "detrend": detrend_channels,
     "offset": subtract_offset,
-    "split": split,
-    "select": select,
-    "pool": pool,
+    "split": split_recording,
+    "select": select_segments,
+    "pool": pool_segments,
     "hold": set_hold,
-    "rename": rename,
+    "rename": rename_channels,
     "unit": set_unit,
 }

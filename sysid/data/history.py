@@ -13,11 +13,11 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, History, Recording, Segment
 
-MORE = 128
+INTERPOLATION_MARGIN = 128
 """Samples besides those that a lag can reach: between them a band-limited input is interpolated."""
 
 
-def with_history(part: Recording, whole: Recording) -> Recording:
+def attach_history(part: Recording, whole: Recording) -> Recording:
     """A recording with what the one it was cut out of holds before it.
 
     As long as the part itself: no lag may be longer than the record it is found from. Where the
@@ -26,21 +26,24 @@ def with_history(part: Recording, whole: Recording) -> Recording:
     earliest = part.start - part.duration
     since = -np.inf
     if part.segments:
-        since = _start_of_cut(whole.segments, part.segments[0].start)
+        since = _find_segment_start(whole.segments, part.segments[0].start)
     channels = tuple(
-        _limited(one.after(whole.channel(one.name)), earliest, since) for one in part.channels
+        _limit_history(one.prepend_history(whole.channel(one.name)), earliest, since)
+        for one in part.channels
     )
     return replace(part, channels=channels)
 
 
-def without_history(recording: Recording) -> Recording:
+def drop_history(recording: Recording) -> Recording:
     """The recording as if nothing were known of what was before it."""
     return replace(
         recording, channels=tuple(replace(one, history=None) for one in recording.channels)
     )
 
 
-def changed(channel: Channel, change: Callable[[FloatArray, FloatArray], FloatArray]) -> Channel:
+def change_values(
+    channel: Channel, change: Callable[[FloatArray, FloatArray], FloatArray]
+) -> Channel:
     """The channel with other values, those of its history changed by the same rule.
 
     Parameters
@@ -54,18 +57,18 @@ def changed(channel: Channel, change: Callable[[FloatArray, FloatArray], FloatAr
     return replace(channel, values=change(channel.times, channel.values), history=history)
 
 
-def _start_of_cut(segments: tuple[Segment, ...], start: float) -> float:
+def _find_segment_start(segments: tuple[Segment, ...], start: float) -> float:
     """From when on the segment goes that holds this time; the first one's history is its own."""
     if start <= segments[0].stop:
         return -np.inf
     return max(one.start for one in segments if one.start <= start)
 
 
-def _limited(channel: Channel, earliest: float, since: float) -> Channel:
+def _limit_history(channel: Channel, earliest: float, since: float) -> Channel:
     if channel.history is None:
         return channel
     times, values = channel.history
-    reached = max(int(np.searchsorted(times, earliest)) - MORE, 0)
+    reached = max(int(np.searchsorted(times, earliest)) - INTERPOLATION_MARGIN, 0)
     first = max(reached, int(np.searchsorted(times, since)))
     if first == times.size:
         return replace(channel, history=None)

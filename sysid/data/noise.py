@@ -52,7 +52,7 @@ class Noise:
             raise InvalidSettings("/noise/terms", f"found {self.terms!r}; need 3 or more")
 
 
-def noise_samples(noise: Noise, n: int, stream: int = 0) -> FloatArray:
+def draw_noise(noise: Noise, n: int, stream: int = 0) -> FloatArray:
     """`n` samples of φ (Eq. 19); `stream` tells channels apart."""
     generator = np.random.Generator(np.random.Philox(key=[noise.seed, stream]))
     if noise.kind == "gaussian":
@@ -63,7 +63,7 @@ def noise_samples(noise: Noise, n: int, stream: int = 0) -> FloatArray:
     return np.asarray(noise.mean + noise.sigma * unit)
 
 
-def with_noise(record: Record, noise: Noise, experiment: int = 0) -> Record:
+def add_output_noise(record: Record, noise: Noise, experiment: int = 0) -> Record:
     """The record with noise on every output; inputs stay."""
     if noise.sigma == 0 and noise.mean == 0:
         return record
@@ -71,7 +71,7 @@ def with_noise(record: Record, noise: Noise, experiment: int = 0) -> Record:
         replace(
             channel,
             values=channel.values
-            + noise_samples(noise, channel.values.size, 1000 * experiment + number),
+            + draw_noise(noise, channel.values.size, 1000 * experiment + number),
         )
         for number, channel in enumerate(record.outputs)
     )

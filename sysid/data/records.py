@@ -6,20 +6,20 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from sysid.core.errors import InvalidRecord, nearest
+from sysid.core.errors import InvalidRecord, suggest_name
 from sysid.core.types import FloatArray
 
 Hold = Literal["zero", "first", "band-limited"]
 HOLDS: tuple[Hold, ...] = get_args(Hold)
 
-REGULAR_WITHIN = 1e-2
+REGULARITY_TOLERANCE = 1e-2
 """Part of a period by which times may be off their places and still be regular.
 
 Files print times with few digits: 610.35 Hz to 10 µs is off by 0.3 % of a period.
 """
 
 
-_SAME_PERIOD = 1e-6  # of a period: how far those of one clock may differ
+_PERIOD_TOLERANCE = 1e-6  # of a period: how far those of one clock may differ
 
 
 class Sampling(NamedTuple):
@@ -36,7 +36,7 @@ class Sampling(NamedTuple):
         return f"{self.samples} samples, {kind} {self.period:.6g} s"
 
 
-def sampling_of(times: FloatArray, within: float = REGULAR_WITHIN) -> Sampling:
+def measure_sampling(times: FloatArray, within: float = REGULARITY_TOLERANCE) -> Sampling:
     """How times (s) are spaced; regular: each within that part of a period from its place."""
     if times.size < 2:
         return Sampling(times.size, float("nan"), is_regular=False)
@@ -96,9 +96,9 @@ class Channel:
         if not np.all(np.isfinite(self.times)) or np.any(np.diff(self.times) < 0):
             raise InvalidRecord(f"the times of channel {self.name!r} decrease or are not finite")
         if self.history is not None:
-            self._check(self.history)
+            self._check_history(self.history)
 
-    def _check(self, history: History) -> None:
+    def _check_history(self, history: History) -> None:
         before, values = history
         if before.ndim != 1 or before.shape != values.shape or before.size == 0:
             raise InvalidRecord(
@@ -114,7 +114,7 @@ class Channel:
             )
 
     @property
-    def whole(self) -> "Channel":
+    def history_and_samples(self) -> "Channel":
         """History and samples as samples of one channel."""
         if self.history is None:
             return self
@@ -127,14 +127,14 @@ class Channel:
     @property
     def sampling(self) -> Sampling:
         """How this channel was sampled."""
-        return sampling_of(self.times)
+        return measure_sampling(self.times)
 
     @property
-    def known_samples(self) -> int:
+    def total_samples(self) -> int:
         """How many samples it has, with those of its history."""
         return self.times.size + (0 if self.history is None else self.history.times.size)
 
-    def between(self, start: float, stop: float) -> "Channel":
+    def slice_time(self, start: float, stop: float) -> "Channel":
         """Return the samples with `start` ≤ time ≤ `stop`; what was cut off before is lost.
 
         Raises
@@ -153,13 +153,13 @@ class Channel:
             self, times=self.times[first:last], values=self.values[first:last], history=kept
         )
 
-    def cut(self, start: float, stop: float) -> "Channel":
+    def slice_with_history(self, start: float, stop: float) -> "Channel":
         """Return the same samples as `between`, with all that was before them as their history."""
-        return self.between(start, stop).after(self)
+        return self.slice_time(start, stop).prepend_history(self)
 
-    def after(self, other: "Channel") -> "Channel":
+    def prepend_history(self, other: "Channel") -> "Channel":
         """Return this channel with what another was before it as its history."""
-        whole = other.whole
+        whole = other.history_and_samples
         count = int(np.searchsorted(whole.times, self.times[0]))
         history = History(whole.times[:count], whole.values[:count]) if count else None
         return replace(self, history=history)
@@ -197,7 +197,9 @@ class Recording:
         for channel in self.channels:
             if channel.name == name:
                 return channel
-        raise InvalidRecord(f"the recording has no channel {name!r}{nearest(name, self.names)}")
+        raise InvalidRecord(
+            f"the recording has no channel {name!r}{suggest_name(name, self.names)}"
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -229,7 +231,7 @@ class Recording:
         """How the longest channel was sampled."""
         return max(self.channels, key=lambda channel: channel.times.size).sampling
 
-    def held(self, holds: Mapping[str, Hold]) -> "Recording":
+    def replace_holds(self, holds: Mapping[str, Hold]) -> "Recording":
         """Return the recording with other intersample behaviour of some channels.
 
         Raises
@@ -246,7 +248,7 @@ class Recording:
             ),
         )
 
-    def record(
+    def to_record(
         self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
     ) -> "Record":
         """Return the recording as one experiment of a model.
@@ -262,7 +264,7 @@ class Recording:
             If a channel is not there or both an input and an output, an input has missing
             values, an output has no value, or the recording consists of several segments.
         """
-        for fault in both_ways(inputs, outputs).values():
+        for fault in find_shared_channels(inputs, outputs).values():
             raise InvalidRecord(fault)
         if len(self.segments) > 1:
             raise InvalidRecord(
@@ -270,29 +272,29 @@ class Recording:
                 "derive one record with 'pool' or 'select', or use every segment as an experiment"
             )
         return Record(
-            tuple(_as_input(self.channel(ours), role) for role, ours in inputs.items()),
-            tuple(_as_output(self.channel(ours), role) for role, ours in outputs.items()),
+            tuple(_to_input(self.channel(ours), role) for role, ours in inputs.items()),
+            tuple(_to_output(self.channel(ours), role) for role, ours in outputs.items()),
             name,
         )
 
-    def records(
+    def to_records(
         self, inputs: Mapping[str, str], outputs: Mapping[str, str], name: str = ""
     ) -> tuple["Record", ...]:
         """Return every segment as one experiment, on its own times; without segments, one."""
-        return tuple(part.record(inputs, outputs, name) for part in self.pieces())
+        return tuple(part.to_record(inputs, outputs, name) for part in self.split_segments())
 
-    def pieces(self) -> tuple["Recording", ...]:
+    def split_segments(self) -> tuple["Recording", ...]:
         """Return every segment as a recording on its own times; without segments, this one."""
         if not self.segments:
             return (self,)
-        return tuple(self._piece(segment) for segment in self.segments)
+        return tuple(self._cut_segment(segment) for segment in self.segments)
 
-    def _piece(self, segment: Segment) -> "Recording":
-        cut = [channel.between(segment.start, segment.stop) for channel in self.channels]
-        return Recording(tuple(_on_own_times(one, segment) for one in cut))
+    def _cut_segment(self, segment: Segment) -> "Recording":
+        cut = [channel.slice_time(segment.start, segment.stop) for channel in self.channels]
+        return Recording(tuple(_shift_to_segment(one, segment) for one in cut))
 
 
-def both_ways(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> dict[str, str]:
+def find_shared_channels(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> dict[str, str]:
     """Inputs whose channel is that of an output as well, and what is wrong with that.
 
     Parameters
@@ -309,7 +311,7 @@ def both_ways(inputs: Mapping[str, str], outputs: Mapping[str, str]) -> dict[str
     }
 
 
-def own_times(times: FloatArray, segment: Segment) -> FloatArray:
+def to_segment_time(times: FloatArray, segment: Segment) -> FloatArray:
     """Times of a segment as they were measured, to the nanosecond.
 
     The rounding takes away what the place on the recording's axis added to the last digits.
@@ -317,19 +319,19 @@ def own_times(times: FloatArray, segment: Segment) -> FloatArray:
     return np.round(times - segment.start + segment.origin, 9)
 
 
-def _begin(channel: Channel) -> float:
-    known = known_history(channel.history)
+def _find_first_known_time(channel: Channel) -> float:
+    known = trim_missing_history(channel.history)
     return float(channel.times[0] if known is None else known.times[0])
 
 
-def _on_own_times(channel: Channel, segment: Segment) -> Channel:
+def _shift_to_segment(channel: Channel, segment: Segment) -> Channel:
     history = channel.history
     if history is not None:
-        history = history._replace(times=own_times(history.times, segment))
-    return replace(channel, times=own_times(channel.times, segment), history=history)
+        history = history._replace(times=to_segment_time(history.times, segment))
+    return replace(channel, times=to_segment_time(channel.times, segment), history=history)
 
 
-def _as_input(channel: Channel, role: str) -> Channel:
+def _to_input(channel: Channel, role: str) -> Channel:
     missing = np.flatnonzero(~np.isfinite(channel.values))
     if missing.size:
         raise InvalidRecord(
@@ -337,10 +339,10 @@ def _as_input(channel: Channel, role: str) -> Channel:
             f"the first at t = {channel.times[missing[0]]:g} s; an input must be known "
             "everywhere: trim the recording or fill the gaps"
         )
-    return replace(channel, name=role, history=known_history(channel.history))
+    return replace(channel, name=role, history=trim_missing_history(channel.history))
 
 
-def known_history(history: History | None) -> History | None:
+def trim_missing_history(history: History | None) -> History | None:
     """The history behind its last missing value: what lies before that may be of another test."""
     if history is None:
         return None
@@ -351,7 +353,7 @@ def known_history(history: History | None) -> History | None:
     return History(history.times[first:], history.values[first:])
 
 
-def _as_output(channel: Channel, role: str) -> Channel:
+def _to_output(channel: Channel, role: str) -> Channel:
     if not np.any(np.isfinite(channel.values)):
         raise InvalidRecord(
             f"output {role!r} (channel {channel.name!r}) has no value: all are missing (NaN)"
@@ -368,9 +370,12 @@ class Record:
     name: str = ""
 
     @property
-    def known_before(self) -> float:
+    def history_duration(self) -> float:
         """For how long (s) before the start all inputs are known; 0 if one is not."""
-        return max(self.start - max((_begin(one) for one in self.inputs), default=np.inf), 0.0)
+        return max(
+            self.start - max((_find_first_known_time(one) for one in self.inputs), default=np.inf),
+            0.0,
+        )
 
     @property
     def start(self) -> float:
@@ -388,10 +393,12 @@ class Record:
         return self.stop - self.start
 
 
-def common_sample_time(records: Sequence[Record]) -> float | None:
+def find_common_sample_time(records: Sequence[Record]) -> float | None:
     """Period (s) with which all outputs of all records are sampled; None if there is none."""
     found = [channel.sampling for record in records for channel in record.outputs]
     periods = [one.period for one in found]
-    if not all(one.is_regular for one in found) or np.ptp(periods) > _SAME_PERIOD * min(periods):
+    if not all(one.is_regular for one in found) or np.ptp(periods) > _PERIOD_TOLERANCE * min(
+        periods
+    ):
         return None
     return periods[0]

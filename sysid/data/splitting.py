@@ -20,15 +20,15 @@ def split_record(record: Record, fraction: float) -> tuple[Record, Record]:
     InvalidSettings
         If the fraction is not between 0 and 1, or leaves a channel of a part without samples.
     """
-    cut = start_of_validation(record, fraction)
+    cut = find_validation_start(record, fraction)
     parts = []
     for start, stop in ((-np.inf, np.nextafter(cut, -np.inf)), (cut, np.inf)):
         try:
             parts.append(
                 replace(
                     record,
-                    inputs=tuple(one.cut(start, stop) for one in record.inputs),
-                    outputs=tuple(one.between(start, stop) for one in record.outputs),
+                    inputs=tuple(one.slice_with_history(start, stop) for one in record.inputs),
+                    outputs=tuple(one.slice_time(start, stop) for one in record.outputs),
                 )
             )
         except InvalidRecord as error:
@@ -36,7 +36,7 @@ def split_record(record: Record, fraction: float) -> tuple[Record, Record]:
     return parts[0], parts[1]
 
 
-def start_of_validation(record: Record, fraction: float) -> float:
+def find_validation_start(record: Record, fraction: float) -> float:
     """Time (s) at which the last `fraction` of a record begins, a sample of the longest output.
 
     Raises
@@ -44,10 +44,12 @@ def start_of_validation(record: Record, fraction: float) -> float:
     InvalidSettings
         If the fraction is not between 0 and 1, or one part would be empty.
     """
-    return time_of_cut(max((one.times for one in record.outputs), key=len), fraction)
+    return find_cut_time(max((one.times for one in record.outputs), key=len), fraction)
 
 
-def time_of_cut(times: FloatArray, fraction: float, pointer: str = "/validation/fraction") -> float:
+def find_cut_time(
+    times: FloatArray, fraction: float, pointer: str = "/validation/fraction"
+) -> float:
     """Time (s) of the sample at which the last `fraction` of the samples begins.
 
     Raises

@@ -4,23 +4,28 @@ import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from sysid.control.linear_form import Identified
-from sysid.export.description import facts, unit_text, value_lines, wrapped
-from sysid.export.expressions import WIDTHS, Language, number, source
-from sysid.export.identifiers import Identifiers, in_c_comment
+from sysid.control.linear_form import IdentifiedModel
+from sysid.export.description import describe_model, describe_unit, describe_values, wrap_source
+from sysid.export.expressions import (
+    HELPER_ARGUMENTS,
+    TargetLanguage,
+    write_expression,
+    write_number,
+)
+from sysid.export.identifiers import Identifiers, escape_c_comment
 from sysid.export.program import (
-    Place,
-    Program,
+    GeneratedProgram,
+    LoopScope,
     equation,
     indented,
-    lag_steps,
     needed_helpers,
     time_loop,
+    write_delay_steps,
 )
 from sysid.language.functions import FUNCTIONS, Level
 from sysid.models.model import MeasuredInitial
 
-_WORDS = (
+_RESERVED_WORDS = (
     "auto break case char const continue default do double else enum extern float for goto if "
     "inline int long register restrict return short signed sizeof static struct switch typedef "
     "union unsigned void volatile while _Bool _Complex _Imaginary asm main errno "
@@ -30,53 +35,53 @@ _WORDS = (
     "dt h k now y0 y1 yn j0 j1 jn gamma signgam unix linux i386 EOF stdin stdout stderr assert "
     "BUFSIZ RAND_MAX"
 )
-_WIDTH = 92
+_LINE_WIDTH = 92
 
 
 @dataclass(slots=True)
-class CLanguage(Language):
+class CLanguage(TargetLanguage):
     """C99 with the functions of math.h; `called` gathers what math.h does not have."""
 
-    called: set[str] = field(default_factory=set)
-    words: Mapping[str, str] = field(default_factory=lambda: {"and": "&&", "or": "||"})
+    called_functions: set[str] = field(default_factory=set)
+    logical_operators: Mapping[str, str] = field(default_factory=lambda: {"and": "&&", "or": "||"})
 
-    def negation(self, condition: str) -> str:
+    def write_negation(self, condition: str) -> str:
         """``not (…)``, to stand anywhere."""
         return f"!({condition})"
 
-    def function(self, name: str, arguments: list[str]) -> str:
+    def write_function_call(self, name: str, arguments: list[str]) -> str:
         """A call of a function of the model language."""
         function = FUNCTIONS[name].c
-        self.called.add(function)
+        self.called_functions.add(function)
         return f"{function}({', '.join(arguments)})"
 
-    def power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
+    def write_power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
         """A power and its level."""
         return f"pow({base}, {exponent})", Level.ATOM
 
-    def choice(self, condition: str, first: str, second: str) -> str:
+    def write_choice(self, condition: str, first: str, second: str) -> str:
         """``where``, to stand anywhere."""
         return f"({condition} ? {first} : {second})"
 
-    def quotient(self, above: str) -> str:
+    def write_constant_dividend(self, above: str) -> str:
         """A dividend of numbers only: it needs nothing here."""
         return above
 
-    def element(self, array: str, index: str, divisor: int) -> str:
+    def write_element(self, array: str, index: str, divisor: int) -> str:
         """Array at the whole part of index / divisor."""
         if divisor == 1:
             return f"{array}[{index}]"
         return f"{array}[{f'({index})' if '-' in index else index}/{divisor}]"
 
-    def read(self, helper: str, signal: str, place: str) -> str:
+    def write_signal_read(self, helper: str, signal: str, place: str) -> str:
         """A call of ``between``, ``held`` or ``averaged``."""
-        return f"{helper}({signal}, n, {place}{WIDTHS[helper]})"
+        return f"{helper}({signal}, n, {place}{HELPER_ARGUMENTS[helper]})"
 
-    def limited(self, value: str, least: int, most: int) -> str:
+    def write_clamp(self, value: str, least: int, most: int) -> str:
         """A number held between two others."""
         return f"fmin(fmax({value}, {least}.0), {most}.0)"
 
-    def real(self, index: str) -> str:
+    def write_float(self, index: str) -> str:
         """A whole number as floating-point number."""
         return f"(double){index}"
 
@@ -93,14 +98,14 @@ class CLanguage(Language):
 
     def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:
         """An assignment."""
-        return _statement(f"const double {name} = " if is_new else f"{name} = ", text)
+        return _wrap_statement(f"const double {name} = " if is_new else f"{name} = ", text)
 
     def close_loop(self) -> list[str]:
         """The brace that ends a loop."""
         return ["}"]
 
 
-def c_source(identified: Identified) -> str:
+def write_c_source(identified: IdentifiedModel) -> str:
     """A C99 file: ``NAME_parameters``, ``NAME_identified`` and ``NAME_simulate``.
 
     Parameters
@@ -113,91 +118,95 @@ def c_source(identified: Identified) -> str:
         If a value is missing.
     """
     language = CLanguage()
-    names = Identifiers([*_WORDS.split(), *(one.c for one in FUNCTIONS.values())])
-    stem = names.of(identified.model.name)
+    names = Identifiers([*_RESERVED_WORDS.split(), *(one.c for one in FUNCTIONS.values())])
+    stem = names.make_identifier(identified.model.name)
     for suffix in ("parameters", "identified", "simulate"):
-        names.of(f"{stem}_{suffix}")
-    program = Program(identified, language, names, prefix="p->")
-    loop = [*time_loop(program, _runge_kutta), *_outputs(program)]
-    body = [*_checks(program), *_steps(program), *_lags(program), *_states(program), *loop,
+        names.make_identifier(f"{stem}_{suffix}")
+    program = GeneratedProgram(identified, language, names, prefix="p->")
+    loop = [*time_loop(program, _write_runge_kutta), *_write_outputs(program)]
+    body = [*_write_checks(program), *_write_step_count(program), *_write_delays(program), *_write_state_arrays(program), *loop,
             "free(work);", "return 0;"]  # fmt: skip
-    helpers = needed_helpers(HELPERS, program.helpers | language.called, identified)
+    helpers = needed_helpers(HELPERS, program.helper_names | language.called_functions, identified)
     parts = [
-        _header(identified, stem), "#include <math.h>\n#include <stdlib.h>\n",
-        _struct(program, stem), _defaults(program, stem), *helpers,
-        _about_simulate(program), _signature(program, stem), "{", *indented(body), "}",
+        _write_header(identified, stem), "#include <math.h>\n#include <stdlib.h>\n",
+        _write_struct(program, stem), _write_identified_function(program, stem), *helpers,
+        _write_simulate_comment(program), _write_signature(program, stem), "{", *indented(body), "}",
     ]  # fmt: skip
     return "\n".join(parts) + "\n"
 
 
-def _header(identified: Identified, stem: str) -> str:
-    lines = [*facts(identified), "", f"{stem}_identified() gives the values that were found.",
+def _write_header(identified: IdentifiedModel, stem: str) -> str:
+    lines = [*describe_model(identified), "", f"{stem}_identified() gives the values that were found.",
              f"{stem}_simulate() runs the model freely; link with -lm."]  # fmt: skip
-    told = "\n".join(f" * {in_c_comment(line)}".rstrip() for line in lines)
+    told = "\n".join(f" * {escape_c_comment(line)}".rstrip() for line in lines)
     return f"/*\n{told}\n */"
 
 
-def _struct(program: Program, stem: str) -> str:
+def _write_struct(program: GeneratedProgram, stem: str) -> str:
     lines = ["typedef struct {"]
-    for name, about in value_lines(program.identified, program.parameters, program.starts):
-        lines.append(f"    double {name}{_size(program, name)}; /* {in_c_comment(about)} */")
+    for name, about in describe_values(
+        program.identified, program.parameter_names, program.start_names
+    ):
+        lines.append(
+            f"    double {name}{_write_array_size(program, name)}; /* {escape_c_comment(about)} */"
+        )
     return "\n".join([*lines, f"}} {stem}_parameters;", ""])
 
 
-def _size(program: Program, name: str) -> str:
+def _write_array_size(program: GeneratedProgram, name: str) -> str:
     """Several first samples are to be given where they are measured."""
     model = program.identified.model
     for state, initial in zip(model.states, model.initial, strict=True):
-        if program.starts[state.name] == name and isinstance(initial, MeasuredInitial):
-            return f"[{program.memory}]" if program.memory > 1 else ""
+        if program.start_names[state.name] == name and isinstance(initial, MeasuredInitial):
+            return f"[{program.n_start_samples}]" if program.n_start_samples > 1 else ""
     return ""
 
 
-def _defaults(program: Program, stem: str) -> str:
+def _write_identified_function(program: GeneratedProgram, stem: str) -> str:
     found = program.identified
     lines = [f"{stem}_parameters {stem}_identified(void)", "{", f"    {stem}_parameters p;"]
-    numbers = found.numbers
+    numbers = found.value_by_name
     lines += [
-        f"    p.{program.parameters[one.name]} = {number(numbers[one.name])};"
+        f"    p.{program.parameter_names[one.name]} = {write_number(numbers[one.name])};"
         for one in found.model.parameters
     ]
     for i, state in enumerate(found.model.states):
-        start, name = program.start(i), program.starts[state.name]
-        value = number(0.0 if start is None else start)
+        start, name = program.find_initial_value(i), program.start_names[state.name]
+        value = write_number(0.0 if start is None else start)
         note = " /* give the measured value */" if start is None else ""
-        elements = _elements(_size(program, name))
+        elements = _list_elements(_write_array_size(program, name))
         lines += [f"    p.{name}{element} = {value};{note}" for element in elements]
     return "\n".join([*lines, "    return p;", "}", ""])
 
 
-def _elements(size: str) -> list[str]:
+def _list_elements(size: str) -> list[str]:
     return [f"[{i}]" for i in range(int(size[1:-1]))] if size else [""]
 
 
-def _about_simulate(program: Program) -> str:
+def _write_simulate_comment(program: GeneratedProgram) -> str:
     model = program.identified.model
     lines = ["Free run of the model at n regular times t (s)."]
     for kind, names, signals in (
-        ("Input", program.inputs, model.inputs),
-        ("Output", program.outputs, model.outputs),
+        ("Input", program.input_names, model.inputs),
+        ("Output", program.output_names, model.outputs),
     ):
-        lines += [f"{kind} {names[q.name]}: {q.name}, {unit_text(q.unit)}." for q in signals]
+        lines += [f"{kind} {names[q.name]}: {q.name}, {describe_unit(q.unit)}." for q in signals]
     lines += ["Gives 0; 1 if n, the times or a lag cannot be used; 2 if memory is short."]
-    told = "\n".join(f" * {in_c_comment(line)}" for line in lines)
+    told = "\n".join(f" * {escape_c_comment(line)}" for line in lines)
     return f"/*\n{told}\n */"
 
 
-def _signature(program: Program, stem: str) -> str:
+def _write_signature(program: GeneratedProgram, stem: str) -> str:
     arguments = ["long n", "const double *t"]
-    arguments += [f"const double *{name}" for name in program.inputs.values()]
+    arguments += [f"const double *{name}" for name in program.input_names.values()]
     arguments += [f"const {stem}_parameters *p"]
-    arguments += [f"double *{name}" for name in program.outputs.values()]
+    arguments += [f"double *{name}" for name in program.output_names.values()]
     head = f"int {stem}_simulate("
-    lines = textwrap.wrap(", ".join(arguments), _WIDTH - 8)
+    lines = textwrap.wrap(", ".join(arguments), _LINE_WIDTH - 8)
     return head + "\n    " + "\n    ".join(lines) + ")"
 
 
-def _checks(program: Program) -> list[str]:
+def _write_checks(program: GeneratedProgram) -> list[str]:
     return [
         "if (n < 2 || !(t[n - 1] > t[0]))",
         "    return 1;",
@@ -209,53 +218,55 @@ def _checks(program: Program) -> list[str]:
     ]
 
 
-def _steps(program: Program) -> list[str]:
-    period, substeps = program.period, program.substeps
-    if program.own_step is None:
+def _write_step_count(program: GeneratedProgram) -> list[str]:
+    period, substeps = program.step_variable, program.substeps
+    if program.grid_step is None:
         count = f"(n - 1)*{substeps}" if substeps > 1 else "n - 1"
-        divided = f"/{number(substeps)}" if substeps > 1 else ""
+        divided = f"/{write_number(substeps)}" if substeps > 1 else ""
         lines = [f"const double {period} = sample_time{divided};",
                  f"const long steps = {count};"]  # fmt: skip
     else:
-        own = number(program.own_step)
-        lines = [f"const double dt = {own}/{number(substeps)};",
+        own = write_number(program.grid_step)
+        lines = [f"const double dt = {own}/{write_number(substeps)};",
                  f"const long points = (long)ceil((t[n - 1] - t[0])/{own} - 0.01);",
                  "if (points < 1)", "    return 1;",
                  f"const long steps = points*{substeps};"]  # fmt: skip
-        if program.helpers & {"between", "held", "averaged"}:
+        if program.helper_names & {"between", "held", "averaged"}:
             lines.append("const double ratio = dt/sample_time;")
-    if "held" in program.helpers:
-        lines.append(f"const double ramp = {program.ramp()}; /* samples: half a jump's width */")
-    if "averaged" in program.helpers:
-        lines.append(f"const double half = {program.half()}; /* samples: half a step */")
+    if "held" in program.helper_names:
+        lines.append(
+            f"const double ramp = {program.write_ramp_width()}; /* samples: half a jump's width */"
+        )
+    if "averaged" in program.helper_names:
+        lines.append(f"const double half = {program.write_half_step()}; /* samples: half a step */")
     return [*lines, f"(void){period};"]
 
 
-def _lags(program: Program) -> list[str]:
+def _write_delays(program: GeneratedProgram) -> list[str]:
     lines = []
-    for lag, name in program.lags.items():
-        lines += [f"const double {name} = {lag_steps(program, lag)}; /* integration steps */",
+    for lag, name in program.delay_names.items():
+        lines += [f"const double {name} = {write_delay_steps(program, lag)}; /* integration steps */",
                   f"if (!({name} < 1e9))", "    return 1;"]  # fmt: skip
     return lines
 
 
-def _states(program: Program) -> list[str]:
+def _write_state_arrays(program: GeneratedProgram) -> list[str]:
     states = program.identified.model.states
     lines = [f"double *const work = malloc({len(states)}*((size_t)steps + 1)*sizeof *work);",
              "if (work == NULL)", "    return 2;"]  # fmt: skip
     for i, state in enumerate(states):
         offset = f" + {i}*(steps + 1)" if i else ""
-        lines.append(f"double *const {program.every[state.name]} = work{offset};")
+        lines.append(f"double *const {program.array_names[state.name]} = work{offset};")
     for state in states:
-        every, start = program.every[state.name], program.starts[state.name]
-        size = _size(program, start)
-        lines += [f"for (long i = 0; i < {program.memory} && i <= steps; ++i)",
+        every, start = program.array_names[state.name], program.start_names[state.name]
+        size = _write_array_size(program, start)
+        lines += [f"for (long i = 0; i < {program.n_start_samples} && i <= steps; ++i)",
                   f"    {every}[i] = p->{start}{'[i]' if size else ''};"]  # fmt: skip
     return lines
 
 
 # ---- the time loop --------------------------------------------------------------------------
-def _runge_kutta(program: Program) -> list[str]:
+def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
     """The four stages as a loop: each begins where the slope of the one before it leads."""
     states = program.identified.model.states
     lines = [
@@ -265,48 +276,52 @@ def _runge_kutta(program: Program) -> list[str]:
         "        const double part = stage == 0 ? 0.0 : stage == 3 ? 1.0 : 0.5;",
     ]
     for i, state in enumerate(states):
-        every, now = program.every[state.name], program.now[state.name]
+        every, now = program.array_names[state.name], program.present_names[state.name]
         moved = f"{every}[step] + (stage == 0 ? 0.0 : part*dt*slope[stage - 1][{i}])"
         lines.append(f"        const double {now} = {moved};")
-    lines += [f"        (void){program.now[state.name]};" for state in states]
+    lines += [f"        (void){program.present_names[state.name]};" for state in states]
     for i in range(len(states)):
-        lines += indented(_statement(f"slope[stage][{i}] = ", equation(program, "slope", i)), 2)
+        lines += indented(
+            _wrap_statement(f"slope[stage][{i}] = ", equation(program, "slope", i)), 2
+        )
     lines.append("    }")
     for i, state in enumerate(states):
-        every = program.every[state.name]
+        every = program.array_names[state.name]
         mean = f"slope[0][{i}] + 2.0*slope[1][{i}] + 2.0*slope[2][{i}] + slope[3][{i}]"
-        lines += indented(_statement(f"{every}[step + 1] = ", f"{every}[step] + dt/6.0*({mean})"))
+        lines += indented(
+            _wrap_statement(f"{every}[step + 1] = ", f"{every}[step] + dt/6.0*({mean})")
+        )
     return [*lines, "}"]
 
 
-def _outputs(program: Program) -> list[str]:
-    if program.own_step is not None:
-        return _outputs_between(program)
+def _write_outputs(program: GeneratedProgram) -> list[str]:
+    if program.grid_step is not None:
+        return _write_interpolated_outputs(program)
     model, substeps = program.identified.model, program.substeps
     place = f"i*{substeps}" if substeps > 1 else "i"
-    lines = ["for (long i = 0; i < n; ++i) {", f"    const long {program.index} = {place};",
-             f"    (void){program.index};"]  # fmt: skip
+    lines = ["for (long i = 0; i < n; ++i) {", f"    const long {program.loop_variable} = {place};",
+             f"    (void){program.loop_variable};"]  # fmt: skip
     for output in model.outputs:
-        text = source(output.expression, program.language, Place(program, "output"))
-        lines += indented(_statement(f"{program.outputs[output.name]}[i] = ", text))
+        text = write_expression(output.expression, program.language, LoopScope(program, "output"))
+        lines += indented(_wrap_statement(f"{program.output_names[output.name]}[i] = ", text))
     return [*lines, "}"]
 
 
-def _outputs_between(program: Program) -> list[str]:
+def _write_interpolated_outputs(program: GeneratedProgram) -> list[str]:
     """The samples lie between the points of the simulation's own grid."""
-    program.helpers.add("between")
-    model, own = program.identified.model, number(program.own_step or 1.0)
+    program.helper_names.add("between")
+    model, own = program.identified.model, write_number(program.grid_step or 1.0)
     lines = []
     for output in model.outputs:
-        text = source(output.expression, program.language, Place(program, "output"))
-        name = program.outputs[output.name]
+        text = write_expression(output.expression, program.language, LoopScope(program, "output"))
+        name = program.output_names[output.name]
         lines += [
             "{",
             "    double *const grid = malloc(((size_t)points + 1)*sizeof *grid);",
             "    if (grid == NULL) {", "        free(work);", "        return 2;", "    }",
             "    for (long i = 0; i <= points; ++i) {",
             f"        const long step = i*{program.substeps};", "        (void)step;",
-            *indented(_statement("grid[i] = ", text), 2), "    }",
+            *indented(_wrap_statement("grid[i] = ", text), 2), "    }",
             "    for (long i = 0; i < n; ++i)",
             f"        {name}[i] = between(grid, points + 1, (t[i] - t[0])/{own});",
             "    free(grid);", "}",
@@ -315,11 +330,11 @@ def _outputs_between(program: Program) -> list[str]:
 
 
 # ---- layout ---------------------------------------------------------------------------------
-def _statement(before: str, text: str) -> list[str]:
+def _wrap_statement(before: str, text: str) -> list[str]:
     """A statement on as many lines as it needs."""
-    if len(before) + len(text) <= _WIDTH - 12:
+    if len(before) + len(text) <= _LINE_WIDTH - 12:
         return [f"{before}{text};"]
-    lines = wrapped(text, _WIDTH - 16)
+    lines = wrap_source(text, _LINE_WIDTH - 16)
     return [before.rstrip(), *(f"    {line}" for line in lines[:-1]), f"    {lines[-1]};"]
 
 
@@ -419,7 +434,7 @@ static double lately(const double *array, double before, long step, double part,
     return past(array, before, step, lag - part);
 }
 """
-_SIGN = """\
+_SIGN_LEVEL = """\
 static double sign(double x)
 {
     return x > 0.0 ? 1.0 : x < 0.0 ? -1.0 : x;
@@ -438,7 +453,7 @@ static double greatest(double a, double b)
 }
 """
 HELPERS: Mapping[str, str] = {
-    "sign": _SIGN, "least": _LEAST, "greatest": _GREATEST, "between": _BETWEEN, "held": _HELD,
+    "sign": _SIGN_LEVEL, "least": _LEAST, "greatest": _GREATEST, "between": _BETWEEN, "held": _HELD,
     "held on grid": _HELD_ON_GRID, "averaged": _AVERAGED,
     "sample": _SAMPLE, "past": _PAST, "past cubic": _PAST_CUBIC, "lately": _LATELY,
 }  # fmt: skip

@@ -10,26 +10,26 @@ from collections.abc import Iterator, Mapping
 from math import isfinite
 from typing import Any
 
-from sysid.control.linear_form import Identified, Value
-from sysid.export.identifiers import one_line
-from sysid.models.model import MeasuredInitial, initial_name
+from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+from sysid.export.identifiers import to_one_line
+from sysid.models.model import MeasuredInitial, name_initial_state
 
-_JOINED = "\N{NO-BREAK SPACE}"
+_NO_BREAK_SPACE = "\N{NO-BREAK SPACE}"
 
 
-def wrapped(source: str, width: int) -> list[str]:
+def wrap_source(source: str, width: int) -> list[str]:
     """Source text on lines that end before an operator or behind a comma."""
-    tied = re.sub(r"(?<=[-+<>=*/]) ", _JOINED, source)
+    tied = re.sub(r"(?<=[-+<>=*/]) ", _NO_BREAK_SPACE, source)
     lines = textwrap.wrap(tied, width, break_long_words=False, break_on_hyphens=False)
-    return [line.replace(_JOINED, " ") for line in lines]
+    return [line.replace(_NO_BREAK_SPACE, " ") for line in lines]
 
 
-def unit_text(unit: str) -> str:
+def describe_unit(unit: str) -> str:
     """A unit as told in a sentence."""
     return "without unit" if unit == "1" else unit
 
 
-def facts(identified: Identified) -> list[str]:
+def describe_model(identified: IdentifiedModel) -> list[str]:
     """Title, source, sampling, hold and provenance, one line each."""
     model = identified.model
     lines = [model.title or model.name, f"Model {model.name!r}, {model.form} form."]
@@ -39,17 +39,17 @@ def facts(identified: Identified) -> list[str]:
         lines.append(f"The data had a sampling period of {identified.sample_time:.10g} s.")
     if model.form == "polynomial":
         lines.append("The coefficients hold for that sampling period only.")
-    lines += [_hold(identified, one.name) for one in model.inputs]
+    lines += [_describe_hold(identified, one.name) for one in model.inputs]
     if identified.version:
         lines.append(f"Written by lagid {identified.version}.")
     for key, value in identified.provenance.items():
         told = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
         lines.append(f"{key}: {told}")
-    return [part for line in lines for part in textwrap.wrap(one_line(line), 94) or [""]]
+    return [part for line in lines for part in textwrap.wrap(to_one_line(line), 94) or [""]]
 
 
-def _hold(identified: Identified, name: str) -> str:
-    hold = identified.hold(name)
+def _describe_hold(identified: IdentifiedModel, name: str) -> str:
+    hold = identified.get_hold(name)
     if hold == "zero":
         return f"Input {name} is held from each sample to the next."
     if hold == "first":
@@ -60,41 +60,44 @@ def _hold(identified: Identified, name: str) -> str:
     )
 
 
-def value_lines(
-    identified: Identified, parameters: Mapping[str, str], starts: Mapping[str, str]
+def describe_values(
+    identified: IdentifiedModel, parameters: Mapping[str, str], starts: Mapping[str, str]
 ) -> Iterator[tuple[str, str]]:
     """Identifier and description of every parameter and start."""
     model = identified.model
     texts = model.document.get("parameters") or {}
     for one in model.parameters:
-        value = identified.find(one.name)
+        value = identified.find_value(one.name)
         about = (texts.get(one.name) or {}).get("description", "")
         name = f"{one.name}: " if parameters[one.name] != one.name else ""
         head = name + (f"{about}, " if about else "")
-        yield parameters[one.name], head + _told(value or Value(one.name, 0.0, one.unit))
+        yield (
+            parameters[one.name],
+            head + _describe_value(value or IdentifiedValue(one.name, 0.0, one.unit)),
+        )
     for state, initial in zip(model.states, model.initial, strict=True):
-        name = initial_name(state.name, 0)
-        value = identified.find(name)
+        name = name_initial_state(state.name, 0)
+        value = identified.find_value(name)
         head = f"{name}: start of {state.name}, "
         if value is not None:
-            yield starts[state.name], head + _told(value)
+            yield starts[state.name], head + _describe_value(value)
         elif isinstance(initial, MeasuredInitial):
-            about = f"{head}{unit_text(state.unit)}; measured: give its first value."
+            about = f"{head}{describe_unit(state.unit)}; measured: give its first value."
             yield starts[state.name], about
         else:
-            yield starts[state.name], f"{head}{unit_text(state.unit)}."
+            yield starts[state.name], f"{head}{describe_unit(state.unit)}."
 
 
-def _told(value: Value) -> str:
+def _describe_value(value: IdentifiedValue) -> str:
     error = "" if value.stderr is None else f"; standard error {value.stderr:.3g}"
     status = f"; {value.status}" if value.status and value.status != "identified" else ""
-    return f"{unit_text(value.unit)}{error}{status}."
+    return f"{describe_unit(value.unit)}{error}{status}."
 
 
-FORMAT = "lagid-model/1"
+JSON_FORMAT = "lagid-model/1"
 
 
-def json_source(identified: Identified) -> str:
+def write_json_source(identified: IdentifiedModel) -> str:
     """A JSON document from which the model can be built and simulated again.
 
     ``model`` is the document that `sysid.load_model` and the service read; each entry of
@@ -104,35 +107,37 @@ def json_source(identified: Identified) -> str:
     ----------
     identified : Identified
     """
-    return json.dumps(_document(identified), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return (
+        json.dumps(_to_document(identified), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    )
 
 
-def _document(identified: Identified) -> dict[str, Any]:
+def _to_document(identified: IdentifiedModel) -> dict[str, Any]:
     covariance = identified.covariance
     return {
-        "format": FORMAT,
+        "format": JSON_FORMAT,
         "lagid": identified.version or None,
         "model": dict(identified.model.document),
-        "values": [_value(one) for one in identified.values],
+        "values": [_to_value_document(one) for one in identified.values],
         "covariance": None if covariance is None else {
             "names": list(covariance.names),
-            "matrix": [[_finite(value) for value in row] for row in covariance.matrix],
+            "matrix": [[_to_finite(value) for value in row] for row in covariance.matrix],
         },
         "data": {
             "sample_time": identified.sample_time,
-            "hold": {one.name: identified.hold(one.name) for one in identified.model.inputs},
+            "hold": {one.name: identified.get_hold(one.name) for one in identified.model.inputs},
         },
         "provenance": dict(identified.provenance),
     }  # fmt: skip
 
 
-def _value(one: Value) -> dict[str, Any]:
+def _to_value_document(one: IdentifiedValue) -> dict[str, Any]:
     return {
         "name": one.name, "value": float(one.value), "unit": one.unit,
-        "stderr": _finite(one.stderr), "status": one.status,
+        "stderr": _to_finite(one.stderr), "status": one.status,
     }  # fmt: skip
 
 
-def _finite(value: float | None) -> float | None:
+def _to_finite(value: float | None) -> float | None:
     """JSON has no number that is not finite."""
     return None if value is None or not isfinite(value) else float(value)

@@ -6,32 +6,32 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from sysid.control.linear_form import Covariance, Identified, Value
-from sysid.core.errors import InvalidSettings, nearest
+from sysid.control.linear_form import Covariance, IdentifiedModel, IdentifiedValue
+from sysid.core.errors import InvalidSettings, suggest_name
 from sysid.data.records import HOLDS, Hold
-from sysid.export.c import c_source
-from sysid.export.description import json_source
-from sysid.export.python import python_source
-from sysid.export.python_control import control_source
+from sysid.export.c import write_c_source
+from sysid.export.description import write_json_source
+from sysid.export.python import write_python_source
+from sysid.export.python_control import write_control_source
 from sysid.identification.result import Identification
-from sysid.language.evaluation import value as value_of
-from sysid.models.model import Model, initial_name
-from sysid.models.parse import with_terms
-from sysid.models.ties import ties_of
+from sysid.language.evaluation import evaluate_expression as value_of
+from sysid.models.model import Model, name_initial_state
+from sysid.models.parse import keep_terms
+from sysid.models.ties import resolve_ties
 
-Format = Literal["json", "python", "c", "control"]
-FORMATS: tuple[Format, ...] = get_args(Format)
-MOST_PADE = 20
+ExportFormat = Literal["json", "python", "c", "control"]
+EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
+MAX_PADE_ORDER = 20
 
-_WRITERS: Mapping[str, Callable[[Identified], str]] = {
-    "json": json_source, "python": python_source, "c": c_source,
+_WRITERS: Mapping[str, Callable[[IdentifiedModel], str]] = {
+    "json": write_json_source, "python": write_python_source, "c": write_c_source,
 }  # fmt: skip
 
 
 def export_model(
     model: Model,
     found: Identification | Mapping[str, float],
-    format: Format = "python",
+    format: ExportFormat = "python",
     *,
     sample_time: float | None = None,
     hold: Mapping[str, Hold] | None = None,
@@ -69,20 +69,20 @@ def export_model(
     holds = dict(hold or {})
     if isinstance(found, Identification):
         if model.rule is not None and found.selection:
-            model = with_terms(model, [one.term for one in found.selection])
+            model = keep_terms(model, [one.term for one in found.selection])
         known = {one.name for one in model.inputs}
         holds = {**{k: v for k, v in found.holds.items() if k in known}, **holds}
         sample_time = found.sample_time if sample_time is None else sample_time
-    values, covariance = _values(model, found)
-    _check(model, values, sample_time, holds)
-    identified = Identified(
+    values, covariance = _collect_values(model, found)
+    _check_options(model, values, sample_time, holds)
+    identified = IdentifiedModel(
         model, values, covariance, sample_time, holds, version, dict(provenance or {})
     )
-    return written(identified, format, pade_order)
+    return write_export(identified, format, pade_order)
 
 
-def written(identified: Identified, format: str, pade_order: int = 3) -> str:
-    """An identified model in one of `FORMATS`.
+def write_export(identified: IdentifiedModel, format: str, pade_order: int = 3) -> str:
+    """An identified model in one of `EXPORT_FORMATS`.
 
     Raises
     ------
@@ -91,46 +91,53 @@ def written(identified: Identified, format: str, pade_order: int = 3) -> str:
     NotLinear
         If the format is ``control`` and the model has no transfer function.
     """
-    if format not in FORMATS:
-        detail = f"{format!r} is not a format{nearest(format, FORMATS)}"
+    if format not in EXPORT_FORMATS:
+        detail = f"{format!r} is not a format{suggest_name(format, EXPORT_FORMATS)}"
         raise InvalidSettings("/format", detail)
-    if not 1 <= pade_order <= MOST_PADE:
+    if not 1 <= pade_order <= MAX_PADE_ORDER:
         raise InvalidSettings(
-            "/pade_order", f"{pade_order!r} is not an order from 1 to {MOST_PADE}"
+            "/pade_order", f"{pade_order!r} is not an order from 1 to {MAX_PADE_ORDER}"
         )
     if identified.model.rule is not None:
         raise InvalidSettings("/model/terms", "the terms are not selected yet; there is no model")
     if format == "control":
-        return control_source(identified, pade_order)
+        return write_control_source(identified, pade_order)
     return _WRITERS[format](identified)
 
 
-def _values(
+def _collect_values(
     model: Model, found: Identification | Mapping[str, float]
-) -> tuple[tuple[Value, ...], Covariance | None]:
+) -> tuple[tuple[IdentifiedValue, ...], Covariance | None]:
     if isinstance(found, Identification):
         values = tuple(
-            Value(one.name, one.value, one.unit, one.stderr, one.status) for one in found.estimates
+            IdentifiedValue(one.name, one.value, one.unit, one.stderr, one.status)
+            for one in found.estimates
         )
         known = found.uncertainty
         return values, None if known is None else Covariance(known.names, known.covariance)
     units = {one.name: one.unit for one in model.parameters}
-    units |= {initial_name(state.name, 0): state.unit for state in model.states}
-    numbers = _with_ties(model, found)
-    return tuple(Value(n, float(v), units.get(n, "1")) for n, v in numbers.items()), None
+    units |= {name_initial_state(state.name, 0): state.unit for state in model.states}
+    numbers = _add_tied_values(model, found)
+    return tuple(IdentifiedValue(n, float(v), units.get(n, "1")) for n, v in numbers.items()), None
 
 
-def _with_ties(model: Model, found: Mapping[str, float]) -> dict[str, float]:
+def _add_tied_values(model: Model, found: Mapping[str, float]) -> dict[str, float]:
     """The values, and those of tied parameters that are not among them."""
     free = [replace(p, tied=None) if p.name in found else p for p in model.parameters]
     for one in free:
         if one.tied is None and one.name not in found:
             raise InvalidSettings(f"/values/{one.name}", "a value is missing")
-    return {**{name: value_of(tie, found) for name, tie in ties_of(model, free).items()}, **found}
+    return {
+        **{name: value_of(tie, found) for name, tie in resolve_ties(model, free).items()},
+        **found,
+    }
 
 
-def _check(
-    model: Model, values: tuple[Value, ...], sample_time: float | None, hold: Mapping[str, Hold]
+def _check_options(
+    model: Model,
+    values: tuple[IdentifiedValue, ...],
+    sample_time: float | None,
+    hold: Mapping[str, Hold],
 ) -> None:
     _check_values(model, {one.name: one.value for one in values})
     if sample_time is not None and not 0.0 < sample_time < float("inf"):
@@ -138,7 +145,7 @@ def _check(
     inputs = [one.name for one in model.inputs]
     for name, kind in hold.items():
         if name not in inputs:
-            detail = f"the model has no input {name!r}{nearest(name, inputs)}"
+            detail = f"the model has no input {name!r}{suggest_name(name, inputs)}"
             raise InvalidSettings(f"/hold/{name}", detail)
         if kind not in HOLDS:
             raise InvalidSettings(f"/hold/{name}", f"{kind!r} is not one of {', '.join(HOLDS)}")
@@ -149,7 +156,7 @@ def _check_values(model: Model, numbers: Mapping[str, float]) -> None:
     starts = {state.name for state in model.states}
     for name, value in numbers.items():
         if name not in names and name.partition("(0)")[0] not in starts:
-            detail = f"the model has no parameter {name!r}{nearest(name, names)}"
+            detail = f"the model has no parameter {name!r}{suggest_name(name, names)}"
             raise InvalidSettings(f"/values/{name}", detail)
         if not np.isfinite(value):
             raise InvalidSettings(f"/values/{name}", f"{value!r} is not a finite number")

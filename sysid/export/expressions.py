@@ -4,43 +4,52 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from sysid.language.functions import OPERATORS, Level
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary, walk
+from sysid.language.tree import (
+    Binary,
+    Expression,
+    FunctionCall,
+    Number,
+    PastValue,
+    Symbol,
+    Unary,
+    walk,
+)
 
-WIDTHS = {"between": "", "held": ", ramp", "averaged": ", half"}
+HELPER_ARGUMENTS = {"between": "", "held": ", ramp", "averaged": ", half"}
 """What the functions that read inputs are told besides the place."""
 
 
-class Language(Protocol):
+class TargetLanguage(Protocol):
     """What two programming languages write differently."""
 
-    words: Mapping[str, str]
+    logical_operators: Mapping[str, str]
     """``and`` and ``or``."""
 
-    def negation(self, condition: str) -> str:
+    def write_negation(self, condition: str) -> str:
         """``not (…)``, to stand anywhere."""
 
-    def function(self, name: str, arguments: list[str]) -> str:
+    def write_function_call(self, name: str, arguments: list[str]) -> str:
         """A call of a function of the model language."""
 
-    def power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
+    def write_power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
         """A power and its level; `base` may be followed by ``**``, `whole` is a small exponent."""
 
-    def choice(self, condition: str, first: str, second: str) -> str:
+    def write_choice(self, condition: str, first: str, second: str) -> str:
         """``where``, to stand anywhere."""
 
-    def quotient(self, above: str) -> str:
+    def write_constant_dividend(self, above: str) -> str:
         """A dividend of numbers only, so that division by zero gives ``inf``."""
 
-    def element(self, array: str, index: str, divisor: int) -> str:
+    def write_element(self, array: str, index: str, divisor: int) -> str:
         """Array at the whole part of index / divisor."""
 
-    def read(self, helper: str, signal: str, place: str) -> str:
+    def write_signal_read(self, helper: str, signal: str, place: str) -> str:
         """A call of ``between`` or ``held``."""
 
-    def limited(self, value: str, least: int, most: int) -> str:
+    def write_clamp(self, value: str, least: int, most: int) -> str:
         """A number held between two others."""
 
-    def real(self, index: str) -> str:
+    def write_float(self, index: str) -> str:
         """A whole number as floating-point number."""
 
     def lag(self, text: str, *, is_whole: bool) -> str:
@@ -56,83 +65,87 @@ class Language(Protocol):
         """What ends a loop."""
 
 
-class Scope(Protocol):
+class ExportScope(Protocol):
     """What names stand for at one place of the program; the texts are to stand anywhere."""
 
-    def symbol(self, symbol: Symbol) -> str:
+    def write_symbol(self, symbol: Symbol) -> str:
         """A parameter or a reserved name."""
 
-    def past(self, past: Past) -> str:
+    def write_past_value(self, past: PastValue) -> str:
         """A state or an input, now or in the past."""
 
 
-def source(expression: Expression, language: Language, scope: Scope, floor: int = 0) -> str:
+def write_expression(
+    expression: Expression, language: TargetLanguage, scope: ExportScope, floor: int = 0
+) -> str:
     """Text of an expression; in parentheses if it binds less than `floor`."""
-    written, level = _written(expression, language, scope)
+    written, level = _write_with_level(expression, language, scope)
     return written if level >= floor else f"({written})"
 
 
-def number(value: float) -> str:
+def write_number(value: float) -> str:
     """Shortest text that gives the number back, and is one of floating point."""
     return repr(float(value))
 
 
-def _written(expression: Expression, language: Language, scope: Scope) -> tuple[str, int]:
+def _write_with_level(
+    expression: Expression, language: TargetLanguage, scope: ExportScope
+) -> tuple[str, int]:
     match expression:
         case Number(value):
-            return number(value), Level.ATOM if value >= 0 else Level.SIGN
+            return write_number(value), Level.ATOM if value >= 0 else Level.SIGN
         case Symbol():
-            return scope.symbol(expression), Level.ATOM
-        case Past():
-            return scope.past(expression), Level.ATOM
+            return scope.write_symbol(expression), Level.ATOM
+        case PastValue():
+            return scope.write_past_value(expression), Level.ATOM
         case Unary():
-            return _prefix(expression, language, scope)
+            return _write_unary(expression, language, scope)
         case Binary("**", base, exponent):
-            return language.power(
-                source(base, language, scope, Level.ATOM), source(exponent, language, scope),
-                _whole(base, exponent),
+            return language.write_power(
+                write_expression(base, language, scope, Level.ATOM), write_expression(exponent, language, scope),
+                _find_integer_exponent(base, exponent),
             )  # fmt: skip
         case Binary():
-            return _infix(expression, language, scope), OPERATORS[expression.operator].level
-        case Call():
-            return _call(expression, language, scope), Level.ATOM
+            return _write_binary(expression, language, scope), OPERATORS[expression.operator].level
+        case FunctionCall():
+            return _write_call(expression, language, scope), Level.ATOM
 
 
-def _prefix(tree: Unary, language: Language, scope: Scope) -> tuple[str, int]:
+def _write_unary(tree: Unary, language: TargetLanguage, scope: ExportScope) -> tuple[str, int]:
     if tree.operator == "-":
-        return f"-{source(tree.operand, language, scope, Level.SIGN + 1)}", Level.SIGN
-    return language.negation(source(tree.operand, language, scope)), Level.ATOM
+        return f"-{write_expression(tree.operand, language, scope, Level.SIGN + 1)}", Level.SIGN
+    return language.write_negation(write_expression(tree.operand, language, scope)), Level.ATOM
 
 
-def _call(tree: Call, language: Language, scope: Scope) -> str:
-    arguments = [source(one, language, scope) for one in tree.arguments]
+def _write_call(tree: FunctionCall, language: TargetLanguage, scope: ExportScope) -> str:
+    arguments = [write_expression(one, language, scope) for one in tree.arguments]
     if tree.function == "where":
         condition, first, second = arguments
-        return language.choice(condition, first, second)
-    return language.function(tree.function, arguments)
+        return language.write_choice(condition, first, second)
+    return language.write_function_call(tree.function, arguments)
 
 
-def _infix(tree: Binary, language: Language, scope: Scope) -> str:
+def _write_binary(tree: Binary, language: TargetLanguage, scope: ExportScope) -> str:
     level = OPERATORS[tree.operator].level
     logical = level <= Level.COMPARISON
     beside = Level.COMPARISON + (level == Level.COMPARISON)
-    before = source(tree.left, language, scope, beside if logical else level)
-    after = source(tree.right, language, scope, beside if logical else level + 1)
-    if tree.operator == "/" and is_number(tree):
-        before = language.quotient(before)
-    operator = language.words.get(tree.operator, tree.operator)
+    before = write_expression(tree.left, language, scope, beside if logical else level)
+    after = write_expression(tree.right, language, scope, beside if logical else level + 1)
+    if tree.operator == "/" and is_constant(tree):
+        before = language.write_constant_dividend(before)
+    operator = language.logical_operators.get(tree.operator, tree.operator)
     space = " " if level <= Level.SUM else ""
     return f"{before}{space}{operator}{space}{after}"
 
 
-def is_number(expression: Expression) -> bool:
+def is_constant(expression: Expression) -> bool:
     """Whether an expression has no names in it."""
-    return not any(isinstance(node, Symbol | Past) for node in walk(expression))
+    return not any(isinstance(node, Symbol | PastValue) for node in walk(expression))
 
 
-def _whole(base: Expression, exponent: Expression) -> int | None:
+def _find_integer_exponent(base: Expression, exponent: Expression) -> int | None:
     match exponent:
-        case Number(value) if value.is_integer() and abs(value) <= 64 and not is_number(base):
+        case Number(value) if value.is_integer() and abs(value) <= 64 and not is_constant(base):
             return int(value)
         case _:
             return None

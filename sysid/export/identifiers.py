@@ -18,9 +18,9 @@ class Identifiers:
     def __init__(self, taken: Iterable[str]) -> None:
         self._taken = set(taken)
 
-    def of(self, name: str) -> str:
+    def make_identifier(self, name: str) -> str:
         """An identifier like the name, that no one else has."""
-        stem = _ascii(name)
+        stem = _to_ascii(name)
         found, number = stem, 1
         while found in self._taken:
             number += 1
@@ -29,7 +29,7 @@ class Identifiers:
         return found
 
 
-def _ascii(name: str) -> str:
+def _to_ascii(name: str) -> str:
     spelled = "".join(_GREEK.get(c, _GREEK.get(c.lower(), c).capitalize() if c.lower() in _GREEK
                                  else c) for c in unicodedata.normalize("NFKC", name))  # fmt: skip
     plain = unicodedata.normalize("NFKD", spelled).encode("ascii", "ignore").decode()
@@ -37,17 +37,17 @@ def _ascii(name: str) -> str:
     return stem if stem and not stem[0].isdigit() else f"p_{stem}".rstrip("_")
 
 
-def one_line(text: str) -> str:
+def to_one_line(text: str) -> str:
     """The text on one line, without characters that cannot be seen or that turn the direction."""
     visible = "".join(c if c.isprintable() else " " for c in text)
     return " ".join(visible.split())
 
 
-def in_docstring(text: str) -> str:
+def escape_docstring(text: str) -> str:
     """A line of a docstring: backslashes and quotes cannot end it."""
-    return one_line(text).replace("\\", "\\\\").replace('"', '\\"')
+    return to_one_line(text).replace("\\", "\\\\").replace('"', '\\"')
 
 
-def in_c_comment(text: str) -> str:
+def escape_c_comment(text: str) -> str:
     """A line inside ``/* … */``: it opens and closes none, and holds no trigraph."""
-    return one_line(text).replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")
+    return to_one_line(text).replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?")

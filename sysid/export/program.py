@@ -11,47 +11,53 @@ from dataclasses import dataclass, field
 from math import ceil
 from typing import Literal
 
-from sysid.control.linear_form import Identified
+from sysid.control.linear_form import IdentifiedModel
 from sysid.core.errors import InvalidSettings
-from sysid.data.interpolation import DENSE, MOST_POINTS
-from sysid.export.expressions import Language, Scope, number, source
+from sysid.data.interpolation import MAX_POINTS_PER_STEP, POINTS_PER_SAMPLE
+from sysid.export.expressions import ExportScope, TargetLanguage, write_expression, write_number
 from sysid.export.identifiers import Identifiers
-from sysid.kernels.reads import averaged_inputs, is_difference
+from sysid.kernels.reads import find_averaged_inputs, is_difference
 from sysid.language.functions import Level
-from sysid.language.tree import Expression, Past, Symbol
-from sysid.models.model import FixedInitial, MeasuredInitial, initial_name
+from sysid.language.tree import Expression, PastValue, Symbol
+from sysid.models.model import FixedInitial, MeasuredInitial, name_initial_state
 
-Kind = Literal["slope", "update", "recursion", "output"]
+EvaluationStage = Literal["slope", "update", "recursion", "output"]
 
 
 @dataclass(slots=True)
-class Program:
+class GeneratedProgram:
     """Identifiers for everything a program names; `lags` and `helpers` grow as it is written."""
 
-    identified: Identified
-    language: Language
-    names: Identifiers
+    identified: IdentifiedModel
+    language: TargetLanguage
+    identifiers: Identifiers
     prefix: str = ""
-    parameters: dict[str, str] = field(default_factory=dict)
-    inputs: dict[str, str] = field(default_factory=dict)
-    outputs: dict[str, str] = field(default_factory=dict)
-    now: dict[str, str] = field(default_factory=dict)
-    every: dict[str, str] = field(default_factory=dict)
-    following: dict[str, str] = field(default_factory=dict)
-    starts: dict[str, str] = field(default_factory=dict)
-    lags: dict[Expression, str] = field(default_factory=dict)
-    helpers: set[str] = field(default_factory=set)
+    parameter_names: dict[str, str] = field(default_factory=dict)
+    input_names: dict[str, str] = field(default_factory=dict)
+    output_names: dict[str, str] = field(default_factory=dict)
+    present_names: dict[str, str] = field(default_factory=dict)
+    array_names: dict[str, str] = field(default_factory=dict)
+    next_names: dict[str, str] = field(default_factory=dict)
+    start_names: dict[str, str] = field(default_factory=dict)
+    delay_names: dict[Expression, str] = field(default_factory=dict)
+    helper_names: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        model, of = self.identified.model, self.names.of
-        self.inputs = {one.name: of(one.name) for one in model.inputs}
-        self.parameters = {one.name: of(one.name) for one in model.parameters}
-        self.now = {one.name: of(one.name) for one in model.states}
-        self.starts = {one.name: of(f"{self.now[one.name]}_0") for one in model.states}
-        self.every = {one.name: of(f"{self.now[one.name]}_all") for one in model.states}
-        self.following = {one.name: of(f"{self.now[one.name]}_next") for one in model.states}
-        states = set(self.now)
-        self.outputs = {
+        model, of = self.identified.model, self.identifiers.make_identifier
+        self.input_names = {one.name: of(one.name) for one in model.inputs}
+        self.parameter_names = {one.name: of(one.name) for one in model.parameters}
+        self.present_names = {one.name: of(one.name) for one in model.states}
+        self.start_names = {
+            one.name: of(f"{self.present_names[one.name]}_0") for one in model.states
+        }
+        self.array_names = {
+            one.name: of(f"{self.present_names[one.name]}_all") for one in model.states
+        }
+        self.next_names = {
+            one.name: of(f"{self.present_names[one.name]}_next") for one in model.states
+        }
+        states = set(self.present_names)
+        self.output_names = {
             one.name: of(f"{one.name}_out" if one.name in states else one.name)
             for one in model.outputs
         }
@@ -62,12 +68,12 @@ class Program:
         return is_difference(self.identified.model)
 
     @property
-    def index(self) -> str:
+    def loop_variable(self) -> str:
         """The loop's variable."""
         return "k" if self.is_recursion else "step"
 
     @property
-    def period(self) -> str:
+    def step_variable(self) -> str:
         """The integration step in s; ``h`` is a word of the language in a recursion only."""
         return "h" if self.is_recursion else "dt"
 
@@ -77,16 +83,16 @@ class Program:
         return self.identified.model.solver.substeps
 
     @property
-    def own_step(self) -> float | None:
+    def grid_step(self) -> float | None:
         """Step of the simulation's own grid in s; None: that of the samples."""
         return None if self.is_recursion else self.identified.model.solver.step
 
     @property
-    def memory(self) -> int:
+    def n_start_samples(self) -> int:
         """Samples that are given, not computed."""
         return max(self.identified.model.memory, 1) if self.is_recursion else 1
 
-    def start(self, state: int) -> float | None:
+    def find_initial_value(self, state: int) -> float | None:
         """Where a state starts; None if it must be measured.
 
         Raises
@@ -95,8 +101,8 @@ class Program:
             If the value of an estimated start is missing.
         """
         model = self.identified.model
-        name = initial_name(model.states[state].name, 0)
-        value, initial = self.identified.find(name), model.initial[state]
+        name = name_initial_state(model.states[state].name, 0)
+        value, initial = self.identified.find_value(name), model.initial[state]
         if value is not None:
             return value.value
         if isinstance(initial, FixedInitial):
@@ -105,158 +111,166 @@ class Program:
             return None
         raise InvalidSettings(f"/values/{name}", "a value is missing")
 
-    def before(self, state: str) -> str:
+    def write_history(self, state: str) -> str:
         """What a state was before the start."""
         zero = self.identified.model.solver.history == "zero"
-        return "0.0" if zero else f"{self.every[state]}[0]"
+        return "0.0" if zero else f"{self.array_names[state]}[0]"
 
-    def call(self, helper: str, *arguments: str) -> str:
+    def write_helper_call(self, helper: str, *arguments: str) -> str:
         """A call of a helper, which is then written out."""
-        self.helpers.add(helper)
+        self.helper_names.add(helper)
         return f"{helper}({', '.join(arguments)})"
 
-    def lag(self, expression: Expression) -> str:
+    def name_delay(self, expression: Expression) -> str:
         """The variable of a lag in integration steps."""
-        if expression not in self.lags:
-            self.lags[expression] = self.names.of(f"lag_{len(self.lags) + 1}")
-        return self.lags[expression]
+        if expression not in self.delay_names:
+            self.delay_names[expression] = self.identifiers.make_identifier(
+                f"lag_{len(self.delay_names) + 1}"
+            )
+        return self.delay_names[expression]
 
-    def ramp(self) -> str:
+    def write_ramp_width(self) -> str:
         """Half the width of a held input's jump, in samples, as `FineInput` has it."""
-        if self.own_step is not None:
-            points = f"2*ceil({DENSE // 2}*ratio - 1e-3)"
-            return f"ratio/{self.language.limited(points, 4, MOST_POINTS)}"
-        points_ = min(max(2 * ceil(DENSE / self.substeps / 2 - 1e-3), 4), MOST_POINTS)
-        return number(1.0 / (points_ * self.substeps))
+        if self.grid_step is not None:
+            points = f"2*ceil({POINTS_PER_SAMPLE // 2}*ratio - 1e-3)"
+            return f"ratio/{self.language.write_clamp(points, 4, MAX_POINTS_PER_STEP)}"
+        points_ = min(
+            max(2 * ceil(POINTS_PER_SAMPLE / self.substeps / 2 - 1e-3), 4), MAX_POINTS_PER_STEP
+        )
+        return write_number(1.0 / (points_ * self.substeps))
 
-    def half(self) -> str:
+    def write_half_step(self) -> str:
         """Half an integration step, in samples: a held input with a lag is a mean over a step."""
-        return "0.5*ratio" if self.own_step is not None else number(0.5 / self.substeps)
+        return "0.5*ratio" if self.grid_step is not None else write_number(0.5 / self.substeps)
 
     @property
-    def averaged(self) -> frozenset[str]:
+    def averaged_input_names(self) -> frozenset[str]:
         """Inputs that are read as means over a step where they are held."""
-        return averaged_inputs(self.identified.model)
+        return find_averaged_inputs(self.identified.model)
 
 
 @dataclass(frozen=True, slots=True)
-class Place(Scope):
+class LoopScope(ExportScope):
     """Where in the loop an expression is evaluated.
 
     ``slope``: `part` of a step after it began; ``update``: as it begins; ``recursion``: at sample
     k; ``output``: at a finished step. `equation` is the one that asks.
     """
 
-    program: Program
-    kind: Kind
+    program: GeneratedProgram
+    stage: EvaluationStage
     equation: int = -1
 
-    def symbol(self, symbol: Symbol) -> str:
+    def write_symbol(self, symbol: Symbol) -> str:
         """A parameter or a reserved name."""
         program = self.program
         if symbol.kind == "parameter":
-            return program.prefix + program.parameters[symbol.name]
+            return program.prefix + program.parameter_names[symbol.name]
         if symbol.kind == "period":
-            return program.period
+            return program.step_variable
         if symbol.kind == "index":
-            return program.language.real(program.index)
-        return f"({self._index()}*{program.period})"
+            return program.language.write_float(program.loop_variable)
+        return f"({self._write_index()}*{program.step_variable})"
 
-    def past(self, past: Past) -> str:
+    def write_past_value(self, past: PastValue) -> str:
         """A state or an input, now or in the past."""
-        return self._input(past) if past.kind == "input" else self._state(past)
+        return self._write_input(past) if past.kind == "input" else self._write_state(past)
 
-    def _index(self) -> str:
-        return "(step + part)" if self.kind == "slope" else self.program.index
+    def _write_index(self) -> str:
+        return "(step + part)" if self.stage == "slope" else self.program.loop_variable
 
-    def _back(self, past: Past) -> str:
+    def _write_position(self, past: PastValue) -> str:
         offset = f"-{past.offset}" if past.offset else ""
-        lag = f" - {self.program.lag(past.lag)}" if past.lag is not None else ""
-        return ("step + part" if self.kind == "slope" else self.program.index) + offset + lag
+        lag = f" - {self.program.name_delay(past.delay)}" if past.delay is not None else ""
+        return (
+            ("step + part" if self.stage == "slope" else self.program.loop_variable) + offset + lag
+        )
 
     # ---- inputs ---------------------------------------------------------------------------
-    def _input(self, past: Past) -> str:
+    def _write_input(self, past: PastValue) -> str:
         program = self.program
-        name, substeps = program.inputs[past.name], program.substeps
-        held = program.identified.hold(past.name) == "zero"
-        early = self.kind == "output" and past.offset > 0  # may lie before the record
-        if past.lag is None and program.own_step is None and not early:
+        name, substeps = program.input_names[past.name], program.substeps
+        held = program.identified.get_hold(past.name) == "zero"
+        early = self.stage == "output" and past.offset > 0  # may lie before the record
+        if past.delay is None and program.grid_step is None and not early:
             if held:
-                at = "step" if self.kind == "slope" else self._back(past)
-                return program.language.element(name, at, substeps)
-            if substeps == 1 and self.kind != "slope":
-                return program.language.element(name, self._back(past), 1)
-        place = self._samples(past)
-        if held and past.name in program.averaged:
-            program.helpers.add("averaged")
+                at = "step" if self.stage == "slope" else self._write_position(past)
+                return program.language.write_element(name, at, substeps)
+            if substeps == 1 and self.stage != "slope":
+                return program.language.write_element(name, self._write_position(past), 1)
+        place = self._write_sample_position(past)
+        if held and past.name in program.averaged_input_names:
+            program.helper_names.add("averaged")
             after = " + half" if program.is_recursion else ""
-            return program.language.read("averaged", name, place + after)
+            return program.language.write_signal_read("averaged", name, place + after)
         if not held:
-            program.helpers.add("between")
-            return program.language.read("between", name, place)
-        program.helpers.add("held")
-        return program.language.read("held", name, place + self._beside(past))
+            program.helper_names.add("between")
+            return program.language.write_signal_read("between", name, place)
+        program.helper_names.add("held")
+        return program.language.write_signal_read(
+            "held", name, place + self._write_jump_offset(past)
+        )
 
-    def _samples(self, past: Past) -> str:
-        program, place = self.program, self._back(past)
-        if program.own_step is not None:
+    def _write_sample_position(self, past: PastValue) -> str:
+        program, place = self.program, self._write_position(past)
+        if program.grid_step is not None:
             return f"({place})*ratio"
         if program.substeps == 1:
             return place
-        return f"({place})/{number(program.substeps)}"
+        return f"({place})/{write_number(program.substeps)}"
 
-    def _beside(self, past: Past) -> str:
+    def _write_jump_offset(self, past: PastValue) -> str:
         """A recursion reads just behind a jump; a solver from behind one to before the next."""
         if self.program.is_recursion:
             return " + ramp"
-        if past.lag is not None:
+        if past.delay is not None:
             return ""
-        return " + ramp*(1.0 - 2.0*part)" if self.kind == "slope" else " + ramp"
+        return " + ramp*(1.0 - 2.0*part)" if self.stage == "slope" else " + ramp"
 
     # ---- states ---------------------------------------------------------------------------
-    def _state(self, past: Past) -> str:
+    def _write_state(self, past: PastValue) -> str:
         program = self.program
-        if past.lag is None and past.offset == 0:
-            return self._present(past.name)
-        if self.kind == "recursion":
-            return self._earlier(past)
-        every, before = program.every[past.name], program.before(past.name)
-        lag = self._steps(past)
-        if self.kind == "slope":
-            present = self._present(past.name)
-            return program.call("lately", every, before, "step", "part", present, lag)
-        if self.kind == "update" and self._is_updated(past.name):
-            following = program.following[past.name]
-            return program.call("lately", every, before, "step", "1.0", following, lag)
-        return program.call("past", every, before, program.index, lag)
+        if past.delay is None and past.offset == 0:
+            return self._write_present_state(past.name)
+        if self.stage == "recursion":
+            return self._write_earlier_state(past)
+        every, before = program.array_names[past.name], program.write_history(past.name)
+        lag = self._write_state_delay(past)
+        if self.stage == "slope":
+            present = self._write_present_state(past.name)
+            return program.write_helper_call("lately", every, before, "step", "part", present, lag)
+        if self.stage == "update" and self._is_updated(past.name):
+            following = program.next_names[past.name]
+            return program.write_helper_call("lately", every, before, "step", "1.0", following, lag)
+        return program.write_helper_call("past", every, before, program.loop_variable, lag)
 
-    def _earlier(self, past: Past) -> str:
+    def _write_earlier_state(self, past: PastValue) -> str:
         program = self.program
-        every, before = program.every[past.name], program.before(past.name)
-        if past.lag is None:
+        every, before = program.array_names[past.name], program.write_history(past.name)
+        if past.delay is None:
             return f"{every}[k-{past.offset}]"
-        lag = program.lag(past.lag)
+        lag = program.name_delay(past.delay)
         if past.offset == 0:
-            present = self._present(past.name)
-            return program.call("lately", every, before, "k-1", "1.0", present, lag)
-        whole = f"{number(past.offset - 1)} + " if past.offset > 1 else ""
-        return program.call("past", every, before, "k-1", whole + lag)
+            present = self._write_present_state(past.name)
+            return program.write_helper_call("lately", every, before, "k-1", "1.0", present, lag)
+        whole = f"{write_number(past.offset - 1)} + " if past.offset > 1 else ""
+        return program.write_helper_call("past", every, before, "k-1", whole + lag)
 
-    def _steps(self, past: Past) -> str:
-        offset = number(past.offset) if past.offset else ""
-        lag = self.program.lag(past.lag) if past.lag is not None else ""
+    def _write_state_delay(self, past: PastValue) -> str:
+        offset = write_number(past.offset) if past.offset else ""
+        lag = self.program.name_delay(past.delay) if past.delay is not None else ""
         return " + ".join(part for part in (offset, lag) if part)
 
-    def _present(self, name: str) -> str:
+    def _write_present_state(self, name: str) -> str:
         program = self.program
-        every = program.every[name]
-        if self.kind == "slope":
-            return program.now[name]
-        if self.kind == "recursion":
-            return program.now[name] if self._is_updated(name) else f"{every}[k-1]"
-        if self.kind == "update" and self._is_updated(name):
-            return program.following[name]
-        return f"{every}[{program.index}]"
+        every = program.array_names[name]
+        if self.stage == "slope":
+            return program.present_names[name]
+        if self.stage == "recursion":
+            return program.present_names[name] if self._is_updated(name) else f"{every}[k-1]"
+        if self.stage == "update" and self._is_updated(name):
+            return program.next_names[name]
+        return f"{every}[{program.loop_variable}]"
 
     def _is_updated(self, name: str) -> bool:
         """Whether the state's next value is known when the equation asks."""
@@ -268,70 +282,72 @@ class Place(Scope):
 
 
 @dataclass(frozen=True, slots=True)
-class Lag(Scope):
+class DelayScope(ExportScope):
     """The scope of a lag: parameters and the sampling period."""
 
-    program: Program
+    program: GeneratedProgram
 
-    def symbol(self, symbol: Symbol) -> str:
+    def write_symbol(self, symbol: Symbol) -> str:
         """A parameter, or the sampling period."""
-        return Place(self.program, "output").symbol(symbol)
+        return LoopScope(self.program, "output").write_symbol(symbol)
 
-    def past(self, past: Past) -> str:
+    def write_past_value(self, past: PastValue) -> str:
         """Never asked: the language allows no signals in a lag."""
         raise AssertionError(f"a lag holds no signal such as {past.name}")
 
 
-def lag_steps(program: Program, lag: Expression) -> str:
+def write_delay_steps(program: GeneratedProgram, lag: Expression) -> str:
     """Text of a lag in integration steps."""
     if program.is_recursion:
-        text = source(lag, program.language, Lag(program))
+        text = write_expression(lag, program.language, DelayScope(program))
     else:
-        text = f"{source(lag, program.language, Lag(program), Level.SIGN)}/{program.period}"
+        text = f"{write_expression(lag, program.language, DelayScope(program), Level.SIGN)}/{program.step_variable}"
     is_whole = program.identified.model.solver.interpolation == "nearest"
     return program.language.lag(text, is_whole=is_whole)
 
 
 # ---- what both languages write alike --------------------------------------------------------
-def time_loop(program: Program, runge_kutta: Callable[[Program], list[str]]) -> list[str]:
+def time_loop(
+    program: GeneratedProgram, runge_kutta: Callable[[GeneratedProgram], list[str]]
+) -> list[str]:
     """The loop that computes the states; of a Runge-Kutta method each language has its own."""
     if program.is_recursion:
-        return _recursion(program)
+        return _write_recursion(program)
     if program.identified.model.solver.method == "rk4":
         return runge_kutta(program)
-    return _euler(program)
+    return _write_euler(program)
 
 
-def _recursion(program: Program) -> list[str]:
+def _write_recursion(program: GeneratedProgram) -> list[str]:
     model, language = program.identified.model, program.language
     body: list[str] = []
     for i in model.order:
         name = model.states[i].name
-        now = program.now[name]
+        now = program.present_names[name]
         body += language.assign(now, equation(program, "recursion", i), is_new=True)
-        body += language.assign(f"{program.every[name]}[k]", now)
-    head = language.open_loop("k", program.memory, to_last=True)
+        body += language.assign(f"{program.array_names[name]}[k]", now)
+    head = language.open_loop("k", program.n_start_samples, to_last=True)
     return [head, *indented(body), *language.close_loop()]
 
 
-def _euler(program: Program) -> list[str]:
+def _write_euler(program: GeneratedProgram) -> list[str]:
     model, language = program.identified.model, program.language
     body: list[str] = []
     for i, state in enumerate(model.states):
         slope = equation(program, "update", i, Level.PRODUCT)
-        text = f"{program.every[state.name]}[step] + dt*{slope}"
-        body += language.assign(program.following[state.name], text, is_new=True)
+        text = f"{program.array_names[state.name]}[step] + dt*{slope}"
+        body += language.assign(program.next_names[state.name], text, is_new=True)
     for state in model.states:
-        target = f"{program.every[state.name]}[step + 1]"
-        body += language.assign(target, program.following[state.name])
+        target = f"{program.array_names[state.name]}[step + 1]"
+        body += language.assign(target, program.next_names[state.name])
     head = language.open_loop("step", 0, to_last=False)
     return [head, *indented(body), *language.close_loop()]
 
 
-def equation(program: Program, kind: Kind, number_: int, floor: int = 0) -> str:
+def equation(program: GeneratedProgram, kind: EvaluationStage, number_: int, floor: int = 0) -> str:
     """Text of an equation's right-hand side; in parentheses if it binds less than `floor`."""
     tree = program.identified.model.equations[number_]
-    return source(tree, program.language, Place(program, kind, number_), floor)
+    return write_expression(tree, program.language, LoopScope(program, kind, number_), floor)
 
 
 def indented(lines: Sequence[str], levels: int = 1) -> list[str]:
@@ -340,7 +356,7 @@ def indented(lines: Sequence[str], levels: int = 1) -> list[str]:
 
 
 def needed_helpers(
-    helpers: Mapping[str, str], used: Iterable[str], identified: Identified
+    helpers: Mapping[str, str], used: Iterable[str], identified: IdentifiedModel
 ) -> list[str]:
     """Texts of the helpers that are used or that those call, each before who calls it."""
     wanted = set(used)
@@ -352,7 +368,7 @@ def needed_helpers(
     return [helpers[variants.get(name, name)] for name in helpers if name in wanted]
 
 
-def _variants_of(identified: Identified) -> Mapping[str, str]:
+def _variants_of(identified: IdentifiedModel) -> Mapping[str, str]:
     """Which helpers of a program are written in another way, by the solver of its model."""
     solver = identified.model.solver
     found = {"past": "past cubic"} if solver.interpolation == "cubic" else {}

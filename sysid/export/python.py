@@ -3,74 +3,79 @@
 import textwrap
 from collections.abc import Mapping
 
-from sysid.control.linear_form import Identified
-from sysid.export.description import facts, unit_text, value_lines, wrapped
-from sysid.export.expressions import WIDTHS, Language, number, source
-from sysid.export.identifiers import Identifiers, in_docstring
+from sysid.control.linear_form import IdentifiedModel
+from sysid.export.description import describe_model, describe_unit, describe_values, wrap_source
+from sysid.export.expressions import (
+    HELPER_ARGUMENTS,
+    TargetLanguage,
+    write_expression,
+    write_number,
+)
+from sysid.export.identifiers import Identifiers, escape_docstring
 from sysid.export.program import (
-    Place,
-    Program,
+    GeneratedProgram,
+    LoopScope,
     equation,
     indented,
-    lag_steps,
     needed_helpers,
     time_loop,
+    write_delay_steps,
 )
 from sysid.language.functions import FUNCTIONS, Level
-from sysid.models.model import Output, Quantity
+from sysid.models.model import ModelSignal, Output
 
-_WORDS = (
+_RESERVED_WORDS = (
     "False None True and as assert async await break class continue def del elif else except "
     "finally for from global if import in is lambda nonlocal not or pass raise return try while "
     "with match case type np t simulate rates step steps part dt h k now slope_1 slope_2 slope_3 "
     "slope_4 every points ratio ramp half averaged sample_time lag range zip map max min int float "
     "abs len y before between held past lately sign signal array grid print math ValueError"
 )
-_WIDTH = 96
+_LINE_WIDTH = 96
 
 
-class PythonLanguage(Language):
+class PythonLanguage(TargetLanguage):
     """Python, with NumPy's functions on single numbers: overflow gives ``inf``, not an error."""
 
-    words: Mapping[str, str] = {}
+    logical_operators: Mapping[str, str] = {}
 
-    def negation(self, condition: str) -> str:
+    def write_negation(self, condition: str) -> str:
         """``not (…)``, to stand anywhere."""
         return f"(not ({condition}))"
 
-    def function(self, name: str, arguments: list[str]) -> str:
+    def write_function_call(self, name: str, arguments: list[str]) -> str:
         """A call of a function of the model language."""
         return f"np.{FUNCTIONS[name].numpy}({', '.join(arguments)})"
 
-    def power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
+    def write_power(self, base: str, exponent: str, whole: int | None) -> tuple[str, int]:
         """A power and its level."""
         if whole is not None:
             return f"{base}**{whole}", Level.ATOM - 1
         return f"np.power({base}, {exponent})", Level.ATOM
 
-    def choice(self, condition: str, first: str, second: str) -> str:
+    def write_choice(self, condition: str, first: str, second: str) -> str:
         """``where``, to stand anywhere."""
         return f"({first} if {condition} else {second})"
 
-    def quotient(self, above: str) -> str:
+    def write_constant_dividend(self, above: str) -> str:
         """A dividend of numbers only."""
         return f"np.float64({above})"
 
-    def element(self, array: str, index: str, divisor: int) -> str:
+    def write_element(self, array: str, index: str, divisor: int) -> str:
         """Array at the whole part of index / divisor."""
         if divisor == 1:
             return f"{array}[{index}]"
         return f"{array}[{f'({index})' if '-' in index else index}//{divisor}]"
 
-    def read(self, helper: str, signal: str, place: str) -> str:
+    def write_signal_read(self, helper: str, signal: str, place: str) -> str:
         """A call of ``between``, ``held`` or ``averaged``."""
-        return f"{helper}({signal}, {place}{WIDTHS[helper]})"
+        return f"{helper}({signal}, {place}{HELPER_ARGUMENTS[helper]})"
 
-    def limited(self, value: str, least: int, most: int) -> str:
+    def write_clamp(self, value: str, least: int, most: int) -> str:
         """A number held between two others."""
         return f"min(max({value.replace('ceil', 'np.ceil')}, {least}), {most})"
 
-    def real(self, index: str) -> str:
+    def write_float(self, index: str) -> str:
         """A whole number as floating-point number."""
         return f"np.float64({index})"
 
@@ -86,14 +91,14 @@ class PythonLanguage(Language):
 
     def assign(self, name: str, text: str, *, is_new: bool = False) -> list[str]:
         """An assignment; a new name is not declared."""
-        return _statement(f"{name} = ", text)
+        return _wrap_statement(f"{name} = ", text)
 
     def close_loop(self) -> list[str]:
         """Nothing: what is no longer indented is behind the loop."""
         return []
 
 
-def python_source(identified: Identified) -> str:
+def write_python_source(identified: IdentifiedModel) -> str:
     """A module with one function ``simulate(t, u, …) -> y``.
 
     Parameters
@@ -106,128 +111,140 @@ def python_source(identified: Identified) -> str:
         If a value is missing.
     """
     names = [output.name for output in identified.model.outputs]
-    taken = [word for word in _WORDS.split() if word not in names]
-    program = Program(identified, PythonLanguage(), Identifiers(taken))
-    loop = [*time_loop(program, _runge_kutta), *_outputs(program)]
-    head = [*_arrays(program), *_steps(program), *_lags(program), *_starts(program)]
-    helpers = needed_helpers(HELPERS, program.helpers, identified)
+    taken = [word for word in _RESERVED_WORDS.split() if word not in names]
+    program = GeneratedProgram(identified, PythonLanguage(), Identifiers(taken))
+    loop = [*time_loop(program, _write_runge_kutta), *_write_outputs(program)]
+    head = [
+        *_write_arrays(program),
+        *_write_step_count(program),
+        *_write_delays(program),
+        *_write_starts(program),
+    ]
+    helpers = needed_helpers(HELPERS, program.helper_names, identified)
     body = [*head, 'with np.errstate(all="ignore"):  # what diverges becomes inf or nan']
     body += indented(loop)
-    parts = [_docstring(identified), "import numpy as np\n", *(f"\n{one}" for one in helpers)]
-    parts.append("\n" + _signature(program))
-    parts += [textwrap.indent("\n".join(_inner_docstring(program)), "    ")]
+    parts = [_write_docstring(identified), "import numpy as np\n", *(f"\n{one}" for one in helpers)]
+    parts.append("\n" + _write_signature(program))
+    parts += [textwrap.indent("\n".join(_write_function_docstring(program)), "    ")]
     parts += [textwrap.indent("\n".join(body), "    ")]
     return "\n".join(parts) + "\n"
 
 
-def _docstring(identified: Identified) -> str:
-    lines = [in_docstring(line) for line in facts(identified)]
+def _write_docstring(identified: IdentifiedModel) -> str:
+    lines = [escape_docstring(line) for line in describe_model(identified)]
     return "\n".join(['"""' + lines[0], "", *lines[1:], '"""', ""])
 
 
-def _signature(program: Program) -> str:
+def _write_signature(program: GeneratedProgram) -> str:
     found = program.identified
-    numbers = found.numbers
+    numbers = found.value_by_name
     required = [
-        program.starts[state.name]
-        for i, state in enumerate(found.model.states) if program.start(i) is None
+        program.start_names[state.name]
+        for i, state in enumerate(found.model.states) if program.find_initial_value(i) is None
     ]  # fmt: skip
     given = [
-        f"{program.parameters[one.name]}={number(numbers[one.name])}"
+        f"{program.parameter_names[one.name]}={write_number(numbers[one.name])}"
         for one in found.model.parameters
     ]
     starts = [
-        f"{program.starts[state.name]}={number(start)}"
+        f"{program.start_names[state.name]}={write_number(start)}"
         for i, state in enumerate(found.model.states)
-        if (start := program.start(i)) is not None
+        if (start := program.find_initial_value(i)) is not None
     ]
     named = [*required, *given, *starts]
-    arguments = ["t", *program.inputs.values(), *(["*"] if named else []), *named]
-    return "def simulate(\n" + _wrapped(", ".join(arguments) + ",", "    ") + "\n):"
+    arguments = ["t", *program.input_names.values(), *(["*"] if named else []), *named]
+    return "def simulate(\n" + _wrap_lines(", ".join(arguments) + ",", "    ") + "\n):"
 
 
-def _inner_docstring(program: Program) -> list[str]:
+def _write_function_docstring(program: GeneratedProgram) -> list[str]:
     model = program.identified.model
     lines = ['"""Free run of the model from its start.', "", "Parameters", "----------",
              "t : array (N,)", "    Times in s, one sampling period apart."]  # fmt: skip
     for one in model.inputs:
-        lines += _described(program.inputs[one.name], "Input", one)
-    for name, line in value_lines(program.identified, program.parameters, program.starts):
+        lines += _describe_signal(program.input_names[one.name], "Input", one)
+    for name, line in describe_values(
+        program.identified, program.parameter_names, program.start_names
+    ):
         lines += [f"{name} : float", f"    {line}"]
     lines += ["", "Returns", "-------"]
     for output in model.outputs:
-        lines += _described(program.outputs[output.name], "Output", output)
-    return [lines[0], *map(_kept, lines[1:]), '"""']
+        lines += _describe_signal(program.output_names[output.name], "Output", output)
+    return [lines[0], *map(_escape_line, lines[1:]), '"""']
 
 
-def _described(identifier: str, kind: str, signal: Quantity | Output) -> list[str]:
-    about = f"    {kind} {signal.name}, {unit_text(signal.unit)}."
+def _describe_signal(identifier: str, kind: str, signal: ModelSignal | Output) -> list[str]:
+    about = f"    {kind} {signal.name}, {describe_unit(signal.unit)}."
     return [f"{identifier} : array (N,)", about]
 
 
-def _kept(line: str) -> str:
+def _escape_line(line: str) -> str:
     indent = len(line) - len(line.lstrip())
-    return " " * indent + in_docstring(line)
+    return " " * indent + escape_docstring(line)
 
 
-def _arrays(program: Program) -> list[str]:
+def _write_arrays(program: GeneratedProgram) -> list[str]:
     lines = ["t = np.asarray(t, dtype=np.float64)"]
-    signals = program.inputs.values()
+    signals = program.input_names.values()
     lines += [f"{name} = np.asarray({name}, dtype=np.float64)" for name in signals]
     shapes = [f"{name}.shape != t.shape" for name in signals]
     wrong = " or ".join(["t.ndim != 1", "t.size < 2", *shapes])
-    lines += [*_statement("if ", wrong, ":"),
+    lines += [*_wrap_statement("if ", wrong, ":"),
               '    raise ValueError("t and the inputs must have one shape (N,), N > 1")',
               "sample_time = (t[-1] - t[0])/(t.size - 1)",
               "if not np.max(np.abs(np.diff(t) - sample_time)) < 0.1*sample_time:",
               '    raise ValueError("t must be regular; resample the inputs first")']  # fmt: skip
-    if program.parameters:
-        targets = ", ".join(program.parameters.values())
-        both = _wrapped(targets + ",", "    ")
+    if program.parameter_names:
+        targets = ", ".join(program.parameter_names.values())
+        both = _wrap_lines(targets + ",", "    ")
         lines += ["(", both, ") = map(np.float64, (", both, "))"]
     return lines
 
 
-def _steps(program: Program) -> list[str]:
-    period, substeps = program.period, program.substeps
-    if program.own_step is None:
+def _write_step_count(program: GeneratedProgram) -> list[str]:
+    period, substeps = program.step_variable, program.substeps
+    if program.grid_step is None:
         divided = f"/{substeps}" if substeps > 1 else ""
         times = f"*{substeps}" if substeps > 1 else ""
         count = f"(t.size - 1){times}" if substeps > 1 else "t.size - 1"
         lines = [f"{period} = sample_time{divided}", f"steps = {count}"]
     else:
-        own = number(program.own_step)
+        own = write_number(program.grid_step)
         lines = [f"dt = {own}/{substeps}" if substeps > 1 else f"dt = {own}",
                  f"points = int(np.ceil((t[-1] - t[0])/{own} - 0.01))",
                  f"steps = points*{substeps}", "ratio = dt/sample_time"]  # fmt: skip
-    if "held" in program.helpers:
-        lines.append(f"ramp = {program.ramp()}  # samples: half the width of a jump")
-    if "averaged" in program.helpers:
-        lines.append(f"half = {program.half()}  # samples: half an integration step")
+    if "held" in program.helper_names:
+        lines.append(f"ramp = {program.write_ramp_width()}  # samples: half the width of a jump")
+    if "averaged" in program.helper_names:
+        lines.append(f"half = {program.write_half_step()}  # samples: half an integration step")
     return lines
 
 
-def _lags(program: Program) -> list[str]:
-    lags = program.lags.items()
-    return [f"{name} = {lag_steps(program, lag)}  # integration steps" for lag, name in lags]
+def _write_delays(program: GeneratedProgram) -> list[str]:
+    lags = program.delay_names.items()
+    return [
+        f"{name} = {write_delay_steps(program, lag)}  # integration steps" for lag, name in lags
+    ]
 
 
-def _starts(program: Program) -> list[str]:
+def _write_starts(program: GeneratedProgram) -> list[str]:
     lines = []
     for state in program.identified.model.states:
-        every, start = program.every[state.name], program.starts[state.name]
-        lines += [f"{every} = np.empty(steps + 1)", f"{every}[:{program.memory}] = {start}"]
+        every, start = program.array_names[state.name], program.start_names[state.name]
+        lines += [
+            f"{every} = np.empty(steps + 1)",
+            f"{every}[:{program.n_start_samples}] = {start}",
+        ]
     return lines
 
 
 # ---- the time loop --------------------------------------------------------------------------
-def _runge_kutta(program: Program) -> list[str]:
+def _write_runge_kutta(program: GeneratedProgram) -> list[str]:
     model = program.identified.model
-    states = [program.now[state.name] for state in model.states]
+    states = [program.present_names[state.name] for state in model.states]
     slopes: list[str] = []
     for i in range(len(model.states)):
-        slopes += indented(_statement("", equation(program, "slope", i), ","), 2)
-    every = [program.every[state.name] for state in model.states]
+        slopes += indented(_wrap_statement("", equation(program, "slope", i), ","), 2)
+    every = [program.array_names[state.name] for state in model.states]
     now = ", ".join(f"{name}[step]" for name in every)
     following = [f"{name}[step + 1]" for name in every]
     target = ", ".join(following) if len(following) > 1 else f"({following[0]},)"
@@ -240,38 +257,38 @@ def _runge_kutta(program: Program) -> list[str]:
         "    slope_2 = rates(step, 0.5, *(now + dt/2*slope_1))",
         "    slope_3 = rates(step, 0.5, *(now + dt/2*slope_2))",
         "    slope_4 = rates(step, 1.0, *(now + dt*slope_3))",
-        *indented(_statement(
+        *indented(_wrap_statement(
             f"{target} = ", "now + dt/6*(slope_1 + 2*slope_2 + 2*slope_3 + slope_4)"
         )),
     ]  # fmt: skip
 
 
-def _outputs(program: Program) -> list[str]:
+def _write_outputs(program: GeneratedProgram) -> list[str]:
     model, substeps = program.identified.model, program.substeps
     by = f"0, steps + 1, {substeps}" if substeps > 1 else "steps + 1"
     lines = []
     for output in model.outputs:
-        text = source(output.expression, program.language, Place(program, "output"))
-        loop = f"for {program.index} in range({by})"
-        target = program.outputs[output.name]
-        lines += [f"{target} = np.array([", *indented(_statement("", text)), f"    {loop}",
+        text = write_expression(output.expression, program.language, LoopScope(program, "output"))
+        loop = f"for {program.loop_variable} in range({by})"
+        target = program.output_names[output.name]
+        lines += [f"{target} = np.array([", *indented(_wrap_statement("", text)), f"    {loop}",
                   "], dtype=np.float64)"]  # fmt: skip
-        if program.own_step is not None:
-            grid = f"t[0] + {number(program.own_step)}*np.arange(points + 1)"
+        if program.grid_step is not None:
+            grid = f"t[0] + {write_number(program.grid_step)}*np.arange(points + 1)"
             lines.append(f"{target} = np.interp(t, {grid}, {target})")
-    return [*lines, f"return {', '.join(program.outputs.values())}"]
+    return [*lines, f"return {', '.join(program.output_names.values())}"]
 
 
 # ---- layout ---------------------------------------------------------------------------------
-def _statement(before: str, text: str, after: str = "") -> list[str]:
+def _wrap_statement(before: str, text: str, after: str = "") -> list[str]:
     """A statement on as many lines as it needs, in parentheses if on several."""
-    if len(before) + len(text) + len(after) <= _WIDTH - 12:
+    if len(before) + len(text) + len(after) <= _LINE_WIDTH - 12:
         return [f"{before}{text}{after}"]
-    return [f"{before}(", _wrapped(text, "    "), f"){after}"]
+    return [f"{before}(", _wrap_lines(text, "    "), f"){after}"]
 
 
-def _wrapped(text: str, indent: str) -> str:
-    return textwrap.indent("\n".join(wrapped(text, _WIDTH - 16)), indent)
+def _wrap_lines(text: str, indent: str) -> str:
+    return textwrap.indent("\n".join(wrap_source(text, _LINE_WIDTH - 16)), indent)
 
 
 # ---- functions that a program calls -----------------------------------------------------------

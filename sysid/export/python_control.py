@@ -1,14 +1,20 @@
 """Export as a script for python-control: transfer functions with their dead times."""
 
-from sysid.control.linear_form import Identified
-from sysid.control.transfer import Quasi, Transfer, Transfers, by_delay, transfers
-from sysid.export.description import facts, wrapped
-from sysid.export.expressions import number
-from sysid.export.identifiers import in_docstring
+from sysid.control.linear_form import IdentifiedModel
+from sysid.control.transfer import (
+    QuasiPolynomial,
+    TransferFunction,
+    TransferFunctions,
+    compute_transfer_functions,
+    group_by_delay,
+)
+from sysid.export.description import describe_model, wrap_source
+from sysid.export.expressions import write_number
+from sysid.export.identifiers import escape_docstring
 
-_WIDTH = 96
+_LINE_WIDTH = 96
 
-_CONTINUOUS = '''\
+_CONTINUOUS_TEMPLATE = '''\
 # numerator and denominator: (dead time in s, coefficients of falling powers of s)
 pairs = {
 @PAIRS@
@@ -43,7 +49,7 @@ def transfer(pair, order=@ORDER@):
 
 systems = {names: transfer(pair) for names, pair in pairs.items()}
 '''
-_DISCRETE = '''\
+_DISCRETE_TEMPLATE = '''\
 period = @PERIOD@  # s
 # numerator and denominator: coefficients of falling powers of z
 pairs = {
@@ -62,7 +68,7 @@ systems = {names: control.tf(*pair, period) for names, pair in pairs.items()}
 '''
 
 
-def control_source(identified: Identified, pade_order: int) -> str:
+def write_control_source(identified: IdentifiedModel, pade_order: int) -> str:
     """A script that makes ``systems``: for (input, output) a transfer function of python-control.
 
     Parameters
@@ -76,59 +82,59 @@ def control_source(identified: Identified, pade_order: int) -> str:
     NotLinear
         If the model has no transfer function; the message says which term is in the way.
     """
-    found = transfers(identified)
+    found = compute_transfer_functions(identified)
     if found.period is None:
-        body = _CONTINUOUS.replace("@ORDER@", str(pade_order))
-        pairs = [_entry(one, *map(_delayed, one[2:])) for one in found.pairs]
+        body = _CONTINUOUS_TEMPLATE.replace("@ORDER@", str(pade_order))
+        pairs = [_write_pair(one, *map(_write_delayed_terms, one[2:])) for one in found.pairs]
     else:
-        body = _DISCRETE.replace("@PERIOD@", number(found.period))
-        pairs = [_entry(one, *_falling(one)) for one in found.pairs]
+        body = _DISCRETE_TEMPLATE.replace("@PERIOD@", write_number(found.period))
+        pairs = [_write_pair(one, *_write_fraction(one)) for one in found.pairs]
     body = body.replace("@PAIRS@", "\n".join(pairs))
-    lines = [*facts(identified), *_deviations(identified, found)]
-    title, *others = map(in_docstring, lines)
+    lines = [*describe_model(identified), *_describe_constants(identified, found)]
+    title, *others = map(escape_docstring, lines)
     told = "\n".join([title, "", *others])
     return f'"""{told}\n"""\n\nimport control\nimport numpy as np\n\n{body}'
 
 
-def _entry(pair: Transfer, numerator: str, denominator: str) -> str:
+def _write_pair(pair: TransferFunction, numerator: str, denominator: str) -> str:
     lines = []
     for text in (numerator, denominator):
-        first, *others = wrapped(text, _WIDTH - 12)
+        first, *others = wrap_source(text, _LINE_WIDTH - 12)
         lines += [f"        {first}", *(f"         {one}" for one in others)]
         lines[-1] += ","
     return "\n".join([f"    ({pair.input!r}, {pair.output!r}): (", *lines, "    ),"])
 
 
-def _delayed(found: Quasi) -> str:
+def _write_delayed_terms(found: QuasiPolynomial) -> str:
     """Terms of a quasi-polynomial; that without dead time first, even if it is zero."""
-    terms = by_delay(found)
-    parts = [f"({number(delay)}, {_listed(powers)})" for delay, powers in terms]
+    terms = group_by_delay(found)
+    parts = [f"({write_number(delay)}, {_write_list(powers)})" for delay, powers in terms]
     return f"[{', '.join(parts)}]"
 
 
-def _falling(pair: Transfer) -> tuple[str, str]:
+def _write_fraction(pair: TransferFunction) -> tuple[str, str]:
     both = (pair.numerator, pair.denominator)
     most = max((int(back) for one in both for _, back in one), default=0)
     numerator, denominator = (
-        _listed([one.get((0, float(back)), 0.0) for back in range(most + 1)]) for one in both
+        _write_list([one.get((0, float(back)), 0.0) for back in range(most + 1)]) for one in both
     )
     return numerator, denominator
 
 
-def _listed(values: list[float]) -> str:
-    return f"[{', '.join(map(number, values))}]"
+def _write_list(values: list[float]) -> str:
+    return f"[{', '.join(map(write_number, values))}]"
 
 
-def _deviations(identified: Identified, found: Transfers) -> list[str]:
+def _describe_constants(identified: IdentifiedModel, found: TransferFunctions) -> list[str]:
     """What the transfer functions leave out."""
     model = identified.model
     constants = [
         f"the output {one.name} has the constant {form.constant:.10g}"
-        for one, form in zip(model.outputs, found.linear.outputs, strict=True) if form.constant
+        for one, form in zip(model.outputs, found.linear_form.outputs, strict=True) if form.constant
     ] + [
         f"the equation of {one.name} has the constant {form.constant:.10g}"
-        for one, form in zip(model.states, found.linear.equations, strict=True) if form.constant
+        for one, form in zip(model.states, found.linear_form.equations, strict=True) if form.constant
     ]  # fmt: skip
     if not constants:
         return []
-    return wrapped(f"Transfer functions are of deviations: {'; '.join(constants)}.", 94)
+    return wrap_source(f"Transfer functions are of deviations: {'; '.join(constants)}.", 94)

@@ -15,15 +15,17 @@ from sysid.core.units import format_unit
 from sysid.models.parameters import Parameter
 from sysid.simulation.scaling import is_at_bounds
 
-_SHARE = 0.05  # of the squared error that the release of this bound would remove
-_SURE = 16.0  # times what a parameter without effect would seem to remove: four standard errors
-_TIE = (
+_LEAST_SHARE = 0.05  # of the squared error that the release of this bound would remove
+_LEAST_SIGNIFICANCE = (
+    16.0  # times what a parameter without effect would seem to remove: four standard errors
+)
+_TIE_TOLERANCE = (
     1e-9  # of the squared error: what leaves as little differs by rounding, and the first is taken
 )
-_ROOM = 0.01  # of the interval: a bound that can be moved by less is as far out as it can be
+_LEAST_ROOM = 0.01  # of the interval: a bound that can be moved by less is as far out as it can be
 
 
-class Pull(NamedTuple):
+class ActiveBound(NamedTuple):
     """A bound to be widened; `share` of the squared error is what it costs.
 
     `limit` is how far out it may be moved; None: there is no limit.
@@ -40,7 +42,7 @@ class Pull(NamedTuple):
         return f"{self.name} beyond its {self.side} bound {self.bound:g}{format_unit(self.unit)}"
 
     @property
-    def cure(self) -> str:
+    def advice(self) -> str:
         """What to do about it."""
         lower = self.side == "lower"
         text = f"{'lower' if lower else 'raise'} the bound of {self.name}"
@@ -50,7 +52,7 @@ class Pull(NamedTuple):
         return f"{text}, to {self.limit:.4g}{format_unit(self.unit)} at the {most}"
 
 
-def is_pulled(influence: FloatArray, columns: FloatArray, place: FloatArray) -> BoolArray:
+def is_active(influence: FloatArray, columns: FloatArray, place: FloatArray) -> BoolArray:
     """Which parameters the data pull beyond their bounds, each looked at alone, (D,).
 
     Parameters
@@ -70,14 +72,14 @@ def is_pulled(influence: FloatArray, columns: FloatArray, place: FloatArray) -> 
     share = downhill**2 / np.where(size > 0, size * total, np.inf)
     low, high = is_at_bounds(place)
     out = (low & (downhill < 0)) | (high & (downhill > 0))
-    return np.asarray(out & (share > _SHARE) & (share * influence.size > _SURE))
+    return np.asarray(out & (share > _LEAST_SHARE) & (share * influence.size > _LEAST_SIGNIFICANCE))
 
 
-def pulls(
+def rank_active_bounds(
     space: tuple[Parameter, ...], reaches: tuple[Interval, ...], influence: FloatArray,
     columns: FloatArray, place: FloatArray,
-) -> tuple[Pull, ...]:  # fmt: skip
-    """Which bounds to widen together, the costliest first; arrays as in `is_pulled`.
+) -> tuple[ActiveBound, ...]:  # fmt: skip
+    """Which bounds to widen together, the costliest first; arrays as in `is_active`.
 
     Parameters
     ----------
@@ -86,37 +88,37 @@ def pulls(
     reaches : tuple of (float, float)
         For each the lowest and the highest value that its bounds may be given.
     """
-    step = _Step.of(space, reaches, influence, columns, place)
+    step = _LinearStep.from_place(space, reaches, influence, columns, place)
     low, high = is_at_bounds(place)
-    room = np.where(low, -step.outer[0] - place, step.outer[1] - (1.0 - place))
-    candidates = [int(d) for d in np.flatnonzero((low | high) & (room > _ROOM))]
+    room = np.where(low, -step.outer_moves[0] - place, step.outer_moves[1] - (1.0 - place))
+    candidates = [int(d) for d in np.flatnonzero((low | high) & (room > _LEAST_ROOM))]
     shares: dict[int, float] = {}
-    loss, total = step.solved(())[1], float(influence @ influence)
+    loss, total = step.solve_released(())[1], float(influence @ influence)
     while left := [d for d in candidates if d not in shares]:
-        tried = [(step.solved((*shares, d))[1], d) for d in left]
-        least = min(tried)[0] + _TIE * total
+        tried = [(step.solve_released((*shares, d))[1], d) for d in left]
+        least = min(tried)[0] + _TIE_TOLERANCE * total
         reached, best = next(one for one in tried if one[0] <= least)
         share = (loss - reached) / total
-        if not (share > _SHARE and share * influence.size > _SURE):
+        if not (share > _LEAST_SHARE and share * influence.size > _LEAST_SIGNIFICANCE):
             break
         shares[best], loss = share, reached
-    moved = place + step.solved(tuple(shares))[0]
+    moved = place + step.solve_released(tuple(shares))[0]
     found = [
-        _pull(space[d], reaches[d], bool(low[d]), share)
+        _make_active_bound(space[d], reaches[d], bool(low[d]), share)
         for d, share in shares.items()
         if (moved[d] < 0.0 if low[d] else moved[d] > 1.0)
     ]
     return tuple(sorted(found, key=lambda one: -one.share))
 
 
-def _pull(one: Parameter, reach: Interval, is_low: bool, share: float) -> Pull:
+def _make_active_bound(one: Parameter, reach: Interval, is_low: bool, share: float) -> ActiveBound:
     limit = reach[0] if is_low else reach[1]
     known = limit if np.isfinite(limit) else None
     bound, side = (one.lower, "lower") if is_low else (one.upper, "upper")
-    return Pull(one.name, side, bound, one.unit, share, known)
+    return ActiveBound(one.name, side, bound, one.unit, share, known)
 
 
-class _Step(NamedTuple):
+class _LinearStep(NamedTuple):
     """A linear step of all parameters: abs(root · move - target)² + rest is the squared error.
 
     `inner` and `outer` (2, D) are the moves to the bounds, and to as far as these can be moved.
@@ -125,35 +127,36 @@ class _Step(NamedTuple):
     root: FloatArray
     target: FloatArray
     rest: float
-    inner: FloatArray
-    outer: FloatArray
+    inner_moves: FloatArray
+    outer_moves: FloatArray
 
     @classmethod
-    def of(
+    def from_place(
         cls, space: tuple[Parameter, ...], reaches: tuple[Interval, ...], influence: FloatArray,
         columns: FloatArray, place: FloatArray,
-    ) -> "_Step":  # fmt: skip
+    ) -> "_LinearStep":  # fmt: skip
         """The step from a place (D,)."""
         basis, root = np.linalg.qr(columns)
         target = -(basis.T @ influence)
         rest = float(influence @ influence - target @ target)
         ends = [
-            [_place(one, end) for end in reach] for one, reach in zip(space, reaches, strict=True)
+            [_to_unit_value(one, end) for end in reach]
+            for one, reach in zip(space, reaches, strict=True)
         ]
         return cls(root, target, rest, np.array([-place, 1.0 - place]), np.array(ends).T - place)
 
-    def solved(self, released: tuple[int, ...]) -> tuple[FloatArray, float]:
+    def solve_released(self, released: tuple[int, ...]) -> tuple[FloatArray, float]:
         """The best move (D,) with some bounds released, and the squared error it leaves."""
         # Here, as it takes a tenth of a second to import and few results need it.
         from scipy.optimize import lsq_linear
 
-        ends = self.inner.copy()
-        ends[:, list(released)] = self.outer[:, list(released)]
+        ends = self.inner_moves.copy()
+        ends[:, list(released)] = self.outer_moves[:, list(released)]
         found = lsq_linear(self.root, self.target, (ends[0], ends[1]), method="bvls")
         return found.x, self.rest + 2.0 * float(found.cost)
 
 
-def _place(parameter: Parameter, value: float) -> float:
+def _to_unit_value(parameter: Parameter, value: float) -> float:
     """Where a value lies: 0 at the lower bound, 1 at the upper one."""
     if parameter.scale == "log":
         if value <= 0.0:

@@ -25,7 +25,7 @@ from sysid.core.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class IdentifiableCombination:
     """A combination of parameters that the data tell, though not what each of them is.
 
     Attributes
@@ -45,13 +45,13 @@ class Group:
     stderr: float | None
 
 
-_LINK = 1e-4  # of two parameters that no direction moves together, this is rounding
-_PIVOT = 1e-3  # of the largest entry of its column
-_RATIONAL, _DENOMINATOR, _LARGEST = 1e-3, 4, 6
+_LINK_TOLERANCE = 1e-4  # of two parameters that no direction moves together, this is rounding
+_PIVOT_TOLERANCE = 1e-3  # of the largest entry of its column
+_FRACTION_TOLERANCE, _LARGEST_DENOMINATOR, _LARGEST_FRACTION = 1e-3, 4, 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class ParameterBlock:
     """Parameters that some directions move together.
 
     Attributes
@@ -65,16 +65,16 @@ class Block:
     basis: FloatArray
 
     @property
-    def tells_nothing(self) -> bool:
+    def has_no_combination(self) -> bool:
         """Whether no combination is left: as many directions as parameters, or one alone."""
         return bool(self.members.size < 2 or self.basis.shape[0] >= self.members.size)
 
 
-def blocks(null: FloatArray, member: BoolArray) -> tuple[Block, ...]:
+def find_blocks(null: FloatArray, member: BoolArray) -> tuple[ParameterBlock, ...]:
     """The blocks of some orthonormal directions (m, D) over the parameters marked in `member`."""
     together = np.abs(null.T @ null)
     own = np.sqrt(np.maximum(np.diag(together), np.finfo(float).tiny))
-    linked = together > _LINK * np.outer(own, own)
+    linked = together > _LINK_TOLERANCE * np.outer(own, own)
     found, left = [], list(np.flatnonzero(member))
     while left:
         block = [left.pop(0)]
@@ -85,13 +85,17 @@ def blocks(null: FloatArray, member: BoolArray) -> tuple[Block, ...]:
         members = np.array(sorted(block), dtype=np.int64)
         _, size, rows = np.linalg.svd(null[:, members], full_matrices=False)
         # A direction of this block lies in it whole, one of another block not at all.
-        found.append(Block(members, rows[size > 0.5]))
+        found.append(ParameterBlock(members, rows[size > 0.5]))
     return tuple(found)
 
 
-def written(
-    block: Block, names: Sequence[str], theta: FloatArray, scale: FloatArray, covariance: FloatArray
-) -> tuple[Group, ...]:
+def express_combinations(
+    block: ParameterBlock,
+    names: Sequence[str],
+    theta: FloatArray,
+    scale: FloatArray,
+    covariance: FloatArray,
+) -> tuple[IdentifiableCombination, ...]:
     """The combinations of a block that the data tell.
 
     Parameters
@@ -102,53 +106,55 @@ def written(
     covariance : FloatArray, shape (D, D)
         Of θ, in its units; without what it would be along the directions.
     """
-    if block.tells_nothing:
+    if block.has_no_combination:
         return ()
     value, unit = theta[block.members], scale[block.members]
     has_logarithm = bool(np.all(value != 0.0))
     per_place = unit / value if has_logarithm else np.ones(value.size)
-    entries = np.array(list(_orthogonal(block.basis * per_place)))
-    small = _small(entries * per_place)
-    powers = _powers(entries, value, small) if has_logarithm else None
+    entries = np.array(list(_iterate_orthogonal(block.basis * per_place)))
+    small = _find_negligible(entries * per_place)
+    powers = _round_powers(entries, value, small) if has_logarithm else None
     sums = np.where(small, 0.0, entries / (value if has_logarithm else unit))
-    sums = sums / _leading(sums)
-    terms = _rational(sums, small, unit)
+    sums = sums / _get_leading(sums)
+    terms = _round_to_fractions(sums, small, unit)
     if powers is not None and (terms is None or powers[1] <= terms[1]):
-        texts = [(e, _product([names[d] for d in block.members], e)) for e in powers[0]]
+        texts = [(e, _format_product([names[d] for d in block.members], e)) for e in powers[0]]
         found = [(text, float(np.prod(value**e)), e / value) for e, text in texts]
         told = [(text, total, total * slope) for text, total, slope in found]
     else:
         kept = sums if terms is None else terms[0]
-        told = [(_sum([names[d] for d in block.members], c), float(c @ value), c) for c in kept]
-    return tuple(_group(block, names, covariance, *one) for one in told)
+        told = [
+            (_format_sum([names[d] for d in block.members], c), float(c @ value), c) for c in kept
+        ]
+    return tuple(_make_combination(block, names, covariance, *one) for one in told)
 
 
-def _group(
-    block: Block, names: Sequence[str], covariance: FloatArray, text: str, value: float,
+def _make_combination(
+    block: ParameterBlock, names: Sequence[str], covariance: FloatArray, text: str, value: float,
     slope: FloatArray,
-) -> Group:  # fmt: skip
+) -> IdentifiableCombination:  # fmt: skip
     inside = covariance[np.ix_(block.members, block.members)]
     stderr = sqrt(max(float(slope @ inside @ slope), 0.0))
     members = tuple(names[d] for d, s in zip(block.members, slope, strict=True) if s != 0.0)
-    return Group(members, text, value, stderr)
+    return IdentifiableCombination(members, text, value, stderr)
 
 
-def _orthogonal(rows: FloatArray) -> Iterator[FloatArray]:
+def _iterate_orthogonal(rows: FloatArray) -> Iterator[FloatArray]:
     """Combinations that are orthogonal to all rows, each with one parameter that is no pivot.
 
     Pivots are the parameters that most directions move, in the order of the model.
     """
-    simple = _reduced(rows, range(rows.shape[1]))[0]
-    counts = np.count_nonzero(np.abs(simple) > _PIVOT, axis=0)
-    reduced, pivots = _reduced(rows, np.argsort(-counts, kind="stable").tolist())
+    simple = _reduce_rows(rows, range(rows.shape[1]))[0]
+    counts = np.count_nonzero(np.abs(simple) > _PIVOT_TOLERANCE, axis=0)
+    reduced, pivots = _reduce_rows(rows, np.argsort(-counts, kind="stable").tolist())
     for j in range(rows.shape[1]):
         if j not in pivots:
             entry = np.zeros(rows.shape[1])
             entry[j], entry[pivots] = 1.0, -reduced[:, j]
-            yield _upright(entry)
+            yield _orient_combination(entry)
 
 
-def _reduced(rows: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, list[int]]:
+def _reduce_rows(rows: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, list[int]]:
     """Reduced echelon form, with the columns taken as pivots in the given order."""
     rows = rows / np.max(np.abs(rows), axis=1, keepdims=True)
     pivots: list[int] = []
@@ -158,7 +164,7 @@ def _reduced(rows: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, list
             break
         best = done + int(np.argmax(np.abs(rows[done:, column])))
         size = float(np.max(np.abs(rows[done:])))
-        if abs(float(rows[best, column])) <= _PIVOT * size:
+        if abs(float(rows[best, column])) <= _PIVOT_TOLERANCE * size:
             continue
         rows[[done, best]] = rows[[best, done]]
         rows[done] /= rows[done, column]
@@ -168,28 +174,28 @@ def _reduced(rows: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, list
     return rows[: len(pivots)], pivots
 
 
-def _upright(entry: FloatArray) -> FloatArray:
+def _orient_combination(entry: FloatArray) -> FloatArray:
     """The combination or its inverse, whichever has fewer negative entries."""
-    large = np.abs(entry) > _PIVOT
+    large = np.abs(entry) > _PIVOT_TOLERANCE
     return -entry if np.sum(entry[large] < 0) > np.sum(entry[large] > 0) else entry
 
 
-def _small(parts: FloatArray) -> BoolArray:
+def _find_negligible(parts: FloatArray) -> BoolArray:
     """Which parameters have next to no part in a combination; two of them have one always.
 
     By how much it changes over their ranges: factors have units, and of a large parameter a small
     one counts.
     """
     second = np.sort(np.abs(parts), axis=1)[:, -2:-1]
-    return np.asarray(np.abs(parts) < _PIVOT * second)
+    return np.asarray(np.abs(parts) < _PIVOT_TOLERANCE * second)
 
 
-def _leading(sums: FloatArray) -> FloatArray:
+def _get_leading(sums: FloatArray) -> FloatArray:
     """For each row its first entry that is not 0, so that sums begin with a plain name."""
     return np.take_along_axis(sums, np.argmax(sums != 0.0, axis=1)[:, None], axis=1)
 
 
-def _rational(
+def _round_to_fractions(
     entries: FloatArray, small: BoolArray, unit: FloatArray | None = None
 ) -> tuple[FloatArray, float] | None:
     """The entries as small fractions, and how far off they are; None where they are not.
@@ -198,7 +204,10 @@ def _rational(
     the members they are factors of a sum that begins with 1, and off by what that makes of it.
     """
     nearest = np.array(
-        [[float(Fraction(v).limit_denominator(_DENOMINATOR)) for v in row] for row in entries]
+        [
+            [float(Fraction(v).limit_denominator(_LARGEST_DENOMINATOR)) for v in row]
+            for row in entries
+        ]
     )
     if np.any((nearest == 0.0) & ~small):
         return None
@@ -207,34 +216,38 @@ def _rational(
         first = np.argmax(entries != 0.0, axis=1)
         apart = apart * np.maximum(1.0, np.abs(unit / unit[first][:, None]))
     off = float(np.max(apart))
-    return (nearest, off) if off < _RATIONAL and np.max(np.abs(nearest)) <= _LARGEST else None
+    return (
+        (nearest, off)
+        if off < _FRACTION_TOLERANCE and np.max(np.abs(nearest)) <= _LARGEST_FRACTION
+        else None
+    )
 
 
-def _powers(
+def _round_powers(
     entries: FloatArray, value: FloatArray, small: BoolArray
 ) -> tuple[FloatArray, float] | None:
     """The same for powers of `value` (M,); None too where one of them is not a real number."""
-    found = _rational(entries, small)
+    found = _round_to_fractions(entries, small)
     if found is None:
         return None
     fractional = found[0] != np.rint(found[0])
     return None if np.any(fractional & (value < 0)) else found
 
 
-def _product(names: Sequence[str], powers: FloatArray) -> str:
-    above = [_power(name, p) for name, p in zip(names, powers, strict=True) if p > 0]
-    below = [_power(name, -p) for name, p in zip(names, powers, strict=True) if p < 0]
+def _format_product(names: Sequence[str], powers: FloatArray) -> str:
+    above = [_format_power(name, p) for name, p in zip(names, powers, strict=True) if p > 0]
+    below = [_format_power(name, -p) for name, p in zip(names, powers, strict=True) if p < 0]
     top = "*".join(above) or "1"
     if not below:
         return top
     return f"{top}/{below[0]}" if len(below) == 1 else f"{top}/({'*'.join(below)})"
 
 
-def _power(name: str, power: float) -> str:
+def _format_power(name: str, power: float) -> str:
     return name if power == 1.0 else f"{name}**{power:g}"
 
 
-def _sum(names: Sequence[str], factors: FloatArray) -> str:
+def _format_sum(names: Sequence[str], factors: FloatArray) -> str:
     text = ""
     for name, factor in zip(names, factors, strict=True):
         if factor == 0.0:
@@ -248,12 +261,12 @@ def _sum(names: Sequence[str], factors: FloatArray) -> str:
 
 # Share of a direction (squared) from which a parameter belongs to it: of one the data tell little
 # about, and of one that has no effect at all, which is known to many digits.
-_WEAK_MEMBER, NULL_MEMBER = 0.05, 1e-5
-_SAYS_NOTHING = 0.5  # of the range: a standard error as large as that
+_WEAK_SHARE, NULL_SHARE = 0.05, 1e-5
+_VAGUE_DEVIATION = 0.5  # of the range: a standard error as large as that
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Directions:
+class SingularDirections:
     """Singular directions (D, D) of the sensitivities, over the places.
 
     `null` are those along which the output does not change, `weak` those of which the data say
@@ -263,14 +276,14 @@ class Directions:
     rows: FloatArray
     null: BoolArray
     weak: BoolArray
-    member: BoolArray
-    vague: BoolArray
+    is_null_member: BoolArray
+    is_vague: BoolArray
 
 
-def weighed(
+def classify_directions(
     singular: FloatArray, rows: FloatArray, null: BoolArray, moved: BoolArray,
     covariance: FloatArray, noise: float,
-) -> Directions:  # fmt: skip
+) -> SingularDirections:  # fmt: skip
     """What a covariance (D, D) of the places makes of the singular directions (D, D).
 
     Parameters
@@ -283,20 +296,20 @@ def weighed(
         Its standard deviation.
     """
     spread = np.sqrt(np.maximum(np.einsum("id,de,ie->i", rows, covariance, rows), 0.0))
-    weak = ~null & ((spread >= _SAYS_NOTHING) | (noise >= _SAYS_NOTHING * singular))
-    member = np.any(rows[null] ** 2 > NULL_MEMBER, axis=0) | moved
-    return Directions(rows, null, weak, member, np.diag(covariance) >= _SAYS_NOTHING**2)
+    weak = ~null & ((spread >= _VAGUE_DEVIATION) | (noise >= _VAGUE_DEVIATION * singular))
+    member = np.any(rows[null] ** 2 > NULL_SHARE, axis=0) | moved
+    return SingularDirections(rows, null, weak, member, np.diag(covariance) >= _VAGUE_DEVIATION**2)
 
 
-def untold(directions: Directions) -> tuple[Block, ...]:
+def find_unidentified(directions: SingularDirections) -> tuple[ParameterBlock, ...]:
     """Parameters that have no effect of their own, then those of which the data say little."""
-    found = blocks(directions.rows[directions.null], directions.member)
+    found = find_blocks(directions.rows[directions.null], directions.is_null_member)
     weak = directions.rows[directions.weak]
     # One that has a small part in a direction of which nothing is known is not known either.
-    has_part = np.any(weak**2 > _WEAK_MEMBER, axis=0) | directions.vague
-    member = has_part & ~directions.member
-    beside = blocks(weak, member)
+    has_part = np.any(weak**2 > _WEAK_SHARE, axis=0) | directions.is_vague
+    member = has_part & ~directions.is_null_member
+    beside = find_blocks(weak, member)
     left = [one for one in beside if not one.basis.size]
-    alone = [d for one in left for d in one.members if directions.vague[d]]
-    nothing = tuple(Block(np.array([d]), np.zeros((0, 1))) for d in alone)
+    alone = [d for one in left for d in one.members if directions.is_vague[d]]
+    nothing = tuple(ParameterBlock(np.array([d]), np.zeros((0, 1))) for d in alone)
     return found + tuple(one for one in beside if one.basis.size) + nothing

@@ -9,31 +9,45 @@ import numpy as np
 
 from sysid.core.errors import DivergedEverywhere, NothingIdentifiable
 from sysid.core.settings import GeneticAlgorithm
-from sysid.core.threads import one_thread
+from sysid.core.threads import use_one_thread
 from sysid.core.types import FloatArray
-from sysid.data.records import common_sample_time
-from sysid.identifiability.exchange import exchange_notes, exchanges, ordered
+from sysid.data.records import find_common_sample_time
+from sysid.identifiability.exchange import describe_exchanges, find_exchanges, order_exchangeable
 from sysid.identification.deadline import Clock, Deadline
-from sysid.identification.generalised_least_squares import Generalised, generalised, whitening
-from sysid.identification.integration_step import step_notes
-from sysid.identification.local_minima import Neighbourhood, affordable, neighbourhood, widened
-from sysid.identification.noise_model_choice import choice_notes, decided, settled, speaks_for_ar1
+from sysid.identification.generalised_least_squares import (
+    GeneralisedEstimate,
+    fit_generalised_least_squares,
+    make_whitening,
+)
+from sysid.identification.integration_step import warn_integration_step
+from sysid.identification.local_minima import (
+    LocalMinima,
+    count_affordable_simulations,
+    find_local_minima,
+    widen_intervals,
+)
+from sysid.identification.noise_model_choice import (
+    confirm_noise_model,
+    explain_noise_model_choice,
+    is_ar1_indicated,
+    resolve_noise_model,
+)
 from sysid.identification.result import Identification
-from sysid.identification.warnings import noise_notes, time_notes, warnings_of
+from sysid.identification.warnings import collect_warnings, warn_noise_model, warn_time_limit
 from sysid.islands.state import RunState
-from sysid.residuals.feedback import feedback_notes
-from sysid.residuals.onset_delay import onset_delays
-from sysid.residuals.residual_tests import ResidualTests, residual_tests, series_of
-from sysid.search.island import analysis_budget, of_island
-from sysid.search.refine import Refined, refine
+from sysid.residuals.feedback import describe_feedback
+from sysid.residuals.onset_delay import estimate_onset_delays
+from sysid.residuals.residual_tests import ResidualTests, list_residual_series, run_residual_tests
+from sysid.search.island import compute_analysis_budget, get_island_settings
+from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.search.state import Improvement, IslandSummary
 from sysid.simulation.metrics import Metrics
-from sysid.simulation.problem import Problem, metrics_of
-from sysid.uncertainty.analysis import Analysis, analyse
+from sysid.simulation.problem import Problem, compute_metrics
+from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 
 
-def conclude(
+def conclude_run(
     problem: Problem,
     algorithm: GeneticAlgorithm,
     state: RunState,
@@ -42,10 +56,11 @@ def conclude(
 ) -> Identification:
     """The identification that a run has led to.
 
-    With ``refine`` the champions of an ``improved`` search are polished by least squares. Those
-    of the paper's two methods are reported as found, so that a comparison is one of the methods.
-    Of a run whose time is limited all of that ends near the limit, and warnings tell what was left
-    out; standard errors, tests and validation are made in any case. `clock` gives seconds.
+    With ``refine_candidates`` the champions of an ``improved`` search are polished by least
+    squares. Those of the paper's two methods are reported as found, so that a comparison is one of
+    the methods. Of a run whose time is limited all of that ends near the limit, and warnings tell
+    what was left out; standard errors, tests and validation are made in any case. `clock` gives
+    seconds.
 
     Raises
     ------
@@ -56,26 +71,28 @@ def conclude(
     """
     if not np.isfinite(state.rms):
         raise DivergedEverywhere(state.evaluations)
-    with one_thread():  # so that the last bit does not depend on the number of cores
+    with use_one_thread():  # so that the last bit does not depend on the number of cores
         deadline = Deadline(algorithm.stop.seconds, state.seconds, clock)
-        return _concluded(problem, algorithm, state, validation, deadline)
+        return _build_identification(problem, algorithm, state, validation, deadline)
 
 
-def _concluded(
+def _build_identification(
     problem: Problem, algorithm: GeneticAlgorithm, state: RunState, validation: Problem | None,
     deadline: Deadline,
 ) -> Identification:  # fmt: skip
-    refined, ends, noise, analysis = _estimated(problem, algorithm, state, deadline)
-    problem, theta = decided(problem, noise), noise.theta
+    refined, ends, noise, analysis = _refine_and_analyse(problem, algorithm, state, deadline)
+    problem, theta = resolve_noise_model(problem, noise), noise.theta
     if analysis.uncertainty is not None and not analysis.uncertainty.singular_values.any():
         raise NothingIdentifiable(problem.free_names)
-    simulated = problem.predictions(theta[None])[0]
-    metrics = metrics_of(problem, simulated)
+    simulated = problem.predict(theta[None])[0]
+    metrics = compute_metrics(problem, simulated)
     times = noise.correlation_times
     kept = (
-        None if validation is None else _validated(validation, problem, analysis.estimates, times)
+        None
+        if validation is None
+        else _validate_estimates(validation, problem, analysis.estimates, times)
     )
-    tests = kept.tests if kept else residual_tests(problem, simulated, "estimation", times)
+    tests = kept.tests if kept else run_residual_tests(problem, simulated, "estimation", times)
     limit = algorithm.safe_limit
     return Identification(
         estimates=analysis.estimates,
@@ -84,121 +101,130 @@ def _concluded(
         rms_validation=None if kept is None else kept.metrics.rms,
         fit_percent_validation=None if kept is None else kept.metrics.fit_percent,
         valid=limit is None or metrics.rms <= limit,
-        evaluations=_evaluations(state, refined, analysis),
+        evaluations=_count_evaluations(state, refined, analysis),
         generations=max(island.generation for island in state.islands),
-        islands=_summaries(state, refined, ends),
-        history=_histories(state, refined),
+        islands=_summarise_islands(state, refined, ends),
+        history=_extend_histories(state, refined),
         migrations=state.migrations,
         uncertainty=analysis.uncertainty,
-        simulated=_split(problem, simulated),
+        simulated=_split_outputs(problem, simulated),
         simulated_validation=() if kept is None else kept.simulated,
         agreement=metrics.channels,
         agreement_validation=() if kept is None else kept.metrics.channels,
         warnings=(
-            *warnings_of(problem, algorithm, analysis, simulated, metrics.rms, tests),
-            *exchange_notes(
+            *collect_warnings(problem, algorithm, analysis, simulated, metrics.rms, tests),
+            *describe_exchanges(
                 problem,
                 analysis.exchanges,
                 {one.name for one in analysis.estimates if one.stderr is not None},
             ),
-            *time_notes(any(end.is_cut_short for end in refined if end is not None)),
-            *_feedback(problem, simulated, analysis),
-            *step_notes(problem, theta, analysis.estimates, simulated, deadline.is_past_grace),
-            *noise_notes(problem, times, noise.is_complete),
-            *choice_notes(problem, noise),
+            *warn_time_limit(any(end.is_cut_short for end in refined if end is not None)),
+            *_check_feedback(problem, simulated, analysis),
+            *warn_integration_step(
+                problem, theta, analysis.estimates, simulated, deadline.is_past_grace
+            ),
+            *warn_noise_model(problem, times, noise.is_complete),
+            *explain_noise_model_choice(problem, noise),
         ),
         selection=() if problem.model.selection is None else problem.model.selection.terms,
         criteria=analysis.criteria,
         residual_tests=tests,
-        onset_delays=onset_delays(problem.model, problem.records),
+        onset_delays=estimate_onset_delays(problem.model, problem.records),
         correlation_times=times,
         holds={one.name: one.hold for one in problem.records[0].inputs},
-        sample_time=common_sample_time(problem.records),
-        known_before=_known_before(problem),
-        known_before_validation=() if validation is None else _known_before(validation),
+        sample_time=find_common_sample_time(problem.records),
+        known_before=_compute_input_history(problem),
+        known_before_validation=() if validation is None else _compute_input_history(validation),
     )
 
 
-def _known_before(problem: Problem) -> tuple[float, ...]:
+def _compute_input_history(problem: Problem) -> tuple[float, ...]:
     """For how long (s) the inputs are known before what is scored of each experiment."""
     since = problem.settings.scored_from or tuple(one.start for one in problem.records)
     return tuple(
-        one.known_before + max(first - one.start, 0.0)
+        one.history_duration + max(first - one.start, 0.0)
         for one, first in zip(problem.records, since, strict=True)
     )
 
 
-def _feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -> list[str]:
+def _check_feedback(problem: Problem, simulated: FloatArray, analysis: Analysis) -> list[str]:
     """Whether a controller made an input; past white residuals it does the estimates no harm."""
     known = analysis.uncertainty
     if known is not None and known.noise_colour == "white":
         return []
     advises = problem.prediction == "simulation" and problem.loss.noise_model != "ar1"
-    return feedback_notes(series_of(problem, simulated), advises_noise_model=advises)
+    return describe_feedback(list_residual_series(problem, simulated), advises_noise_model=advises)
 
 
-def _estimated(
+def _refine_and_analyse(
     problem: Problem, algorithm: GeneticAlgorithm, state: RunState, deadline: Deadline
-) -> tuple[tuple[Refined | None, ...], list[tuple[FloatArray, float]], Generalised, Analysis]:
+) -> tuple[
+    tuple[RefinedCandidate | None, ...],
+    list[tuple[FloatArray, float]],
+    GeneralisedEstimate,
+    Analysis,
+]:
     """What refinement made of the islands' champions, where each ended, and the best's analysis."""
-    champions = [_champion(problem, island.history) for island in state.islands]
-    refined = _polished(problem, algorithm, state, champions, deadline)
+    champions = [_get_champion(problem, island.history) for island in state.islands]
+    refined = _refine_champions(problem, algorithm, state, champions, deadline)
     ends = [
         (champion, island.champion_rms) if end is None else (end.theta, end.rms)
         for champion, island, end in zip(champions, state.islands, refined, strict=True)
     ]
     best = min(range(len(ends)), key=lambda i: ends[i][1])
-    left = _left(algorithm, state, refined)
-    spare = None if left is None else max(0, left - analysis_budget(ends[best][0].size))
-    groups, spent = exchanges(problem, ends[best][0], spare)
-    ends = [(ordered(problem, theta, groups), rms) for theta, rms in ends]
+    left = _count_budget_left(algorithm, state, refined)
+    spare = None if left is None else max(0, left - compute_analysis_budget(ends[best][0].size))
+    groups, spent = find_exchanges(problem, ends[best][0], spare)
+    ends = [(order_exchangeable(problem, theta, groups), rms) for theta, rms in ends]
     refined = tuple(
         None if one is None else replace(one, theta=end)
         for one, (end, _) in zip(refined, ends, strict=True)
     )
     theta = ends[best][0]
-    analysis = analyse(problem, theta, None if left is None else left - spent)
+    analysis = analyse_estimate(problem, theta, None if left is None else left - spent)
     analysis = replace(analysis, evaluations=analysis.evaluations + spent, exchanges=groups)
-    if _polishes(algorithm, len(ends)):
-        end, analysis = _with_neighbours(
+    if _should_refine(algorithm, len(ends)):
+        end, analysis = _search_local_minima(
             problem, algorithm, state, refined, ends[best], analysis, deadline
         )
         theta = end.theta
         ends[best] = theta, end.rms
         refined = (*refined[:best], end, *refined[best + 1 :])
-    noise, analysis = _under_noise(problem, algorithm, state, refined, theta, analysis, deadline)
+    noise, analysis = _apply_noise_model(
+        problem, algorithm, state, refined, theta, analysis, deadline
+    )
     return refined, ends, noise, analysis
 
 
-def _champion(problem: Problem, history: tuple[Improvement, ...]) -> FloatArray:
+def _get_champion(problem: Problem, history: tuple[Improvement, ...]) -> FloatArray:
     if history:
         return np.array(history[-1].parameters)
     return 0.5 * (problem.evaluator.lower + problem.evaluator.upper)
 
 
-def _polished(
+def _refine_champions(
     problem: Problem, algorithm: GeneticAlgorithm, state: RunState, champions: list[FloatArray],
     deadline: Deadline,
-) -> tuple[Refined | None, ...]:  # fmt: skip
-    if not _polishes(algorithm, len(champions)):
+) -> tuple[RefinedCandidate | None, ...]:  # fmt: skip
+    if not _should_refine(algorithm, len(champions)):
         return (None,) * len(champions)
-    left = _left(algorithm, state, ())
-    kept = analysis_budget(len(champions[0]))
+    left = _count_budget_left(algorithm, state, ())
+    kept = compute_analysis_budget(len(champions[0]))
     most = None if left is None else max(0, left - kept)
-    return refine(problem, champions, most, deadline.is_past_grace)
+    return refine_candidates(problem, champions, most, deadline.is_past_grace)
 
 
-def _polishes(algorithm: GeneticAlgorithm, islands: int) -> bool:
+def _should_refine(algorithm: GeneticAlgorithm, islands: int) -> bool:
     """Whether least squares goes on from where the search has ended."""
-    methods = {of_island(algorithm, i).method for i in range(islands)}
+    methods = {get_island_settings(algorithm, i).method for i in range(islands)}
     return algorithm.refine and "improved" in methods
 
 
-def _with_neighbours(
+def _search_local_minima(
     problem: Problem, algorithm: GeneticAlgorithm, state: RunState,
-    refined: tuple[Refined | None, ...], end: tuple[FloatArray, float], analysis: Analysis,
+    refined: tuple[RefinedCandidate | None, ...], end: tuple[FloatArray, float], analysis: Analysis,
     deadline: Deadline,
-) -> tuple[Refined, Analysis]:  # fmt: skip
+) -> tuple[RefinedCandidate, Analysis]:  # fmt: skip
     """The best of the minima beside an estimate, with intervals that allow for the others.
 
     The evaluations of it are those of all the islands' ends in its place, and of the search here.
@@ -206,94 +232,109 @@ def _with_neighbours(
     theta, rms = end
     known = next((one for one in refined if one is not None and one.theta is theta), None)
     before, is_cut = (0, False) if known is None else (known.evaluations, known.is_cut_short)
-    unchanged = Refined(theta, rms, before, is_cut)
-    if analysis.linear is None:
+    unchanged = RefinedCandidate(theta, rms, before, is_cut)
+    if analysis.linear_model is None:
         return unchanged, analysis
-    left = _left(algorithm, state, refined)
-    kept = analysis.evaluations + analysis_budget(theta.size)
+    left = _count_budget_left(algorithm, state, refined)
+    kept = analysis.evaluations + compute_analysis_budget(theta.size)
     is_late = deadline.is_over()
-    most = affordable(problem, is_late)
+    most = count_affordable_simulations(problem, is_late)
     if most == 0 and is_late:
         return unchanged, replace(analysis, is_cut_short=True)
     if left is not None:
         shared = 2 if problem.loss.noise_model == "ar1" else 1  # with the noise model
         most = min(most, max(0, left - kept) // shared)
-    found = neighbourhood(problem, theta, rms, analysis.linear, state.seed, most)
+    found = find_local_minima(problem, theta, rms, analysis.linear_model, state.seed, most)
     spent = before + found.evaluations
     if found.best is not None:
         spent += analysis.evaluations
         groups = analysis.exchanges
-        theta, rms = ordered(problem, found.best.theta, groups), found.best.rms
+        theta, rms = order_exchangeable(problem, found.best.theta, groups), found.best.rms
         left = None if left is None else left - analysis.evaluations - found.evaluations
-        analysis = replace(analyse(problem, theta, left), exchanges=groups)
-    return Refined(theta, rms, spent, is_cut), _widened(problem, analysis, found)
+        analysis = replace(analyse_estimate(problem, theta, left), exchanges=groups)
+    return RefinedCandidate(theta, rms, spent, is_cut), _widen_intervals(problem, analysis, found)
 
 
-def _widened(problem: Problem, analysis: Analysis, found: Neighbourhood) -> Analysis:
+def _widen_intervals(problem: Problem, analysis: Analysis, found: LocalMinima) -> Analysis:
     """The analysis with intervals that hold those of all minima found."""
-    if analysis.linear is None:
+    if analysis.linear_model is None:
         return analysis
-    share = analysis.linear.share
-    found = replace(found, values=ordered(problem, found.values, analysis.exchanges))
-    estimates = widened(analysis.estimates, problem.free_names, problem.n_scored, found, share)
+    share = analysis.linear_model.variance_ratio
+    found = replace(found, values=order_exchangeable(problem, found.values, analysis.exchanges))
+    estimates = widen_intervals(
+        analysis.estimates, problem.free_names, problem.n_scored, found, share
+    )
     return replace(analysis, estimates=estimates)
 
 
-def _under_noise(
+def _apply_noise_model(
     problem: Problem, algorithm: GeneticAlgorithm, state: RunState,
-    refined: tuple[Refined | None, ...], theta: FloatArray, analysis: Analysis, deadline: Deadline,
-) -> tuple[Generalised, Analysis]:  # fmt: skip
+    refined: tuple[RefinedCandidate | None, ...], theta: FloatArray, analysis: Analysis, deadline: Deadline,
+) -> tuple[GeneralisedEstimate, Analysis]:  # fmt: skip
     """The estimates under the noise model that was asked for or chosen, and their analysis.
 
     Those of the paper's methods stay as found; so do all where residuals may as well be white.
     """
     asked = problem.loss.noise_model
-    if asked == "white" or not _polishes(algorithm, len(state.islands)):
-        return Generalised(theta, {}, 0, asked != "ar1"), analysis
-    in_time = deadline.simulations(state.seconds, state.evaluations, problem.n_steps)
+    if asked == "white" or not _should_refine(algorithm, len(state.islands)):
+        return GeneralisedEstimate(theta, {}, 0, asked != "ar1"), analysis
+    in_time = deadline.count_simulations_left(state.seconds, state.evaluations, problem.n_steps)
     late = deadline.is_past_grace
-    if asked == "auto" and not speaks_for_ar1(problem, theta, analysis, late, in_time):
-        return Generalised(theta, {}, 0, True), analysis
-    left = _left(algorithm, state, refined)
-    kept = analysis.evaluations + analysis_budget(theta.size)
+    if asked == "auto" and not is_ar1_indicated(problem, theta, analysis, late, in_time):
+        return GeneralisedEstimate(theta, {}, 0, True), analysis
+    left = _count_budget_left(algorithm, state, refined)
+    kept = analysis.evaluations + compute_analysis_budget(theta.size)
     limits = None if left is None else max(0, left - kept), in_time
     most = min((one for one in limits if one is not None), default=None)
     nothing = np.zeros((theta.size, theta.size))
     covariance = nothing if analysis.uncertainty is None else analysis.uncertainty.covariance
     is_cut_short = analysis.is_cut_short
-    found = generalised(problem, theta, covariance, state.seed, most)
+    found = fit_generalised_least_squares(problem, theta, covariance, state.seed, most)
     spent = analysis.evaluations + found.evaluations
     if asked == "auto":
-        found = settled(problem, theta, found)
+        found = confirm_noise_model(problem, theta, found)
     if any(found.correlation_times.values()):
-        white = whitening(problem, found.correlation_times)
-        groups, theta = analysis.exchanges, ordered(problem, found.theta, analysis.exchanges)
+        white = make_whitening(problem, found.correlation_times)
+        groups, theta = (
+            analysis.exchanges,
+            order_exchangeable(problem, found.theta, analysis.exchanges),
+        )
         found = found._replace(theta=theta)
-        analysis = analyse(problem, theta, None if left is None else left - spent, white)
+        analysis = analyse_estimate(problem, theta, None if left is None else left - spent, white)
         analysis = replace(analysis, exchanges=groups)
         spent += analysis.evaluations
-        analysis = _widened(problem, analysis, Neighbourhood(None, found.minima, found.rms, 0))
+        analysis = _widen_intervals(
+            problem, analysis, LocalMinima(None, found.minima, found.rms, 0)
+        )
     return found, replace(analysis, evaluations=spent, is_cut_short=is_cut_short)
 
 
-def _left(
-    algorithm: GeneticAlgorithm, state: RunState, refined: tuple[Refined | None, ...]
+def _count_budget_left(
+    algorithm: GeneticAlgorithm, state: RunState, refined: tuple[RefinedCandidate | None, ...]
 ) -> int | None:
     """What search and refinement have left of the budget of simulations; None: there is none."""
     limit = algorithm.stop.evaluations
-    return None if limit is None else max(0, limit - state.evaluations - _polishing(refined))
+    return (
+        None
+        if limit is None
+        else max(0, limit - state.evaluations - _count_refinement_evaluations(refined))
+    )
 
 
-def _polishing(refined: tuple[Refined | None, ...]) -> int:
+def _count_refinement_evaluations(refined: tuple[RefinedCandidate | None, ...]) -> int:
     return sum(end.evaluations for end in refined if end is not None)
 
 
-def _evaluations(state: RunState, refined: tuple[Refined | None, ...], analysis: Analysis) -> int:
-    return state.evaluations + _polishing(refined) + analysis.evaluations
+def _count_evaluations(
+    state: RunState, refined: tuple[RefinedCandidate | None, ...], analysis: Analysis
+) -> int:
+    return state.evaluations + _count_refinement_evaluations(refined) + analysis.evaluations
 
 
-def _summaries(
-    state: RunState, refined: tuple[Refined | None, ...], ends: list[tuple[FloatArray, float]]
+def _summarise_islands(
+    state: RunState,
+    refined: tuple[RefinedCandidate | None, ...],
+    ends: list[tuple[FloatArray, float]],
 ) -> tuple[IslandSummary, ...]:
     return tuple(
         IslandSummary(
@@ -306,8 +347,8 @@ def _summaries(
     )
 
 
-def _histories(
-    state: RunState, refined: tuple[Refined | None, ...]
+def _extend_histories(
+    state: RunState, refined: tuple[RefinedCandidate | None, ...]
 ) -> tuple[tuple[Improvement, ...], ...]:
     """The islands' histories, with what the refinement gained."""
     histories = []
@@ -322,21 +363,21 @@ def _histories(
     return tuple(histories)
 
 
-def _split(problem: Problem, values: FloatArray) -> tuple[tuple[FloatArray, ...], ...]:
+def _split_outputs(problem: Problem, values: FloatArray) -> tuple[tuple[FloatArray, ...], ...]:
     names = [output.name for output in problem.model.outputs]
-    return tuple(tuple(part[name] for name in names) for part in problem.split(values))
+    return tuple(tuple(part[name] for name in names) for part in problem.split_by_output(values))
 
 
-class _Validated(NamedTuple):
+class _ValidationResult(NamedTuple):
     metrics: Metrics
     simulated: tuple[tuple[FloatArray, ...], ...]
     tests: ResidualTests
 
 
-def _validated(
+def _validate_estimates(
     validation: Problem, estimation: Problem, estimates: tuple[Estimate, ...],
     correlation_times: Mapping[str, float],
-) -> _Validated:  # fmt: skip
+) -> _ValidationResult:  # fmt: skip
     """Agreement and simulation on data that were not used.
 
     The model's parameters are those of the estimate, and so are the weights, so that both RMS
@@ -346,29 +387,29 @@ def _validated(
     model, changes = validation.untied_model, validation.settings.parameters
     is_part = validation.settings.scored_from is not None
     own = {p.name for p in (validation.all_parameters if is_part else model.parameters)}
-    fixed = {e.name: _known(e) for e in estimates if e.name in own}
+    fixed = {e.name: _to_fixed_parameter(e) for e in estimates if e.name in own}
     kept = {name: fields for name, fields in changes.items() if name not in own}
     known = validation.rebuild(parameters={**kept, **fixed}, weights=estimation.output_weights)
     theta = np.zeros(0)
-    if known.space:
+    if known.free_parameters:
         middle = 0.5 * (known.evaluator.lower + known.evaluator.upper)
-        start = refine(known, [middle])[0]
+        start = refine_candidates(known, [middle])[0]
         theta = middle if start is None else start.theta
-    simulated = known.predictions(theta[None])[0]
-    return _Validated(
-        metrics_of(known, simulated), _judged(known, _split(known, simulated)),
-        residual_tests(known, simulated, "validation", correlation_times),
+    simulated = known.predict(theta[None])[0]
+    return _ValidationResult(
+        compute_metrics(known, simulated), _select_scored_part(known, _split_outputs(known, simulated)),
+        run_residual_tests(known, simulated, "validation", correlation_times),
     )  # fmt: skip
 
 
-def _known(estimate: Estimate) -> dict[str, float | str]:
+def _to_fixed_parameter(estimate: Estimate) -> dict[str, float | str]:
     """An estimate as a fixed value; that of a tie may lie outside its parameter's bounds."""
     value = estimate.value
     bounds = {"lower": min(estimate.lower, value), "upper": max(estimate.upper, value)}
     return {"fixed": value, "scale": "linear", **bounds}
 
 
-def _judged(
+def _select_scored_part(
     known: Problem, simulated: tuple[tuple[FloatArray, ...], ...]
 ) -> tuple[tuple[FloatArray, ...], ...]:
     """The part from the time on at which the records are scored, at its measured times."""

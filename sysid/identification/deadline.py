@@ -6,10 +6,10 @@ from time import perf_counter
 Clock = Callable[[], float]
 """Seconds from any moment on."""
 
-_GRACE, _LEAST, _MOST = 0.1, 0.2, 10.0  # of the limit; s
-_LATE = 20_000_000
+_GRACE_SHARE, _MIN_GRACE_SECONDS, _MAX_GRACE_SECONDS = 0.1, 0.2, 10.0  # of the limit; s
+_STEPS_AFTER_DEADLINE = 20_000_000
 """Steps of integration or recursion that may follow where the time is over: about 0.2 s."""
-_CLOCK = 1e-3  # s: a search that took less says nothing of what a simulation takes
+_MIN_MEASURED_SECONDS = 1e-3  # s: a search that took less says nothing of what a simulation takes
 
 
 class Deadline:
@@ -29,10 +29,10 @@ class Deadline:
         self._is_limited = limit is not None
         limit = float("inf") if limit is None else limit
         self._end = clock() + (limit - used)
-        self._grace = min(max(_GRACE * limit, _LEAST), _MOST)
+        self._grace = min(max(_GRACE_SHARE * limit, _MIN_GRACE_SECONDS), _MAX_GRACE_SECONDS)
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Seconds until the end, 0 or more."""
         return max(0.0, self._end - self._clock())
 
@@ -44,12 +44,12 @@ class Deadline:
         """Whether the grace is over as well."""
         return self._clock() >= self._end + self._grace
 
-    def simulations(self, seconds: float, evaluations: int, steps: int) -> int | None:
+    def count_simulations_left(self, seconds: float, evaluations: int, steps: int) -> int | None:
         """Simulations of some steps that are left, by what those of a search took; None: no limit.
 
         As many as are over at once are there always.
         """
         if not self._is_limited:
             return None
-        each = max(seconds, _CLOCK) / max(evaluations, 1)
-        return max(_LATE // max(steps, 1), int(self.left / each))
+        each = max(seconds, _MIN_MEASURED_SECONDS) / max(evaluations, 1)
+        return max(_STEPS_AFTER_DEADLINE // max(steps, 1), int(self.seconds_left / each))

@@ -6,19 +6,19 @@ from importlib.metadata import version
 from pathlib import Path
 
 from sysid.core.code_cache import digest_files
-from sysid.kernels.machine_code import machine_name
+from sysid.kernels.machine_code import describe_machine
 
 _LIBRARIES = ("numpy", "scipy", "numba")
 
 
 @cache
-def program(*packages: Path) -> str:
+def compute_fingerprint(*packages: Path) -> str:
     """Digest of all that a result depends on besides its specification.
 
     The sources of this package and of those given as folders, the versions of the libraries, and
     what kernels depend on in the machine.
     """
-    parts = [machine_name(), *(f"{name} {version(name)}" for name in _LIBRARIES)]
+    parts = [describe_machine(), *(f"{name} {version(name)}" for name in _LIBRARIES)]
     for folder in (Path(__file__).parents[1], *packages):
         sources = (*folder.rglob("*.py"), *folder.rglob("*.yaml"))
         parts.append(digest_files(sources, folder.parent))

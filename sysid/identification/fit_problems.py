@@ -6,11 +6,11 @@ from typing import NamedTuple, TypeAlias
 
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import FitSettings
-from sysid.data.noise import Noise, with_noise
+from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Record
-from sysid.data.splitting import split_record, start_of_validation
+from sysid.data.splitting import find_validation_start, split_record
 from sysid.models.model import Model
-from sysid.selection.select import selected
+from sysid.selection.select import select_model_terms
 from sysid.simulation.problem import Problem
 
 ProblemPair: TypeAlias = tuple[Problem, Problem | None]
@@ -66,7 +66,7 @@ def prepare_records(
     if validation is not None:
         raise InvalidSettings("/validation", "give either records or a fraction")
     parts = [split_record(record, fraction) for record in whole]
-    starts = tuple(start_of_validation(record, fraction) for record in whole)
+    starts = tuple(find_validation_start(record, fraction) for record in whole)
     first, last = tuple(part[0] for part in parts), tuple(part[1] for part in parts)
     return FitRecords(_add_noise(first, noise), last, whole, starts)
 
@@ -81,7 +81,9 @@ def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> 
     InvalidRecord, RecordTooShort, InvalidSettings, InvalidBounds
         If model, records or settings cannot be used.
     """
-    model, changes = selected(model, records.estimation, settings.parameters, settings.skip)
+    model, changes = select_model_terms(
+        model, records.estimation, settings.parameters, settings.skip
+    )
     problem = Problem.from_settings(
         model, records.estimation, replace(settings, parameters=changes)
     )
@@ -95,4 +97,4 @@ def build_problems(model: Model, records: FitRecords, settings: FitSettings) -> 
 
 
 def _add_noise(records: tuple[Record, ...], noise: Noise) -> tuple[Record, ...]:
-    return tuple(with_noise(record, noise, number) for number, record in enumerate(records))
+    return tuple(add_output_noise(record, noise, number) for number, record in enumerate(records))

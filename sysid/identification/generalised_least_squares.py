@@ -31,25 +31,32 @@ from numpy.fft import irfft, rfft
 
 from sysid.core.linear_algebra import truncated_svd
 from sysid.core.types import FloatArray
-from sysid.residuals.autocorrelation import laid_out
-from sysid.residuals.coloured import Part, is_coloured, parts
-from sysid.residuals.whitening import Whitening, owed
-from sysid.search.least_squares import TRIED, Scored, Solution, fill_jacobian, solve, steps_at_once
+from sysid.residuals.autocorrelation import space_residuals
+from sysid.residuals.coloured import ResidualPart, is_coloured, iterate_parts
+from sysid.residuals.whitening import Whitening, compute_ar1_coefficient
+from sysid.search.least_squares import (
+    N_TRIED,
+    LeastSquaresSolution,
+    ScoredSamples,
+    fill_jacobian,
+    solve_least_squares,
+    steps_at_once,
+)
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import located, placed
-from sysid.uncertainty.linear_model import drawn_along, moves_of
+from sysid.simulation.scaling import from_unit, to_unit
+from sysid.uncertainty.linear_model import factor_covariance, make_move_generator
 
-_ROUNDS = 12
-_SAME = 1e-3  # relative: correlation times that differ by less
-_STEPS = 40  # of least squares in a round
-_SIZES = np.array([0.3, 1.0, 2.0])  # standard errors by which drawn places are off
-_DRAWN, _STARTS = 96, 6
-_WORK = 50_000_000  # steps of integration or recursion: no places are drawn on longer records
-_FALLEN = float(np.exp(-1.0))
-_WHITE = 0.1  # correlation of neighbours: below, it is not worth a model
+_MAX_ROUNDS = 12
+_TIME_TOLERANCE = 1e-3  # relative: correlation times that differ by less
+_MAX_STEPS = 40  # of least squares in a round
+_START_DEVIATIONS = np.array([0.3, 1.0, 2.0])  # standard errors by which drawn places are off
+_N_DRAWN, _MAX_STARTS = 96, 6
+_MAX_WORK = 50_000_000  # steps of integration or recursion: no places are drawn on longer records
+_DECAY_LEVEL = float(np.exp(-1.0))
+_MIN_CORRELATION = 0.1  # correlation of neighbours: below, it is not worth a model
 
 
-class Generalised(NamedTuple):
+class GeneralisedEstimate(NamedTuple):
     """Estimates under coloured noise.
 
     Attributes
@@ -77,22 +84,25 @@ class Generalised(NamedTuple):
     is_complete: bool
     minima: FloatArray = np.zeros((0, 0))
     rms: FloatArray = np.zeros(0)
-    instead_of: FloatArray | None = None
-    too_slow: Mapping[str, float] = MappingProxyType({})
+    least_squares_theta: FloatArray | None = None
+    unresolved_times: Mapping[str, float] = MappingProxyType({})
 
 
-def whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
+def make_whitening(problem: Problem, correlation_times: Mapping[str, float]) -> Whitening:
     """The whitening of a problem's scored samples."""
-    each = [owed(one.times, correlation_times.get(one.output, 0.0)) for one in parts(problem)]
+    each = [
+        compute_ar1_coefficient(one.times, correlation_times.get(one.output, 0.0))
+        for one in iterate_parts(problem)
+    ]
     return Whitening(
         np.concatenate([np.zeros(0), *each]), sum(time > 0 for time in correlation_times.values())
     )
 
 
-def generalised(
+def fit_generalised_least_squares(
     problem: Problem, theta: FloatArray, covariance: FloatArray, seed: int,
     most: int | None = None,
-) -> Generalised:  # fmt: skip
+) -> GeneralisedEstimate:  # fmt: skip
     """Estimates under first-order noise, from those of least squares (D,).
 
     With no more than `most` simulations. Where all residuals may as well be white the estimates
@@ -105,92 +115,98 @@ def generalised(
     seed : int
         Of the places that are drawn along it.
     """
-    search = _Search(problem, 2**62 if most is None else most)
-    if search.left < 1:
-        return Generalised(theta, {}, 0, False)
-    place = placed(problem.evaluator, theta[None])[0]
-    error = search.errors(place[None])[0]
-    coloured = _coloured(problem, error)
+    search = _WhitenedLeastSquares(problem, 2**62 if most is None else most)
+    if search.simulations_left < 1:
+        return GeneralisedEstimate(theta, {}, 0, False)
+    place = to_unit(problem.evaluator, theta[None])[0]
+    error = search.compute_residuals(place[None])[0]
+    coloured = _select_coloured_outputs(problem, error)
     known: Mapping[str, float] = {}
-    random = moves_of(seed)
-    for i in range(_ROUNDS if coloured else 0):
-        found = _correlation_times(problem, coloured, error, None)
-        is_last = i == _ROUNDS - 1 or _are_alike(found, known)
-        if search.left < search.round:
-            return _told(problem, theta, place, known, search, False)
+    random = make_move_generator(seed)
+    for i in range(_MAX_ROUNDS if coloured else 0):
+        found = _estimate_correlation_times(problem, coloured, error, None)
+        is_last = i == _MAX_ROUNDS - 1 or _have_converged(found, known)
+        if search.simulations_left < search.round_simulations:
+            return _to_estimate(problem, theta, place, known, search, False)
         if is_last:
-            spread = _spread(search.slopes(place, error), error, whitening(problem, known))
-            found = _correlation_times(problem, coloured, error, spread)
-        known, white = found, whitening(problem, found)
-        starts = _starts(search, place, white, covariance, random) if i == 0 or is_last else []
-        place = search.lowest([place, *starts], white)
-        error = search.errors(place[None])[0]
+            spread = _factor_output_covariance(
+                search.compute_slopes(place, error), error, make_whitening(problem, known)
+            )
+            found = _estimate_correlation_times(problem, coloured, error, spread)
+        known, white = found, make_whitening(problem, found)
+        starts = _draw_starts(search, place, white, covariance, random) if i == 0 or is_last else []
+        place = search.find_lowest_minimum([place, *starts], white)
+        error = search.compute_residuals(place[None])[0]
         if is_last:
             break
-    return _told(problem, theta, place, known, search, not search.is_cut)
+    return _to_estimate(problem, theta, place, known, search, not search.is_cut)
 
 
-def coloured_outputs(problem: Problem, theta: FloatArray) -> set[str]:
+def find_coloured_outputs(problem: Problem, theta: FloatArray) -> set[str]:
     """Outputs whose residuals at theta (D,) are clearly not white."""
-    place = placed(problem.evaluator, theta[None])
-    return _coloured(problem, _Search(problem, 1).errors(place)[0])
-
-
-def _coloured(problem: Problem, error: FloatArray) -> set[str]:
-    return {one.output for one in parts(problem) if is_coloured(one, error[one.rows])}
-
-
-def _told(
-    problem: Problem, theta: FloatArray, place: FloatArray, known: Mapping[str, float],
-    search: "_Search", is_complete: bool,
-) -> Generalised:  # fmt: skip
-    """The estimates at a place, those there were where no correlation was found."""
-    if any(known.values()):
-        theta = located(problem.evaluator, place[None])[0]
-    minima = located(problem.evaluator, search.ends)
-    return Generalised(theta, known, search.evaluations, is_complete, minima, search.rms)
-
-
-def _starts(
-    search: "_Search", place: FloatArray, white: Whitening, covariance: FloatArray,
-    random: np.random.Generator,
-) -> list[FloatArray]:  # fmt: skip
-    """Places around one (D,), those that lie lowest of some that are drawn."""
-    count = _DRAWN + _STARTS * search.round
-    if search.left < count or count * search.problem.n_steps > _WORK:
-        return []
-    evaluator = search.problem.evaluator
-    moves = _SIZES[np.arange(_DRAWN) % _SIZES.size, None]
-    moves = moves * random.standard_normal((_DRAWN, place.size)) @ drawn_along(covariance).T
-    theta = located(evaluator, place[None]) + moves
-    places = placed(evaluator, np.clip(theta, evaluator.lower, evaluator.upper))
-    totals = _sums(white.of(search.errors(places)))
-    return [places[i] for i in np.argsort(totals, kind="stable")[:_STARTS]]
-
-
-def _are_alike(found: Mapping[str, float], known: Mapping[str, float]) -> bool:
-    return bool(known) and all(
-        abs(found[name] - known[name]) <= _SAME * known[name] for name in found
+    place = to_unit(problem.evaluator, theta[None])
+    return _select_coloured_outputs(
+        problem, _WhitenedLeastSquares(problem, 1).compute_residuals(place)[0]
     )
 
 
-def _spread(columns: FloatArray, error: FloatArray, white: Whitening) -> FloatArray:
+def _select_coloured_outputs(problem: Problem, error: FloatArray) -> set[str]:
+    return {one.output for one in iterate_parts(problem) if is_coloured(one, error[one.rows])}
+
+
+def _to_estimate(
+    problem: Problem, theta: FloatArray, place: FloatArray, known: Mapping[str, float],
+    search: "_WhitenedLeastSquares", is_complete: bool,
+) -> GeneralisedEstimate:  # fmt: skip
+    """The estimates at a place, those there were where no correlation was found."""
+    if any(known.values()):
+        theta = from_unit(problem.evaluator, place[None])[0]
+    minima = from_unit(problem.evaluator, search.ends)
+    return GeneralisedEstimate(theta, known, search.evaluations, is_complete, minima, search.rms)
+
+
+def _draw_starts(
+    search: "_WhitenedLeastSquares", place: FloatArray, white: Whitening, covariance: FloatArray,
+    random: np.random.Generator,
+) -> list[FloatArray]:  # fmt: skip
+    """Places around one (D,), those that lie lowest of some that are drawn."""
+    count = _N_DRAWN + _MAX_STARTS * search.round_simulations
+    if search.simulations_left < count or count * search.problem.n_steps > _MAX_WORK:
+        return []
+    evaluator = search.problem.evaluator
+    moves = _START_DEVIATIONS[np.arange(_N_DRAWN) % _START_DEVIATIONS.size, None]
+    moves = moves * random.standard_normal((_N_DRAWN, place.size)) @ factor_covariance(covariance).T
+    theta = from_unit(evaluator, place[None]) + moves
+    places = to_unit(evaluator, np.clip(theta, evaluator.lower, evaluator.upper))
+    totals = _sum_squares(white.whiten(search.compute_residuals(places)))
+    return [places[i] for i in np.argsort(totals, kind="stable")[:_MAX_STARTS]]
+
+
+def _have_converged(found: Mapping[str, float], known: Mapping[str, float]) -> bool:
+    return bool(known) and all(
+        abs(found[name] - known[name]) <= _TIME_TOLERANCE * known[name] for name in found
+    )
+
+
+def _factor_output_covariance(
+    columns: FloatArray, error: FloatArray, white: Whitening
+) -> FloatArray:
     """L (n, D) of the covariance LLᵀ of fitted outputs with slopes (n, D)."""
-    seen, left = white.of(columns.T).T, white.of(error)
+    seen, left = white.whiten(columns.T).T, white.whiten(error)
     _, singular, rows, kept = truncated_svd(seen)
     deviation = np.sqrt(float(left @ left) / max(error.size - columns.shape[1], 1))
     return np.asarray(deviation * columns @ (rows[kept].T / singular[kept]))
 
 
-def _correlation_times(
+def _estimate_correlation_times(
     problem: Problem, coloured: set[str], error: FloatArray, spread: FloatArray | None
 ) -> dict[str, float]:
     """Of each output in s: the mean over its series, by their samples."""
     found: dict[str, list[tuple[float, int]]] = {}
-    for one in parts(problem):
+    for one in iterate_parts(problem):
         if one.output in coloured:
             also = None if spread is None else spread[one.rows]
-            time = _correlation_time(one, error[one.rows], also)
+            time = _estimate_correlation_time(one, error[one.rows], also)
             found.setdefault(one.output, []).append((time, one.times.size))
     return {
         name: sum(time * n for time, n in each) / sum(n for _, n in each)
@@ -198,99 +214,104 @@ def _correlation_times(
     }
 
 
-def _correlation_time(part: Part, error: FloatArray, spread: FloatArray | None) -> float:
+def _estimate_correlation_time(
+    part: ResidualPart, error: FloatArray, spread: FloatArray | None
+) -> float:
     """Time (s) at which the autocorrelation of one series has fallen to 1/e, half of it at most."""
-    laid = laid_out(part.times, error)
+    laid = space_residuals(part.times, error)
     present = laid.present.astype(np.float64)
-    covariance = _lagged(laid.values)
+    covariance = _autocorrelate(laid.values)
     for column in () if spread is None else spread.T:
         values = np.zeros(laid.values.size)
         values[laid.present] = column
-        covariance += _lagged(values)
+        covariance += _autocorrelate(values)
     n = laid.values.size
-    pairs = np.maximum(np.rint(_lagged(present)), 1.0)
+    pairs = np.maximum(np.rint(_autocorrelate(present)), 1.0)
     covariance *= np.arange(n, n - pairs.size, -1.0) / pairs  # as if no sample were missing
     if not covariance.size or not covariance[0] > 0:
         return 0.0
-    return laid.period * _fallen(covariance / covariance[0])
+    return laid.period * _find_decay_lag(covariance / covariance[0])
 
 
-def _lagged(values: FloatArray) -> FloatArray:
+def _autocorrelate(values: FloatArray) -> FloatArray:
     """Σ v(t) v(t + k) for k from 0 up to half the values' number."""
     n = values.size
     length = 1 << (2 * n - 1).bit_length()
     return np.asarray(irfft(np.square(np.abs(rfft(values, length))), length)[: n // 2])
 
 
-def _fallen(correlation: FloatArray) -> float:
+def _find_decay_lag(correlation: FloatArray) -> float:
     """Lag at which a correlation function has fallen to 1/e, by a line between two lags."""
-    below = np.flatnonzero(correlation <= _FALLEN)
+    below = np.flatnonzero(correlation <= _DECAY_LEVEL)
     if not below.size:
         return float(correlation.size)
     k = int(below[0])
     if k == 1:  # faster than the samples: what is left of the first-order noise after one of them
-        return -1.0 / float(np.log(correlation[1])) if correlation[1] > _WHITE else 0.0
+        return -1.0 / float(np.log(correlation[1])) if correlation[1] > _MIN_CORRELATION else 0.0
     before, after = correlation[k - 1], correlation[k]
-    return k - 1 + float((before - _FALLEN) / (before - after))
+    return k - 1 + float((before - _DECAY_LEVEL) / (before - after))
 
 
-class _Search:
+class _WhitenedLeastSquares:
     """Least squares of whitened residuals over places in [0, 1], counting simulations."""
 
     def __init__(self, problem: Problem, budget: int) -> None:
         self.problem, self._budget, self.evaluations = problem, budget, 0
         self.is_cut = False  # whether a minimum was left before its end for want of simulations
-        self.ends, self.rms = np.zeros((0, len(problem.space))), np.zeros(0)  # of the last round
-        rows = problem.scored
-        self._scored = Scored(problem.evaluator, rows, problem.evaluator.weight[rows])
-        self._step = len(problem.space) + TRIED
+        self.ends, self.rms = (
+            np.zeros((0, len(problem.free_parameters))),
+            np.zeros(0),
+        )  # of the last round
+        rows = problem.scored_rows
+        self._scored = ScoredSamples(problem.evaluator, rows, problem.evaluator.weight[rows])
+        self._step_simulations = len(problem.free_parameters) + N_TRIED
         # Simulations without which no round begins: the slopes, a step, residuals at both ends.
-        self.round = len(problem.space) + self._step + 2
+        self.round_simulations = len(problem.free_parameters) + self._step_simulations + 2
 
     @property
-    def left(self) -> int:
+    def simulations_left(self) -> int:
         """Simulations that may still be run."""
         return self._budget - self.evaluations
 
-    def errors(self, places: FloatArray) -> FloatArray:
+    def compute_residuals(self, places: FloatArray) -> FloatArray:
         """Weighted residuals (P, n) of places (P, D)."""
         self.evaluations += places.shape[0]
-        predicted = self.problem.predictions(located(self.problem.evaluator, places))
+        predicted = self.problem.predict(from_unit(self.problem.evaluator, places))
         scored = self._scored
         measured = scored.evaluator.measured[scored.rows]
         return np.asarray(scored.weight * (predicted[:, scored.rows] - measured))
 
-    def slopes(self, place: FloatArray, error: FloatArray) -> FloatArray:
+    def compute_slopes(self, place: FloatArray, error: FloatArray) -> FloatArray:
         """Slopes (n, D) of the residuals."""
         columns = np.empty((place.size, error.size))
         fill_jacobian(self._scored, place, error, columns)
         self.evaluations += place.size
         return columns.T
 
-    def lowest(self, starts: Sequence[FloatArray], white: Whitening) -> FloatArray:
+    def find_lowest_minimum(self, starts: Sequence[FloatArray], white: Whitening) -> FloatArray:
         """The lowest minimum from places (D,), of which the first is sure to be searched from."""
         found = []
         for start in starts:
-            steps = min(_STEPS, (self.left - 2) // self._step)
+            steps = min(_MAX_STEPS, (self.simulations_left - 2) // self._step_simulations)
             if steps < 1:
                 self.is_cut = True
                 break
             solution = self._solve(start, white, steps)
-            self.is_cut |= steps < _STEPS and not solution.is_converged
+            self.is_cut |= steps < _MAX_STEPS and not solution.is_converged
             found.append(solution)
         self.ends = np.array([one.place for one in found])
         self.rms = np.sqrt([one.loss for one in found])
         return found[int(np.argmin(self.rms))].place
 
-    def _solve(self, place: FloatArray, white: Whitening, steps: int) -> Solution:
+    def _solve(self, place: FloatArray, white: Whitening, steps: int) -> LeastSquaresSolution:
         at_once = steps_at_once(place.size, self.problem.n_steps)
-        scored = self._scored._replace(owed=white.owed)
-        solution = solve(scored, place, 0.0, steps=steps, at_once=at_once)
+        scored = self._scored._replace(owed=white.ar1_coefficient)
+        solution = solve_least_squares(scored, place, 0.0, steps=steps, at_once=at_once)
         self.evaluations += solution.evaluations
         return solution
 
 
-def _sums(errors: FloatArray) -> FloatArray:
+def _sum_squares(errors: FloatArray) -> FloatArray:
     """Sums of squares (P,) of residuals (P, n); inf where one is not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         totals = np.einsum("pn,pn->p", errors, errors)

@@ -3,17 +3,17 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, Prediction
+from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss, PredictionKind
 from sysid.data.noise import Noise
 from sysid.data.records import Record
-from sysid.identification.conclude import conclude
+from sysid.identification.conclude import conclude_run
 from sysid.identification.fit_problems import build_problems, prepare_records
 from sysid.identification.result import Identification
-from sysid.identification.run import advance, begin, is_finished
+from sysid.identification.run import advance_run, begin_run, is_finished
 from sysid.islands.state import RunState
-from sysid.models.delays import check_used
+from sysid.models.delays import check_unused_settings
 from sysid.models.model import Model
-from sysid.models.units import check_units
+from sysid.models.units import check_signal_units
 from sysid.simulation.problem import Problem
 
 _PROGRESS_SECONDS = 0.25
@@ -26,7 +26,7 @@ def identify(
     *,
     seed: int = 1,
     parameters: Mapping[str, Mapping[str, Any]] | None = None,
-    prediction: Prediction = "simulation",
+    prediction: PredictionKind = "simulation",
     loss: Loss | None = None,
     weights: Mapping[str, float] | None = None,
     skip: int = 0,
@@ -69,29 +69,31 @@ def identify(
         If an argument cannot be used.
     """
     algorithm = settings or GeneticAlgorithm()
-    whole, other = _several(records), None if validation is None else _several(validation)
-    check_used(model, len(whole), parameters, weights)
-    check_units(model, (*whole, *(other or ())))
+    whole, other = _to_records(records), None if validation is None else _to_records(validation)
+    check_unused_settings(model, len(whole), parameters, weights)
+    check_signal_units(model, (*whole, *(other or ())))
     fit = FitSettings(parameters or {}, prediction, loss or Loss(), weights, skip)
     prepared = prepare_records(whole, other, validation_fraction, noise)
     problem, judged = build_problems(model, prepared, fit)
-    return conclude(problem, algorithm, _searched(problem, algorithm, seed, warm, progress), judged)
+    return conclude_run(
+        problem, algorithm, _run_search(problem, algorithm, seed, warm, progress), judged
+    )
 
 
-def _searched(
+def _run_search(
     problem: Problem,
     algorithm: GeneticAlgorithm,
     seed: int,
     warm: Mapping[str, float] | None,
     progress: Callable[[RunState], None] | None,
 ) -> RunState:
-    state = begin(problem, algorithm, seed, warm)
+    state = begin_run(problem, algorithm, seed, warm)
     while not is_finished(algorithm, state):
-        state = advance(problem, algorithm, state, _PROGRESS_SECONDS)
+        state = advance_run(problem, algorithm, state, _PROGRESS_SECONDS)
         if progress is not None:
             progress(state)
     return state
 
 
-def _several(records: Record | Sequence[Record]) -> tuple[Record, ...]:
+def _to_records(records: Record | Sequence[Record]) -> tuple[Record, ...]:
     return (records,) if isinstance(records, Record) else tuple(records)

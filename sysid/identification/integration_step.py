@@ -16,39 +16,39 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.types import RANK, FloatArray
+from sysid.core.types import RANK_TOLERANCE, FloatArray
 from sysid.core.units import format_unit
 from sysid.kernels.reads import is_difference
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import physical_scale
+from sysid.uncertainty.analysis import compute_physical_scale
 from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.sensitivities import sensitivities
+from sysid.uncertainty.sensitivities import compute_sensitivities
 
-_FINER = 2
-_NOTABLE = 1e-3  # of the output's size: smaller errors of the integration are let pass
-_SHARE = 0.01  # of a value: so is a smaller move where the record fits better with the step
+_SUBSTEP_FACTOR = 2
+_NOTABLE_ERROR = 1e-3  # of the output's size: smaller errors of the integration are let pass
+_NOTABLE_SHARE = 0.01  # of a value: so is a smaller move where the record fits better with the step
 _TINY = float(np.finfo(float).tiny)
-_FAR_BETTER = 10.0  # twice the logarithm of the ratio of likelihoods
-_MOST_STEPS = 2_000_000
+_LIKELIHOOD_GAIN = 10.0  # twice the logarithm of the ratio of likelihoods
+_MAX_STEPS = 2_000_000
 """Steps that the finer simulation may take; of a longer one nothing is told."""
 
 
-def step_notes(
+def warn_integration_step(
     problem: Problem, theta: FloatArray, estimates: tuple[Estimate, ...], simulated: FloatArray,
     is_late: Callable[[], bool] | None = None,
 ) -> list[str]:  # fmt: skip
     """Estimates (D,) that would be others with half the integration step; simulated (M,)."""
     plain = problem.loss.noise_model != "ar1"
-    if is_difference(problem.model) or not plain or _FINER * problem.n_steps > _MOST_STEPS:
+    if is_difference(problem.model) or not plain or _SUBSTEP_FACTOR * problem.n_steps > _MAX_STEPS:
         return []
-    fine = _finer(problem)
+    fine = _halve_step(problem)
     weight = problem.evaluator.weight
     with np.errstate(all="ignore"):  # what diverges with one of the steps
-        move = weight * (fine.predictions(theta[None])[0] - simulated)
+        move = weight * (fine.predict(theta[None])[0] - simulated)
         error = weight * (simulated - problem.evaluator.measured)
         n, squares = max(problem.n_scored, 1), float(move @ move)
-        is_near = np.sqrt(squares / n) <= _NOTABLE * problem.output_scale
+        is_near = np.sqrt(squares / n) <= _NOTABLE_ERROR * problem.output_scale
     if squares <= float(error @ error) / n:
         return []
     if is_late is not None and is_late():
@@ -58,50 +58,58 @@ def step_notes(
         ]
     error = error[weight > 0]
     end = (
-        _beside(problem, theta, estimates, move[weight > 0], error)
+        _predict_estimate(problem, theta, estimates, move[weight > 0], error)
         if is_near
-        else _anew(fine, theta, is_late)
+        else _refit_estimate(fine, theta, is_late)
     )
     gain = n * np.log(max(end.squares, _TINY) / max(float(error @ error), _TINY))
-    told = _told(problem, theta, estimates, end.theta, _SHARE if gain > _FAR_BETTER else 0.0)
+    told = _describe_shifts(
+        problem, theta, estimates, end.theta, _NOTABLE_SHARE if gain > _LIKELIHOOD_GAIN else 0.0
+    )
     if not told:
         return []
     substeps = problem.model.solver.substeps
     return [
         f"the integration step is too long for these estimates: with half of it {', '.join(told)}; "
-        f"give the model solver: {{substeps: {2 * _FINER * substeps}}}"
+        f"give the model solver: {{substeps: {2 * _SUBSTEP_FACTOR * substeps}}}"
     ]
 
 
-class _End(NamedTuple):
+class _FineEstimate(NamedTuple):
     """Estimates (D,) with the finer step, and the sum of their squared residuals."""
 
     theta: FloatArray
     squares: float
 
 
-def _anew(fine: Problem, theta: FloatArray, is_late: Callable[[], bool] | None) -> _End:
+def _refit_estimate(
+    fine: Problem, theta: FloatArray, is_late: Callable[[], bool] | None
+) -> _FineEstimate:
     """Where least squares ends with the finer step."""
-    (end,) = refine(fine, [theta], None, is_late)
-    return _End(theta, 0.0) if end is None else _End(end.theta, fine.n_scored * end.rms**2)
+    (end,) = refine_candidates(fine, [theta], None, is_late)
+    return (
+        _FineEstimate(theta, 0.0)
+        if end is None
+        else _FineEstimate(end.theta, fine.n_scored * end.rms**2)
+    )
 
 
-def _beside(
+def _predict_estimate(
     problem: Problem, theta: FloatArray, estimates: tuple[Estimate, ...], move: FloatArray,
     error: FloatArray,
-) -> _End:  # fmt: skip
+) -> _FineEstimate:  # fmt: skip
     """Where it would end if outputs that move by so little (n,) are linear."""
     held = {one.name for one in estimates if one.status == "at bound"}
-    found = sensitivities(problem, theta)
-    sloping = (found.plateau == 0.0) & ~found.one_sided
+    found = compute_sensitivities(problem, theta)
+    sloping = (found.plateau_width == 0.0) & ~found.one_sided
     sloping &= [name not in held for name in problem.free_names]
     columns = found.columns * sloping
-    shift = -np.linalg.lstsq(columns, move, rcond=RANK)[0]
+    shift = -np.linalg.lstsq(columns, move, rcond=RANK_TOLERANCE)[0]
     left = error + move + columns @ shift
-    return _End(theta + shift * physical_scale(problem, theta), float(left @ left))
+    return _FineEstimate(theta + shift * compute_physical_scale(problem, theta), float(left @ left))
 
 
-def _told(
+def _describe_shifts(
     problem: Problem, theta: FloatArray, estimates: tuple[Estimate, ...], end: FloatArray,
     share: float,
 ) -> list[str]:  # fmt: skip
@@ -121,8 +129,8 @@ def _told(
     return told
 
 
-def _finer(problem: Problem) -> Problem:
+def _halve_step(problem: Problem) -> Problem:
     """The problem with shorter steps of integration."""
     model = problem.untied_model
-    solver = replace(model.solver, substeps=_FINER * model.solver.substeps)
+    solver = replace(model.solver, substeps=_SUBSTEP_FACTOR * model.solver.substeps)
     return problem.rebuild(model=replace(model, solver=solver))

@@ -26,29 +26,34 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sysid.core.types import FloatArray
-from sysid.search.refine import Refined, refine_one
+from sysid.search.refine import RefinedCandidate, refine_candidate
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.linear_model import Linear, drawn_along, moves_of
+from sysid.uncertainty.linear_model import LinearOutputModel, factor_covariance, make_move_generator
 
-_SIZES = np.array([0.5, 1.0, 2.0, 3.0])  # standard errors
-_LOOK = 24  # places that tell whether the loss is rough
-_DRAWN = 192  # places in a round
-_POLISHED = 8  # of these: the lowest under the linear model
-_ROUNDS = 2
-_STEPS = 12  # of least squares from each place
-_LINEAR = 0.5  # of the linear model's likelihood ratio: deviations that are no roughness
-_BATCH = 32  # places around the best one
-_FIRST, _LAST = 0.5, 1e-3  # their spread at the beginning and at the end, standard errors
-_MORE, _LESS = 1.1, 0.7  # spread after a gain, after none
-_MOST = 1800  # simulations
-_WORK = 50_000_000  # steps of integration or recursion: on long records simulations are fewer
-_LATE = 5_000_000  # as many when the time of the run is over
-_BETTER = 1e-9  # relative
+_DRAW_DEVIATIONS = np.array([0.5, 1.0, 2.0, 3.0])  # standard errors
+_ROUGHNESS_PLACES = 24  # places that tell whether the loss is rough
+_PLACES_PER_ROUND = 192  # places in a round
+_STARTS_PER_ROUND = 8  # of these: the lowest under the linear model
+_MAX_ROUNDS = 2
+_MAX_STEPS = 12  # of least squares from each place
+_ROUGHNESS_TOLERANCE = (
+    0.5  # of the linear model's likelihood ratio: deviations that are no roughness
+)
+_BATCH_SIZE = 32  # places around the best one
+_FIRST_SPREAD, _LAST_SPREAD = (
+    0.5,
+    1e-3,
+)  # their spread at the beginning and at the end, standard errors
+_SPREAD_GROWTH, _SPREAD_DECAY = 1.1, 0.7  # spread after a gain, after none
+_MAX_SIMULATIONS = 1800  # simulations
+_MAX_WORK = 50_000_000  # steps of integration or recursion: on long records simulations are fewer
+_MAX_LATE_WORK = 5_000_000  # as many when the time of the run is over
+_GAIN_TOLERANCE = 1e-9  # relative
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Neighbourhood:
+class LocalMinima:
     """What was found beside an estimate.
 
     Attributes
@@ -61,121 +66,125 @@ class Neighbourhood:
     evaluations : int
     """
 
-    best: Refined | None
+    best: RefinedCandidate | None
     values: FloatArray
     rms: FloatArray
     evaluations: int
 
 
-def affordable(problem: Problem, is_late: bool) -> int:
+def count_affordable_simulations(problem: Problem, is_late: bool) -> int:
     """Simulations that may be spent beside an estimate, fewer the longer one takes.
 
     By the steps of a simulation, not by the clock, so that the same run has the same result.
     """
     steps = sum(one.grid.points * one.grid.substeps for one in problem.experiments)
-    most = min(_MOST, (_LATE if is_late else _WORK) // max(steps, 1))
-    return most if most >= _LOOK else 0
+    most = min(_MAX_SIMULATIONS, (_MAX_LATE_WORK if is_late else _MAX_WORK) // max(steps, 1))
+    return most if most >= _ROUGHNESS_PLACES else 0
 
 
-def neighbourhood(
-    problem: Problem, theta: FloatArray, rms: float, linear: Linear, seed: int,
+def find_local_minima(
+    problem: Problem, theta: FloatArray, rms: float, linear: LinearOutputModel, seed: int,
     left: int | None = None,
-) -> Neighbourhood:  # fmt: skip
+) -> LocalMinima:  # fmt: skip
     """Look for minima around an estimate (D,) with a linear model, in at most `left` runs."""
-    look = _Look(problem, linear, seed, 2**62 if left is None else left)
-    first = best = Refined(theta, rms, 0)
+    look = _LocalSearch(problem, linear, seed, 2**62 if left is None else left)
+    first = best = RefinedCandidate(theta, rms, 0)
     found = [first]
     if rms > 0 and look.root.any() and look.is_rough(best):
-        for _ in range(_ROUNDS):
-            ends = look.minima(best)
+        for _ in range(_MAX_ROUNDS):
+            ends = look.refine_starts(best)
             found += ends
             reached = min((best, *ends), key=lambda one: one.rms)
-            gains = reached.rms < best.rms * (1.0 - _BETTER)
+            gains = reached.rms < best.rms * (1.0 - _GAIN_TOLERANCE)
             best = reached  # also where it is lower by rounding only: what follows ends the lowest
             if not gains or best.rms == 0:
                 break
-        found.append(look.followed(best) if best.rms > 0 else best)
+        found.append(look.run_evolution_strategy(best) if best.rms > 0 else best)
         best = found[-1]
-    better = best if best.rms < rms * (1.0 - _BETTER) else None
-    return Neighbourhood(
+    better = best if best.rms < rms * (1.0 - _GAIN_TOLERANCE) else None
+    return LocalMinima(
         better, np.array([one.theta for one in found]), np.array([one.rms for one in found]),
-        look.spent,
+        look.evaluations,
     )  # fmt: skip
 
 
-class _Look:
+class _LocalSearch:
     """Places drawn around an estimate and what is found from there, counting simulations."""
 
-    def __init__(self, problem: Problem, linear: Linear, seed: int, budget: int) -> None:
-        self._problem, self._budget, self.spent = problem, budget, 0
+    def __init__(self, problem: Problem, linear: LinearOutputModel, seed: int, budget: int) -> None:
+        self._problem, self._budget, self.evaluations = problem, budget, 0
         self._linear = linear
-        self._random = moves_of(seed)
-        self.root = drawn_along(linear.covariance)
+        self._random = make_move_generator(seed)
+        self.root = factor_covariance(linear.covariance)
 
-    def is_rough(self, centre: Refined) -> bool:
+    def is_rough(self, centre: RefinedCandidate) -> bool:
         """Whether losses around differ from those of the linear model; no, if none can be had."""
-        if self._budget - self.spent < _LOOK:
+        if self._budget - self.evaluations < _ROUGHNESS_PLACES:
             return False
-        _, _, expected, beyond = self._drawn(centre, _LOOK)
-        return bool(np.any(~(np.abs(beyond) <= _LINEAR * np.maximum(expected, 1.0))))
+        _, _, expected, beyond = self._draw_places(centre, _ROUGHNESS_PLACES)
+        return bool(np.any(~(np.abs(beyond) <= _ROUGHNESS_TOLERANCE * np.maximum(expected, 1.0))))
 
-    def minima(self, centre: Refined) -> list[Refined]:
+    def refine_starts(self, centre: RefinedCandidate) -> list[RefinedCandidate]:
         """What least squares makes of the most promising places around."""
-        count = min(_DRAWN, (self._budget - self.spent) // 2)
-        if count < _LOOK:
+        count = min(_PLACES_PER_ROUND, (self._budget - self.evaluations) // 2)
+        if count < _ROUGHNESS_PLACES:
             return []
-        starts, values, _, beyond = self._drawn(centre, count)
+        starts, values, _, beyond = self._draw_places(centre, count)
         ends = []
-        for i in np.argsort(beyond, kind="stable")[:_POLISHED]:
-            left = self._budget - self.spent
-            end = refine_one(self._problem, starts[i], float(values[i]), left, _STEPS)
+        for i in np.argsort(beyond, kind="stable")[:_STARTS_PER_ROUND]:
+            left = self._budget - self.evaluations
+            end = refine_candidate(self._problem, starts[i], float(values[i]), left, _MAX_STEPS)
             if end is None or not np.isfinite(end.rms):
                 break
-            self.spent += end.evaluations
+            self.evaluations += end.evaluations
             ends.append(end)
         return ends
 
-    def followed(self, centre: Refined) -> Refined:
+    def run_evolution_strategy(self, centre: RefinedCandidate) -> RefinedCandidate:
         """The best that batches of places around the best one lead to."""
-        theta, rms, size = centre.theta, centre.rms, _FIRST
-        while size > _LAST and self._budget - self.spent >= _BATCH:
-            sizes = size * np.exp(self._random.uniform(-1.5, 0.5, _BATCH))
-            starts, values = self._simulated(theta, sizes)
+        theta, rms, size = centre.theta, centre.rms, _FIRST_SPREAD
+        while size > _LAST_SPREAD and self._budget - self.evaluations >= _BATCH_SIZE:
+            sizes = size * np.exp(self._random.uniform(-1.5, 0.5, _BATCH_SIZE))
+            starts, values = self._simulate_moves(theta, sizes)
             best = int(np.argmin(values))
             gains = bool(values[best] < rms)
             if gains:
                 theta, rms = starts[best], float(values[best])
-            size *= _MORE if gains else _LESS
-        return Refined(theta, rms, 0)
+            size *= _SPREAD_GROWTH if gains else _SPREAD_DECAY
+        return RefinedCandidate(theta, rms, 0)
 
-    def _drawn(
-        self, centre: Refined, count: int
+    def _draw_places(
+        self, centre: RefinedCandidate, count: int
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Places, their RMS, the likelihood ratio expected there, and by how much it is more."""
-        starts, values = self._simulated(centre.theta, _SIZES[np.arange(count) % _SIZES.size])
+        starts, values = self._simulate_moves(
+            centre.theta, _DRAW_DEVIATIONS[np.arange(count) % _DRAW_DEVIATIONS.size]
+        )
         n = self._problem.n_scored
-        expected = n * np.log1p(self._linear.excess(starts - centre.theta))
+        expected = n * np.log1p(self._linear.predict_relative_increase(starts - centre.theta))
         with np.errstate(divide="ignore"):
             ratio = 2.0 * n * np.log(values / centre.rms)
         return starts, values, expected, ratio - expected
 
-    def _simulated(self, theta: FloatArray, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _simulate_moves(
+        self, theta: FloatArray, sizes: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Places that many standard errors away, inside the bounds, and their RMS."""
         moves = sizes[:, None] * self._random.standard_normal((sizes.size, theta.size))
         evaluator = self._problem.evaluator
         starts = np.maximum(theta + moves @ self.root.T, evaluator.lower)
         starts = np.minimum(starts, evaluator.upper)  # quicker than clip for so few
-        self.spent += sizes.size
-        return starts, self._problem.fitness(starts)
+        self.evaluations += sizes.size
+        return starts, self._problem.evaluate_fitness(starts)
 
 
-def widened(
-    estimates: tuple[Estimate, ...], names: tuple[str, ...], n: int, found: Neighbourhood,
+def widen_intervals(
+    estimates: tuple[Estimate, ...], names: tuple[str, ...], n: int, found: LocalMinima,
     share: FloatArray,
 ) -> tuple[Estimate, ...]:  # fmt: skip
     """Estimates whose intervals hold those of all minima that the data do not rule out.
 
-    `share` (D,) is that of `Linear`, of the parameters of these names.
+    `share` (D,) is that of `LinearOutputModel`, of the parameters of these names.
     """
     least = found.rms.min()
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -33,25 +33,28 @@ import numpy as np
 from sysid.core.settings import NoiseModel
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
-from sysid.identification.generalised_least_squares import Generalised, coloured_outputs
-from sysid.identification.integration_step import step_notes
-from sysid.kernels.layout import Layout
-from sysid.residuals.autocorrelation import ROUNDING
-from sysid.residuals.coloured import parts
-from sysid.simulation.evaluator import population_predictions
+from sysid.identification.generalised_least_squares import (
+    GeneralisedEstimate,
+    find_coloured_outputs,
+)
+from sysid.identification.integration_step import warn_integration_step
+from sysid.kernels.layout import ExperimentLayout
+from sysid.residuals.autocorrelation import ROUNDING_SHARE
+from sysid.residuals.coloured import iterate_parts
+from sysid.simulation.evaluator import predict_population
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 
-_MOVE = 1e-3  # of the outputs' size: the change that is looked at
-_NEAR = 3.0  # factor by which it may be another
-TRIES = 8
+_CHANGE_SIZE = 1e-3  # of the outputs' size: the change that is looked at
+_CHANGE_TOLERANCE = 3.0  # factor by which it may be another
+MAX_TRIES = 8
 """Simulations for each state, at most."""
-_FARTHER = 1e4  # where a move shows nothing: states have units of their own
-_LEFT = 0.05  # of the largest change
-_LATE = 0.75  # of a record: behind it the change is looked for
+_MOVE_FACTOR = 1e4  # where a move shows nothing: states have units of their own
+_LASTING_SHARE = 0.05  # of the largest change
+_LATE_PART = 0.75  # of a record: behind it the change is looked for
 
 
-def remembering(problem: Problem, theta: FloatArray) -> set[str]:
+def find_integrating_outputs(problem: Problem, theta: FloatArray) -> set[str]:
     """Outputs in which a shift by the start of some state lasts up to the end of a record.
 
     Parameters
@@ -59,71 +62,77 @@ def remembering(problem: Problem, theta: FloatArray) -> set[str]:
     theta : FloatArray, shape (D,)
     """
     names: set[str] = set()
-    before = problem.predictions(theta[None])[0]
+    before = problem.predict(theta[None])[0]
     for state in range(len(problem.model.states)):
-        change = _change(problem, theta, before, state)
+        change = _perturb_state(problem, theta, before, state)
         if change is not None:
-            names |= _lasting(problem, change)
+            names |= _find_lasting_changes(problem, change)
     return names
 
 
-def _change(
+def _perturb_state(
     problem: Problem, theta: FloatArray, before: FloatArray, state: int
 ) -> FloatArray | None:
     """What a move of a state's start makes of the weighted outputs (M,); None: nothing."""
     size = problem.output_scale
-    move, weight = _MOVE * size, problem.evaluator.weight
-    for _ in range(TRIES):
+    move, weight = _CHANGE_SIZE * size, problem.evaluator.weight
+    for _ in range(MAX_TRIES):
         with np.errstate(all="ignore"):  # what diverges from where it is moved to
-            change = weight * (_moved(problem, theta, state, move) - before)
+            change = weight * (_simulate_shifted_start(problem, theta, state, move) - before)
             largest = float(np.max(np.abs(change)))
         if not np.isfinite(largest):
-            move /= _FARTHER
-        elif largest <= ROUNDING * size:
-            move *= _FARTHER
-        elif size * _MOVE / _NEAR <= largest <= size * _MOVE * _NEAR:
+            move /= _MOVE_FACTOR
+        elif largest <= ROUNDING_SHARE * size:
+            move *= _MOVE_FACTOR
+        elif (
+            size * _CHANGE_SIZE / _CHANGE_TOLERANCE
+            <= largest
+            <= size * _CHANGE_SIZE * _CHANGE_TOLERANCE
+        ):
             return np.asarray(change)
         else:
-            move *= size * _MOVE / largest
-    return np.asarray(change) if np.isfinite(largest) and largest > ROUNDING * size else None
+            move *= size * _CHANGE_SIZE / largest
+    return np.asarray(change) if np.isfinite(largest) and largest > ROUNDING_SHARE * size else None
 
 
-def _moved(problem: Problem, theta: FloatArray, state: int, move: float) -> FloatArray:
+def _simulate_shifted_start(
+    problem: Problem, theta: FloatArray, state: int, move: float
+) -> FloatArray:
     """Outputs (M,) where a state starts elsewhere, in every experiment."""
-    evaluator, layout = problem.evaluator, Layout.of(problem.model)
+    evaluator, layout = problem.evaluator, ExperimentLayout.from_model(problem.model)
     floats, template, values = evaluator.floats.copy(), evaluator.template.copy(), theta.copy()
-    for laid, (ints, first, _) in zip(problem.experiments, evaluator.plans.tolist(), strict=True):
+    for laid, (ints, first, _) in zip(problem.experiments, evaluator.offsets.tolist(), strict=True):
         start = laid.starts[state]
         if start.row >= 0:
             template[start.row] += move
-            values[evaluator.rows == start.row] += move
+            values[evaluator.free_rows == start.row] += move
         else:
-            floats[first + layout.initial(state)] += move
-            given = first + int(evaluator.ints[ints + layout.state(state, "given")])
-            floats[given : given + start.given.size] += move
+            floats[first + layout.locate_initial(state)] += move
+            given = first + int(evaluator.ints[ints + layout.locate_state(state, "given")])
+            floats[given : given + start.first_values.size] += move
     elsewhere = evaluator._replace(floats=floats, template=template)
-    return np.asarray(population_predictions(elsewhere, values[None])[0])
+    return np.asarray(predict_population(elsewhere, values[None])[0])
 
 
-def _lasting(problem: Problem, change: FloatArray) -> set[str]:
+def _find_lasting_changes(problem: Problem, change: FloatArray) -> set[str]:
     """Outputs shifted one way at the end of every experiment, beside its largest change of all."""
     lasts: dict[str, bool] = {}
-    weights = problem.split(problem.evaluator.weight)
-    for changes, weight in zip(problem.split(change), weights, strict=True):
+    weights = problem.split_by_output(problem.evaluator.weight)
+    for changes, weight in zip(problem.split_by_output(change), weights, strict=True):
         seen = {name: one[weight[name] > 0] for name, one in changes.items()}
         largest = max(float(np.max(np.abs(one), initial=0.0)) for one in seen.values())
         for name, one in seen.items():
-            late = one[int(_LATE * one.size) :]
+            late = one[int(_LATE_PART * one.size) :]
             if late.size:
-                is_left = max(np.min(late), np.min(-late)) > _LEFT * largest
+                is_left = max(np.min(late), np.min(-late)) > _LASTING_SHARE * largest
                 lasts[name] = lasts.get(name, True) and bool(is_left)
     return {name for name, is_left in lasts.items() if is_left}
 
 
-_TIMES = 5.0  # correlation times that a record lasts at least
+_MIN_RECORD_TIMES = 5.0  # correlation times that a record lasts at least
 
 
-def speaks_for_ar1(
+def is_ar1_indicated(
     problem: Problem, theta: FloatArray, analysis: Analysis,
     is_late: Callable[[], bool] | None = None, most: int | None = None,
 ) -> bool:  # fmt: skip
@@ -137,30 +146,36 @@ def speaks_for_ar1(
     is_free = problem.prediction == "simulation" and problem.loss.kind == "squares"
     if not is_free or known is None or known.noise_colour == "white":
         return False
-    if most is not None and most < 2 + TRIES * len(problem.model.states):
+    if most is not None and most < 2 + MAX_TRIES * len(problem.model.states):
         return False
-    coloured = coloured_outputs(problem, theta)
-    if not coloured or not coloured <= remembering(problem, theta):
+    coloured = find_coloured_outputs(problem, theta)
+    if not coloured or not coloured <= find_integrating_outputs(problem, theta):
         return False
-    simulated = problem.predictions(theta[None])[0]
-    return not step_notes(problem, theta, analysis.estimates, simulated, is_late)
+    simulated = problem.predict(theta[None])[0]
+    return not warn_integration_step(problem, theta, analysis.estimates, simulated, is_late)
 
 
-def settled(problem: Problem, theta: FloatArray, found: Generalised) -> Generalised:
+def confirm_noise_model(
+    problem: Problem, theta: FloatArray, found: GeneralisedEstimate
+) -> GeneralisedEstimate:
     """What was found under first-order noise, or squares again where it is not known well."""
     longest: dict[str, float] = {}
-    for one in parts(problem):
+    for one in iterate_parts(problem):
         span = float(one.times[-1] - one.times[0])
         longest[one.output] = max(span, longest.get(one.output, 0.0))
     times = found.correlation_times
-    squares = Generalised(theta, {}, found.evaluations, True)
+    squares = GeneralisedEstimate(theta, {}, found.evaluations, True)
     if not found.is_complete or not any(times.values()):
         return squares
-    slow = {name: time for name, time in times.items() if _TIMES * time > longest[name]}
-    return squares._replace(too_slow=slow) if slow else found._replace(instead_of=theta)
+    slow = {name: time for name, time in times.items() if _MIN_RECORD_TIMES * time > longest[name]}
+    return (
+        squares._replace(unresolved_times=slow)
+        if slow
+        else found._replace(least_squares_theta=theta)
+    )
 
 
-def decided(problem: Problem, noise: Generalised) -> Problem:
+def resolve_noise_model(problem: Problem, noise: GeneralisedEstimate) -> Problem:
     """The problem with the noise model that its estimates are of, in place of ``auto``."""
     if problem.loss.noise_model != "auto":
         return problem
@@ -169,22 +184,24 @@ def decided(problem: Problem, noise: Generalised) -> Problem:
     return replace(problem, settings=replace(problem.settings, loss=loss))
 
 
-def choice_notes(problem: Problem, noise: Generalised) -> tuple[str, ...]:
+def explain_noise_model_choice(problem: Problem, noise: GeneralisedEstimate) -> tuple[str, ...]:
     """Why there is a noise model that nobody asked for, and what squares gave; or why not."""
-    if noise.too_slow:
-        found = ", ".join(f"{name} {time:.3g} s" for name, time in noise.too_slow.items())
+    if noise.unresolved_times:
+        found = ", ".join(f"{name} {time:.3g} s" for name, time in noise.unresolved_times.items())
         return (
             "noise_model auto keeps squares, though the residuals drift and the model does not "
             "forget where it began: ar1 would have a correlation time of "
-            f"{found}, and the record is not {_TIMES:g} times as long",
+            f"{found}, and the record is not {_MIN_RECORD_TIMES:g} times as long",
         )
-    if noise.instead_of is None:
+    if noise.least_squares_theta is None:
         return ()
     squares = ", ".join(
         f"{one.name} = {value:.4g}{format_unit(one.unit)}"
-        for one, value in zip(problem.space, noise.instead_of.tolist(), strict=True)
+        for one, value in zip(
+            problem.free_parameters, noise.least_squares_theta.tolist(), strict=True
+        )
     )
-    metrics = problem.metrics(np.asarray(noise.instead_of))
+    metrics = problem.evaluate_metrics(np.asarray(noise.least_squares_theta))
     unit = format_unit(metrics.unit)
     return (
         "noise_model auto chose ar1: the residuals of squares are not white, and the model does "

@@ -11,28 +11,39 @@ from dataclasses import replace
 from time import perf_counter
 
 from sysid.core.settings import GeneticAlgorithm
-from sysid.identification.conclude import conclude
-from sysid.islands.archipelago import found, plans
-from sysid.islands.evolve import course, ends_of, evolve_all, next_border, step_of
+from sysid.islands.archipelago import create_islands, make_plans
+from sysid.islands.evolve import (
+    compute_next_border,
+    evolve_islands,
+    get_border_interval,
+    make_search_plan,
+    make_stopping_rule,
+)
 from sysid.islands.migration import migrate
 from sysid.islands.state import RunState
-from sysid.islands.stopping import has_ended
-from sysid.search.island import Island, evolve, of_island
-from sysid.selection.starts import equation_error_starts
+from sysid.islands.stopping import has_process_ended
+from sysid.search.island import Island, evolve, get_island_settings
+from sysid.selection.starts import find_equation_error_starts
 from sysid.simulation.problem import Problem
 
 __all__ = [
-    "RunState", "advance", "advance_island", "begin", "border", "conclude", "exchange",
+    "RunState",
+    "advance_island",
+    "advance_run",
+    "begin_run",
+    "conclude_run",
+    "exchange_migrants",
+    "find_next_border",
     "is_finished",
 ]  # fmt: skip
 
 CALL_SECONDS = 0.1
 """Aimed at for one compiled call, by measured cost, so that a cancel is heard in time."""
 
-UNMEASURED_STEPS = 1_000_000  # steps of integration or recursion in a first call: some 10 ms
+FIRST_CALL_STEPS = 1_000_000  # steps of integration or recursion in a first call: some 10 ms
 
 
-def begin(
+def begin_run(
     problem: Problem,
     algorithm: GeneticAlgorithm,
     seed: int,
@@ -47,53 +58,57 @@ def begin(
     given = (warm,) if isinstance(warm, Mapping) else tuple(warm or ())
     given = tuple(one for one in given if one)
     is_warm = any(all(name in one for name in problem.free_names) for one in given)
-    starts = equation_error_starts(problem, algorithm)
-    islands = found(problem, algorithm, seed, given, starts.values, starts.evaluations)
+    starts = find_equation_error_starts(problem, algorithm)
+    islands = create_islands(problem, algorithm, seed, given, starts.values, starts.evaluations)
     for island in islands:
         island.search.is_warm_start = is_warm
     return RunState(seed, islands, is_warm=is_warm)
 
 
-def border(algorithm: GeneticAlgorithm, state: RunState) -> int:
+def find_next_border(algorithm: GeneticAlgorithm, state: RunState) -> int:
     """The generation up to which every island evolves alone."""
-    step = step_of(algorithm, is_warm=state.is_warm)
-    return next_border(state.generation, step, algorithm.migration.every, algorithm.generations)
+    step = get_border_interval(algorithm, is_warm=state.is_warm)
+    return compute_next_border(
+        state.generation, step, algorithm.migration.every, algorithm.generations
+    )
 
 
 def advance_island(
     problem: Problem, algorithm: GeneticAlgorithm, island: Island, generations: int
 ) -> Island:
     """The island after some generations, fewer where it comes to rest."""
-    plan = plans(problem, algorithm, island.seed)[island.index]
+    plan = make_plans(problem, algorithm, island.seed)[island.index]
     return evolve(problem.evaluator, plan, island, generations)
 
 
-def exchange(algorithm: GeneticAlgorithm, state: RunState, islands: Sequence[Island]) -> RunState:
+def exchange_migrants(
+    algorithm: GeneticAlgorithm, state: RunState, islands: Sequence[Island]
+) -> RunState:
     """The run at the next border, when all its islands have got there: migrate, look at the end."""
-    generation = border(algorithm, state)
+    generation = find_next_border(algorithm, state)
     state = replace(state, islands=tuple(islands), generation=generation)
     if generation % algorithm.migration.every == 0 and len(islands) > 1:
-        bits = tuple(of_island(algorithm, i).bits for i in range(len(islands)))
+        bits = tuple(get_island_settings(algorithm, i).bits for i in range(len(islands)))
         moved, log = migrate(state.islands, bits, algorithm.migration, state.epoch)
         state = replace(
             state, islands=moved, migrations=state.migrations + log, epoch=state.epoch + 1
         )
-    return replace(state, ended=_has_ended(algorithm, state))
+    return replace(state, has_ended=_has_ended(algorithm, state))
 
 
 def _has_ended(algorithm: GeneticAlgorithm, state: RunState) -> bool:
-    is_old = state.is_warm and state.is_the_best_since(state.generation // 2)
-    ends = ends_of(algorithm, is_warm=state.is_warm)
-    return has_ended(ends, state.generation, *state.tally, is_old)
+    is_old = state.is_warm and state.is_unimproved_since(state.generation // 2)
+    ends = make_stopping_rule(algorithm, is_warm=state.is_warm)
+    return has_process_ended(ends, state.generation, *state.champions_and_counters, is_old)
 
 
 def is_finished(algorithm: GeneticAlgorithm, state: RunState) -> bool:
     """Whether an end condition holds: generations, evaluations, target RMS, settled, seconds."""
     limit = algorithm.stop.seconds
-    return state.ended or (limit is not None and state.seconds >= limit)
+    return state.has_ended or (limit is not None and state.seconds >= limit)
 
 
-def advance(
+def advance_run(
     problem: Problem,
     algorithm: GeneticAlgorithm,
     state: RunState,
@@ -104,34 +119,34 @@ def advance(
 
     `should_stop` is asked between compiled calls, about every 0.1 s.
     """
-    way = course(problem, algorithm, state.seed, is_warm=state.is_warm)
+    way = make_search_plan(problem, algorithm, state.seed, is_warm=state.is_warm)
     size = algorithm.population // algorithm.n_islands
-    pace = _Pace(
+    pace = _CallBudget(
         seconds, algorithm.stop.seconds, state.seconds, should_stop,
-        UNMEASURED_STEPS // (size * max(problem.n_steps, 1)),
+        FIRST_CALL_STEPS // (size * max(problem.n_steps, 1)),
     )  # fmt: skip
     while not is_finished(algorithm, state) and not pace.is_over():
-        before, left = _done(state), algorithm.generations - state.generation
-        stand = evolve_all(
+        before, left = _count_generations(state), algorithm.generations - state.generation
+        stand = evolve_islands(
             problem.evaluator, way, state.islands, state.generation, state.epoch,
-            pace.affordable(left * algorithm.n_islands),
+            pace.count_affordable_generations(left * algorithm.n_islands),
         )  # fmt: skip
         state = replace(
             state, islands=stand.islands, generation=stand.generation, epoch=stand.epoch,
             migrations=state.migrations + stand.migrants,
         )  # fmt: skip
-        pace.measure(_done(state) - before)
+        pace.record_call(_count_generations(state) - before)
         ended = stand.has_crossed and _has_ended(algorithm, state)
-        state = replace(state, ended=ended, seconds=pace.used())
+        state = replace(state, has_ended=ended, seconds=pace.measure_used_seconds())
     return state
 
 
-def _done(state: RunState) -> int:
+def _count_generations(state: RunState) -> int:
     """Generations of all islands together."""
     return sum(island.generation for island in state.islands)
 
 
-class _Pace:
+class _CallBudget:
     """How many generations one compiled call may run, and when to stop, by the clock.
 
     `first`: those of the first call, before anything is measured.
@@ -151,10 +166,10 @@ class _Pace:
             end for end in (seconds, None if limit is None else limit - before) if end is not None
         ]
         self._end = min(ends, default=float("inf"))
-        self._first = first
-        self._cost = 0.0  # of one generation of one island, as measured
+        self._first_call_generations = first
+        self._generation_seconds = 0.0  # of one generation of one island, as measured
 
-    def used(self) -> float:
+    def measure_used_seconds(self) -> float:
         return self._before + perf_counter() - self._start
 
     def is_over(self) -> bool:
@@ -162,7 +177,7 @@ class _Pace:
         stopped = self._should_stop is not None and self._should_stop()
         return stopped or (self._calls > 0 and self._last - self._start >= self._end)
 
-    def affordable(self, wanted: int) -> int:
+    def count_affordable_generations(self, wanted: int) -> int:
         """Generations for the next call: as many as are left, or as the time allows; one at least.
 
         No time at all stands for the least that can be done.
@@ -170,9 +185,17 @@ class _Pace:
         left = min(CALL_SECONDS, self._start + self._end - self._last)
         if left <= 0:
             return 1
-        return max(1, min(wanted, int(left / self._cost) if self._calls else self._first))
+        return max(
+            1,
+            min(
+                wanted,
+                int(left / self._generation_seconds)
+                if self._calls
+                else self._first_call_generations,
+            ),
+        )
 
-    def measure(self, count: int) -> None:
+    def record_call(self, count: int) -> None:
         now = perf_counter()
-        self._cost = max((now - self._last) / max(count, 1), 1e-9)
+        self._generation_seconds = max((now - self._last) / max(count, 1), 1e-9)
         self._last, self._calls = now, self._calls + 1

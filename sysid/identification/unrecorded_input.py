@@ -13,39 +13,43 @@ import numpy as np
 
 from sysid.core.errors import InvalidRecord
 from sysid.core.linear_algebra import truncated_svd
-from sysid.core.types import RANK, BoolArray, FloatArray
+from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
 from sysid.data.records import Channel, Record
-from sysid.kernels.reads import lags
-from sysid.models.delays import longest_lag, past_signals
+from sysid.kernels.reads import list_delayed_values
+from sysid.models.delays import compute_longest_delay, list_past_values
 from sysid.models.model import EstimatedInitial
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import Analysis, physical_scale
+from sysid.uncertainty.analysis import Analysis, compute_physical_scale
 from sysid.uncertainty.estimates import Estimate
 
-_NOTABLE = 1.0  # of a standard error
-_UNLIKELY = 4.0  # deviations of the difference of both estimates
-_PLENTY = 2  # samples for each parameter, that are left
-_STEPS = 30  # of least squares, with as many simulations as there are parameters and one
+_NOTABLE_MOVE = 1.0  # of a standard error
+_UNLIKELY_MOVE = 4.0  # deviations of the difference of both estimates
+_MIN_SAMPLES_PER_PARAMETER = 2  # samples for each parameter, that are left
+_MAX_STEPS = 30  # of least squares, with as many simulations as there are parameters and one
 
 
-def past_notes(problem: Problem, analysis: Analysis) -> list[str]:
+def warn_unrecorded_input(problem: Problem, analysis: Analysis) -> list[str]:
     """What to say of estimates that are others without the samples that read an assumed input."""
-    if analysis.slopes is None or analysis.linear is None or problem.prediction != "simulation":
+    if (
+        analysis.residuals_and_sensitivities is None
+        or analysis.linear_model is None
+        or problem.prediction != "simulation"
+    ):
         return []  # whitened, or not of squares
     if analysis.is_cut_short:
         return []  # the time is over
     if not all(isinstance(one, EstimatedInitial) for one in problem.model.initial):
         return []  # a start that is given carries the effect of the guess into the other samples
-    parts = reads_assumed(problem, analysis)
-    assumed = np.concatenate(parts)[problem.scored]
+    parts = find_assumed_samples(problem, analysis)
+    assumed = np.concatenate(parts)[problem.scored_rows]
     count = int(np.count_nonzero(assumed))
     left = assumed.size - count
-    if not count or left <= _PLENTY * len(problem.space):
+    if not count or left <= _MIN_SAMPLES_PER_PARAMETER * len(problem.free_parameters):
         return []
     if not _would_move(problem, analysis, assumed):
         return []
-    told = _told(problem, analysis, _without(problem, analysis))
+    told = _describe_moves(problem, analysis, _refit_without_assumed(problem, analysis))
     if not told:
         return []
     what, them = ("one sample reads", "it") if count == 1 else (f"{count} samples read", "them")
@@ -57,95 +61,97 @@ def past_notes(problem: Problem, analysis: Analysis) -> list[str]:
     ]
 
 
-def reads_assumed(problem: Problem, analysis: Analysis) -> list[BoolArray]:
+def find_assumed_samples(problem: Problem, analysis: Analysis) -> list[BoolArray]:
     """Of every output of every experiment, which samples read an input of before what is known."""
     return [
         channel.times < until
-        for record, until in zip(problem.records, _known_from(problem, analysis), strict=True)
-        for channel in _outputs(problem, record)
+        for record, until in zip(
+            problem.records, _find_recorded_starts(problem, analysis), strict=True
+        )
+        for channel in _order_outputs(problem, record)
     ]
 
 
-def _outputs(problem: Problem, record: Record) -> list[Channel]:
+def _order_outputs(problem: Problem, record: Record) -> list[Channel]:
     channels = {channel.name: channel for channel in record.outputs}
     return [channels[output.name] for output in problem.model.outputs]
 
 
-def _known_from(problem: Problem, analysis: Analysis) -> list[float]:
+def _find_recorded_starts(problem: Problem, analysis: Analysis) -> list[float]:
     """For each experiment the time (s) from which on only recorded inputs are read."""
-    reach = _reach(problem, analysis)
+    reach = _compute_longest_input_delay(problem, analysis)
     return [
-        experiment.grid.start + reach - record.known_before
+        experiment.grid.start + reach - record.history_duration
         for record, experiment in zip(problem.records, problem.experiments, strict=True)
     ]
 
 
-def _reach(problem: Problem, analysis: Analysis) -> float:
+def _compute_longest_input_delay(problem: Problem, analysis: Analysis) -> float:
     """How far (s) the estimated lags of inputs reach back."""
-    if not lags(problem.model, "input"):
+    if not list_delayed_values(problem.model, "input"):
         return 0.0
     spans = {one.name: (one.value, one.value) for one in analysis.estimates}
     step = problem.experiments[0].grid.integration_step
     return max(
-        longest_lag(problem.model, one, spans, step)
-        for one in past_signals(problem.model)
+        compute_longest_delay(problem.model, one, spans, step)
+        for one in list_past_values(problem.model)
         if one.kind == "input"
     )
 
 
 def _would_move(problem: Problem, analysis: Analysis, assumed: BoolArray) -> bool:
     """Whether one step without these samples moves an estimate by far more than chance would."""
-    if analysis.slopes is None:
+    if analysis.residuals_and_sensitivities is None:
         return False
-    error, columns = analysis.slopes
+    error, columns = analysis.residuals_and_sensitivities
     known = columns[~assumed]
-    move = -np.linalg.lstsq(known, error[~assumed], rcond=RANK)[0]
-    by_all, by_known = _variances(columns), _variances(known)
-    scale = physical_scale(problem, _theta(problem, analysis))
-    for d, estimate in enumerate(_told_of(problem, analysis)):
+    move = -np.linalg.lstsq(known, error[~assumed], rcond=RANK_TOLERANCE)[0]
+    by_all, by_known = _compute_variances(columns), _compute_variances(known)
+    scale = compute_physical_scale(problem, _to_theta(problem, analysis))
+    for d, estimate in enumerate(_select_identified(problem, analysis)):
         if estimate is None or not estimate.stderr or not 0.0 < by_all[d] < np.inf:
             continue
         chance = np.sqrt(max(by_known[d] / by_all[d] - 1.0, 0.0))
-        if abs(move[d] * scale[d]) / estimate.stderr > max(_NOTABLE, _UNLIKELY * chance):
+        if abs(move[d] * scale[d]) / estimate.stderr > max(_NOTABLE_MOVE, _UNLIKELY_MOVE * chance):
             return True
     return False
 
 
-def _told_of(problem: Problem, analysis: Analysis) -> list[Estimate | None]:
+def _select_identified(problem: Problem, analysis: Analysis) -> list[Estimate | None]:
     """The estimates in the order of the free parameters (D,); None of starts, and of vague ones."""
     own = {one.name for one in problem.model.parameters}
     by = {one.name: one for one in analysis.estimates if one.status == "identified"}
     return [by.get(name) if name in own else None for name in problem.free_names]
 
 
-def _theta(problem: Problem, analysis: Analysis) -> FloatArray:
+def _to_theta(problem: Problem, analysis: Analysis) -> FloatArray:
     by = {one.name: one.value for one in analysis.estimates}
     return np.array([by[name] for name in problem.free_names])
 
 
-def _without(problem: Problem, analysis: Analysis) -> FloatArray:
+def _refit_without_assumed(problem: Problem, analysis: Analysis) -> FloatArray:
     """The estimate (D,) from the other samples, from where it is; itself if there is none."""
-    theta = _theta(problem, analysis)
+    theta = _to_theta(problem, analysis)
     since = problem.settings.scored_from or [-np.inf] * len(problem.records)
-    from_then = zip(_known_from(problem, analysis), since, strict=True)
+    from_then = zip(_find_recorded_starts(problem, analysis), since, strict=True)
     try:
         others = problem.rebuild(
             weights=problem.output_weights, scored_from=tuple(max(pair) for pair in from_then)
         )
     except InvalidRecord:  # of one record nothing would be left
         return theta
-    (end,) = refine(others, [theta], _STEPS * (theta.size + 1))
+    (end,) = refine_candidates(others, [theta], _MAX_STEPS * (theta.size + 1))
     return theta if end is None else end.theta
 
 
-def _told(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:
+def _describe_moves(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:
     """Estimates that would be others, with their moves in standard errors."""
     told = []
-    for estimate, value in zip(_told_of(problem, analysis), end.tolist(), strict=True):
+    for estimate, value in zip(_select_identified(problem, analysis), end.tolist(), strict=True):
         if estimate is None or not estimate.stderr:
             continue
         shift = abs(value - estimate.value) / estimate.stderr
-        if shift > _NOTABLE:
+        if shift > _NOTABLE_MOVE:
             told.append(
                 f"{estimate.name} is {value:.4g} instead of {estimate.value:.4g}, {shift:.2g} of "
                 "its standard errors away"
@@ -153,10 +159,10 @@ def _told(problem: Problem, analysis: Analysis, end: FloatArray) -> list[str]:
     return told
 
 
-def _variances(columns: FloatArray) -> FloatArray:
+def _compute_variances(columns: FloatArray) -> FloatArray:
     """Diagonal of (SᵀS)⁻¹, (D,); inf of what these rows leave open."""
     triangle = np.asarray(np.linalg.qr(columns, mode="r"))  # of a long record in half the time
     _, singular, rows, kept = truncated_svd(triangle)
     found: FloatArray = np.sum((rows[kept].T / singular[kept]) ** 2, axis=1)
-    is_open = np.max(np.abs(rows[~kept]), axis=0, initial=0.0) > RANK
+    is_open = np.max(np.abs(rows[~kept]), axis=0, initial=0.0) > RANK_TOLERANCE
     return np.where(is_open, np.inf, found)

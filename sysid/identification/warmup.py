@@ -8,7 +8,7 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 
 
-def warm_up() -> None:
+def compile_search() -> None:
     """Run the smallest search there is.
 
     The search is one compiled function for all models; its machine code is kept on disk, so this

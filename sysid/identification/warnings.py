@@ -7,28 +7,39 @@ import numpy as np
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.core.units import format_unit
-from sysid.identifiability.combinations import Group
-from sysid.identification.unrecorded_input import past_notes
-from sysid.kernels.reads import is_difference, lags
-from sysid.models.ties import names_in
-from sysid.models.units import mixed_units, time_unit_notes, unread_units
-from sysid.residuals.onset_delay import moves_alone
+from sysid.identifiability.combinations import IdentifiableCombination
+from sysid.identification.unrecorded_input import warn_unrecorded_input
+from sysid.kernels.reads import is_difference, list_delayed_values
+from sysid.models.ties import collect_parameter_names
+from sysid.models.units import (
+    list_mixed_unit_warnings,
+    list_time_unit_warnings,
+    list_unread_unit_warnings,
+)
+from sysid.residuals.onset_delay import find_unprompted_output
 from sysid.residuals.past_outputs import reads_outputs
 from sysid.residuals.residual_tests import ResidualTests
-from sysid.search.island import of_island
+from sysid.search.island import get_island_settings
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.analysis import Analysis
 from sysid.uncertainty.estimates import Estimate, NoiseColour, Uncertainty
 
-_RIDGE, _STRONG = 0.9, 0.95  # of correlations, of a lag that may as well be 0, and of others
-_HELD = 0.5  # of an input's neighbouring samples are equal, where it is taken for one of steps
+_RIDGE_CORRELATION, _STRONG_CORRELATION = (
+    0.9,
+    0.95,
+)  # of correlations, of a lag that may as well be 0, and of others
+_HELD_SHARE = (
+    0.5  # of an input's neighbouring samples are equal, where it is taken for one of steps
+)
 _NOTABLE_GAIN = 0.01
-_SEPARABLE = 2.0  # standard errors: a lag on a ridge that is less than that
-_VAGUE = 0.5  # of its value: standard error of a group of which next to nothing is known
-_CHANCE = 1e-3  # that a true model's residuals look as little white: below, it is worth a sentence
-_ROUNDING = 1e-9  # of the output: below, the residual is rounding and has no optimum
+_SEPARABLE_STDERRS = 2.0  # standard errors: a lag on a ridge that is less than that
+_VAGUE_SHARE = 0.5  # of its value: standard error of a group of which next to nothing is known
+_WHITENESS_LEVEL = (
+    1e-3  # that a true model's residuals look as little white: below, it is worth a sentence
+)
+_ROUNDING_SHARE = 1e-9  # of the output: below, the residual is rounding and has no optimum
 
-_ALLOWED: Mapping[NoiseColour, str] = {
+_STDERR_MEANINGS: Mapping[NoiseColour, str] = {
     "white": "the standard errors are too small",
     "first-order": "the standard errors are those of the noise model",
     "coloured": "the standard errors allow for the colour of the residuals, not for what the model "
@@ -36,10 +47,10 @@ _ALLOWED: Mapping[NoiseColour, str] = {
     "drifting": "the residuals drift over the whole record, so the standard errors are too small",
 }
 
-_SUGGESTION = "; if it is the noise that is coloured, use loss: {noise_model: ar1}"
+_NOISE_MODEL_SUGGESTION = "; if it is the noise that is coloured, use loss: {noise_model: ar1}"
 
 
-def warnings_of(
+def collect_warnings(
     problem: Problem,
     algorithm: GeneticAlgorithm,
     analysis: Analysis,
@@ -52,46 +63,48 @@ def warnings_of(
     limit = algorithm.safe_limit
     if limit is not None and rms > limit:
         found.append(f"the RMS error {rms:.4g} is above the safe limit {limit:g}: not valid")
-    found += mixed_units(problem.model, problem.records)
-    found += time_unit_notes(problem.model)
-    found += _held_back(analysis)
-    found += _no_prediction(problem)
-    found += _constant_outputs(problem)
-    found += _worse_than_a_line(problem, simulated)
-    found += _without_excitation(problem, analysis.estimates)
-    found += _steps_read_as_ramps(problem)
-    found += _begun_before(problem) or past_notes(problem, analysis)
-    found += [text for e in analysis.estimates if (text := _of_estimate(e))]
-    lagged = lag_parameters(problem)
+    found += list_mixed_unit_warnings(problem.model, problem.records)
+    found += list_time_unit_warnings(problem.model)
+    found += _warn_active_bounds(analysis)
+    found += _warn_no_prediction(problem)
+    found += _warn_constant_outputs(problem)
+    found += _warn_worse_than_line(problem, simulated)
+    found += _warn_constant_inputs(problem, analysis.estimates)
+    found += _warn_held_inputs(problem)
+    found += _warn_early_response(problem) or warn_unrecorded_input(problem, analysis)
+    found += [text for e in analysis.estimates if (text := _warn_unidentified(e))]
+    lagged = find_delay_parameters(problem)
     if analysis.uncertainty is not None:
-        found += [text for e in analysis.estimates if (text := _vague(e))]
-        found += [text for group in analysis.uncertainty.groups if (text := _of_group(group))]
-        found += _correlated(analysis.uncertainty, analysis.estimates, lagged)
+        found += [text for e in analysis.estimates if (text := _warn_insignificant(e))]
+        found += [
+            text for group in analysis.uncertainty.groups if (text := _warn_vague_group(group))
+        ]
+        found += _warn_correlations(analysis.uncertainty, analysis.estimates, lagged)
     if analysis.is_cut_short:
         found.append(
             "the time was over, so minima beside the estimate were not looked for: where the loss "
             "is rough the intervals are too narrow"
         )
-    if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING * problem.output_scale:
-        found.append(_not_an_optimum(algorithm, analysis.possible_gain))
+    if analysis.possible_gain > _NOTABLE_GAIN and rms > _ROUNDING_SHARE * problem.output_scale:
+        found.append(_warn_not_optimal(algorithm, analysis.possible_gain))
     elif tests is not None:
         loss = problem.loss
         plain = loss.kind == "squares" and loss.noise_model != "ar1"
-        found += _coloured(tests, lagged, analysis.uncertainty, may_be_noise=plain)
-    return (*found, *unread_units(problem.model, problem.records))
+        found += _warn_coloured_residuals(tests, lagged, analysis.uncertainty, may_be_noise=plain)
+    return (*found, *list_unread_unit_warnings(problem.model, problem.records))
 
 
-def _held_back(analysis: Analysis) -> list[str]:
+def _warn_active_bounds(analysis: Analysis) -> list[str]:
     """Bounds too narrow for the data, and which of them to widen."""
-    if not analysis.pulls:
+    if not analysis.active_bounds:
         return []
-    first, *others = analysis.pulls
+    first, *others = analysis.active_bounds
     more = f", and {', '.join(map(str, others))}" if others else ""
-    cures = " and ".join(one.cure for one in analysis.pulls)
+    cures = " and ".join(one.advice for one in analysis.active_bounds)
     return [f"the data pull {first}{more}: {cures}, unless nature sets it there"]
 
 
-def _steps_read_as_ramps(problem: Problem) -> list[str]:
+def _warn_held_inputs(problem: Problem) -> list[str]:
     """Inputs that look held between samples, but are read as straight lines.
 
     A jump read as a ramp over one sample moves the estimate of a lag by half a sample.
@@ -102,7 +115,7 @@ def _steps_read_as_ramps(problem: Problem) -> list[str]:
     names = {
         one.name
         for one in channels
-        if one.hold == "first" and _HELD <= np.mean(np.diff(one.values) == 0) < 1
+        if one.hold == "first" and _HELD_SHARE <= np.mean(np.diff(one.values) == 0) < 1
     }
     return [
         f"input {name!r} stays constant between jumps, but is read as straight between its "
@@ -112,13 +125,13 @@ def _steps_read_as_ramps(problem: Problem) -> list[str]:
     ]
 
 
-def _begun_before(problem: Problem) -> list[str]:
+def _warn_early_response(problem: Problem) -> list[str]:
     """Records of a lagged input whose output leaves its rest while no input has moved."""
-    if not lags(problem.model, "input"):
+    if not list_delayed_values(problem.model, "input"):
         return []
     found = []
     for number, record in enumerate(problem.records, 1):
-        if alone := moves_alone(record):
+        if alone := find_unprompted_output(record):
             where = f" in experiment {number}" if len(problem.records) > 1 else ""
             found.append(
                 f"output {alone[0]!r} begins to move at t = {alone[1]:.4g} s{where} although no "
@@ -129,7 +142,7 @@ def _begun_before(problem: Problem) -> list[str]:
     return found
 
 
-def _no_prediction(problem: Problem) -> list[str]:
+def _warn_no_prediction(problem: Problem) -> list[str]:
     """Whether predictions one step ahead are asked for of a model that reads no measured output."""
     if problem.prediction == "simulation" or reads_outputs(problem.model):
         return []
@@ -140,10 +153,10 @@ def _no_prediction(problem: Problem) -> list[str]:
     ]
 
 
-def _constant_outputs(problem: Problem) -> list[str]:
+def _warn_constant_outputs(problem: Problem) -> list[str]:
     """Outputs whose scored samples are all the same, in every experiment."""
-    measured = problem.split(problem.evaluator.measured)
-    weights = problem.split(problem.evaluator.weight)
+    measured = problem.split_by_output(problem.evaluator.measured)
+    weights = problem.split_by_output(problem.evaluator.weight)
     found = []
     for output in problem.model.outputs:
         values = np.concatenate(
@@ -158,11 +171,11 @@ def _constant_outputs(problem: Problem) -> list[str]:
     return found
 
 
-def _worse_than_a_line(problem: Problem, simulated: FloatArray) -> list[str]:
+def _warn_worse_than_line(problem: Problem, simulated: FloatArray) -> list[str]:
     """Whether straight lines through the outputs would fit better than the model does."""
-    measured = problem.split(problem.evaluator.measured)
-    weights = problem.split(problem.evaluator.weight)
-    models = problem.split(simulated)
+    measured = problem.split_by_output(problem.evaluator.measured)
+    weights = problem.split_by_output(problem.evaluator.weight)
+    models = problem.split_by_output(simulated)
     found = []
     for e, experiment in enumerate(problem.experiments):
         for output, samples in zip(problem.model.outputs, experiment.outputs, strict=True):
@@ -170,8 +183,8 @@ def _worse_than_a_line(problem: Problem, simulated: FloatArray) -> list[str]:
             if np.count_nonzero(scored) < 3:
                 continue
             y, model = measured[e][output.name][scored], models[e][output.name][scored]
-            line = _rms(y - _line(samples.places[scored], y))
-            rms = _rms(y - model)
+            line = _compute_rms(y - _fit_line(samples.places[scored], y))
+            rms = _compute_rms(y - model)
             if rms > line:
                 where = f" of experiment {e + 1}" if len(problem.experiments) > 1 else ""
                 unit = format_unit(output.unit)
@@ -182,19 +195,19 @@ def _worse_than_a_line(problem: Problem, simulated: FloatArray) -> list[str]:
     return found
 
 
-def _line(x: FloatArray, y: FloatArray) -> FloatArray:
+def _fit_line(x: FloatArray, y: FloatArray) -> FloatArray:
     centred = x - np.mean(x)
     spread = float(centred @ centred)
     slope = float(centred @ (y - np.mean(y))) / spread if spread > 0 else 0.0
     return np.asarray(np.mean(y) + slope * centred)
 
 
-def _rms(values: FloatArray) -> float:
+def _compute_rms(values: FloatArray) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
         return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _of_estimate(estimate: Estimate) -> str:
+def _warn_unidentified(estimate: Estimate) -> str:
     low = estimate.value < 0.5 * (estimate.lower + estimate.upper)
     side, bound = ("lower", estimate.lower) if low else ("upper", estimate.upper)
     unit = format_unit(estimate.unit)
@@ -208,7 +221,7 @@ def _of_estimate(estimate: Estimate) -> str:
     return ""
 
 
-def _vague(estimate: Estimate) -> str:
+def _warn_insignificant(estimate: Estimate) -> str:
     """Of a quantity that cannot be negative, and that may as well be 0.
 
     Where both signs are allowed (an offset, an initial state) 0 is a value like any other.
@@ -224,8 +237,8 @@ def _vague(estimate: Estimate) -> str:
     )
 
 
-def _of_group(group: Group) -> str:
-    if not group.stderr or group.stderr < _VAGUE * abs(group.value):
+def _warn_vague_group(group: IdentifiableCombination) -> str:
+    if not group.stderr or group.stderr < _VAGUE_SHARE * abs(group.value):
         return ""
     return (
         f"{group.expression} is practically unidentifiable: {group.value:.3g} with a standard "
@@ -233,17 +246,20 @@ def _of_group(group: Group) -> str:
     )
 
 
-def lag_parameters(problem: Problem) -> set[str]:
+def find_delay_parameters(problem: Problem) -> set[str]:
     """Names of the parameters that lags are made of."""
-    past = [*lags(problem.model, "input"), *lags(problem.model, "state")]
+    past = [
+        *list_delayed_values(problem.model, "input"),
+        *list_delayed_values(problem.model, "state"),
+    ]
     found: set[str] = set()
     for one in past:
-        if one.lag is not None:
-            found |= names_in(one.lag)
+        if one.delay is not None:
+            found |= collect_parameter_names(one.delay)
     return found & set(problem.free_names)
 
 
-def _correlated(
+def _warn_correlations(
     uncertainty: Uncertainty, estimates: tuple[Estimate, ...], lagged: set[str]
 ) -> list[str]:
     """Ridges; a lag on one that may as well be 0 is not separable from the other parameter.
@@ -252,21 +268,25 @@ def _correlated(
     another stays. Of parameters that have no standard error their groups tell.
     """
     blind = {e.name for e in estimates if e.stderr is None}
-    vague = {e.name for e in estimates if e.name in lagged and _is_vague_lag(e)}
+    vague = {e.name for e in estimates if e.name in lagged and _is_insignificant_delay(e)}
     found = []
     for i, first in enumerate(uncertainty.names):
         for j in range(i + 1, len(uncertainty.names)):
             second, r = uncertainty.names[j], float(uncertainty.correlation[i, j])
             if {first, second} & blind:
                 continue
-            alike = float(uncertainty.alike[i, j])
-            if {first, second} & vague and max(abs(r), abs(alike)) > _RIDGE:
-                plain = "" if abs(r) > _RIDGE else f", {alike:.3f} if the residuals were white"
+            alike = float(uncertainty.sensitivity_correlation[i, j])
+            if {first, second} & vague and max(abs(r), abs(alike)) > _RIDGE_CORRELATION:
+                plain = (
+                    ""
+                    if abs(r) > _RIDGE_CORRELATION
+                    else f", {alike:.3f} if the residuals were white"
+                )
                 found.append(
                     f"{first} and {second} not separable (r = {r:.3f}{plain}): the data fix a "
                     "combination of them, and the lag is less than two of its standard errors"
                 )
-            elif abs(r) > _STRONG:
+            elif abs(r) > _STRONG_CORRELATION:
                 found.append(
                     f"{first} and {second} are strongly correlated (r = {r:.3f}): "
                     "the data fix a combination of them better than each alone"
@@ -274,11 +294,13 @@ def _correlated(
     return found
 
 
-def _is_vague_lag(estimate: Estimate) -> bool:
-    return estimate.stderr is not None and abs(estimate.value) < _SEPARABLE * estimate.stderr
+def _is_insignificant_delay(estimate: Estimate) -> bool:
+    return (
+        estimate.stderr is not None and abs(estimate.value) < _SEPARABLE_STDERRS * estimate.stderr
+    )
 
 
-def _coloured(
+def _warn_coloured_residuals(
     tests: ResidualTests, lagged: set[str], uncertainty: Uncertainty | None, *, may_be_noise: bool
 ) -> list[str]:
     """Residuals that are clearly not white: the model lacks something, most often an order.
@@ -290,7 +312,9 @@ def _coloured(
     the estimates do the same as dynamics that are missing: nothing is wrong with the standard
     errors then.
     """
-    if all(one.kind != "whiteness" or one.p is None or one.p > _CHANCE for one in tests.tests):
+    if all(
+        one.kind != "whiteness" or one.p is None or one.p > _WHITENESS_LEVEL for one in tests.tests
+    ):
         return []
     colour = "white" if uncertainty is None else uncertainty.noise_colour
     depends = any(one.kind == "independence" and one.outcome == "failed" for one in tests.tests)
@@ -303,21 +327,21 @@ def _coloured(
             "standard errors only; estimate from data that cover both"
         ]
     if lagged:
-        suggestion = _SUGGESTION if advises else ""
+        suggestion = _NOISE_MODEL_SUGGESTION if advises else ""
         return [
             f"the residuals are not white (on the {tests.data} data): something of the dynamics is "
             f"not in the model, the estimate of {', '.join(sorted(lagged))} depends on the order "
-            f"of the model, and {_ALLOWED[colour]}{suggestion}"
+            f"of the model, and {_STDERR_MEANINGS[colour]}{suggestion}"
         ]
     if not advises:
         return []
     return [
         f"the residuals are not white (on the {tests.data} data), and no input tells them: squares "
-        f"give slow noise too much weight{_SUGGESTION}"
+        f"give slow noise too much weight{_NOISE_MODEL_SUGGESTION}"
     ]
 
 
-def time_notes(is_cut_short: bool) -> tuple[str, ...]:
+def warn_time_limit(is_cut_short: bool) -> tuple[str, ...]:
     """What refinement left out because the time was over."""
     if not is_cut_short:
         return ()
@@ -328,7 +352,7 @@ def time_notes(is_cut_short: bool) -> tuple[str, ...]:
     )
 
 
-def noise_notes(
+def warn_noise_model(
     problem: Problem, correlation_times: Mapping[str, float], is_complete: bool
 ) -> tuple[str, ...]:
     """What a noise model did, or why it did nothing."""
@@ -351,7 +375,7 @@ def noise_notes(
     return tuple(notes)
 
 
-def _without_excitation(problem: Problem, estimates: tuple[Estimate, ...]) -> list[str]:
+def _warn_constant_inputs(problem: Problem, estimates: tuple[Estimate, ...]) -> list[str]:
     """Inputs that stay constant in every record, and what they leave open."""
     blind = ", ".join(
         e.name for e in estimates if e.status in ("group", "unidentifiable") and e.stderr is None
@@ -370,8 +394,8 @@ def _without_excitation(problem: Problem, estimates: tuple[Estimate, ...]) -> li
     return found
 
 
-def _not_an_optimum(algorithm: GeneticAlgorithm, gain: float) -> str:
-    methods = {of_island(algorithm, i).method for i in range(algorithm.n_islands)}
+def _warn_not_optimal(algorithm: GeneticAlgorithm, gain: float) -> str:
+    methods = {get_island_settings(algorithm, i).method for i in range(algorithm.n_islands)}
     text = (
         "the estimate is not a local optimum: one least-squares step promises to remove "
         f"{100 * gain:.0f} % of the squared error, so the standard errors are a rough guide"

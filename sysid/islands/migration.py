@@ -5,21 +5,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.settings import Migration
 from sysid.core.types import FloatArray, IntArray, WordArray
-from sysid.islands.packed import Fleet, News, dealt, empty_news, gathered, migrations
-from sysid.islands.topology import edges
+from sysid.islands.packed import (
+    EvolutionLog,
+    PackedIslands,
+    allocate_log,
+    list_migrants,
+    pack_islands,
+    unpack_islands,
+)
+from sysid.islands.topology import list_edges
 from sysid.search.evolution import reset_evidence, write_improvement
 from sysid.search.island import Island
-from sysid.search.operators import coded, decoded, rank
+from sysid.search.operators import decode, encode, sort_population
 from sysid.search.state import (
-    MIGRATION,
+    PHASE_MIGRATION,
     Migrant,
 )
 
 
-class Routes(NamedTuple):
+class MigrationRoutes(NamedTuple):
     """Who sends how many to whom, as compiled code reads it.
 
     Attributes
@@ -34,13 +41,13 @@ class Routes(NamedTuple):
 
     edges: IntArray
     bits: IntArray
-    migrants: int
+    most_migrants: int
 
 
-def routes(bits: Sequence[int], migration: Migration, largest: int) -> Routes:
+def make_routes(bits: Sequence[int], migration: Migration, largest: int) -> MigrationRoutes:
     """The routes between islands, the largest of which has so many individuals."""
-    pairs = edges(migration.topology, len(bits))
-    return Routes(
+    pairs = list_edges(migration.topology, len(bits))
+    return MigrationRoutes(
         np.array(pairs, dtype=np.int64).reshape(len(pairs), 2),
         np.array(bits, dtype=np.int64), min(migration.migrants, largest),
     )  # fmt: skip
@@ -56,70 +63,74 @@ def migrate(
     worse. `bits` are those of each island; between islands that differ the nearest chromosome
     arrives, to be evaluated at its destination.
     """
-    ways = routes(bits, migration, max(island.fitness.size for island in islands))
-    fleet, count = gathered(islands), len(ways.edges)
-    news = empty_news(count, count * ways.migrants, fleet.champions.shape[1])
-    send(ways, fleet, epoch, news)
-    return dealt(fleet, news, islands), migrations(news)
+    ways = make_routes(bits, migration, max(island.fitness.size for island in islands))
+    fleet, count = pack_islands(islands), len(ways.edges)
+    news = allocate_log(count, count * ways.most_migrants, fleet.champions.shape[1])
+    exchange_migrants(ways, fleet, epoch, news)
+    return unpack_islands(fleet, news, islands), list_migrants(news)
 
 
-@compiled
-def send(ways: Routes, fleet: Fleet, epoch: int, news: News) -> None:
+@jit_compile
+def exchange_migrants(
+    ways: MigrationRoutes, fleet: PackedIslands, epoch: int, news: EvolutionLog
+) -> None:
     """One exchange in place: see `migrate`. An edge writes one improvement at most."""
-    words, fitness = fleet.words.copy(), fleet.fitness.copy()
+    words, fitness = fleet.chromosomes.copy(), fleet.fitness.copy()
     champions = fleet.champions.copy()
     discontinuities = fleet.search.fitness_discontinuities.copy()
     for e in range(ways.edges.shape[0]):
         source, destination = ways.edges[e, 0], ways.edges[e, 1]
-        begin, end = fleet.first[source], fleet.first[source + 1]
+        begin, end = fleet.offsets[source], fleet.offsets[source + 1]
         exact = ways.bits[source] == ways.bits[destination]
         known = fleet.search[destination]  # of the fitness, not of the place:
         known.fitness_discontinuities = max(known.fitness_discontinuities, discontinuities[source])
-        for p in range(begin, min(end, begin + ways.migrants)):
+        for p in range(begin, min(end, begin + ways.most_migrants)):
             word = words[p : p + 1]
             if not exact:
-                word = coded(decoded(word, ways.bits[source]), ways.bits[destination])
-            if not _arrives(fleet, destination, word[0], fitness[p]):
+                word = encode(decode(word, ways.bits[source]), ways.bits[destination])
+            if not _accepts_migrant(fleet, destination, word[0], fitness[p]):
                 continue
-            _settle(fleet, destination, word[0], fitness[p] if exact else np.nan)
-            line = news.migrants[news.written[1]]
+            _insert_migrant(fleet, destination, word[0], fitness[p] if exact else np.nan)
+            line = news.migrants[news.counts[1]]
             line[0], line[1], line[2], line[3] = epoch, source, destination, fitness[p]
-            news.written[1] += 1
-            if exact and p == begin and fitness[p] < fleet.rms[destination]:
-                _lead(fleet, destination, fitness[p], champions[source], news)
+            news.counts[1] += 1
+            if exact and p == begin and fitness[p] < fleet.champion_rms[destination]:
+                _record_champion(fleet, destination, fitness[p], champions[source], news)
 
 
-@compiled
-def _arrives(fleet: Fleet, island: int, word: WordArray, fitness: float) -> bool:
+@jit_compile
+def _accepts_migrant(fleet: PackedIslands, island: int, word: WordArray, fitness: float) -> bool:
     """Whether a migrant is fitter than the worst, and new here."""
-    begin, end = fleet.first[island], fleet.first[island + 1]
+    begin, end = fleet.offsets[island], fleet.offsets[island + 1]
     if not fitness < fleet.fitness[end - 1]:  # nan, not evaluated yet, comes last and is kept
         return False
     is_new = True
     for p in range(begin, end):
-        is_new &= not np.all(fleet.words[p] == word)
+        is_new &= not np.all(fleet.chromosomes[p] == word)
     return is_new
 
 
-@compiled
-def _settle(fleet: Fleet, island: int, word: WordArray, fitness: float) -> None:
+@jit_compile
+def _insert_migrant(fleet: PackedIslands, island: int, word: WordArray, fitness: float) -> None:
     """Put a migrant in the place of the worst individual."""
-    begin, end = fleet.first[island], fleet.first[island + 1]
+    begin, end = fleet.offsets[island], fleet.offsets[island + 1]
     for d in range(word.size):
-        fleet.words[end - 1, d] = word[d]
+        fleet.chromosomes[end - 1, d] = word[d]
     fleet.fitness[end - 1] = fitness
-    rank(fleet.words[begin:end], fleet.fitness[begin:end])
+    sort_population(fleet.chromosomes[begin:end], fleet.fitness[begin:end])
 
 
-@compiled
-def _lead(fleet: Fleet, island: int, fitness: float, values: FloatArray, news: News) -> None:
+@jit_compile
+def _record_champion(
+    fleet: PackedIslands, island: int, fitness: float, values: FloatArray, news: EvolutionLog
+) -> None:
     """Note that an island's champion has come from another."""
-    search, row = fleet.search[island], news.improvements[news.written[0]]
-    news.owners[news.written[0]] = island
-    news.written[0] += 1
-    write_improvement(search, fitness, MIGRATION, values, row)
+    search, row = fleet.search[island], news.improvements[news.counts[0]]
+    news.improvement_islands[news.counts[0]] = island
+    news.counts[0] += 1
+    write_improvement(search, fitness, PHASE_MIGRATION, values, row)
     search.stagnation, search.champion_converged = 0, 0
-    reset_evidence(search, fitness, fleet.rms[island])
-    fleet.rms[island] = fitness
+    reset_evidence(search, fitness, fleet.champion_rms[island])
+    fleet.champion_rms[island] = fitness
     for d in range(values.size):
         fleet.champions[island, d] = values[d]

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sysid.core.types import FloatArray, IntArray, WordArray
-from sysid.search.island import Island, improvement, stack_search
-from sysid.search.state import VALUES, Improvement, Migrant, SearchArray
+from sysid.search.island import Island, stack_search, to_improvement
+from sysid.search.state import COLUMN_VALUES, Improvement, Migrant, SearchArray
 
 
-class Fleet(NamedTuple):
+class PackedIslands(NamedTuple):
     """All islands of a run.
 
     Attributes
@@ -28,16 +28,16 @@ class Fleet(NamedTuple):
         Its values; arbitrary before the first evaluation.
     """
 
-    first: IntArray
-    words: WordArray
+    offsets: IntArray
+    chromosomes: WordArray
     fitness: FloatArray
     search: SearchArray
     points: FloatArray
-    rms: FloatArray
+    champion_rms: FloatArray
     champions: FloatArray
 
 
-class News(NamedTuple):
+class EvolutionLog(NamedTuple):
     """What compiled code writes down of the islands of a fleet.
 
     Attributes
@@ -52,20 +52,20 @@ class News(NamedTuple):
     """
 
     improvements: FloatArray
-    owners: IntArray
+    improvement_islands: IntArray
     migrants: FloatArray
-    written: IntArray
+    counts: IntArray
 
 
-def gathered(islands: Sequence[Island]) -> Fleet:
+def pack_islands(islands: Sequence[Island]) -> PackedIslands:
     """Copies of the islands' arrays, one behind the other."""
-    champions = np.zeros((len(islands), islands[0].words.shape[1]))
+    champions = np.zeros((len(islands), islands[0].chromosomes.shape[1]))
     for i, island in enumerate(islands):
         if island.history:
             champions[i] = island.history[-1].parameters
-    return Fleet(
+    return PackedIslands(
         np.cumsum([0, *(island.fitness.size for island in islands)]),
-        np.concatenate([island.words for island in islands]),
+        np.concatenate([island.chromosomes for island in islands]),
         np.concatenate([island.fitness for island in islands]),
         stack_search(islands),
         np.array([island.point for island in islands]),
@@ -74,32 +74,34 @@ def gathered(islands: Sequence[Island]) -> Fleet:
     )
 
 
-def dealt(fleet: Fleet, news: News, islands: Sequence[Island]) -> tuple[Island, ...]:
+def unpack_islands(
+    fleet: PackedIslands, news: EvolutionLog, islands: Sequence[Island]
+) -> tuple[Island, ...]:
     """The islands as they are in the fleet, their histories longer by what is new."""
     better: list[list[Improvement]] = [[] for _ in islands]
-    count = int(news.written[0])
-    owners, rows = news.owners[:count].tolist(), news.improvements[:count].tolist()
+    count = int(news.counts[0])
+    owners, rows = news.improvement_islands[:count].tolist(), news.improvements[:count].tolist()
     for owner, row in zip(owners, rows, strict=True):
-        better[owner].append(improvement(row))
-    ends = fleet.first.tolist()
+        better[owner].append(to_improvement(row))
+    ends = fleet.offsets.tolist()
     return tuple(
         Island(
-            island.index, island.seed, fleet.words[begin:end], fleet.fitness[begin:end],
+            island.index, island.seed, fleet.chromosomes[begin:end], fleet.fitness[begin:end],
             fleet.search[i, ...], fleet.points[i], (*island.history, *better[i]),
         )
         for i, (island, begin, end) in enumerate(zip(islands, ends[:-1], ends[1:], strict=True))
     )  # fmt: skip
 
 
-def empty_news(improvements: int, migrants: int, n: int) -> News:
+def allocate_log(improvements: int, migrants: int, n: int) -> EvolutionLog:
     """Room for so many improvements of n parameters and so many migrants."""
-    return News(
-        np.empty((improvements, VALUES + n)), np.empty(improvements, dtype=np.int64),
+    return EvolutionLog(
+        np.empty((improvements, COLUMN_VALUES + n)), np.empty(improvements, dtype=np.int64),
         np.empty((migrants, 4)), np.zeros(2, dtype=np.int64),
     )  # fmt: skip
 
 
-def migrations(news: News) -> tuple[Migrant, ...]:
+def list_migrants(news: EvolutionLog) -> tuple[Migrant, ...]:
     """The migrants that arrived."""
-    rows = news.migrants[: int(news.written[1])].tolist()
+    rows = news.migrants[: int(news.counts[1])].tolist()
     return tuple(Migrant(int(at), int(a), int(b), fitness) for at, a, b, fitness in rows)

@@ -6,7 +6,7 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.search.island import Island, stack_search
-from sysid.search.state import SAME, Improvement, Migrant, SearchArray
+from sysid.search.state import SAME_OPTIMUM, Improvement, Migrant, SearchArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +37,7 @@ class RunState:
     epoch: int = 0
     migrations: tuple[Migrant, ...] = ()
     seconds: float = 0.0
-    ended: bool = False
+    has_ended: bool = False
     is_warm: bool = False
 
     @property
@@ -51,14 +51,14 @@ class RunState:
         return min(island.champion_rms for island in self.islands)
 
     @property
-    def tally(self) -> tuple[FloatArray, SearchArray]:
+    def champions_and_counters(self) -> tuple[FloatArray, SearchArray]:
         """RMS of the champions (I,) and search records (I,) of the islands."""
         rms = np.array([island.champion_rms for island in self.islands])
         return rms, stack_search(self.islands)
 
-    def is_the_best_since(self, generation: int) -> bool:
+    def is_unimproved_since(self, generation: int) -> bool:
         """Whether the best fitness was found by then, and nothing better after."""
-        most = self.rms * (1.0 + SAME)
+        most = self.rms * (1.0 + SAME_OPTIMUM)
         return any(
             one.rms <= most and one.generation <= generation
             for history in self.history for one in history

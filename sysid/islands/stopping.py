@@ -4,19 +4,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
-from sysid.search.state import SAME, SearchArray
+from sysid.search.state import SAME_OPTIMUM, SearchArray
 
-_OF_EACH, _MORE = 2, 2
-_SHARE = 1 / 3  # of all searches
-_HALF, _MANY = 0.5, 2.5  # of those from random places agree, or there are so many times enough
-_AGREE = 2 / 3  # of the searches from random places, where the fitness jumps
-_RETURN = 0.9  # of those from beside the best individual
-_WARM_SETTLED = 3  # of the searches that agree, a warm start needs one in three
+_PARTS_OF_EACH, _EXTRA_AGREEMENTS = 2, 2
+_LEAST_SHARE = 1 / 3  # of all searches
+_CONFIRMED_SHARE, _MANY_STARTS = (
+    0.5,
+    2.5,
+)  # of those from random places agree, or there are so many times enough
+_CONFIRMED_SHARE_ROUGH = 2 / 3  # of the searches from random places, where the fitness jumps
+_RETURNED_SHARE_ROUGH = 0.9  # of those from beside the best individual
+_WARM_DIVISOR = 3  # of the searches that agree, a warm start needs one in three
 
 
-class Ends(NamedTuple):
+class StoppingRule(NamedTuple):
     """End conditions that are looked at where all islands have got to a border.
 
     Attributes
@@ -30,13 +33,13 @@ class Ends(NamedTuple):
         Whether an earlier result stands behind the run.
     """
 
-    generations: int
-    rms: float
-    settled: int
+    most_generations: int
+    target_rms: float
+    agreed_restarts: int
     is_warm: bool
 
 
-class Searches(NamedTuple):
+class RestartCounts(NamedTuple):
     """What the searches of all islands found, as far as it is the best champion.
 
     Attributes
@@ -53,14 +56,14 @@ class Searches(NamedTuple):
     confirmed: int
     hops: int
     returned: int
-    has_cliffs: bool
+    has_discontinuities: bool
 
 
-@compiled
-def searches(rms: FloatArray, search: SearchArray) -> Searches:
+@jit_compile
+def count_restarts(rms: FloatArray, search: SearchArray) -> RestartCounts:
     """Count them over islands with these champions' RMS (I,) and records (I,)."""
     independent = confirmed = hops = returned = 0
-    has_cliffs, most = False, np.min(rms) * (1.0 + SAME)
+    has_cliffs, most = False, np.min(rms) * (1.0 + SAME_OPTIMUM)
     for i in range(rms.size):
         independent += search[i].random_starts
         if rms[i] <= most:
@@ -68,28 +71,30 @@ def searches(rms: FloatArray, search: SearchArray) -> Searches:
             hops += search[i].hop_count
             returned += search[i].returned_hops
             has_cliffs |= search[i].champion_discontinuities > 0
-    return Searches(independent, confirmed, hops, returned, has_cliffs)
+    return RestartCounts(independent, confirmed, hops, returned, has_cliffs)
 
 
-@compiled
-def has_ended(
-    ends: Ends, generation: int, rms: FloatArray, search: SearchArray, is_old: bool
+@jit_compile
+def has_process_ended(
+    ends: StoppingRule, generation: int, rms: FloatArray, search: SearchArray, is_old: bool
 ) -> bool:
     """Whether one of the conditions holds at the border `generation`.
 
     `is_old`: nothing better was found in the second half of the generations. It matters behind a
     warm start alone.
     """
-    if generation >= ends.generations or np.min(rms) <= ends.rms:
+    if generation >= ends.most_generations or np.min(rms) <= ends.target_rms:
         return True
-    if ends.settled > 0 and _is_settled(ends.settled, ends.is_warm, searches(rms, search), is_old):
+    if ends.agreed_restarts > 0 and _restarts_agree(
+        ends.agreed_restarts, ends.is_warm, count_restarts(rms, search), is_old
+    ):
         return True
     # Below the border only those islands stay that have used up their evaluations.
     return bool(np.all(search.generation < generation))
 
 
-@compiled
-def _is_settled(settled: int, is_warm: bool, made: Searches, is_old: bool) -> bool:
+@jit_compile
+def _restarts_agree(settled: int, is_warm: bool, made: RestartCounts, is_old: bool) -> bool:
     """Whether searches keep finding the best individual, from random places and from beside it.
 
     Had a better one as many ways that lead to it, all of k searches that found the best again and
@@ -106,17 +111,17 @@ def _is_settled(settled: int, is_warm: bool, made: Searches, is_old: bool) -> bo
     do: around a false optimum they find nothing better.
     """
     if is_warm:
-        beside = settled if made.has_cliffs else 1
+        beside = settled if made.has_discontinuities else 1
         if is_old and made.independent >= settled and made.hops >= beside:
             return True
-        settled = -(-settled // _WARM_SETTLED)
-    if made.has_cliffs:
-        every = made.returned >= max(settled, _RETURN * made.hops)
-        return every and made.confirmed >= max(settled, _AGREE * made.independent)
-    again, enough = made.confirmed + made.returned, settled + _MORE
-    if min(made.confirmed, made.returned) < -(-settled // _OF_EACH):
+        settled = -(-settled // _WARM_DIVISOR)
+    if made.has_discontinuities:
+        every = made.returned >= max(settled, _RETURNED_SHARE_ROUGH * made.hops)
+        return every and made.confirmed >= max(settled, _CONFIRMED_SHARE_ROUGH * made.independent)
+    again, enough = made.confirmed + made.returned, settled + _EXTRA_AGREEMENTS
+    if min(made.confirmed, made.returned) < -(-settled // _PARTS_OF_EACH):
         return False
-    agree = made.confirmed >= max(enough, _HALF * made.independent)
-    if not (is_warm or agree or made.independent >= _MANY * enough):
+    agree = made.confirmed >= max(enough, _CONFIRMED_SHARE * made.independent)
+    if not (is_warm or agree or made.independent >= _MANY_STARTS * enough):
         return False
-    return again >= max(enough, _SHARE * (made.independent + made.hops))
+    return again >= max(enough, _LEAST_SHARE * (made.independent + made.hops))

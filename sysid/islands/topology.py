@@ -5,41 +5,41 @@ from typing import TypeAlias
 
 from sysid.core.settings import TopologyName
 
-Edge: TypeAlias = tuple[int, int]
+MigrationEdge: TypeAlias = tuple[int, int]
 """Source and destination."""
 
 
-def edges(name: TopologyName, n: int) -> tuple[Edge, ...]:
+def list_edges(name: TopologyName, n: int) -> tuple[MigrationEdge, ...]:
     """All connections of an archipelago of `n` islands, by source and destination."""
     return tuple(sorted(edge for edge in CONNECTIONS[name](n) if edge[0] != edge[1]))
 
 
-def _connect_next(n: int) -> set[Edge]:
+def _connect_next(n: int) -> set[MigrationEdge]:
     """Each to the next."""
     return {(i, (i + 1) % n) for i in range(n)}
 
 
-def _connect_neighbours(n: int) -> set[Edge]:
+def _connect_neighbours(n: int) -> set[MigrationEdge]:
     """Each to both neighbours."""
     return {(i, (i + step) % n) for i in range(n) for step in (1, -1)}
 
 
-def _connect_all(n: int) -> set[Edge]:
+def _connect_all(n: int) -> set[MigrationEdge]:
     """Each to all others."""
     return {(i, j) for i in range(n) for j in range(n)}
 
 
-def _connect_centre(n: int) -> set[Edge]:
+def _connect_centre(n: int) -> set[MigrationEdge]:
     """Island 0 to all others, and they to it."""
     return {edge for i in range(1, n) for edge in ((0, i), (i, 0))}
 
 
-def _connect_none(n: int) -> set[Edge]:
+def _connect_none(n: int) -> set[MigrationEdge]:
     """None: every island searches alone."""
     return set()
 
 
-CONNECTIONS: Mapping[TopologyName, Callable[[int], set[Edge]]] = {
+CONNECTIONS: Mapping[TopologyName, Callable[[int], set[MigrationEdge]]] = {
     "one-way-ring": _connect_next,
     "ring": _connect_neighbours,
     "fully-connected": _connect_all,

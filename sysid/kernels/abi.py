@@ -5,7 +5,7 @@ A kernel is one C function of addresses and whole numbers::
     void kernel(i64 P, double *theta, i64 stride, i64 *ints, double *floats, double *work,
                 double *predictions, i64 predictions_stride, double *loss)
 
-theta : K rows of `stride`: row = parameter, column = individual; P is a multiple of `FEW`.
+theta : K rows of `stride`: row = parameter, column = individual; P is a multiple of `NARROW_LANES`.
 ints, floats : one experiment as `sysid.simulation.packing` lays it out.
 work : scratch of the experiment's size; its contents on entry do not matter.
 predictions : null, or M_e rows of `predictions_stride`: the simulated value at each measured time.
@@ -24,18 +24,18 @@ from numba.extending import intrinsic
 LANES = 16
 """W: individuals that run side by side in one vector of doubles."""
 
-FEW = 8
+NARROW_LANES = 8
 """The same where no more are left: a block of so many takes two thirds of the time."""
 
-ARGUMENTS = ("P", "theta", "stride", "ints", "floats", "work", "predictions",
+KERNEL_ARGUMENTS = ("P", "theta", "stride", "ints", "floats", "work", "predictions",
              "predictions_stride", "loss")  # fmt: skip
-_NUMBERS = ("P", "stride", "predictions_stride")
+_INTEGER_ARGUMENTS = ("P", "stride", "predictions_stride")
 
 
-def kernel_type() -> ir.FunctionType:
+def build_kernel_type() -> ir.FunctionType:
     """LLVM type of a kernel; every argument is 64 bits wide."""
     number, address = ir.IntType(64), ir.PointerType()
-    arguments = [number if name in _NUMBERS else address for name in ARGUMENTS]
+    arguments = [number if name in _INTEGER_ARGUMENTS else address for name in KERNEL_ARGUMENTS]
     return ir.FunctionType(ir.VoidType(), arguments)
 
 

@@ -5,30 +5,30 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from sysid.core.code_cache import digest_files, store, stored
+from sysid.core.code_cache import digest_files, load_code, store_code
 from sysid.core.memo import cache_by_identity
-from sysid.kernels.kernel import KERNEL, kernel_code
-from sysid.kernels.layout import Variant
-from sysid.kernels.machine_code import loaded, machine_name, object_code_bounded
+from sysid.kernels.kernel import KERNEL_NAME, emit_kernel
+from sysid.kernels.layout import KernelVariant
+from sysid.kernels.machine_code import compile_bounded, describe_machine, load_object_code
 from sysid.models.model import EstimatedInitial, Model
 
-_addresses: dict[str, int] = {}
+_kernel_addresses: dict[str, int] = {}
 
 
-def kernel_address(model: Model, variant: Variant) -> int:
+def get_kernel_address(model: Model, variant: KernelVariant) -> int:
     """Address of the model's kernel in this process, for `sysid.kernels.abi.call_kernel`."""
-    key = kernel_key(model, variant)
-    if key not in _addresses:
-        code = stored(key)
+    key = compute_kernel_key(model, variant)
+    if key not in _kernel_addresses:
+        code = load_code(key)
         if code is None:
-            code = object_code_bounded(kernel_code(model, variant))
-            store(key, code)
-        _addresses[key] = loaded(code, KERNEL)
-    return _addresses[key]
+            code = compile_bounded(emit_kernel(model, variant))
+            store_code(key, code)
+        _kernel_addresses[key] = load_object_code(code, KERNEL_NAME)
+    return _kernel_addresses[key]
 
 
 @cache_by_identity  # it is a long walk, and many runs have one model
-def kernel_key(model: Model, variant: Variant) -> str:
+def compute_kernel_key(model: Model, variant: KernelVariant) -> str:
     """Name of a kernel: what its code depends on, and nothing else.
 
     Bounds, units, titles and the grid's step are data of the problem; changing them compiles
@@ -45,13 +45,13 @@ def kernel_key(model: Model, variant: Variant) -> str:
         [output.expression for output in model.outputs],
         [parameter.name for parameter in model.parameters],
         model.equations, starts, model.order, model.memory,
-        replace(model.solver, step=None), variant, machine_name(), _writers(),
+        replace(model.solver, step=None), variant, describe_machine(), _digest_emitters(),
     )  # fmt: skip
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
 @cache
-def _writers() -> str:
+def _digest_emitters() -> str:
     """Digest of what writes kernels: a new version of it makes new kernels."""
     package = Path(__file__).parents[1]
     sources = (*package.glob("kernels/*.py"), package / "language" / "functions.py")

@@ -7,48 +7,50 @@ computed once, and what one step has read the next need not read again.
 from dataclasses import dataclass
 from typing import Protocol
 
-from sysid.kernels.vectors import Lanes, Loop, Value
+from sysid.kernels.vectors import IrValue, KernelLoop, VectorBuilder
 
 
 @dataclass(frozen=True, slots=True)
-class History:
+class StateHistory:
     """One state's past in the work array: a row for each step m, in it a double for each lane."""
 
-    base: Value
+    base: IrValue
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class TimeStep:
     """One step of the time loop: its number, and the history's row of the last finished one."""
 
-    step: Value
-    row: Value
+    step: IrValue
+    row: IrValue
 
 
-class Reader(Protocol):
+class DelayedReader(Protocol):
     """Reads one signal at one lag.
 
     Its life: made before the loop, opened in its head, and in every turn begun, read from and
     ended.
     """
 
-    def open(self, loop: Loop) -> None:
+    def open_loop(self, loop: KernelLoop) -> None:
         """Make the values that one turn hands to the next."""
 
-    def begin(self, turn: Turn) -> None:
+    def begin_step(self, turn: TimeStep) -> None:
         """Read what the turn will need."""
 
-    def read(self, halves: int, now: Value, stage: Value) -> Value:
+    def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
         """Value at a place; a state is `now` at 0 and `stage` at the place itself."""
 
-    def end(self, loop: Loop, following: Value) -> None:
+    def end_step(self, loop: KernelLoop, following: IrValue) -> None:
         """Hand over to the next turn; `following` is the state's next value."""
 
 
-def inside_step(lanes: Lanes, lag: Value, halves: int, now: Value, stage: Value) -> Value:
+def interpolate_inside_step(
+    lanes: VectorBuilder, lag: IrValue, halves: int, now: IrValue, stage: IrValue
+) -> IrValue:
     """Value inside the present step: x + (c - ℓ)/c (x_c - x), which tends to x_c as ℓ → 0."""
-    portion = lanes.sub(lanes.number(1.0), lanes.mul(lag, lanes.number(2.0 / halves)))
-    return lanes.between(now, portion, stage)
+    portion = lanes.sub(lanes.make_number(1.0), lanes.mul(lag, lanes.make_number(2.0 / halves)))
+    return lanes.interpolate(now, portion, stage)
 
 
 class LinearReader:
@@ -59,70 +61,78 @@ class LinearReader:
     """
 
     def __init__(
-        self, lanes: Lanes, history: History, lag: Value, places: list[int], row: Value
+        self,
+        lanes: VectorBuilder,
+        history: StateHistory,
+        lag: IrValue,
+        places: list[int],
+        row: IrValue,
     ) -> None:
         self._lanes, self._lag = lanes, lag
         self._forward = places[0] > 0
         self._top = min(places[0], 0) // 2
         self._length = self._top - places[-1] // 2
-        whole, self._fraction = lanes.whole_and_fraction(lag)
+        whole, self._fraction = lanes.split_fraction(lag)
         b = lanes.builder
-        wide, own = lanes.splat(lanes.integer(lanes.width)), lanes.lane_numbers()
-        one = lanes.splat(lanes.integer(1))
-        self._within = b.icmp_signed("==", whole, lanes.splat(lanes.integer(0)))
+        wide, own = lanes.splat(lanes.make_integer(lanes.width)), lanes.make_lane_numbers()
+        one = lanes.splat(lanes.make_integer(1))
+        self._within = b.icmp_signed("==", whole, lanes.splat(lanes.make_integer(0)))
         back = b.select(self._within, one, whole)
-        self._addresses = lanes.addresses(history.base, b.sub(own, b.mul(whole, wide)))
+        self._addresses = lanes.compute_addresses(history.base, b.sub(own, b.mul(whole, wide)))
         # a lag below one step has no finished sample ahead: it reads the last one instead
-        self._ahead_addresses = lanes.addresses(history.base, b.sub(own, b.mul(back, wide)))
-        samples = [self._sample(row, self._top - j) for j in range(self._length + 2)]
+        self._ahead_addresses = lanes.compute_addresses(history.base, b.sub(own, b.mul(back, wide)))
+        samples = [self._load_sample(row, self._top - j) for j in range(self._length + 2)]
         self._initial = [samples[0], samples[1]] + [
-            lanes.between(samples[j], self._fraction, samples[j + 1])
+            lanes.interpolate(samples[j], self._fraction, samples[j + 1])
             for j in range(1, self._length + 1)
         ]
 
-    def _sample(self, row: Value, steps: int) -> Value:
+    def _load_sample(self, row: IrValue, steps: int) -> IrValue:
         b, lanes = self._lanes.builder, self._lanes
-        index = b.mul(b.add(row, lanes.integer(steps)), lanes.integer(lanes.width))
+        index = b.mul(b.add(row, lanes.make_integer(steps)), lanes.make_integer(lanes.width))
         return lanes.gather(self._addresses, index)
 
-    def open(self, loop: Loop) -> None:
+    def open_loop(self, loop: KernelLoop) -> None:
         """Make the values that one turn hands to the next."""
         newest, *rest = self._initial
         self._newest = loop.carry(newest) if self._forward else None
         self._older, *self._chain = [loop.carry(value) for value in rest]
 
-    def begin(self, turn: Turn) -> None:
+    def begin_step(self, turn: TimeStep) -> None:
         """Read what the turn will need."""
         lanes = self._lanes
         if self._forward:
             b = lanes.builder
-            index = b.mul(b.add(turn.row, lanes.integer(1)), lanes.integer(lanes.width))
+            index = b.mul(b.add(turn.row, lanes.make_integer(1)), lanes.make_integer(lanes.width))
             self._sample_now = self._newest
             self._ahead = lanes.gather(self._ahead_addresses, index)
         else:
-            self._sample_now = self._sample(turn.row, self._top)
-        self._values = [lanes.between(self._sample_now, self._fraction, self._older), *self._chain]
+            self._sample_now = self._load_sample(turn.row, self._top)
+        self._values = [
+            lanes.interpolate(self._sample_now, self._fraction, self._older),
+            *self._chain,
+        ]
 
-    def read(self, halves: int, now: Value, stage: Value) -> Value:
+    def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
         """Value at a place."""
         if halves <= 0:
             return self._values[self._top - halves // 2]
-        finished = self._ahead_whole() if halves == 2 else self._ahead_half()
-        inside = inside_step(self._lanes, self._lag, halves, now, stage)
-        limit = self._lanes.number(halves / 2)
+        finished = self._read_ahead_whole() if halves == 2 else self._read_ahead_half()
+        inside = interpolate_inside_step(self._lanes, self._lag, halves, now, stage)
+        limit = self._lanes.make_number(halves / 2)
         is_inside = self._lanes.compare("<", self._lag, limit)
         return self._lanes.select(is_inside, inside, finished)
 
-    def _ahead_whole(self) -> Value:
-        return self._lanes.between(self._ahead, self._fraction, self._sample_now)
+    def _read_ahead_whole(self) -> IrValue:
+        return self._lanes.interpolate(self._ahead, self._fraction, self._sample_now)
 
-    def _ahead_half(self) -> Value:
-        lanes, half = self._lanes, self._lanes.number(0.5)
-        later = lanes.between(self._ahead, lanes.add(self._fraction, half), self._sample_now)
-        earlier = lanes.between(self._sample_now, lanes.sub(self._fraction, half), self._older)
+    def _read_ahead_half(self) -> IrValue:
+        lanes, half = self._lanes, self._lanes.make_number(0.5)
+        later = lanes.interpolate(self._ahead, lanes.add(self._fraction, half), self._sample_now)
+        earlier = lanes.interpolate(self._sample_now, lanes.sub(self._fraction, half), self._older)
         return lanes.select(lanes.compare("<", self._fraction, half), later, earlier)
 
-    def end(self, loop: Loop, following: Value) -> None:
+    def end_step(self, loop: KernelLoop, following: IrValue) -> None:
         """Hand over to the next turn."""
         if self._newest is not None:
             newest = self._lanes.builder.select(
@@ -134,7 +144,7 @@ class LinearReader:
             loop.update(carried, value)
 
 
-class FreshReader:
+class DirectReader:
     """A state between its samples, read anew in every step.
 
     For cubic interpolation (Lagrange through four samples; through three, or on a line inside the
@@ -142,54 +152,62 @@ class FreshReader:
     samples change after they were read.
     """
 
-    def __init__(self, lanes: Lanes, history: History, lag: Value, cubic: bool) -> None:
+    def __init__(
+        self, lanes: VectorBuilder, history: StateHistory, lag: IrValue, cubic: bool
+    ) -> None:
         self._lanes, self._history, self._lag, self._cubic = lanes, history, lag, cubic
 
-    def open(self, loop: Loop) -> None:
+    def open_loop(self, loop: KernelLoop) -> None:
         """Make the values that one turn hands to the next."""
 
-    def begin(self, turn: Turn) -> None:
+    def begin_step(self, turn: TimeStep) -> None:
         """Read what the turn will need."""
         self._turn = turn
-        self._finished: dict[int, Value] = {}
+        self._finished: dict[int, IrValue] = {}
 
-    def read(self, halves: int, now: Value, stage: Value) -> Value:
+    def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
         """Value at a place."""
         if halves not in self._finished:
-            self._finished[halves] = self._interpolated(halves)
+            self._finished[halves] = self._interpolate(halves)
         if halves <= 0:
             return self._finished[halves]
-        inside = inside_step(self._lanes, self._lag, halves, now, stage)
-        is_inside = self._lanes.compare("<", self._lag, self._lanes.number(halves / 2))
+        inside = interpolate_inside_step(self._lanes, self._lag, halves, now, stage)
+        is_inside = self._lanes.compare("<", self._lag, self._lanes.make_number(halves / 2))
         return self._lanes.select(is_inside, inside, self._finished[halves])
 
-    def end(self, loop: Loop, following: Value) -> None:
+    def end_step(self, loop: KernelLoop, following: IrValue) -> None:
         """Hand over to the next turn."""
 
-    def _interpolated(self, halves: int) -> Value:
+    def _interpolate(self, halves: int) -> IrValue:
         lanes = self._lanes
-        place = lanes.sub(lanes.number(halves / 2), self._lag)
-        whole, fraction = lanes.whole_and_fraction(place)
+        place = lanes.sub(lanes.make_number(halves / 2), self._lag)
+        whole, fraction = lanes.split_fraction(place)
         if not self._cubic:
-            return lanes.between(self._sample(whole, 0), fraction, self._sample(whole, 1))
-        samples = [self._sample(whole, j) for j in (-1, 0, 1, 2)]
-        four = _lagrange(lanes, fraction, (-1, 0, 1, 2), samples)
-        three = _lagrange(lanes, fraction, (-1, 0, 1), samples[:3])
-        limit = lanes.splat(lanes.integer(-2))
+            return lanes.interpolate(
+                self._load_sample(whole, 0), fraction, self._load_sample(whole, 1)
+            )
+        samples = [self._load_sample(whole, j) for j in (-1, 0, 1, 2)]
+        four = _interpolate_lagrange(lanes, fraction, (-1, 0, 1, 2), samples)
+        three = _interpolate_lagrange(lanes, fraction, (-1, 0, 1), samples[:3])
+        limit = lanes.splat(lanes.make_integer(-2))
         return lanes.select(lanes.builder.icmp_signed("<=", whole, limit), four, three)
 
-    def _sample(self, whole: Value, steps: int) -> Value:
+    def _load_sample(self, whole: IrValue, steps: int) -> IrValue:
         """Sample `whole` + `steps` after the last finished one, or that one if it is later."""
         lanes, b = self._lanes, self._lanes.builder
-        zero = lanes.splat(lanes.integer(0))
-        place = b.add(whole, lanes.splat(lanes.integer(steps)))
+        zero = lanes.splat(lanes.make_integer(0))
+        place = b.add(whole, lanes.splat(lanes.make_integer(steps)))
         place = b.select(b.icmp_signed("<", place, zero), place, zero)
-        index = b.add(lanes.lane_numbers(), b.mul(place, lanes.splat(lanes.integer(lanes.width))))
-        addresses = lanes.addresses(self._history.base, index)
-        return lanes.gather(addresses, b.mul(self._turn.row, lanes.integer(lanes.width)))
+        index = b.add(
+            lanes.make_lane_numbers(), b.mul(place, lanes.splat(lanes.make_integer(lanes.width)))
+        )
+        addresses = lanes.compute_addresses(self._history.base, index)
+        return lanes.gather(addresses, b.mul(self._turn.row, lanes.make_integer(lanes.width)))
 
 
-def _lagrange(lanes: Lanes, at: Value, nodes: tuple[int, ...], samples: list[Value]) -> Value:
+def _interpolate_lagrange(
+    lanes: VectorBuilder, at: IrValue, nodes: tuple[int, ...], samples: list[IrValue]
+) -> IrValue:
     """Polynomial through samples at whole nodes, at a fraction between 0 and 1."""
     total = None
     for node, sample in zip(nodes, samples, strict=True):
@@ -198,9 +216,9 @@ def _lagrange(lanes: Lanes, at: Value, nodes: tuple[int, ...], samples: list[Val
         for other in nodes:
             if other != node:
                 scale *= node - other
-                factor = lanes.sub(at, lanes.number(other))
+                factor = lanes.sub(at, lanes.make_number(other))
                 weight = factor if weight is None else lanes.mul(weight, factor)
-        term = lanes.mul(lanes.mul(weight, lanes.number(1.0 / scale)), sample)
+        term = lanes.mul(lanes.mul(weight, lanes.make_number(1.0 / scale)), sample)
         total = term if total is None else lanes.add(total, term)
     return total
 
@@ -212,35 +230,41 @@ class InputReader:
     """
 
     def __init__(
-        self, lanes: Lanes, floats: Value, zero: Value, points: Value, lag: Value, places: list[int]
+        self,
+        lanes: VectorBuilder,
+        floats: IrValue,
+        zero: IrValue,
+        points: IrValue,
+        lag: IrValue,
+        places: list[int],
     ) -> None:
         b = lanes.builder
         self._lanes, self._floats, self._points, self._places = lanes, floats, points, places
-        whole, self._fraction = lanes.whole_and_fraction(lag)
-        self._addresses = lanes.addresses(floats, b.sub(lanes.splat(zero), whole))
-        self._initial = [self._value(lanes.integer(0), halves) for halves in places[1:]]
+        whole, self._fraction = lanes.split_fraction(lag)
+        self._addresses = lanes.compute_addresses(floats, b.sub(lanes.splat(zero), whole))
+        self._initial = [self._load_value(lanes.make_integer(0), halves) for halves in places[1:]]
 
-    def _value(self, step: Value, halves: int) -> Value:
+    def _load_value(self, step: IrValue, halves: int) -> IrValue:
         lanes, b = self._lanes, self._lanes.builder
-        place = b.mul(b.add(b.add(step, step), lanes.integer(halves)), self._points)
-        place = b.ashr(place, lanes.integer(1))
+        place = b.mul(b.add(b.add(step, step), lanes.make_integer(halves)), self._points)
+        place = b.ashr(place, lanes.make_integer(1))
         newest = lanes.gather(self._addresses, place)
-        older = lanes.gather(self._addresses, b.sub(place, lanes.integer(1)))
-        return lanes.between(newest, self._fraction, older)
+        older = lanes.gather(self._addresses, b.sub(place, lanes.make_integer(1)))
+        return lanes.interpolate(newest, self._fraction, older)
 
-    def open(self, loop: Loop) -> None:
+    def open_loop(self, loop: KernelLoop) -> None:
         """Make the values that one turn hands to the next."""
         self._chain = [loop.carry(value) for value in self._initial]
 
-    def begin(self, turn: Turn) -> None:
+    def begin_step(self, turn: TimeStep) -> None:
         """Read what the turn will need."""
-        self._values = [self._value(turn.step, self._places[0]), *self._chain]
+        self._values = [self._load_value(turn.step, self._places[0]), *self._chain]
 
-    def read(self, halves: int, now: Value, stage: Value) -> Value:
+    def read_value(self, halves: int, now: IrValue, stage: IrValue) -> IrValue:
         """Value at a place."""
         return self._values[self._places.index(halves)]
 
-    def end(self, loop: Loop, following: Value) -> None:
+    def end_step(self, loop: KernelLoop, following: IrValue) -> None:
         """Hand over to the next turn."""
         for carried, value in zip(self._chain, self._values, strict=False):
             loop.update(carried, value)

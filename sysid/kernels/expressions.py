@@ -2,9 +2,9 @@
 
 from typing import Protocol
 
-from sysid.kernels.vectors import Lanes, Value
+from sysid.kernels.vectors import IrValue, VectorBuilder
 from sysid.language.functions import FUNCTIONS, OPERATORS, Level
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
 LARGEST_POWER = 64
 """Whole exponents up to this one are written as multiplications."""
@@ -12,76 +12,80 @@ LARGEST_POWER = 64
 _ARITHMETIC = {"+": "add", "-": "sub", "*": "mul", "/": "div"}
 
 
-class Scope(Protocol):
+class Environment(Protocol):
     """What names stand for at one place of the simulation."""
 
-    def symbol(self, symbol: Symbol) -> Value:
+    def emit_symbol(self, symbol: Symbol) -> IrValue:
         """Value of a parameter or of a reserved name."""
 
-    def past(self, past: Past) -> Value:
+    def emit_past_value(self, past: PastValue) -> IrValue:
         """Value of a state or an input, now or in the past."""
 
 
-def emit(lanes: Lanes, expression: Expression, scope: Scope) -> Value:
+def emit_expression(lanes: VectorBuilder, expression: Expression, scope: Environment) -> IrValue:
     """Instructions that compute an expression; the result is a scalar or a vector."""
     match expression:
         case Number(value):
-            return lanes.number(value)
+            return lanes.make_number(value)
         case Symbol():
-            return scope.symbol(expression)
-        case Past():
-            return scope.past(expression)
+            return scope.emit_symbol(expression)
+        case PastValue():
+            return scope.emit_past_value(expression)
         case Unary("-", operand):
-            return lanes.sub(lanes.number(-0.0), emit(lanes, operand, scope))
+            return lanes.sub(lanes.make_number(-0.0), emit_expression(lanes, operand, scope))
         case Unary(_, operand):
-            return lanes.builder.not_(emit(lanes, operand, scope))
+            return lanes.builder.not_(emit_expression(lanes, operand, scope))
         case Binary():
-            return _binary(lanes, expression, scope)
-        case Call():
-            arguments = [emit(lanes, argument, scope) for argument in expression.arguments]
-            return _call(lanes, expression.function, arguments)
+            return _emit_binary(lanes, expression, scope)
+        case FunctionCall():
+            arguments = [
+                emit_expression(lanes, argument, scope) for argument in expression.arguments
+            ]
+            return _emit_call(lanes, expression.function, arguments)
 
 
-def constant(expression: Expression) -> float | None:
+def evaluate_constant(expression: Expression) -> float | None:
     """Value of an expression of numbers only, for exponents; None for any other."""
     match expression:
         case Number(value):
             return value
         case Unary("-", operand):
-            inner = constant(operand)
+            inner = evaluate_constant(operand)
             return None if inner is None else -inner
         case Binary("/", left, right):
-            above, below = constant(left), constant(right)
+            above, below = evaluate_constant(left), evaluate_constant(right)
             return above / below if above is not None and below else None
         case _:
             return None
 
 
-def _binary(lanes: Lanes, expression: Binary, scope: Scope) -> Value:
+def _emit_binary(lanes: VectorBuilder, expression: Binary, scope: Environment) -> IrValue:
     operator = expression.operator
-    left = emit(lanes, expression.left, scope)
+    left = emit_expression(lanes, expression.left, scope)
     if operator == "**":
-        return _power(lanes, left, expression.right, scope)
-    right = emit(lanes, expression.right, scope)
+        return _emit_power(lanes, left, expression.right, scope)
+    right = emit_expression(lanes, expression.right, scope)
     if operator in _ARITHMETIC:
         return getattr(lanes, _ARITHMETIC[operator])(left, right)
     if OPERATORS[operator].level == Level.COMPARISON:
         return lanes.compare(operator, left, right)
-    left, right = lanes.same_shape(left, right)
+    left, right = lanes.match_shapes(left, right)
     return lanes.builder.and_(left, right) if operator == "and" else lanes.builder.or_(left, right)
 
 
-def _power(lanes: Lanes, base: Value, exponent: Expression, scope: Scope) -> Value:
-    value = constant(exponent)
+def _emit_power(
+    lanes: VectorBuilder, base: IrValue, exponent: Expression, scope: Environment
+) -> IrValue:
+    value = evaluate_constant(exponent)
     if value == 0.5:
-        return lanes.intrinsic("sqrt", base)
+        return lanes.call_intrinsic("sqrt", base)
     if value is not None and value.is_integer() and abs(value) <= LARGEST_POWER:
-        whole = _whole_power(lanes, base, int(abs(value)))
-        return whole if value >= 0 else lanes.div(lanes.number(1.0), whole)
-    return lanes.intrinsic("pow", base, emit(lanes, exponent, scope))
+        whole = _emit_whole_power(lanes, base, int(abs(value)))
+        return whole if value >= 0 else lanes.div(lanes.make_number(1.0), whole)
+    return lanes.call_intrinsic("pow", base, emit_expression(lanes, exponent, scope))
 
 
-def _whole_power(lanes: Lanes, base: Value, exponent: int) -> Value:
+def _emit_whole_power(lanes: VectorBuilder, base: IrValue, exponent: int) -> IrValue:
     """Base to a whole power by squaring; 0 ** 0 = 1."""
     result, square = None, base
     while exponent:
@@ -90,19 +94,19 @@ def _whole_power(lanes: Lanes, base: Value, exponent: int) -> Value:
         exponent >>= 1
         if exponent:
             square = lanes.mul(square, square)
-    return lanes.number(1.0) if result is None else result
+    return lanes.make_number(1.0) if result is None else result
 
 
-def _call(lanes: Lanes, function: str, arguments: list[Value]) -> Value:
+def _emit_call(lanes: VectorBuilder, function: str, arguments: list[IrValue]) -> IrValue:
     if function == "where":
         return lanes.select(*arguments)
     if function == "sign":
-        return _sign(lanes, arguments[0])
-    return lanes.intrinsic(FUNCTIONS[function].llvm, *arguments)
+        return _emit_sign(lanes, arguments[0])
+    return lanes.call_intrinsic(FUNCTIONS[function].llvm, *arguments)
 
 
-def _sign(lanes: Lanes, value: Value) -> Value:
+def _emit_sign(lanes: VectorBuilder, value: IrValue) -> IrValue:
     """-1, 0 or 1; nan stays nan."""
-    zero = lanes.number(0.0)
-    negative = lanes.select(lanes.compare("<", value, zero), lanes.number(-1.0), value)
-    return lanes.select(lanes.compare(">", value, zero), lanes.number(1.0), negative)
+    zero = lanes.make_number(0.0)
+    negative = lanes.select(lanes.compare("<", value, zero), lanes.make_number(-1.0), value)
+    return lanes.select(lanes.compare(">", value, zero), lanes.make_number(1.0), negative)

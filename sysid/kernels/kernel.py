@@ -5,51 +5,59 @@ from dataclasses import dataclass
 from llvmlite import ir
 
 from sysid.kernels import reads as demand
-from sysid.kernels.abi import ARGUMENTS, FEW, LANES, kernel_type
-from sysid.kernels.delayed_reads import Turn
-from sysid.kernels.integrators import Place, Placing, next_states
-from sysid.kernels.layout import Layout, Variant
-from sysid.kernels.loss import Comparison
-from sysid.kernels.signals import Experiment, Lags, Parameters, Signals, States
-from sysid.kernels.vectors import Lanes, Loop, Value
+from sysid.kernels.abi import KERNEL_ARGUMENTS, LANES, NARROW_LANES, build_kernel_type
+from sysid.kernels.delayed_reads import TimeStep
+from sysid.kernels.integrators import EnvironmentBuilder, StepEnvironment, emit_next_states
+from sysid.kernels.layout import ExperimentLayout, KernelVariant
+from sysid.kernels.loss import LossAccumulator
+from sysid.kernels.signals import (
+    Delays,
+    ExperimentHead,
+    ParameterEnvironment,
+    SignalReaders,
+    States,
+)
+from sysid.kernels.vectors import IrValue, KernelLoop, VectorBuilder
 from sysid.models.model import EstimatedInitial, MeasuredInitial, Model
 
-KERNEL = "kernel"
+KERNEL_NAME = "kernel"
 """Name of the function in its module."""
 
 
-def kernel_code(model: Model, variant: Variant) -> str:
+def emit_kernel(model: Model, variant: KernelVariant) -> str:
     """LLVM assembly of a model's kernel."""
     module = ir.Module("lagid")
-    function = ir.Function(module, kernel_type(), KERNEL)
-    for argument, name in zip(function.args, ARGUMENTS, strict=True):
+    function = ir.Function(module, build_kernel_type(), KERNEL_NAME)
+    for argument, name in zip(function.args, KERNEL_ARGUMENTS, strict=True):
         argument.name = name
         if isinstance(argument.type, ir.PointerType):
             argument.add_attribute("noalias")
-    lanes = Lanes(function, LANES)
-    arguments = dict(zip(ARGUMENTS, function.args, strict=True))
-    experiment = Experiment(lanes, Layout.of(model), arguments["ints"], arguments["floats"])
-    blocks = Loop(lanes)
-    first = blocks.carry(lanes.integer(0))
+    lanes = VectorBuilder(function, LANES)
+    arguments = dict(zip(KERNEL_ARGUMENTS, function.args, strict=True))
+    experiment = ExperimentHead(
+        lanes, ExperimentLayout.from_model(model), arguments["ints"], arguments["floats"]
+    )
+    blocks = KernelLoop(lanes)
+    first = blocks.carry(lanes.make_integer(0))
     left = lanes.builder.sub(arguments["P"], first)
-    blocks.leave_if(lanes.builder.icmp_signed("<=", left, lanes.integer(FEW)))
+    blocks.leave_if(lanes.builder.icmp_signed("<=", left, lanes.make_integer(NARROW_LANES)))
     _add_loss(lanes, _Block(lanes, model, variant, experiment, arguments, first))
-    blocks.update(first, lanes.builder.add(first, lanes.integer(LANES)))
+    blocks.update(first, lanes.builder.add(first, lanes.make_integer(LANES)))
     blocks.repeat()
 
-    def few() -> list[Value]:
+    def few() -> list[IrValue]:
         _add_loss(narrow, _Block(narrow, model, variant, experiment, arguments, first))
         return []
 
-    narrow = lanes.of_width(FEW)
-    lanes.branch(lanes.builder.icmp_signed(">", left, lanes.integer(0)), few, [])
+    narrow = lanes.copy_with_width(NARROW_LANES)
+    lanes.branch(lanes.builder.icmp_signed(">", left, lanes.make_integer(0)), few, [])
     lanes.builder.ret_void()
     return str(module)
 
 
-def _add_loss(lanes: Lanes, block: "_Block") -> None:
+def _add_loss(lanes: VectorBuilder, block: "_Block") -> None:
     """Simulate a block and add its losses to those that are there."""
-    loss, target = block.simulated(), block.arguments["loss"]
+    loss, target = block.emit_simulation(), block.arguments["loss"]
     so_far = lanes.load_row(target, block.first)
     lanes.store_row(lanes.add(so_far, loss), target, block.first)
 
@@ -58,99 +66,114 @@ def _add_loss(lanes: Lanes, block: "_Block") -> None:
 class _Block:
     """As many individuals as lanes, from the start of the experiment to its end."""
 
-    lanes: Lanes
+    lanes: VectorBuilder
     model: Model
-    variant: Variant
-    experiment: Experiment
-    arguments: dict[str, Value]
-    first: Value
+    variant: KernelVariant
+    experiment: ExperimentHead
+    arguments: dict[str, IrValue]
+    first: IrValue
 
-    def simulated(self) -> Value:
+    def emit_simulation(self) -> IrValue:
         """Write the simulation; gives the sum of the losses."""
         lanes, model, experiment = self.lanes, self.model, self.experiment
-        step = experiment.number("step")
-        scope = Parameters(
-            {p.name: self._theta(lanes.integer(i)) for i, p in enumerate(model.parameters)}, step
+        step = experiment.get_number("step")
+        scope = ParameterEnvironment(
+            {
+                p.name: self._load_parameter(lanes.make_integer(i))
+                for i, p in enumerate(model.parameters)
+            },
+            step,
         )
-        start = [self._initial(i) for i in range(len(model.states))]
+        start = [self._load_initial_state(i) for i in range(len(model.states))]
         states = States(lanes, model, experiment, self.arguments["work"], start)
         row = states.fill_history()
-        lags = Lags(lanes, model, scope, step)
-        signals = Signals(lanes, model, experiment, states, lags, self.variant.one_step)
-        comparison = Comparison(lanes, model, self.variant, experiment, self.arguments, self.first)
+        lags = Delays(lanes, model, scope, step)
+        signals = SignalReaders(lanes, model, experiment, states, lags, self.variant.one_step)
+        comparison = LossAccumulator(
+            lanes, model, self.variant, experiment, self.arguments, self.first
+        )
 
-        loop = Loop(lanes)
-        turn = Turn(loop.carry(lanes.integer(0)), loop.carry(row))
-        states.open(loop)
-        signals.open(loop)
-        comparison.open(loop)
-        signals.begin(turn)
-        at = _placing(lanes, model, scope, states, signals, turn)
-        comparison.compare(turn, states, at)
-        loop.leave_if(lanes.builder.icmp_signed(">=", turn.step, experiment.head("last")))
+        loop = KernelLoop(lanes)
+        turn = TimeStep(loop.carry(lanes.make_integer(0)), loop.carry(row))
+        states.open_loop(loop)
+        signals.open_loop(loop)
+        comparison.open_loop(loop)
+        signals.begin_step(turn)
+        at = _bind_environment(lanes, model, scope, states, signals, turn)
+        comparison.compare_step(turn, states, at)
+        loop.leave_if(lanes.builder.icmp_signed(">=", turn.step, experiment.get_head("last")))
         if self.variant.one_step:
-            states.store(turn.row)
-            signals.begin(turn)
-        following = self._following(turn, states, at)
-        signals.end(loop, following)
-        states.end(loop, following)
-        comparison.end(loop)
-        loop.update(turn.row, states.end_row(turn.row))
-        loop.update(turn.step, lanes.builder.add(turn.step, lanes.integer(1)))
+            states.store_states(turn.row)
+            signals.begin_step(turn)
+        following = self._emit_following_states(turn, states, at)
+        signals.end_step(loop, following)
+        states.end_step(loop, following)
+        comparison.end_step(loop)
+        loop.update(turn.row, states.advance_row(turn.row))
+        loop.update(turn.step, lanes.builder.add(turn.step, lanes.make_integer(1)))
         loop.repeat()
-        return self._unless_diverged(comparison.loss, states)
+        return self._mark_divergence(comparison.loss, states)
 
-    def _unless_diverged(self, loss: Value, states: States) -> Value:
+    def _mark_divergence(self, loss: IrValue, states: States) -> IrValue:
         """The loss, or nan where a state is not finite even if the outputs hide it."""
         for name in states.names:
             last = states.line[name][0]
             loss = self.lanes.add(loss, self.lanes.sub(last, last))
         return loss
 
-    def _theta(self, row: Value) -> Value:
+    def _load_parameter(self, row: IrValue) -> IrValue:
         b = self.lanes.builder
         index = b.add(b.mul(row, self.arguments["stride"]), self.first)
         return self.lanes.load_row(self.arguments["theta"], index)
 
-    def _initial(self, i: int) -> Value:
+    def _load_initial_state(self, i: int) -> IrValue:
         """Where a state starts: a number of the experiment, or a row of theta."""
         known = self.experiment.initial[i]
         if not isinstance(self.model.initial[i], EstimatedInitial):
             return known
-        return self._theta(self.experiment.state(i, "row"))
+        return self._load_parameter(self.experiment.get_state_field(i, "row"))
 
-    def _following(self, turn: Turn, states: States, at: Placing) -> dict[str, Value]:
+    def _emit_following_states(
+        self, turn: TimeStep, states: States, at: EnvironmentBuilder
+    ) -> dict[str, IrValue]:
         """The next states: computed, or, in the first samples of a recursion, given."""
         lanes, model = self.lanes, self.model
         if not demand.is_difference(model) or model.memory <= 1:
-            return next_states(lanes, model, self.experiment.number("step"), states, at)
-        following = lanes.builder.add(turn.step, lanes.integer(1))
-        given = [lanes.splat(self._given(i, following)) for i in range(len(states.names))]
+            return emit_next_states(lanes, model, self.experiment.get_number("step"), states, at)
+        following = lanes.builder.add(turn.step, lanes.make_integer(1))
+        given = [
+            lanes.splat(self._load_measured_state(i, following)) for i in range(len(states.names))
+        ]
 
-        def computed() -> list[Value]:
-            values = next_states(lanes, model, self.experiment.number("step"), states, at)
+        def computed() -> list[IrValue]:
+            values = emit_next_states(lanes, model, self.experiment.get_number("step"), states, at)
             return [lanes.splat(values[name]) for name in states.names]
 
-        is_computed = lanes.builder.icmp_signed(">=", following, lanes.integer(model.memory))
+        is_computed = lanes.builder.icmp_signed(">=", following, lanes.make_integer(model.memory))
         made = lanes.branch(is_computed, computed, given)
         return dict(zip(states.names, made, strict=True))
 
-    def _given(self, i: int, sample: Value) -> Value:
+    def _load_measured_state(self, i: int, sample: IrValue) -> IrValue:
         if not isinstance(self.model.initial[i], MeasuredInitial):
-            return self._initial(i)
+            return self._load_initial_state(i)
         b, lanes = self.lanes.builder, self.lanes
-        last = lanes.integer(self.model.memory - 1)
+        last = lanes.make_integer(self.model.memory - 1)
         inside = b.select(b.icmp_signed("<", sample, last), sample, last)
-        place = b.add(self.experiment.state(i, "given"), inside)
-        return lanes.load(self.experiment.floats, place)
+        place = b.add(self.experiment.get_state_field(i, "given"), inside)
+        return lanes.load_double(self.experiment.floats, place)
 
 
-def _placing(
-    lanes: Lanes, model: Model, scope: Parameters, states: States, signals: Signals, turn: Turn
-) -> Placing:
+def _bind_environment(
+    lanes: VectorBuilder,
+    model: Model,
+    scope: ParameterEnvironment,
+    states: States,
+    signals: SignalReaders,
+    turn: TimeStep,
+) -> EnvironmentBuilder:
     """What names mean at a place of this turn, given the states' values there."""
 
-    def at(halves: int, values: dict[str, Value], equation: int = 0) -> Place:
-        return Place(lanes, model, scope, states, signals, turn, halves, values, equation)
+    def at(halves: int, values: dict[str, IrValue], equation: int = 0) -> StepEnvironment:
+        return StepEnvironment(lanes, model, scope, states, signals, turn, halves, values, equation)
 
     return at

@@ -8,28 +8,28 @@ from dataclasses import dataclass
 
 from sysid.models.model import Model
 
-HEAD = ("last", "reach", "rows")
+HEAD_FIELDS = ("last", "reach", "rows")
 """Last integration step; rows of history that lags reach back; rows of the history's buffer."""
 
-STATE = ("row", "given")
+STATE_FIELDS = ("row", "given")
 """Row of theta that holds the initial value, or -1; place of the given first samples, or -1."""
 
-INPUT = ("zero", "points", "begin", "end", "cap")
+INPUT_FIELDS = ("zero", "points", "begin", "end", "cap")
 """Place of the value at step 0; fine points in a step; where a step begins and ends, in fine
 points (they differ from 0 and `points` where a held input jumps); largest lag in fine points."""
 
-OUTPUT = ("measured", "weight", "samples", "fraction", "first", "grid")
+OUTPUT_FIELDS = ("measured", "weight", "samples", "fraction", "first", "grid")
 """Places of measured values and weights; place (in ints) of each grid point's row or of the
 bounds of its interval's samples; place of the samples' positions inside their interval; first row
 of the predictions; place of the measurement interpolated to the grid."""
 
-NUMBERS = ("step", "cap", "scale")
+FLOAT_FIELDS = ("step", "cap", "scale")
 """Integration step in s (difference form: h); largest lag in steps; scale of soft-l1. The
 states' initial values follow."""
 
 
 @dataclass(frozen=True, slots=True)
-class Variant:
+class KernelVariant:
     """What is compiled into a kernel besides the model.
 
     Attributes
@@ -51,7 +51,7 @@ class Variant:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class ExperimentLayout:
     """Places of the head, in ints, for a model of these sizes."""
 
     states: int
@@ -59,32 +59,40 @@ class Layout:
     outputs: int
 
     @classmethod
-    def of(cls, model: Model) -> "Layout":
+    def from_model(cls, model: Model) -> "ExperimentLayout":
         """Layout for a model's experiments."""
         return cls(len(model.states), len(model.inputs), len(model.outputs))
 
-    def state(self, number: int, field: str) -> int:
+    def locate_state(self, number: int, field: str) -> int:
         """Place of a state's entry."""
-        return len(HEAD) + number * len(STATE) + STATE.index(field)
+        return len(HEAD_FIELDS) + number * len(STATE_FIELDS) + STATE_FIELDS.index(field)
 
-    def input(self, number: int, field: str) -> int:
+    def locate_input(self, number: int, field: str) -> int:
         """Place of an input's entry."""
-        return self.state(self.states, STATE[0]) + number * len(INPUT) + INPUT.index(field)
+        return (
+            self.locate_state(self.states, STATE_FIELDS[0])
+            + number * len(INPUT_FIELDS)
+            + INPUT_FIELDS.index(field)
+        )
 
-    def output(self, number: int, field: str) -> int:
+    def locate_output(self, number: int, field: str) -> int:
         """Place of an output's entry."""
-        return self.input(self.inputs, INPUT[0]) + number * len(OUTPUT) + OUTPUT.index(field)
+        return (
+            self.locate_input(self.inputs, INPUT_FIELDS[0])
+            + number * len(OUTPUT_FIELDS)
+            + OUTPUT_FIELDS.index(field)
+        )
 
     @property
     def n_ints(self) -> int:
         """Length of the head in ints."""
-        return self.output(self.outputs, OUTPUT[0])
+        return self.locate_output(self.outputs, OUTPUT_FIELDS[0])
 
     @property
     def n_floats(self) -> int:
         """Length of the head in floats."""
-        return len(NUMBERS) + self.states
+        return len(FLOAT_FIELDS) + self.states
 
-    def initial(self, number: int) -> int:
+    def locate_initial(self, number: int) -> int:
         """Place (in floats) of a state's initial value."""
-        return len(NUMBERS) + number
+        return len(FLOAT_FIELDS) + number

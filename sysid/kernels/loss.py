@@ -1,52 +1,52 @@
 """Comparison of the simulated outputs with the measured ones, inside the time loop."""
 
-from sysid.kernels.delayed_reads import Turn
-from sysid.kernels.expressions import emit
-from sysid.kernels.integrators import Placing
-from sysid.kernels.layout import Variant
-from sysid.kernels.signals import Experiment, States
-from sysid.kernels.vectors import INT, Lanes, Loop, Value
+from sysid.kernels.delayed_reads import TimeStep
+from sysid.kernels.expressions import emit_expression
+from sysid.kernels.integrators import EnvironmentBuilder
+from sysid.kernels.layout import KernelVariant
+from sysid.kernels.signals import ExperimentHead, States
+from sysid.kernels.vectors import INT, IrValue, KernelLoop, VectorBuilder
 from sysid.language.tree import match_plain_state
 from sysid.models.model import Model
 
 
-class Comparison:
+class LossAccumulator:
     """Sums the loss at each grid point and stores predictions where they are asked for."""
 
     def __init__(
-        self, lanes: Lanes, model: Model, variant: Variant, experiment: Experiment,
-        arguments: dict[str, Value], first: Value,
+        self, lanes: VectorBuilder, model: Model, variant: KernelVariant, experiment: ExperimentHead,
+        arguments: dict[str, IrValue], first: IrValue,
     ) -> None:  # fmt: skip
         self._lanes, self._model, self._variant = lanes, model, variant
         self._experiment, self._arguments, self._column = experiment, arguments, first
         b = lanes.builder
         address = b.ptrtoint(arguments["predictions"], INT)
-        self._stores = b.icmp_signed("!=", address, lanes.integer(0))
-        self.loss = lanes.splat(lanes.number(0.0))
-        self._earlier: list[Value] = []
+        self._stores = b.icmp_signed("!=", address, lanes.make_integer(0))
+        self.loss = lanes.splat(lanes.make_number(0.0))
+        self._earlier: list[IrValue] = []
 
-    def open(self, loop: Loop) -> None:
+    def open_loop(self, loop: KernelLoop) -> None:
         """Carry the sum, and the outputs at the last grid point where samples lie between."""
         self._carried_loss = loop.carry(self.loss)
         self.loss = self._carried_loss
         if not self._variant.on_grid:
-            zero = self._lanes.splat(self._lanes.number(0.0))
+            zero = self._lanes.splat(self._lanes.make_number(0.0))
             self._earlier = [loop.carry(zero) for _ in self._model.outputs]
         self._carried_earlier = list(self._earlier)
 
-    def compare(self, turn: Turn, states: States, at: Placing) -> None:
+    def compare_step(self, turn: TimeStep, states: States, at: EnvironmentBuilder) -> None:
         """Compare if the step is a grid point; for one-step prediction replace the states."""
         lanes, b = self._lanes, self._lanes.builder
         substeps = self._substeps
         if substeps == 1:
-            self._at_grid(turn.step, states, at)
+            self._compare_grid_point(turn.step, states, at)
             return
-        number = lanes.integer(substeps)
+        number = lanes.make_integer(substeps)
         grid = b.sdiv(turn.step, number)
         before = [self.loss, *self._earlier, *states.now.values()]
 
-        def body() -> list[Value]:
-            self._at_grid(grid, states, at)
+        def body() -> list[IrValue]:
+            self._compare_grid_point(grid, states, at)
             return [self.loss, *self._earlier, *states.now.values()]
 
         is_grid = b.icmp_signed("==", b.mul(grid, number), turn.step)
@@ -55,7 +55,7 @@ class Comparison:
         self._earlier = rest[:count]
         states.now = dict(zip(states.names, rest[count:], strict=True))
 
-    def end(self, loop: Loop) -> None:
+    def end_step(self, loop: KernelLoop) -> None:
         """Hand over to the next turn; after the loop, `loss` is what the last turn had."""
         loop.update(self._carried_loss, self.loss)
         for carried, value in zip(self._carried_earlier, self._earlier, strict=True):
@@ -65,11 +65,12 @@ class Comparison:
     def _substeps(self) -> int:
         return self._model.solver.substeps
 
-    def _at_grid(self, grid: Value, states: States, at: Placing) -> None:
+    def _compare_grid_point(self, grid: IrValue, states: States, at: EnvironmentBuilder) -> None:
         lanes = self._lanes
         scope = at(0, dict(states.now), -1)
         outputs = [
-            lanes.splat(emit(lanes, output.expression, scope)) for output in self._model.outputs
+            lanes.splat(emit_expression(lanes, output.expression, scope))
+            for output in self._model.outputs
         ]
         for i, value in enumerate(outputs):
             if self._variant.on_grid:
@@ -77,72 +78,78 @@ class Comparison:
             else:
                 self._compare_interval(i, grid, value)
         if self._variant.one_step:
-            self._replace(grid, states)
+            self._replace_states(grid, states)
 
-    def _compare_sample(self, i: int, grid: Value, value: Value) -> None:
+    def _compare_sample(self, i: int, grid: IrValue, value: IrValue) -> None:
         """The output has at most one sample here, and it lies on the grid point."""
         lanes, b = self._lanes, self._lanes.builder
-        self.loss = lanes.add(self.loss, self._cost(i, grid, value))
+        self.loss = lanes.add(self.loss, self._emit_cost(i, grid, value))
 
-        def store() -> list[Value]:
-            place = b.add(self._experiment.output(i, "samples"), grid)
-            row = lanes.load_int(self._experiment.ints, place)
-            is_sample = b.icmp_signed(">=", row, lanes.integer(0))
-            lanes.branch(is_sample, lambda: self._store(row, value), [])
+        def store() -> list[IrValue]:
+            place = b.add(self._experiment.get_output_field(i, "samples"), grid)
+            row = lanes.load_integer(self._experiment.ints, place)
+            is_sample = b.icmp_signed(">=", row, lanes.make_integer(0))
+            lanes.branch(is_sample, lambda: self._store_prediction(row, value), [])
             return []
 
         lanes.branch(self._stores, store, [])
 
-    def _compare_interval(self, i: int, grid: Value, value: Value) -> None:
+    def _compare_interval(self, i: int, grid: IrValue, value: IrValue) -> None:
         """Samples lie anywhere between the last grid point and this one."""
         lanes, b, experiment = self._lanes, self._lanes.builder, self._experiment
-        bounds = b.add(experiment.output(i, "samples"), grid)
-        start = lanes.load_int(experiment.ints, bounds)
-        stop = lanes.load_int(experiment.ints, b.add(bounds, lanes.integer(1)))
-        loop = Loop(lanes)
+        bounds = b.add(experiment.get_output_field(i, "samples"), grid)
+        start = lanes.load_integer(experiment.ints, bounds)
+        stop = lanes.load_integer(experiment.ints, b.add(bounds, lanes.make_integer(1)))
+        loop = KernelLoop(lanes)
         sample, loss = loop.carry(start), loop.carry(self.loss)
         loop.leave_if(b.icmp_signed(">=", sample, stop))
-        place = b.add(experiment.output(i, "fraction"), sample)
-        between = lanes.between(self._earlier[i], lanes.load(experiment.floats, place), value)
-        following = lanes.add(loss, self._cost(i, sample, between))
+        place = b.add(experiment.get_output_field(i, "fraction"), sample)
+        between = lanes.interpolate(
+            self._earlier[i], lanes.load_double(experiment.floats, place), value
+        )
+        following = lanes.add(loss, self._emit_cost(i, sample, between))
 
-        def store() -> list[Value]:
-            return self._store(b.add(experiment.output(i, "first"), sample), between)
+        def store() -> list[IrValue]:
+            return self._store_prediction(
+                b.add(experiment.get_output_field(i, "first"), sample), between
+            )
 
         lanes.branch(self._stores, store, [])
-        loop.update(sample, b.add(sample, lanes.integer(1)))
+        loop.update(sample, b.add(sample, lanes.make_integer(1)))
         loop.update(loss, following)
         loop.repeat()
         self.loss = loss
         self._earlier[i] = value
 
-    def _cost(self, i: int, sample: Value, value: Value) -> Value:
+    def _emit_cost(self, i: int, sample: IrValue, value: IrValue) -> IrValue:
         """Loss of one sample: w²e², or 2s²(√(1 + (we/s)²) - 1) without its cancellation."""
         lanes, b, experiment = self._lanes, self._lanes.builder, self._experiment
-        measured = lanes.load(experiment.floats, b.add(experiment.output(i, "measured"), sample))
+        measured = lanes.load_double(
+            experiment.floats, b.add(experiment.get_output_field(i, "measured"), sample)
+        )
         error = lanes.sub(value, measured)
         if self._variant.weighted:
-            place = b.add(experiment.output(i, "weight"), sample)
-            error = lanes.mul(error, lanes.load(experiment.floats, place))
+            place = b.add(experiment.get_output_field(i, "weight"), sample)
+            error = lanes.mul(error, lanes.load_double(experiment.floats, place))
         square = lanes.mul(error, error)
         if not self._variant.soft:
             return square
-        scale, one = experiment.number("scale"), lanes.number(1.0)
+        scale, one = experiment.get_number("scale"), lanes.make_number(1.0)
         ratio = lanes.div(square, lanes.mul(scale, scale))
-        root = lanes.intrinsic("sqrt", lanes.add(one, ratio))
-        return lanes.div(lanes.mul(lanes.number(2.0), square), lanes.add(one, root))
+        root = lanes.call_intrinsic("sqrt", lanes.add(one, ratio))
+        return lanes.div(lanes.mul(lanes.make_number(2.0), square), lanes.add(one, root))
 
-    def _store(self, row: Value, value: Value) -> list[Value]:
+    def _store_prediction(self, row: IrValue, value: IrValue) -> list[IrValue]:
         b = self._lanes.builder
         place = b.add(b.mul(row, self._arguments["predictions_stride"]), self._column)
         self._lanes.store_row(value, self._arguments["predictions"], place)
         return []
 
-    def _replace(self, grid: Value, states: States) -> None:
+    def _replace_states(self, grid: IrValue, states: States) -> None:
         """One-step prediction goes on from the measurement."""
         for i, output in enumerate(self._model.outputs):
             name = match_plain_state(output.expression)
             if name is not None:
-                place = self._lanes.builder.add(self._experiment.output(i, "grid"), grid)
-                value = self._lanes.load(self._experiment.floats, place)
+                place = self._lanes.builder.add(self._experiment.get_output_field(i, "grid"), grid)
+                value = self._lanes.load_double(self._experiment.floats, place)
                 states.now[name] = self._lanes.splat(value)

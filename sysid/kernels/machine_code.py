@@ -16,48 +16,51 @@ from typing import Any
 import llvmlite
 import llvmlite.binding as llvm
 
-from sysid.kernels.vectors import vector_functions
+from sysid.kernels.vectors import load_vector_functions
 
-_LEVEL = 3
+_OPTIMIZATION_LEVEL = 3
 _engines: list[Any] = []  # an engine owns the memory of its code: it lives as long as the process
 
 
 @cache
-def _target() -> Any:
+def _create_target_machine() -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     target = llvm.Target.from_default_triple()
     return target.create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=_features(), opt=_LEVEL, jit=True
+        cpu=llvm.get_host_cpu_name(),
+        features=_list_cpu_features(),
+        opt=_OPTIMIZATION_LEVEL,
+        jit=True,
     )
 
 
-def _features() -> str:
+def _list_cpu_features() -> str:
     return str(llvm.get_host_cpu_features().flatten())
 
 
 @cache
-def machine_name() -> str:
+def describe_machine() -> str:
     """What object code depends on besides its source: compiler, processor, vector library."""
     words = (llvmlite.__version__, str(llvm.llvm_version_info), llvm.get_host_cpu_name())
-    return "\n".join((*words, _features(), *vector_functions().symbols.values()))
+    return "\n".join((*words, _list_cpu_features(), *load_vector_functions().symbols.values()))
 
 
-def object_code(assembly: str) -> bytes:
+def compile_assembly(assembly: str) -> bytes:
     """Compile assembly for this machine."""
-    machine = _target()
+    machine = _create_target_machine()
     module = llvm.parse_assembly(assembly)
     module.verify()
-    options = llvm.create_pipeline_tuning_options(speed_level=_LEVEL)
+    options = llvm.create_pipeline_tuning_options(speed_level=_OPTIMIZATION_LEVEL)
     builder = llvm.create_pass_builder(machine, options)
     builder.getModulePassManager().run(module, builder)
     return bytes(machine.emit_object(module))
 
 
-def loaded(code: bytes, function: str) -> int:
+def load_object_code(code: bytes, function: str) -> int:
     """Address of a function of some object code, which stays loaded."""
-    _target()
-    vector_functions()  # the code may call them
+    _create_target_machine()
+    load_vector_functions()  # the code may call them
     empty = llvm.parse_assembly("")
     # each engine owns its target machine, so the one that compiles cannot be shared with it
     machine = llvm.Target.from_default_triple().create_target_machine(jit=True)
@@ -68,39 +71,45 @@ def loaded(code: bytes, function: str) -> int:
     return int(engine.get_function_address(function))
 
 
-OWN = 64
+MAX_OWN_COMPILATIONS = 64
 """Kernels that a process compiles itself: it takes half a second less than to start another."""
 
-_SECONDS = 300.0
-_KEPT = ("PATH", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH")  # what an interpreter may need to start
-_made: list[None] = []  # one entry for each, since += on a number is two steps of two threads
+_TIMEOUT_SECONDS = 300.0
+_INHERITED_VARIABLES = (
+    "PATH",
+    "LD_LIBRARY_PATH",
+    "DYLD_LIBRARY_PATH",
+)  # what an interpreter may need to start
+_own_compilations: list[
+    None
+] = []  # one entry for each, since += on a number is two steps of two threads
 _log = logging.getLogger(__name__)
 
 
-def object_code_bounded(assembly: str) -> bytes:
-    """Compile assembly for this machine, here or, after `OWN` of them, in another process."""
-    if len(_made) >= OWN:
+def compile_bounded(assembly: str) -> bytes:
+    """Compile assembly for this machine, here or, after `MAX_OWN_COMPILATIONS` of them, in another process."""
+    if len(_own_compilations) >= MAX_OWN_COMPILATIONS:
         try:
-            return _compiled_apart(assembly)
+            return _compile_in_subprocess(assembly)
         except (OSError, subprocess.SubprocessError) as error:
             _log.warning("a kernel is compiled in this process, which keeps its traces: %s", error)
-    _made.append(None)
-    return object_code(assembly)
+    _own_compilations.append(None)
+    return compile_assembly(assembly)
 
 
-def _compiled_apart(assembly: str) -> bytes:
+def _compile_in_subprocess(assembly: str) -> bytes:
     # What this process imports and no more: `-m` alone would put the folder it stands in first.
     path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
-    kept = {name: os.environ[name] for name in _KEPT if name in os.environ}
+    kept = {name: os.environ[name] for name in _INHERITED_VARIABLES if name in os.environ}
     return subprocess.run(
         [sys.executable, "-P", "-m", "sysid.kernels.machine_code"],
         input=assembly.encode(),
         stdout=subprocess.PIPE,
-        timeout=_SECONDS,
+        timeout=_TIMEOUT_SECONDS,
         env={**kept, "PYTHONPATH": path},
         check=True,
     ).stdout
 
 
 if __name__ == "__main__":
-    sys.stdout.buffer.write(object_code(sys.stdin.buffer.read().decode()))
+    sys.stdout.buffer.write(compile_assembly(sys.stdin.buffer.read().decode()))

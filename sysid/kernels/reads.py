@@ -7,21 +7,21 @@ Runge-Kutta step lie at 0, 1 and 2; the sample that a difference equation comput
 from typing import NamedTuple
 
 from sysid.core.memo import cache_by_identity
-from sysid.language.delays import mentions_time, past_values
-from sysid.language.tree import Past
+from sysid.language.delays import collect_past_values, mentions_time
+from sysid.language.tree import PastValue
 from sysid.models.model import Model
 
-NEAR = 8
+MAX_REGISTER_OFFSET = 8
 """Fixed offsets up to this many samples are kept in registers, further ones in the history."""
 
-_GAP = 4  # half steps: two values at most this far apart share one read
+_MAX_GAP = 4  # half steps: two values at most this far apart share one read
 
 
-class Read(NamedTuple):
+class SignalRead(NamedTuple):
     """A past value and its place without its lag."""
 
-    past: Past
-    halves: int
+    past: PastValue
+    half_steps: int
 
 
 def is_difference(model: Model) -> bool:
@@ -29,14 +29,14 @@ def is_difference(model: Model) -> bool:
     return model.form != "differential"
 
 
-def stages(model: Model) -> tuple[int, ...]:
+def list_stages(model: Model) -> tuple[int, ...]:
     """Places at which the equations are evaluated in one step."""
     if is_difference(model):
         return (2,)
     return (0, 1, 2) if model.solver.method == "rk4" else (0,)
 
 
-def state_place(model: Model, stage: int, equation: int, state: int) -> int:
+def find_state_place(model: Model, stage: int, equation: int, state: int) -> int:
     """Place of a state's value without lag, in an equation at a stage.
 
     The semi-implicit method uses states already updated as they are at the end of the step.
@@ -46,63 +46,68 @@ def state_place(model: Model, stage: int, equation: int, state: int) -> int:
 
 
 @cache_by_identity  # every run asks
-def reads(model: Model) -> tuple[Read, ...]:
+def collect_reads(model: Model) -> tuple[SignalRead, ...]:
     """Every past value that the equations and the outputs read."""
     numbers = {state.name: i for i, state in enumerate(model.states)}
-    found: list[Read] = []
+    found: list[SignalRead] = []
     for i, equation in enumerate(model.equations):
-        for stage in stages(model):
-            for past in past_values(equation):
+        for stage in list_stages(model):
+            for past in collect_past_values(equation):
                 state = past.kind == "state"
-                at = state_place(model, stage, i, numbers[past.name]) if state else stage
-                found.append(Read(past, at - 2 * past.offset))
+                at = find_state_place(model, stage, i, numbers[past.name]) if state else stage
+                found.append(SignalRead(past, at - 2 * past.offset))
     for output in model.outputs:
-        found += [Read(past, -2 * past.offset) for past in past_values(output.expression)]
+        found += [
+            SignalRead(past, -2 * past.offset) for past in collect_past_values(output.expression)
+        ]
     return tuple(found)
 
 
-def lags(model: Model, kind: str) -> list[Past]:
+def list_delayed_values(model: Model, kind: str) -> list[PastValue]:
     """The lagged values of that kind of signal, each once."""
-    return [*dict.fromkeys(r.past for r in reads(model) if r.past.kind == kind and r.past.lag)]
+    return [
+        *dict.fromkeys(r.past for r in collect_reads(model) if r.past.kind == kind and r.past.delay)
+    ]
 
 
-def averaged_inputs(model: Model) -> frozenset[str]:
+def find_averaged_inputs(model: Model) -> frozenset[str]:
     """Inputs that are read with unknown lags only: held ones are given as means over a step."""
-    inputs = [r.past for r in reads(model) if r.past.kind == "input"]
-    unknown = {past.name for past in inputs if _is_unknown(past)}
-    return frozenset(unknown - {past.name for past in inputs if not _is_unknown(past)})
+    inputs = [r.past for r in collect_reads(model) if r.past.kind == "input"]
+    unknown = {past.name for past in inputs if _has_unknown_delay(past)}
+    return frozenset(unknown - {past.name for past in inputs if not _has_unknown_delay(past)})
 
 
-def _is_unknown(past: Past) -> bool:
-    return past.lag is not None and mentions_time(past.lag, "parameter")
+def _has_unknown_delay(past: PastValue) -> bool:
+    return past.delay is not None and mentions_time(past.delay, "parameter")
 
 
-def with_history(model: Model) -> list[str]:
+def list_states_with_history(model: Model) -> list[str]:
     """States whose past must be kept in memory, in the model's order."""
     needed = {
         r.past.name
-        for r in reads(model)
-        if r.past.kind == "state" and (r.past.lag is not None or r.halves < -2 * NEAR)
+        for r in collect_reads(model)
+        if r.past.kind == "state"
+        and (r.past.delay is not None or r.half_steps < -2 * MAX_REGISTER_OFFSET)
     }
     return [state.name for state in model.states if state.name in needed]
 
 
-def depth(model: Model, state: str) -> int:
+def count_register_samples(model: Model, state: str) -> int:
     """How many finished samples of a state are kept in registers besides the last."""
     fixed = [
-        -r.halves // 2
-        for r in reads(model)
-        if r.past.name == state and r.past.kind == "state" and r.past.lag is None
+        -r.half_steps // 2
+        for r in collect_reads(model)
+        if r.past.name == state and r.past.kind == "state" and r.past.delay is None
     ]
-    return max([0, *(back for back in fixed if back <= NEAR)])
+    return max([0, *(back for back in fixed if back <= MAX_REGISTER_OFFSET)])
 
 
-def furthest(model: Model) -> int:
+def find_furthest_offset(model: Model) -> int:
     """Whole steps that the furthest read lies back, without its lag."""
-    return max([0, *(-(r.halves // 2) for r in reads(model))])
+    return max([0, *(-(r.half_steps // 2) for r in collect_reads(model))])
 
 
-def chains(places: set[int]) -> list[list[int]]:
+def group_places(places: set[int]) -> list[list[int]]:
     """Places grouped so that a group needs one read: the rest are its values of earlier steps.
 
     Each group holds the place that is read and then, step by step, those behind it.
@@ -111,7 +116,7 @@ def chains(places: set[int]) -> list[list[int]]:
     for parity in (0, 1):
         for place in sorted((p for p in places if p % 2 == parity), reverse=True):
             last = groups[-1] if groups else None
-            if last and last[0] % 2 == parity and last[-1] - place <= _GAP:
+            if last and last[0] % 2 == parity and last[-1] - place <= _MAX_GAP:
                 last.extend(range(last[-1] - 2, place - 1, -2))
             else:
                 groups.append([place])

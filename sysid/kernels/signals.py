@@ -7,98 +7,123 @@ from dataclasses import dataclass
 
 from sysid.kernels import reads as demand
 from sysid.kernels.delayed_reads import (
-    FreshReader,
-    History,
+    DelayedReader,
+    DirectReader,
     InputReader,
     LinearReader,
-    Reader,
-    Turn,
+    StateHistory,
+    TimeStep,
 )
-from sysid.kernels.expressions import Scope, emit
-from sysid.kernels.layout import HEAD, INPUT, NUMBERS, OUTPUT, STATE, Layout
-from sysid.kernels.vectors import DOUBLE, Lanes, Loop, Value
-from sysid.language.tree import Expression, Past, Symbol
+from sysid.kernels.expressions import Environment, emit_expression
+from sysid.kernels.layout import (
+    FLOAT_FIELDS,
+    HEAD_FIELDS,
+    INPUT_FIELDS,
+    OUTPUT_FIELDS,
+    STATE_FIELDS,
+    ExperimentLayout,
+)
+from sysid.kernels.vectors import DOUBLE, IrValue, KernelLoop, VectorBuilder
+from sysid.language.tree import Expression, PastValue, Symbol
 from sysid.models.model import Model
 
 
-class Experiment:
+class ExperimentHead:
     """The head of an experiment's numbers, loaded where it is made: at the kernel's entry."""
 
-    def __init__(self, lanes: Lanes, layout: Layout, ints: Value, floats: Value) -> None:
+    def __init__(
+        self, lanes: VectorBuilder, layout: ExperimentLayout, ints: IrValue, floats: IrValue
+    ) -> None:
         self.ints, self.floats = ints, floats
-        self._head = {name: lanes.load_int(ints, lanes.integer(i)) for i, name in enumerate(HEAD)}
+        self._head = {
+            name: lanes.load_integer(ints, lanes.make_integer(i))
+            for i, name in enumerate(HEAD_FIELDS)
+        }
         self._numbers = {
-            name: lanes.load(floats, lanes.integer(i)) for i, name in enumerate(NUMBERS)
+            name: lanes.load_double(floats, lanes.make_integer(i))
+            for i, name in enumerate(FLOAT_FIELDS)
         }
         self._states = [
-            {f: lanes.load_int(ints, lanes.integer(layout.state(i, f))) for f in STATE}
+            {
+                f: lanes.load_integer(ints, lanes.make_integer(layout.locate_state(i, f)))
+                for f in STATE_FIELDS
+            }
             for i in range(layout.states)
         ]
         self._inputs = [
-            {f: lanes.load_int(ints, lanes.integer(layout.input(i, f))) for f in INPUT}
+            {
+                f: lanes.load_integer(ints, lanes.make_integer(layout.locate_input(i, f)))
+                for f in INPUT_FIELDS
+            }
             for i in range(layout.inputs)
         ]
         self._outputs = [
-            {f: lanes.load_int(ints, lanes.integer(layout.output(i, f))) for f in OUTPUT}
+            {
+                f: lanes.load_integer(ints, lanes.make_integer(layout.locate_output(i, f)))
+                for f in OUTPUT_FIELDS
+            }
             for i in range(layout.outputs)
         ]
         self.initial = [
-            lanes.load(floats, lanes.integer(layout.initial(i))) for i in range(layout.states)
+            lanes.load_double(floats, lanes.make_integer(layout.locate_initial(i)))
+            for i in range(layout.states)
         ]
 
-    def head(self, field: str) -> Value:
+    def get_head(self, field: str) -> IrValue:
         """A number of the experiment as a whole."""
         return self._head[field]
 
-    def number(self, field: str) -> Value:
+    def get_number(self, field: str) -> IrValue:
         """A real number of the experiment as a whole."""
         return self._numbers[field]
 
-    def state(self, i: int, field: str) -> Value:
+    def get_state_field(self, i: int, field: str) -> IrValue:
         """A number of the i-th state."""
         return self._states[i][field]
 
-    def input(self, i: int, field: str) -> Value:
+    def get_input_field(self, i: int, field: str) -> IrValue:
         """A number of the i-th input."""
         return self._inputs[i][field]
 
-    def output(self, i: int, field: str) -> Value:
+    def get_output_field(self, i: int, field: str) -> IrValue:
         """A number of the i-th output."""
         return self._outputs[i][field]
 
 
 @dataclass(frozen=True, slots=True)
-class Parameters(Scope):
+class ParameterEnvironment(Environment):
     """The scope of a lag: parameters and the sampling period."""
 
-    values: dict[str, Value]
-    period: Value
+    values: dict[str, IrValue]
+    period: IrValue
 
-    def symbol(self, symbol: Symbol) -> Value:
+    def emit_symbol(self, symbol: Symbol) -> IrValue:
         """Value of a parameter, or h."""
         return self.values[symbol.name] if symbol.kind == "parameter" else self.period
 
-    def past(self, past: Past) -> Value:
+    def emit_past_value(self, past: PastValue) -> IrValue:
         """Never asked: the language allows no signals in a lag."""
         raise AssertionError(f"a lag holds no signal such as {past.name}")
 
 
-class Lags:
+class Delays:
     """Lags in integration steps, each expression written once."""
 
-    def __init__(self, lanes: Lanes, model: Model, scope: Parameters, step: Value) -> None:
+    def __init__(
+        self, lanes: VectorBuilder, model: Model, scope: ParameterEnvironment, step: IrValue
+    ) -> None:
         self._lanes, self._model, self._scope, self._step = lanes, model, scope, step
-        self._known: dict[Expression, Value] = {}
+        self._known: dict[Expression, IrValue] = {}
 
-    def steps(self, lag: Expression) -> Value:
+    def to_steps(self, lag: Expression) -> IrValue:
         """The lag in steps; to the nearest whole one where the model asks for that."""
         if lag not in self._known:
             lanes = self._lanes
-            value = lanes.splat(emit(lanes, lag, self._scope))
+            value = lanes.splat(emit_expression(lanes, lag, self._scope))
             if not demand.is_difference(self._model):
                 value = lanes.div(value, self._step)
             if self._model.solver.interpolation == "nearest":
-                value = lanes.intrinsic("floor", lanes.add(value, lanes.number(0.5)))
+                value = lanes.call_intrinsic("floor", lanes.add(value, lanes.make_number(0.5)))
             self._known[lag] = value
         return self._known[lag]
 
@@ -107,70 +132,79 @@ class States:
     """The states: their last samples in registers, and in the history where lags need it."""
 
     def __init__(
-        self, lanes: Lanes, model: Model, experiment: Experiment, work: Value, start: list[Value]
+        self,
+        lanes: VectorBuilder,
+        model: Model,
+        experiment: ExperimentHead,
+        work: IrValue,
+        start: list[IrValue],
     ) -> None:
         self._lanes, self._model = lanes, model
         self.names = [state.name for state in model.states]
         self.now = dict(zip(self.names, (lanes.splat(v) for v in start), strict=True))
         zero = model.solver.history == "zero"
         self._before = {
-            n: lanes.splat(lanes.number(0.0)) if zero else v for n, v in self.now.items()
+            n: lanes.splat(lanes.make_number(0.0)) if zero else v for n, v in self.now.items()
         }
-        self._reach, self._rows = experiment.head("reach"), experiment.head("rows")
-        size = lanes.builder.mul(self._rows, lanes.integer(lanes.width))
+        self._reach, self._rows = experiment.get_head("reach"), experiment.get_head("rows")
+        size = lanes.builder.mul(self._rows, lanes.make_integer(lanes.width))
         self._histories = {
-            name: History(
+            name: StateHistory(
                 lanes.builder.gep(
-                    work, [lanes.builder.mul(size, lanes.integer(i))], source_etype=DOUBLE
+                    work, [lanes.builder.mul(size, lanes.make_integer(i))], source_etype=DOUBLE
                 )
             )
-            for i, name in enumerate(demand.with_history(model))
+            for i, name in enumerate(demand.list_states_with_history(model))
         }
-        self.line: dict[str, list[Value]] = {}
+        self.line: dict[str, list[IrValue]] = {}
 
-    def history(self, name: str) -> History:
+    def get_history(self, name: str) -> StateHistory:
         """Where the past of a state is kept."""
         return self._histories[name]
 
-    def fill_history(self) -> Value:
+    def fill_history(self) -> IrValue:
         """Write what was before the start and the start itself; gives the row of the start."""
         lanes, b = self._lanes, self._lanes.builder
         if self._histories:
-            loop = Loop(lanes)
-            row = loop.carry(lanes.integer(0))
+            loop = KernelLoop(lanes)
+            row = loop.carry(lanes.make_integer(0))
             for name, history in self._histories.items():
                 lanes.store_row(
-                    self._before[name], history.base, b.mul(row, lanes.integer(lanes.width))
+                    self._before[name], history.base, b.mul(row, lanes.make_integer(lanes.width))
                 )
-            following = b.add(row, lanes.integer(1))
+            following = b.add(row, lanes.make_integer(1))
             loop.update(row, following)
             loop.leave_if(b.icmp_signed(">=", following, self._reach))
             loop.repeat()
-            self.store(self._reach)
+            self.store_states(self._reach)
         return self._reach
 
-    def store(self, row: Value) -> None:
+    def store_states(self, row: IrValue) -> None:
         """Write the present states into a row of the history."""
-        index = self._lanes.builder.mul(row, self._lanes.integer(self._lanes.width))
+        index = self._lanes.builder.mul(row, self._lanes.make_integer(self._lanes.width))
         for name, history in self._histories.items():
             self._lanes.store_row(self.now[name], history.base, index)
 
-    def far(self, name: str, back: int, row: Value) -> Value:
+    def load_far_sample(self, name: str, back: int, row: IrValue) -> IrValue:
         """A sample a fixed number of steps before the last finished one."""
         b = self._lanes.builder
-        index = b.mul(b.sub(row, self._lanes.integer(back)), self._lanes.integer(self._lanes.width))
+        index = b.mul(
+            b.sub(row, self._lanes.make_integer(back)), self._lanes.make_integer(self._lanes.width)
+        )
         return self._lanes.load_row(self._histories[name].base, index)
 
-    def open(self, loop: Loop) -> None:
+    def open_loop(self, loop: KernelLoop) -> None:
         """Carry the states, and those before them, through the time loop."""
         for name in self.names:
             first = loop.carry(self.now[name])
             before = self._before[name]
-            rest = [loop.carry(before) for _ in range(demand.depth(self._model, name))]
+            rest = [
+                loop.carry(before) for _ in range(demand.count_register_samples(self._model, name))
+            ]
             self.line[name] = [first, *rest]
             self.now[name] = first
 
-    def end(self, loop: Loop, following: dict[str, Value]) -> None:
+    def end_step(self, loop: KernelLoop, following: dict[str, IrValue]) -> None:
         """Hand the next states over; `now` may have been replaced by measurements."""
         for name in self.names:
             carried = self.line[name]
@@ -179,116 +213,120 @@ class States:
                 loop.update(phi, value)
         self.now = following
 
-    def end_row(self, row: Value) -> Value:
+    def advance_row(self, row: IrValue) -> IrValue:
         """Row of the next step: one further, or, at the end of the buffer, back at its front."""
         lanes, b = self._lanes, self._lanes.builder
-        following = b.add(row, lanes.integer(1))
+        following = b.add(row, lanes.make_integer(1))
         if not self._histories:
             return following
-        self.store(following)
+        self.store_states(following)
 
-        def slide() -> list[Value]:
+        def slide() -> list[IrValue]:
             first = b.sub(following, self._reach)
-            size = b.mul(b.add(self._reach, lanes.integer(1)), lanes.integer(lanes.width))
-            source = b.mul(first, lanes.integer(lanes.width))
+            size = b.mul(b.add(self._reach, lanes.make_integer(1)), lanes.make_integer(lanes.width))
+            source = b.mul(first, lanes.make_integer(lanes.width))
             for history in self._histories.values():
-                lanes.copy_rows(history.base, lanes.integer(0), source, size)
+                lanes.copy_rows(history.base, lanes.make_integer(0), source, size)
             return [self._reach]
 
-        is_last = b.icmp_signed("==", following, b.sub(self._rows, lanes.integer(1)))
+        is_last = b.icmp_signed("==", following, b.sub(self._rows, lanes.make_integer(1)))
         return lanes.branch(is_last, slide, [following])[0]
 
 
-class Signals:
+class SignalReaders:
     """Readers of all lagged signals of a model, and the inputs without lag."""
 
     def __init__(
-        self, lanes: Lanes, model: Model, experiment: Experiment, states: States, lags: Lags,
+        self, lanes: VectorBuilder, model: Model, experiment: ExperimentHead, states: States, lags: Delays,
         fresh: bool,
     ) -> None:  # fmt: skip
         self._lanes, self._model, self._experiment = lanes, model, experiment
         self._inputs = {quantity.name: i for i, quantity in enumerate(model.inputs)}
-        self._readers: dict[tuple[str, Expression, int], Reader] = {}
-        self._owners: list[tuple[str, Reader]] = []
+        self._readers: dict[tuple[str, Expression, int], DelayedReader] = {}
+        self._owners: list[tuple[str, DelayedReader]] = []
         cubic = model.solver.interpolation == "cubic"
-        for past, places in _lagged(model, "state").items():
-            lag = lanes.clamped(lags.steps(past[1]), experiment.number("cap"))
-            history = states.history(past[0])
+        for past, places in _group_delayed_reads(model, "state").items():
+            lag = lanes.clamp(lags.to_steps(past[1]), experiment.get_number("cap"))
+            history = states.get_history(past[0])
             if fresh or cubic:
-                self._add(past, places, FreshReader(lanes, history, lag, cubic))
+                self._add_reader(past, places, DirectReader(lanes, history, lag, cubic))
                 continue
-            for chain in _state_chains(places):
-                reader = LinearReader(lanes, history, lag, chain, experiment.head("reach"))
+            for chain in _group_state_places(places):
+                reader = LinearReader(lanes, history, lag, chain, experiment.get_head("reach"))
                 served = places if chain[0] > 0 else set()
-                self._add(past, {*chain, *(p for p in served if p > 0)}, reader)
-        for past, places in _lagged(model, "input").items():
-            for chain in demand.chains(places):
-                self._add(past, {*chain}, self._input_reader(past[0], lags.steps(past[1]), chain))
+                self._add_reader(past, {*chain, *(p for p in served if p > 0)}, reader)
+        for past, places in _group_delayed_reads(model, "input").items():
+            for chain in demand.group_places(places):
+                self._add_reader(
+                    past, {*chain}, self._build_input_reader(past[0], lags.to_steps(past[1]), chain)
+                )
 
-    def _add(self, past: tuple[str, Expression], places: set[int], reader: Reader) -> None:
+    def _add_reader(
+        self, past: tuple[str, Expression], places: set[int], reader: DelayedReader
+    ) -> None:
         for place in places:
             self._readers[*past, place] = reader
         self._owners.append((past[0], reader))
 
-    def _input_reader(self, name: str, lag: Value, chain: list[int]) -> InputReader:
+    def _build_input_reader(self, name: str, lag: IrValue, chain: list[int]) -> InputReader:
         lanes, number, experiment = self._lanes, self._inputs[name], self._experiment
-        points = experiment.input(number, "points")
+        points = experiment.get_input_field(number, "points")
         fine = lanes.mul(lag, lanes.builder.sitofp(points, DOUBLE))
-        cap = lanes.builder.sitofp(experiment.input(number, "cap"), DOUBLE)
-        zero = self._zero(number)
-        return InputReader(lanes, experiment.floats, zero, points, lanes.clamped(fine, cap), chain)
+        cap = lanes.builder.sitofp(experiment.get_input_field(number, "cap"), DOUBLE)
+        zero = self._find_input_start(number)
+        return InputReader(lanes, experiment.floats, zero, points, lanes.clamp(fine, cap), chain)
 
-    def _zero(self, number: int) -> Value:
+    def _find_input_start(self, number: int) -> IrValue:
         """Place of the input at step 0; difference equations read just behind a jump."""
-        zero = self._experiment.input(number, "zero")
+        zero = self._experiment.get_input_field(number, "zero")
         if not demand.is_difference(self._model):
             return zero
-        return self._lanes.builder.add(zero, self._experiment.input(number, "begin"))
+        return self._lanes.builder.add(zero, self._experiment.get_input_field(number, "begin"))
 
-    def reader(self, past: Past, halves: int) -> Reader:
+    def get_reader(self, past: PastValue, halves: int) -> DelayedReader:
         """Who reads that lagged signal at that place."""
-        if past.lag is None:
+        if past.delay is None:
             raise AssertionError(f"{past.name} is read without lag")
-        return self._readers[past.name, past.lag, halves]
+        return self._readers[past.name, past.delay, halves]
 
-    def input(self, name: str, halves: int, step: Value) -> Value:
+    def load_input(self, name: str, halves: int, step: IrValue) -> IrValue:
         """An input without lag: the same for all individuals."""
         b, lanes, number = self._lanes.builder, self._lanes, self._inputs[name]
-        points = self._experiment.input(number, "points")
-        start = b.add(self._zero(number), b.mul(step, points))
+        points = self._experiment.get_input_field(number, "points")
+        start = b.add(self._find_input_start(number), b.mul(step, points))
         if demand.is_difference(self._model):
-            shift = b.mul(points, lanes.integer(halves // 2))
+            shift = b.mul(points, lanes.make_integer(halves // 2))
         elif halves == 1:
-            shift = b.ashr(points, lanes.integer(1))
+            shift = b.ashr(points, lanes.make_integer(1))
         else:
-            shift = self._experiment.input(number, "end" if halves == 2 else "begin")
-        return lanes.load(self._experiment.floats, b.add(start, shift))
+            shift = self._experiment.get_input_field(number, "end" if halves == 2 else "begin")
+        return lanes.load_double(self._experiment.floats, b.add(start, shift))
 
-    def open(self, loop: Loop) -> None:
+    def open_loop(self, loop: KernelLoop) -> None:
         """Begin the time loop."""
         for _, reader in self._owners:
-            reader.open(loop)
+            reader.open_loop(loop)
 
-    def begin(self, turn: Turn) -> None:
+    def begin_step(self, turn: TimeStep) -> None:
         """Begin one turn of it."""
         for _, reader in self._owners:
-            reader.begin(turn)
+            reader.begin_step(turn)
 
-    def end(self, loop: Loop, following: dict[str, Value]) -> None:
+    def end_step(self, loop: KernelLoop, following: dict[str, IrValue]) -> None:
         """End one turn of it."""
         for name, reader in self._owners:
-            reader.end(loop, following.get(name, self._lanes.number(0.0)))
+            reader.end_step(loop, following.get(name, self._lanes.make_number(0.0)))
 
 
-def _lagged(model: Model, kind: str) -> dict[tuple[str, Expression], set[int]]:
+def _group_delayed_reads(model: Model, kind: str) -> dict[tuple[str, Expression], set[int]]:
     places: dict[tuple[str, Expression], set[int]] = {}
-    for read in demand.reads(model):
-        if read.past.kind == kind and read.past.lag is not None:
-            places.setdefault((read.past.name, read.past.lag), set()).add(read.halves)
+    for read in demand.collect_reads(model):
+        if read.past.kind == kind and read.past.delay is not None:
+            places.setdefault((read.past.name, read.past.delay), set()).add(read.half_steps)
     return places
 
 
-def _state_chains(places: set[int]) -> list[list[int]]:
+def _group_state_places(places: set[int]) -> list[list[int]]:
     """Chains of whole steps; a reader that looks into the present step holds its start too."""
     forward = {0, 2} if any(place > 0 for place in places) else set()
-    return demand.chains({place for place in places if place % 2 == 0} | forward)
+    return demand.group_places({place for place in places if place % 2 == 0} | forward)

@@ -3,50 +3,58 @@
 from math import floor, isinf
 from typing import NamedTuple
 
-from sysid.language.intervals import bounds
-from sysid.language.monomials import CONSTANT, Polynomial, add, collect, rebuild, scale, times
-from sysid.language.printer import number, text
+from sysid.language.intervals import bound_expression
+from sysid.language.monomials import (
+    CONSTANT,
+    LaurentPolynomial,
+    add_polynomials,
+    collect_terms,
+    multiply_factor,
+    scale_polynomial,
+    to_expression,
+)
+from sysid.language.printer import format_expression, format_number
 from sysid.language.scope import Scope
-from sysid.language.tree import Expression, Past, Symbol, walk
+from sysid.language.tree import Expression, PastValue, Symbol, walk
 
 _PERIOD = Symbol("h", "period")
-_LONGEST = 1e6
+_MAX_DELAY = 1e6
 
 
-class Delay(NamedTuple):
+class PastIndex(NamedTuple):
     """How far back a value lies: whole samples, and what comes on top."""
 
     offset: int
-    lag: Expression | None
+    delay: Expression | None
 
 
-def delay(index: Expression, scope: Scope) -> Delay | str:
+def split_index(index: Expression, scope: Scope) -> PastIndex | str:
     """The delay that an index stands for, or what is wrong with it.
 
     In the difference form the offset is as large as the bounds allow to be fixed: ``y(k - d)``
     with d from 1 to 20 is one sample back and d - 1 more.
     """
     clock = Symbol(scope.clock, "index" if scope.form == "difference" else "time")
-    terms = collect(index)
+    terms = collect_terms(index)
     slope = terms.pop(((clock, 1),), 0.0)
-    back = scale(terms, -1.0)
-    rest = rebuild(back)
+    back = scale_polynomial(terms, -1.0)
+    rest = to_expression(back)
     if slope == 1.0 and set(back) == {CONSTANT} and back[CONSTANT] < 0:
         return "this is a value of the future, which is not known"
     if not mentions_time(rest) and not slope:
-        return f"the index does not count from {scope.clock}; {_right(scope)}"
+        return f"the index does not count from {scope.clock}; {_describe_form(scope)}"
     if scope.form == "difference" and mentions_time(rest, "time"):
-        return f"the index counts seconds; {_right(scope)}"
+        return f"the index counts seconds; {_describe_form(scope)}"
     if abs(slope - 1.0) > 1e-9 or mentions_time(rest):
-        return f"the lag changes with time; {_right(scope)}, where the lag is fixed"
-    if (low := bounds(rest, scope.parameters)[0]) < 0:
-        return _negative(back, low, scope)
+        return f"the lag changes with time; {_describe_form(scope)}, where the lag is fixed"
+    if (low := bound_expression(rest, scope.parameters)[0]) < 0:
+        return _describe_negative(back, low, scope)
     if not back:
-        return Delay(0, None)
+        return PastIndex(0, None)
     # Any period tells a lag without limit; back[CONSTANT] counts samples or seconds.
-    if max(bounds(rest, scope.parameters, 1.0)[1], back.get(CONSTANT, 0.0)) > _LONGEST:
-        return f"the lag {text(rest, scope.clock)} has no limit inside the bounds of its parameters"
-    return Delay(0, rest) if scope.form == "differential" else _split(back, low, scope)
+    if max(bound_expression(rest, scope.parameters, 1.0)[1], back.get(CONSTANT, 0.0)) > _MAX_DELAY:
+        return f"the lag {format_expression(rest, scope.clock)} has no limit inside the bounds of its parameters"
+    return PastIndex(0, rest) if scope.form == "differential" else _split_offset(back, low, scope)
 
 
 def mentions_time(expression: Expression, *kinds: str) -> bool:
@@ -55,33 +63,36 @@ def mentions_time(expression: Expression, *kinds: str) -> bool:
     return any(isinstance(node, Symbol) and node.kind in wanted for node in walk(expression))
 
 
-def past_values(expression: Expression) -> tuple[Past, ...]:
+def collect_past_values(expression: Expression) -> tuple[PastValue, ...]:
     """Every signal value in an expression, in the order of the text."""
-    return tuple(node for node in walk(expression) if isinstance(node, Past))
+    return tuple(node for node in walk(expression) if isinstance(node, PastValue))
 
 
-def _split(back: Polynomial, low: float, scope: Scope) -> Delay:
+def _split_offset(back: LaurentPolynomial, low: float, scope: Scope) -> PastIndex:
     constant = back.get(CONSTANT, 0.0)
     unknown = {monomial: value for monomial, value in back.items() if monomial != CONSTANT}
     offset = 1 if low >= 1 else 0
-    if bounds(rebuild(unknown), scope.parameters)[0] >= 0:
+    if bound_expression(to_expression(unknown), scope.parameters)[0] >= 0:
         offset = max(offset, floor(constant))
-    lag = add(back, {CONSTANT: -float(offset)})
-    return Delay(offset, rebuild(lag) if lag else None)
+    lag = add_polynomials(back, {CONSTANT: -float(offset)})
+    return PastIndex(offset, to_expression(lag) if lag else None)
 
 
-def _negative(back: Polynomial, low: float, scope: Scope) -> str:
+def _describe_negative(back: LaurentPolynomial, low: float, scope: Scope) -> str:
     unit = "samples" if scope.form == "difference" else "s"
     if isinf(low):  # h may be as small as it likes: say it in seconds
-        low, unit = bounds(rebuild(times(back, _PERIOD)), scope.parameters)[0], "s"
-    smallest = "" if isinf(low) else f"; its smallest value is {number(low)} {unit}"
+        low, unit = (
+            bound_expression(to_expression(multiply_factor(back, _PERIOD)), scope.parameters)[0],
+            "s",
+        )
+    smallest = "" if isinf(low) else f"; its smallest value is {format_number(low)} {unit}"
     return (
-        f"the lag {text(rebuild(back), scope.clock)} may be negative inside the bounds{smallest}; "
+        f"the lag {format_expression(to_expression(back), scope.clock)} may be negative inside the bounds{smallest}; "
         "give its parameters bounds that keep it at 0 or more"
     )
 
 
-def _right(scope: Scope) -> str:
+def _describe_form(scope: Scope) -> str:
     if scope.form == "difference":
         return "in the difference form write x(k - n - L/h)"
     return "in the differential form write x(t - L)"

@@ -11,19 +11,19 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 from sysid.language.functions import FUNCTIONS, OPERATORS
-from sysid.language.tree import Binary, Call, Expression, Number, Symbol, Unary
+from sysid.language.tree import Binary, Expression, FunctionCall, Number, Symbol, Unary
 
 
-def value(expression: Expression, parameters: Mapping[str, float]) -> float:
+def evaluate_expression(expression: Expression, parameters: Mapping[str, float]) -> float:
     """What an expression of parameters and numbers is worth; ``nan`` or ``inf`` where undefined.
 
     Past values, time and the sampling period have no place in it.
     """
     with np.errstate(all="ignore"):
-        return float(_value(expression, {k: np.float64(v) for k, v in parameters.items()}))
+        return float(_evaluate_node(expression, {k: np.float64(v) for k, v in parameters.items()}))
 
 
-def values_at(expression: Expression, times: FloatArray) -> FloatArray:
+def evaluate_signal(expression: Expression, times: FloatArray) -> FloatArray:
     """Values (N,) of an expression of ``t``, ``k`` and ``h`` at regular times (N,) in s.
 
     Past values and parameters have no place in it.
@@ -31,24 +31,26 @@ def values_at(expression: Expression, times: FloatArray) -> FloatArray:
     period = times[1] - times[0]
     named = {"t": times, "k": np.arange(float(times.size)), "h": period}
     with np.errstate(all="ignore"):
-        return np.array(np.broadcast_to(_value(expression, named), times.shape), dtype=np.float64)
+        return np.array(
+            np.broadcast_to(_evaluate_node(expression, named), times.shape), dtype=np.float64
+        )
 
 
-def _value(expression: Expression, named: Mapping[str, Any]) -> Any:
+def _evaluate_node(expression: Expression, named: Mapping[str, Any]) -> Any:
     match expression:
         case Number(number):
             return np.float64(number)
         case Symbol(name, kind) if kind == "parameter" or name in named:
             return named[name]
         case Unary(operator, operand):
-            inside = _value(operand, named)
+            inside = _evaluate_node(operand, named)
             return -inside if operator == "-" else np.logical_not(inside)
         case Binary(operator, left, right):
-            operands = (_value(left, named), _value(right, named))
+            operands = (_evaluate_node(left, named), _evaluate_node(right, named))
             return getattr(np, OPERATORS[operator].numpy)(*operands)
-        case Call(function, arguments):
+        case FunctionCall(function, arguments):
             return getattr(np, FUNCTIONS[function].numpy)(
-                *(_value(one, named) for one in arguments)
+                *(_evaluate_node(one, named) for one in arguments)
             )
         case _:
             return np.float64(nan)

@@ -11,7 +11,7 @@ from math import atan, exp, inf, log, pi, sqrt, tan, tanh
 
 from sysid.core.types import Interval
 
-EVERYTHING: Interval = (-inf, inf)
+REAL_LINE: Interval = (-inf, inf)
 
 
 class Level(IntEnum):
@@ -76,46 +76,46 @@ class Function:
                 object.__setattr__(self, language, self.name)
 
 
-def _sum(a: Interval, b: Interval) -> Interval:
+def _add(a: Interval, b: Interval) -> Interval:
     return (a[0] + b[0], a[1] + b[1])
 
 
-def _difference(a: Interval, b: Interval) -> Interval:
+def _subtract(a: Interval, b: Interval) -> Interval:
     return (a[0] - b[1], a[1] - b[0])
 
 
-def _times(a: float, b: float) -> float:
+def _multiply_ends(a: float, b: float) -> float:
     return 0.0 if a == 0.0 or b == 0.0 else a * b  # an unbounded end is never reached, so 0·∞ = 0
 
 
-def _product(a: Interval, b: Interval) -> Interval:
-    corners = [_times(x, y) for x in a for y in b]
+def _multiply(a: Interval, b: Interval) -> Interval:
+    corners = [_multiply_ends(x, y) for x in a for y in b]
     return (min(corners), max(corners))
 
 
-def _quotient(a: Interval, b: Interval) -> Interval:
+def _divide(a: Interval, b: Interval) -> Interval:
     if b[0] > 0 or b[1] < 0:
-        return _product(a, (1 / b[1], 1 / b[0]))
+        return _multiply(a, (1 / b[1], 1 / b[0]))
     if b[0] == 0 and b[1] > 0:
-        return _product(a, (1 / b[1], inf))
+        return _multiply(a, (1 / b[1], inf))
     if b[1] == 0 and b[0] < 0:
-        return _product(a, (-inf, 1 / b[0]))
-    return EVERYTHING
+        return _multiply(a, (-inf, 1 / b[0]))
+    return REAL_LINE
 
 
-def _power(a: Interval, b: Interval) -> Interval:
+def _raise_interval(a: Interval, b: Interval) -> Interval:
     if b[0] == b[1] and b[0] >= 0 and b[0].is_integer():
-        ends = [_raise(x, b[0]) for x in a]
+        ends = [_raise_number(x, b[0]) for x in a]
         if b[0] % 2 == 0 and a[0] < 0 < a[1]:
             ends.append(0.0 if b[0] else 1.0)
         return (min(ends), max(ends))
     if a[0] >= 0:  # monotone in either argument, so the ends lie at the corners
-        corners = [_raise(x, y) for x in a for y in b]
+        corners = [_raise_number(x, y) for x in a for y in b]
         return (min(corners), max(corners))
-    return EVERYTHING
+    return REAL_LINE
 
 
-def _raise(base: float, exponent: float) -> float:
+def _raise_number(base: float, exponent: float) -> float:
     try:
         return float(base**exponent)
     except OverflowError:
@@ -124,7 +124,7 @@ def _raise(base: float, exponent: float) -> float:
         return inf
 
 
-def _rising(function: Callable[[float], float]) -> Callable[[Interval], Interval]:
+def _map_monotone(function: Callable[[float], float]) -> Callable[[Interval], Interval]:
     return lambda a: (function(a[0]), function(a[1]))
 
 
@@ -149,23 +149,23 @@ def _absolute(a: Interval) -> Interval:
     return (low, max(abs(a[0]), abs(a[1])))
 
 
-def _wave(_: Interval) -> Interval:
+def _bound_wave(_: Interval) -> Interval:
     return (-1.0, 1.0)
 
 
-def _tangent(a: Interval) -> Interval:
-    return (tan(a[0]), tan(a[1])) if -pi / 2 < a[0] and a[1] < pi / 2 else EVERYTHING
+def _bound_tangent(a: Interval) -> Interval:
+    return (tan(a[0]), tan(a[1])) if -pi / 2 < a[0] and a[1] < pi / 2 else REAL_LINE
 
 
-def _least(a: Interval, b: Interval) -> Interval:
+def _minimum(a: Interval, b: Interval) -> Interval:
     return (min(a[0], b[0]), min(a[1], b[1]))
 
 
-def _either(_: Interval, a: Interval, b: Interval) -> Interval:
+def _join_branches(_: Interval, a: Interval, b: Interval) -> Interval:
     return (min(a[0], b[0]), max(a[1], b[1]))
 
 
-def _greatest(a: Interval, b: Interval) -> Interval:
+def _maximum(a: Interval, b: Interval) -> Interval:
     return (max(a[0], b[0]), max(a[1], b[1]))
 
 
@@ -178,29 +178,29 @@ OPERATORS: Mapping[str, Operator] = {
     ">=": Operator(Level.COMPARISON, "greater_equal"),
     "==": Operator(Level.COMPARISON, "equal"),
     "!=": Operator(Level.COMPARISON, "not_equal"),
-    "+": Operator(Level.SUM, "add", _sum),
-    "-": Operator(Level.SUM, "subtract", _difference),
-    "*": Operator(Level.PRODUCT, "multiply", _product),
-    "/": Operator(Level.PRODUCT, "divide", _quotient),
-    "**": Operator(Level.POWER, "power", _power),
+    "+": Operator(Level.SUM, "add", _add),
+    "-": Operator(Level.SUM, "subtract", _subtract),
+    "*": Operator(Level.PRODUCT, "multiply", _multiply),
+    "/": Operator(Level.PRODUCT, "divide", _divide),
+    "**": Operator(Level.POWER, "power", _raise_interval),
 }
 
 FUNCTIONS: Mapping[str, Function] = {
     function.name: function
     for function in (
-        Function("sin", _wave),
-        Function("cos", _wave),
-        Function("tan", _tangent),
-        Function("exp", _rising(_exp)),
-        Function("log", _rising(_log)),
-        Function("sqrt", _rising(_sqrt)),
+        Function("sin", _bound_wave),
+        Function("cos", _bound_wave),
+        Function("tan", _bound_tangent),
+        Function("exp", _map_monotone(_exp)),
+        Function("log", _map_monotone(_log)),
+        Function("sqrt", _map_monotone(_sqrt)),
         Function("abs", _absolute, llvm="fabs", c="fabs"),
-        Function("sign", _rising(_sign)),
-        Function("tanh", _rising(tanh)),
-        Function("atan", _rising(atan), numpy="arctan"),
+        Function("sign", _map_monotone(_sign)),
+        Function("tanh", _map_monotone(tanh)),
+        Function("atan", _map_monotone(atan), numpy="arctan"),
         # Unlike a comparison, minimum and maximum pass nan on, so that divergence is not hidden.
-        Function("min", _least, 2, None, numpy="minimum", llvm="minimum", c="least"),
-        Function("max", _greatest, 2, None, numpy="maximum", llvm="maximum", c="greatest"),
-        Function("where", _either, 3, 3),
+        Function("min", _minimum, 2, None, numpy="minimum", llvm="minimum", c="least"),
+        Function("max", _maximum, 2, None, numpy="maximum", llvm="maximum", c="greatest"),
+        Function("where", _join_branches, 3, 3),
     )
 }

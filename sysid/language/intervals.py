@@ -8,11 +8,11 @@ from collections.abc import Mapping
 from math import inf, isnan
 
 from sysid.core.types import Interval
-from sysid.language.functions import EVERYTHING, FUNCTIONS, OPERATORS
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.language.functions import FUNCTIONS, OPERATORS, REAL_LINE
+from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
 
-def bounds(
+def bound_expression(
     expression: Expression, parameters: Mapping[str, Interval], period: float | None = None
 ) -> Interval:
     """Interval that holds every value of an expression.
@@ -28,22 +28,24 @@ def bounds(
         case Number(value):
             return (value, value)
         case Symbol():
-            return _symbol(expression, parameters, period)
-        case Past():
-            return EVERYTHING
+            return _bound_symbol(expression, parameters, period)
+        case PastValue():
+            return REAL_LINE
         case Unary("-", operand):
-            return _negative(bounds(operand, parameters, period))
+            return _negate(bound_expression(operand, parameters, period))
         case Binary(operator, left, right) if (rule := OPERATORS[operator].interval) is not None:
-            ends = (bounds(one, parameters, period) for one in (left, right))
-            return _usable(rule(*ends))
-        case Call(function, arguments):
-            ends = (bounds(one, parameters, period) for one in arguments)
-            return _usable(FUNCTIONS[function].interval(*ends))
+            ends = (bound_expression(one, parameters, period) for one in (left, right))
+            return _widen_if_nan(rule(*ends))
+        case FunctionCall(function, arguments):
+            ends = (bound_expression(one, parameters, period) for one in arguments)
+            return _widen_if_nan(FUNCTIONS[function].interval(*ends))
         case _:  # a condition: false or true
             return (0.0, 1.0)
 
 
-def _symbol(symbol: Symbol, parameters: Mapping[str, Interval], period: float | None) -> Interval:
+def _bound_symbol(
+    symbol: Symbol, parameters: Mapping[str, Interval], period: float | None
+) -> Interval:
     if symbol.kind == "parameter":
         return parameters[symbol.name]
     if symbol.kind == "period" and period is not None:
@@ -51,9 +53,9 @@ def _symbol(symbol: Symbol, parameters: Mapping[str, Interval], period: float | 
     return (0.0, inf)
 
 
-def _usable(interval: Interval) -> Interval:
-    return EVERYTHING if isnan(interval[0]) or isnan(interval[1]) else interval
+def _widen_if_nan(interval: Interval) -> Interval:
+    return REAL_LINE if isnan(interval[0]) or isnan(interval[1]) else interval
 
 
-def _negative(a: Interval) -> Interval:
+def _negate(a: Interval) -> Interval:
     return (-a[1], -a[0])

@@ -11,7 +11,7 @@ from typing import TypeAlias
 from sysid.language.tree import Binary, Expression, Number, Unary
 
 Monomial: TypeAlias = tuple[tuple[Expression, int], ...]
-Polynomial: TypeAlias = dict[Monomial, float]
+LaurentPolynomial: TypeAlias = dict[Monomial, float]
 
 CONSTANT: Monomial = ()
 
@@ -19,28 +19,30 @@ _MAX_TERMS = 64
 """A product that would have more terms is kept as one factor."""
 
 
-def collect(expression: Expression) -> Polynomial:
+def collect_terms(expression: Expression) -> LaurentPolynomial:
     """The expression as a polynomial; equal terms are added, ``h/h`` is 1."""
     match expression:
         case Number(value):
             return {CONSTANT: value} if value else {}
         case Unary("-", operand):
-            return scale(collect(operand), -1.0)
+            return scale_polynomial(collect_terms(operand), -1.0)
         case Binary("+", left, right):
-            return add(collect(left), collect(right))
+            return add_polynomials(collect_terms(left), collect_terms(right))
         case Binary("-", left, right):
-            return add(collect(left), scale(collect(right), -1.0))
+            return add_polynomials(
+                collect_terms(left), scale_polynomial(collect_terms(right), -1.0)
+            )
         case Binary("*", left, right):
-            return _product(collect(left), collect(right), expression)
+            return _multiply_polynomials(collect_terms(left), collect_terms(right), expression)
         case Binary("/", left, right):
-            return _product(collect(left), _reciprocal(right), expression)
+            return _multiply_polynomials(collect_terms(left), _invert_expression(right), expression)
         case Binary("**", base, Number(value)) if value.is_integer() and 0 < value <= 8:
-            return _power(collect(base), int(value), expression)
+            return _raise_polynomial(collect_terms(base), int(value), expression)
         case _:
             return {((expression, 1),): 1.0}
 
 
-def add(a: Polynomial, b: Polynomial) -> Polynomial:
+def add_polynomials(a: LaurentPolynomial, b: LaurentPolynomial) -> LaurentPolynomial:
     """Sum, without the terms that cancel."""
     total = dict(a)
     for monomial, coefficient in b.items():
@@ -48,49 +50,49 @@ def add(a: Polynomial, b: Polynomial) -> Polynomial:
     return {monomial: value for monomial, value in total.items() if value}
 
 
-def scale(a: Polynomial, factor: float) -> Polynomial:
+def scale_polynomial(a: LaurentPolynomial, factor: float) -> LaurentPolynomial:
     """Product with a number."""
     return {monomial: value * factor for monomial, value in a.items()}
 
 
-def times(a: Polynomial, factor: Expression) -> Polynomial:
+def multiply_factor(a: LaurentPolynomial, factor: Expression) -> LaurentPolynomial:
     """Product with one factor."""
-    return {_merged(monomial, ((factor, 1),)): value for monomial, value in a.items()}
+    return {_merge_monomials(monomial, ((factor, 1),)): value for monomial, value in a.items()}
 
 
-def rebuild(a: Polynomial) -> Expression:
+def to_expression(a: LaurentPolynomial) -> Expression:
     """The polynomial as a tree; the constant comes last."""
     ordered = sorted(a.items(), key=lambda term: term[0] == CONSTANT)
     if not ordered:
         return Number(0.0)
     first, *others = ordered
-    return reduce(_with_term, others, _term(*first))
+    return reduce(_append_term, others, _build_term(*first))
 
 
-def _with_term(tree: Expression, term: tuple[Monomial, float]) -> Expression:
+def _append_term(tree: Expression, term: tuple[Monomial, float]) -> Expression:
     monomial, value = term
-    return Binary("-" if value < 0 else "+", tree, _term(monomial, abs(value)))
+    return Binary("-" if value < 0 else "+", tree, _build_term(monomial, abs(value)))
 
 
-def _term(monomial: Monomial, coefficient: float) -> Expression:
-    above = [_raised(factor, power) for factor, power in monomial if power > 0]
-    below = [_raised(factor, -power) for factor, power in monomial if power < 0]
+def _build_term(monomial: Monomial, coefficient: float) -> Expression:
+    above = [_raise_factor(factor, power) for factor, power in monomial if power > 0]
+    below = [_raise_factor(factor, -power) for factor, power in monomial if power < 0]
     if coefficient == -1.0 and above:
         above[0] = Unary("-", above[0])
     elif coefficient != 1.0 or not above:
         above.insert(0, Number(coefficient))
-    return reduce(lambda a, b: Binary("/", a, b), below, reduce(_multiplied, above))
+    return reduce(lambda a, b: Binary("/", a, b), below, reduce(_multiply_expressions, above))
 
 
-def _multiplied(a: Expression, b: Expression) -> Expression:
+def _multiply_expressions(a: Expression, b: Expression) -> Expression:
     return Binary("*", a, b)
 
 
-def _raised(factor: Expression, power: int) -> Expression:
+def _raise_factor(factor: Expression, power: int) -> Expression:
     return factor if power == 1 else Binary("**", factor, Number(float(power)))
 
 
-def _merged(a: Monomial, b: Monomial) -> Monomial:
+def _merge_monomials(a: Monomial, b: Monomial) -> Monomial:
     powers = dict(a)
     for factor, power in b:
         powers[factor] = powers.get(factor, 0) + power
@@ -98,24 +100,30 @@ def _merged(a: Monomial, b: Monomial) -> Monomial:
     return tuple(sorted(((f, p) for f, p in powers.items() if p), key=lambda item: repr(item)))
 
 
-def _product(a: Polynomial, b: Polynomial, whole: Expression) -> Polynomial:
+def _multiply_polynomials(
+    a: LaurentPolynomial, b: LaurentPolynomial, whole: Expression
+) -> LaurentPolynomial:
     if len(a) * len(b) > _MAX_TERMS:
         return {((whole, 1),): 1.0}
-    total: Polynomial = {}
+    total: LaurentPolynomial = {}
     for monomial, value in a.items():
-        total = add(total, {_merged(monomial, m): value * v for m, v in b.items()})
+        total = add_polynomials(
+            total, {_merge_monomials(monomial, m): value * v for m, v in b.items()}
+        )
     return total
 
 
-def _power(base: Polynomial, exponent: int, whole: Expression) -> Polynomial:
+def _raise_polynomial(
+    base: LaurentPolynomial, exponent: int, whole: Expression
+) -> LaurentPolynomial:
     total = base
     for _ in range(exponent - 1):
-        total = _product(total, base, whole)
+        total = _multiply_polynomials(total, base, whole)
     return total
 
 
-def _reciprocal(divisor: Expression) -> Polynomial:
-    terms = collect(divisor)
+def _invert_expression(divisor: Expression) -> LaurentPolynomial:
+    terms = collect_terms(divisor)
     if len(terms) != 1:
         return {((divisor, -1),): 1.0}
     [(monomial, value)] = terms.items()

@@ -15,10 +15,10 @@ from typing import Literal, NamedTuple, TypeAlias
 
 from sysid.language.functions import OPERATORS, Level
 
-MAX_LENGTH = 4000
+MAX_EXPRESSION_LENGTH = 4000
 """Characters of one equation."""
 
-MAX_DEPTH = 64
+MAX_EXPRESSION_DEPTH = 64
 """Nesting of one equation; long sums and products are folded, so they do not count as deep."""
 
 
@@ -46,7 +46,7 @@ class SyntaxFault(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class NumberSyntax:
+class NumberLiteral:
     """A number as written."""
 
     value: float
@@ -66,7 +66,7 @@ class Prefix:
     """``-a`` or ``not a``."""
 
     operator: str
-    operand: "Syntax"
+    operand: "SyntaxNode"
     column: int
 
 
@@ -75,8 +75,8 @@ class Infix:
     """``a operator b``; the column is the operator's."""
 
     operator: str
-    left: "Syntax"
-    right: "Syntax"
+    left: "SyntaxNode"
+    right: "SyntaxNode"
     column: int
 
 
@@ -85,13 +85,13 @@ class Apply:
     """``name(a, b, …)``: a function, or a signal at another time."""
 
     name: str
-    arguments: "tuple[Syntax, ...]"
+    arguments: "tuple[SyntaxNode, ...]"
     column: int
 
 
-Syntax: TypeAlias = NumberSyntax | Name | Prefix | Infix | Apply
+SyntaxNode: TypeAlias = NumberLiteral | Name | Prefix | Infix | Apply
 
-Kind = Literal["number", "name", "operator", "end"]
+TokenKind = Literal["number", "name", "operator", "end"]
 
 _TOKEN = re.compile(
     r"""
@@ -122,12 +122,12 @@ _HINTS = {
 class Token(NamedTuple):
     """One word of the text; `column` counts from 1."""
 
-    kind: Kind
+    kind: TokenKind
     text: str
     column: int
 
 
-def tokens(text: str) -> tuple[list[Token], list[TextFault]]:
+def tokenize_expression(text: str) -> tuple[list[Token], list[TextFault]]:
     """Tokens of a text, the last being its end, and what in it is no token of the language."""
     found: list[Token] = []
     faults: list[TextFault] = []
@@ -142,14 +142,14 @@ def tokens(text: str) -> tuple[list[Token], list[TextFault]]:
             if isinf(float(word)):
                 faults.append(TextFault(column, f"the number {word[:20]} is too large"))
         elif kind != "space":
-            faults.append(TextFault(column, _foreign(kind, word)))
+            faults.append(TextFault(column, _describe_foreign(kind, word)))
             if kind == "string":  # stands for a number, so that the rest can be checked as well
                 found.append(Token("number", "0", column))
     found.append(Token("end", "", len(text) + 1))
     return found, faults
 
 
-def _foreign(kind: str | None, word: str) -> str:
+def _describe_foreign(kind: str | None, word: str) -> str:
     if kind == "string":
         return "strings are not part of the language; it has numbers, names and operators"
     if kind == "attribute":
@@ -160,24 +160,24 @@ def _foreign(kind: str | None, word: str) -> str:
 
 _OPPOSITE = {"+": "-", "-": "+", "*": "/", "/": "*"}
 
-_FOLD = 8
+_MIN_FOLDED_LINKS = 8
 """Chains up to this length are computed as written, left to right; longer ones in halves."""
 
 
-def parse(text: str) -> tuple[Syntax | None, list[TextFault]]:
+def parse_expression(text: str) -> tuple[SyntaxNode | None, list[TextFault]]:
     """Syntax of a text, or None, and what is wrong with it."""
-    if len(text) > MAX_LENGTH:
-        detail = f"the text has {len(text)} characters; at most {MAX_LENGTH} are allowed"
+    if len(text) > MAX_EXPRESSION_LENGTH:
+        detail = f"the text has {len(text)} characters; at most {MAX_EXPRESSION_LENGTH} are allowed"
         return None, [TextFault(1, detail)]
-    words, faults = tokens(text)
+    words, faults = tokenize_expression(text)
     try:
-        return _Parser(words).whole(), faults
+        return _ExpressionParser(words).parse_whole(), faults
     except SyntaxFault as error:
         # After a foreign token, what follows is a consequence and would only confuse.
         return None, faults or [error.fault]
 
 
-class _Parser:
+class _ExpressionParser:
     """One pass over the tokens of one text."""
 
     def __init__(self, words: Sequence[Token]) -> None:
@@ -185,70 +185,72 @@ class _Parser:
         self._next = 0
         self._depth = 0
 
-    def whole(self) -> Syntax:
+    def parse_whole(self) -> SyntaxNode:
         """The syntax of the whole text."""
         if self._peek().kind == "end":
             raise SyntaxFault(1, "the expression is empty")
-        found = self._expression(Level.OR)
+        found = self._parse_operators(Level.OR)
         word = self._peek()
         if word.kind != "end":
-            raise SyntaxFault(word.column, _unexpected(word))
+            raise SyntaxFault(word.column, _describe_unexpected(word))
         return found
 
-    def _expression(self, floor: int) -> Syntax:
+    def _parse_operators(self, floor: int) -> SyntaxNode:
         """An expression of operators that bind at least as tightly as `floor`."""
         self._depth += 1
-        if self._depth > MAX_DEPTH:
-            detail = f"the expression is nested deeper than {MAX_DEPTH} levels"
+        if self._depth > MAX_EXPRESSION_DEPTH:
+            detail = f"the expression is nested deeper than {MAX_EXPRESSION_DEPTH} levels"
             raise SyntaxFault(self._peek().column, detail)
-        left = self._operand()
+        left = self._parse_operand()
         while (level := self._next_level()) >= floor:
-            left = self._chain(left, level)
+            left = self._parse_chain(left, level)
         self._depth -= 1
         return left
 
-    def _chain(self, first: Syntax, level: int) -> Syntax:
+    def _parse_chain(self, first: SyntaxNode, level: int) -> SyntaxNode:
         """What follows `first` at one level of precedence: ``a - b + c``."""
-        links: list[tuple[Token, Syntax]] = []
+        links: list[tuple[Token, SyntaxNode]] = []
         while self._next_level() == level:
             operator = self._advance()
             if level == Level.COMPARISON and links:
                 detail = "comparisons do not chain; write a < b and b < c"
                 raise SyntaxFault(operator.column, detail)
             # ** groups to the right: a**b**c is a**(b**c).
-            links.append((operator, self._expression(level if level == Level.POWER else level + 1)))
-        return _folded(first, links)
+            links.append(
+                (operator, self._parse_operators(level if level == Level.POWER else level + 1))
+            )
+        return _fold_chain(first, links)
 
-    def _operand(self) -> Syntax:
+    def _parse_operand(self) -> SyntaxNode:
         word = self._advance()
         if word.kind == "number":
-            return NumberSyntax(float(word.text), word.column)
+            return NumberLiteral(float(word.text), word.column)
         if word.text == "-":
-            return Prefix("-", self._expression(Level.SIGN), word.column)
+            return Prefix("-", self._parse_operators(Level.SIGN), word.column)
         if word.text == "not":
-            return Prefix("not", self._expression(Level.COMPARISON), word.column)
+            return Prefix("not", self._parse_operators(Level.COMPARISON), word.column)
         if word.text == "(":
-            inner = self._expression(Level.OR)
-            self._close(word)
+            inner = self._parse_operators(Level.OR)
+            self._expect_closing(word)
             return inner
         if word.kind == "name" and word.text not in OPERATORS:
-            return self._named(word)
-        raise SyntaxFault(word.column, _missing_operand(word))
+            return self._parse_name(word)
+        raise SyntaxFault(word.column, _describe_missing_operand(word))
 
-    def _named(self, word: Token) -> Syntax:
+    def _parse_name(self, word: Token) -> SyntaxNode:
         if self._peek().text != "(":
             return Name(word.text, word.column)
         opening = self._advance()
-        arguments: list[Syntax] = []
+        arguments: list[SyntaxNode] = []
         if self._peek().text != ")":
-            arguments.append(self._expression(Level.OR))
+            arguments.append(self._parse_operators(Level.OR))
             while self._peek().text == ",":
                 self._advance()
-                arguments.append(self._expression(Level.OR))
-        self._close(opening)
+                arguments.append(self._parse_operators(Level.OR))
+        self._expect_closing(opening)
         return Apply(word.text, tuple(arguments), word.column)
 
-    def _close(self, opening: Token) -> None:
+    def _expect_closing(self, opening: Token) -> None:
         word = self._peek()
         if word.text == ")":
             self._advance()
@@ -256,7 +258,7 @@ class _Parser:
             detail = f"the parenthesis opened at column {opening.column} is not closed"
             raise SyntaxFault(opening.column, detail)
         else:
-            raise SyntaxFault(word.column, _unexpected(word))
+            raise SyntaxFault(word.column, _describe_unexpected(word))
 
     def _peek(self) -> Token:
         return self._words[self._next]
@@ -273,9 +275,9 @@ class _Parser:
         return word
 
 
-def _folded(first: Syntax, links: Sequence[tuple[Token, Syntax]]) -> Syntax:
+def _fold_chain(first: SyntaxNode, links: Sequence[tuple[Token, SyntaxNode]]) -> SyntaxNode:
     """``first op a op b …`` as a tree whose depth grows with the logarithm of a long chain."""
-    if len(links) < _FOLD or links[0][0].text not in _OPPOSITE:
+    if len(links) < _MIN_FOLDED_LINKS or links[0][0].text not in _OPPOSITE:
         tree = first
         for operator, operand in links:
             tree = Infix(operator.text, tree, operand, operator.column)
@@ -285,10 +287,12 @@ def _folded(first: Syntax, links: Sequence[tuple[Token, Syntax]]) -> Syntax:
     tail = links[middle + 1 :]
     if joint.text in "-/":  # a - b + c = a - (b - c)
         tail = [(word._replace(text=_OPPOSITE[word.text]), operand) for word, operand in tail]
-    return Infix(joint.text, _folded(first, links[:middle]), _folded(head, tail), joint.column)
+    return Infix(
+        joint.text, _fold_chain(first, links[:middle]), _fold_chain(head, tail), joint.column
+    )
 
 
-def _unexpected(word: Token) -> str:
+def _describe_unexpected(word: Token) -> str:
     if word.text == ")":
         return "')' closes a parenthesis that was never opened"
     if word.text == ",":
@@ -296,7 +300,7 @@ def _unexpected(word: Token) -> str:
     return f"unexpected {word.text!r}; an operator such as * is missing before it"
 
 
-def _missing_operand(word: Token) -> str:
+def _describe_missing_operand(word: Token) -> str:
     if word.kind == "end":
         return "the expression ends where a number, a name or a parenthesis should follow"
     if word.text == "+":

@@ -1,11 +1,11 @@
 """Checked trees back to text, with no more parentheses than needed."""
 
 from sysid.language.functions import OPERATORS, Level
-from sysid.language.monomials import CONSTANT, add, collect, rebuild
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.language.monomials import CONSTANT, add_polynomials, collect_terms, to_expression
+from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
 
-def text(expression: Expression, clock: str = "k") -> str:
+def format_expression(expression: Expression, clock: str = "k") -> str:
     """Text of the expression, which parses to the same tree if that came from a text.
 
     Parameters
@@ -14,53 +14,55 @@ def text(expression: Expression, clock: str = "k") -> str:
     clock : {"k", "t"}
         What past values are counted from: ``k`` in the difference form, ``t`` in the differential.
     """
-    return _text(expression, clock, 0)
+    return _format_nested(expression, clock, 0)
 
 
-def _text(expression: Expression, clock: str, floor: int) -> str:
-    written, level = _written(expression, clock)
+def _format_nested(expression: Expression, clock: str, floor: int) -> str:
+    written, level = _format_with_level(expression, clock)
     return written if level >= floor else f"({written})"
 
 
-def _written(expression: Expression, clock: str) -> tuple[str, int]:
+def _format_with_level(expression: Expression, clock: str) -> tuple[str, int]:
     match expression:
         case Number(value):
-            return number(value), Level.ATOM if value >= 0 else Level.SIGN
+            return format_number(value), Level.ATOM if value >= 0 else Level.SIGN
         case Symbol(name):
             return name, Level.ATOM
-        case Past():
-            return _past(expression, clock), Level.ATOM
+        case PastValue():
+            return _format_past_value(expression, clock), Level.ATOM
         case Unary("-", operand):
-            return f"-{_text(operand, clock, Level.SIGN)}", Level.SIGN
+            return f"-{_format_nested(operand, clock, Level.SIGN)}", Level.SIGN
         case Unary(_, operand):
-            return f"not {_text(operand, clock, Level.COMPARISON)}", Level.NOT
+            return f"not {_format_nested(operand, clock, Level.COMPARISON)}", Level.NOT
         case Binary(operator, left, right):
-            return _infix(operator, left, right, clock), OPERATORS[operator].level
-        case Call(function, arguments):
-            inside = ", ".join(_text(one, clock, 0) for one in arguments)
+            return _format_infix(operator, left, right, clock), OPERATORS[operator].level
+        case FunctionCall(function, arguments):
+            inside = ", ".join(_format_nested(one, clock, 0) for one in arguments)
             return f"{function}({inside})", Level.ATOM
 
 
-def _infix(operator: str, left: Expression, right: Expression, clock: str) -> str:
+def _format_infix(operator: str, left: Expression, right: Expression, clock: str) -> str:
     level = OPERATORS[operator].level
     grows_right = operator == "**"
-    before = _text(left, clock, level + 1 if grows_right or level == Level.COMPARISON else level)
-    after = _text(right, clock, Level.SIGN if grows_right else level + 1)
+    before = _format_nested(
+        left, clock, level + 1 if grows_right or level == Level.COMPARISON else level
+    )
+    after = _format_nested(right, clock, Level.SIGN if grows_right else level + 1)
     space = " " if level <= Level.SUM else ""
     return f"{before}{space}{operator}{space}{after}"
 
 
-def _past(value: Past, clock: str) -> str:
-    back = collect(Number(float(value.offset)))
-    if value.lag is not None:
-        back = add(back, collect(value.lag))
+def _format_past_value(value: PastValue, clock: str) -> str:
+    back = collect_terms(Number(float(value.offset)))
+    if value.delay is not None:
+        back = add_polynomials(back, collect_terms(value.delay))
     constant = back.pop(CONSTANT, 0.0)
-    whole = f"-{number(constant)}" if constant else ""
-    lag = _text(rebuild(back), clock, Level.PRODUCT)
+    whole = f"-{format_number(constant)}" if constant else ""
+    lag = _format_nested(to_expression(back), clock, Level.PRODUCT)
     index = f"{clock}{whole} - {lag}" if back else f"{clock}{whole}"
     return value.name if index == clock else f"{value.name}({index})"
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Shortest text that gives the number back; without a decimal point where it is whole."""
     return str(int(value)) if value.is_integer() and abs(value) < 1e15 else repr(value)

@@ -6,15 +6,15 @@ from typing import Literal
 
 from sysid.language.functions import FUNCTIONS
 
-WORDS = ("and", "or", "not")
+OPERATOR_WORDS = ("and", "or", "not")
 
-Timing = Literal["difference", "differential"]
+EquationForm = Literal["difference", "differential"]
 
 
-def reserved(form: Timing) -> tuple[str, ...]:
+def list_reserved_names(form: EquationForm) -> tuple[str, ...]:
     """Names that a model of this form cannot give to something of its own."""
     own = ("k", "h") if form == "difference" else ()
-    return ("t", "pi", *own, *FUNCTIONS, *WORDS)
+    return ("t", "pi", *own, *FUNCTIONS, *OPERATOR_WORDS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Scope:
     constants : mapping of str to float
     """
 
-    form: Timing
+    form: EquationForm
     states: tuple[str, ...] = ()
     inputs: tuple[str, ...] = ()
     parameters: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -47,7 +47,7 @@ class Scope:
         return "k" if self.form == "difference" else "t"
 
     @property
-    def known(self) -> tuple[str, ...]:
+    def names(self) -> tuple[str, ...]:
         """Every name that is not a function."""
         own = ("k", "h") if self.form == "difference" else ()
         return (*self.signals, *self.parameters, *self.constants, "t", "pi", *own)

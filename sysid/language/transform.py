@@ -6,7 +6,7 @@ Trees with parts replaced: how a parameter is tied to others, or an input fed ba
 from collections.abc import Callable
 from dataclasses import replace
 
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 
 
 def substitute(
@@ -21,14 +21,14 @@ def substitute(
     if found is not None:
         return found
     match tree:
-        case Past(lag=lag) if lag is not None:
-            return replace(tree, lag=substitute(lag, replacement))
+        case PastValue(delay=lag) if lag is not None:
+            return replace(tree, delay=substitute(lag, replacement))
         case Unary(operator, operand):
             return Unary(operator, substitute(operand, replacement))
         case Binary(operator, left, right):
             return Binary(operator, substitute(left, replacement), substitute(right, replacement))
-        case Call(function, arguments):
-            return Call(function, tuple(substitute(one, replacement) for one in arguments))
+        case FunctionCall(function, arguments):
+            return FunctionCall(function, tuple(substitute(one, replacement) for one in arguments))
         case _:
             return tree
 
@@ -36,13 +36,15 @@ def substitute(
 _PERIOD = Symbol("h", "period")
 
 
-def shifted(tree: Expression, steps: int, lag: Expression | None, *, counts: bool) -> Expression:
+def shift_expression(
+    tree: Expression, steps: int, lag: Expression | None, *, counts: bool
+) -> Expression:
     """An expression as it was some whole steps and a lag ago; `counts`: lags are in samples."""
 
     def earlier(node: Expression) -> Expression | None:
         match node:
-            case Past(name, kind, offset, own):
-                return Past(name, kind, offset + steps, in_series(own, lag))
+            case PastValue(name, kind, offset, own):
+                return PastValue(name, kind, offset + steps, add_delays(own, lag))
             case Symbol(_, "index"):
                 return Binary("-", node, back)
             case Symbol(_, "time"):
@@ -54,7 +56,7 @@ def shifted(tree: Expression, steps: int, lag: Expression | None, *, counts: boo
     return tree if steps == 0 and lag is None else substitute(tree, earlier)
 
 
-def in_series(lag: Expression | None, other: Expression | None) -> Expression | None:
+def add_delays(lag: Expression | None, other: Expression | None) -> Expression | None:
     """Two lags, one after the other."""
     if lag is None or other is None:
         return other if lag is None else lag

@@ -1,7 +1,7 @@
 """The checked expression tree of the model language: what the grammar makes and the kernels read.
 
-After checking, every name is resolved and every past value is a `Past` with its fixed offset and
-its unknown lag apart, so that code generation never looks at text.
+After checking, every name is resolved and every past value is a `PastValue` with its fixed offset
+and its unknown lag apart, so that code generation never looks at text.
 """
 
 from collections.abc import Iterator
@@ -29,7 +29,7 @@ class Symbol:
 
 
 @dataclass(frozen=True, slots=True)
-class Past:
+class PastValue:
     """The value of a state or an input, now or in the past.
 
     Attributes
@@ -48,7 +48,7 @@ class Past:
     name: str
     kind: Literal["state", "input"]
     offset: int = 0
-    lag: "Expression | None" = None
+    delay: "Expression | None" = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,26 +72,26 @@ class Binary:
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class FunctionCall:
     """A function of the table (`sysid.language.functions`) of its arguments."""
 
     function: str
     arguments: "tuple[Expression, ...]"
 
 
-Expression: TypeAlias = Number | Symbol | Past | Unary | Binary | Call
+Expression: TypeAlias = Number | Symbol | PastValue | Unary | Binary | FunctionCall
 
 
-def children(tree: Expression) -> tuple[Expression, ...]:
-    """The nodes right below the root of a tree, in the order of the text; of `Past`, its lag."""
+def find_children(tree: Expression) -> tuple[Expression, ...]:
+    """The nodes right below the root of a tree, in the order of the text; of `PastValue`, its lag."""
     match tree:
-        case Past(lag=lag):
+        case PastValue(delay=lag):
             return () if lag is None else (lag,)
         case Unary(_, operand):
             return (operand,)
         case Binary(_, left, right):
             return (left, right)
-        case Call(_, arguments):
+        case FunctionCall(_, arguments):
             return arguments
         case _:
             return ()
@@ -100,14 +100,14 @@ def children(tree: Expression) -> tuple[Expression, ...]:
 def walk(tree: Expression) -> Iterator[Expression]:
     """Every node of a tree, the root first, then its children in the order of the text."""
     yield tree
-    for child in children(tree):
+    for child in find_children(tree):
         yield from walk(child)
 
 
 def match_plain_state(tree: Expression) -> str | None:
     """Name of the state that an expression is; None where it is anything else."""
     match tree:
-        case Past(name, "state", 0, None):
+        case PastValue(name, "state", 0, None):
             return name
         case _:
             return None

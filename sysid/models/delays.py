@@ -8,19 +8,21 @@ from collections.abc import Mapping, Sequence
 from sysid.core.errors import Fault, InvalidSettings, RecordTooShort
 from sysid.core.types import Interval
 from sysid.core.units import format_unit
-from sysid.language.delays import past_values
-from sysid.language.intervals import bounds
-from sysid.language.printer import text
-from sysid.language.tree import Past
-from sysid.models.model import Model, initial_parameters
-from sysid.models.parameters import Parameter, override
-from sysid.models.sections import interval
-from sysid.models.ties import names_in, tied_model, ties_of
+from sysid.language.delays import collect_past_values
+from sysid.language.intervals import bound_expression
+from sysid.language.printer import format_expression
+from sysid.language.tree import PastValue
+from sysid.models.model import Model, build_initial_parameters
+from sysid.models.parameters import Parameter, override_parameters
+from sysid.models.sections import get_interval
+from sysid.models.ties import apply_ties, collect_parameter_names, resolve_ties
 
 _HALVINGS = 60  # of a parameter's interval, in search of the largest value that a record allows
 
 
-def check_lags(model: Model, parameters: Sequence[Parameter], period: float | None = None) -> None:
+def check_delays(
+    model: Model, parameters: Sequence[Parameter], period: float | None = None
+) -> None:
     """Raise if a lag could be negative inside these bounds.
 
     Parameters
@@ -36,36 +38,38 @@ def check_lags(model: Model, parameters: Sequence[Parameter], period: float | No
     InvalidSettings
         Naming the past value and the smallest lag.
     """
-    ends = {parameter.name: interval(parameter) for parameter in parameters}
+    ends = {parameter.name: get_interval(parameter) for parameter in parameters}
     clock = "t" if model.form == "differential" else "k"
     unit = "s" if model.form == "differential" else "samples"
-    for value in past_signals(model):
-        low = bounds(value.lag, ends, period)[0] if value.lag is not None else 0.0
+    for value in list_past_values(model):
+        low = bound_expression(value.delay, ends, period)[0] if value.delay is not None else 0.0
         if low < 0:
             smallest = f"{low + value.offset:g} {unit}"
             raise InvalidSettings(
                 "/parameters",
-                f"inside these bounds the lag of {text(value, clock)} can be as small as "
+                f"inside these bounds the lag of {format_expression(value, clock)} can be as small as "
                 f"{smallest}; the model needs {value.offset} {unit} or more",
             )
 
 
-def past_signals(model: Model) -> list[Past]:
+def list_past_values(model: Model) -> list[PastValue]:
     """Every past value that an equation or an output reads."""
     trees = (*model.equations, *(output.expression for output in model.outputs))
-    return [value for tree in trees for value in past_values(tree)]
+    return [value for tree in trees for value in collect_past_values(tree)]
 
 
-def longest_lag(
-    model: Model, past: Past, spans: Mapping[str, Interval], step: float | None
+def compute_longest_delay(
+    model: Model, past: PastValue, spans: Mapping[str, Interval], step: float | None
 ) -> float:
     """How far (s) a past value may lie back inside these bounds; `step`: of the integration, s."""
-    back = past.offset + (0.0 if past.lag is None else bounds(past.lag, spans, step)[1])
+    back = past.offset + (
+        0.0 if past.delay is None else bound_expression(past.delay, spans, step)[1]
+    )
     return back if model.form == "differential" else back * (step or 0.0)
 
 
-def check_length(
-    model: Model, past: Past, spans: Mapping[str, Interval], step: float, duration: float
+def check_record_length(
+    model: Model, past: PastValue, spans: Mapping[str, Interval], step: float, duration: float
 ) -> None:
     """Raise if a past value may lie as far back as a record lasts.
 
@@ -82,17 +86,19 @@ def check_length(
         Naming the parameters that the lag is made of, their bounds, and what would be short
         enough.
     """
-    longest = longest_lag(model, past, spans, step)
+    longest = compute_longest_delay(model, past, spans, step)
     if longest < duration:
         return
-    names = sorted(names_in(past.lag) & set(spans)) if past.lag is not None else []
+    names = (
+        sorted(collect_parameter_names(past.delay) & set(spans)) if past.delay is not None else []
+    )
     units = {parameter.name: parameter.unit for parameter in model.parameters}
-    told = [_told(name, spans[name], units.get(name, "1")) for name in names]
+    told = [_describe_bound(name, spans[name], units.get(name, "1")) for name in names]
     cure = "a longer record"
     if len(names) == 1:
-        most = _largest(model, past, spans, step, duration)
+        most = _find_largest_value(model, past, spans, step, duration)
         unit = format_unit(units.get(names[0], "1"))
-        end = names[0] if _is_known(spans[names[0]]) else f"upper bound of {names[0]}"
+        end = names[0] if _is_fixed(spans[names[0]]) else f"upper bound of {names[0]}"
         cure += "" if most is None else f", or a smaller {end}: below {most:.4g}{unit}"
     elif names:
         cure += ", or smaller ones"
@@ -100,25 +106,25 @@ def check_length(
     raise RecordTooShort(duration, longest, what, " and ".join(told), cure)
 
 
-def _told(name: str, span: Interval, unit: str) -> str:
+def _describe_bound(name: str, span: Interval, unit: str) -> str:
     value = f"{span[1]:.6g}{format_unit(unit)}"
-    return f"{name} is {value}" if _is_known(span) else f"the upper bound of {name} is {value}"
+    return f"{name} is {value}" if _is_fixed(span) else f"the upper bound of {name} is {value}"
 
 
-def _is_known(span: Interval) -> bool:
+def _is_fixed(span: Interval) -> bool:
     return span[0] == span[1]
 
 
-def _largest(
-    model: Model, past: Past, spans: Mapping[str, Interval], step: float, duration: float
+def _find_largest_value(
+    model: Model, past: PastValue, spans: Mapping[str, Interval], step: float, duration: float
 ) -> float | None:
     """The largest value of the lag's only parameter that the record allows; None: there is none."""
-    [name] = names_in(past.lag) & set(spans) if past.lag is not None else []
+    [name] = collect_parameter_names(past.delay) & set(spans) if past.delay is not None else []
     lower, upper = spans[name]
-    start = min(lower, 0.0) if _is_known(spans[name]) else lower
+    start = min(lower, 0.0) if _is_fixed(spans[name]) else lower
 
     def fits(value: float) -> bool:
-        return longest_lag(model, past, {**spans, name: (start, value)}, step) < duration
+        return compute_longest_delay(model, past, {**spans, name: (start, value)}, step) < duration
 
     if not fits(start):
         return None
@@ -129,7 +135,7 @@ def _largest(
     return high
 
 
-def unused(
+def find_unused_settings(
     model: Model, parameters: Sequence[Parameter], weights: Mapping[str, float] | None
 ) -> list[Fault]:
     """Free parameters that no equation reads, and a weight beside which there is no other output.
@@ -142,7 +148,7 @@ def unused(
         The model's own, as they are sought.
     """
     trees = (*model.equations, *(output.expression for output in model.outputs))
-    read = {name for tree in trees for name in names_in(tree)}
+    read = {name for tree in trees for name in collect_parameter_names(tree)}
     where = "no term" if model.form == "polynomial" else "no equation and no output"
     found = [
         Fault(
@@ -163,7 +169,7 @@ def unused(
     return found
 
 
-def check_used(
+def check_unused_settings(
     model: Model,
     experiments: int,
     changes: Mapping[str, Mapping[str, object]] | None,
@@ -176,9 +182,9 @@ def check_used(
     InvalidSettings, InvalidBounds
         With its pointer; also if the changes of parameters cannot be used.
     """
-    everything = override(
-        (*model.parameters, *initial_parameters(model, experiments)), dict(changes or {})
+    everything = override_parameters(
+        (*model.parameters, *build_initial_parameters(model, experiments)), dict(changes or {})
     )
-    tied = tied_model(model, ties_of(model, everything))
-    for fault in unused(tied, everything[: len(model.parameters)], weights):
+    tied = apply_ties(model, resolve_ties(model, everything))
+    for fault in find_unused_settings(tied, everything[: len(model.parameters)], weights):
         raise InvalidSettings(fault.pointer, fault.detail)

@@ -10,12 +10,12 @@ from typing import Any, NoReturn
 
 import yaml
 
-from sysid.core.errors import Fault, InvalidModel, join_pointer, nearest
+from sysid.core.errors import Fault, InvalidModel, join_pointer, suggest_name
 
-MAX_CHARACTERS = 262_144
+MAX_DOCUMENT_CHARACTERS = 262_144
 _MAX_DEPTH = 20
 
-_TRUTH = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
+_BOOLEAN = re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$")
 _FLOAT = re.compile(
     r"^(?:[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?[0-9]+[eE][-+]?[0-9]+"
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
@@ -24,7 +24,7 @@ _INTEGER = re.compile(r"^[-+]?[0-9]{1,300}$")
 _NULL = re.compile(r"^(?:~|null|Null|NULL|)$")
 
 
-class _Loader(yaml.SafeLoader):
+class _YamlLoader(yaml.SafeLoader):
     """The safe loader without aliases (a small text could stand for a huge document).
 
     Its numbers are those of YAML 1.2: ``1e-3`` is a number, and ``on``, ``no`` and ``12:30`` are
@@ -37,11 +37,11 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         if isinstance(event, yaml.events.AliasEvent):
-            _refuse("aliases are not allowed; write the value again", event)
+            _reject_node("aliases are not allowed; write the value again", event)
         if getattr(event, "tag", None) not in (None, "!"):
-            _refuse(f"the tag {event.tag[:60]!r} is not allowed; write plain data", event)
+            _reject_node(f"the tag {event.tag[:60]!r} is not allowed; write plain data", event)
         if self._depth >= _MAX_DEPTH:
-            _refuse(f"nested deeper than {_MAX_DEPTH} levels", event)
+            _reject_node(f"nested deeper than {_MAX_DEPTH} levels", event)
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
@@ -52,30 +52,30 @@ class _Loader(yaml.SafeLoader):
         for key, _ in node.value:
             if isinstance(key.value, str):
                 if key.value in seen:
-                    _refuse(f"{key.value!r} is given twice", key)
+                    _reject_node(f"{key.value!r} is given twice", key)
                 seen.add(key.value)
         return super().construct_mapping(node, deep=deep)
 
 
-def _refuse(detail: str, where: Any) -> NoReturn:
+def _reject_node(detail: str, where: Any) -> NoReturn:
     raise yaml.composer.ComposerError(None, None, detail, where.start_mark)
 
 
-def _integer(loader: Any, node: Any) -> int:
+def _construct_integer(loader: Any, node: Any) -> int:
     return int(loader.construct_scalar(node))  # 010 is ten, as in YAML 1.2
 
 
 for _tag, _pattern, _first in (
-    ("bool", _TRUTH, "tTfF"),
+    ("bool", _BOOLEAN, "tTfF"),
     ("int", _INTEGER, "-+0123456789"),
     ("float", _FLOAT, "-+0123456789."),
     ("null", _NULL, ["~", "n", "N", ""]),
 ):
-    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", _pattern, list(_first))
-_Loader.add_constructor("tag:yaml.org,2002:int", _integer)
+    _YamlLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", _pattern, list(_first))
+_YamlLoader.add_constructor("tag:yaml.org,2002:int", _construct_integer)
 
 
-def read_yaml(text: str) -> Any:
+def parse_yaml(text: str) -> Any:
     """The data of a YAML text (JSON is YAML, too).
 
     Raises
@@ -83,16 +83,16 @@ def read_yaml(text: str) -> Any:
     InvalidModel
         In one line, with the line and column where reading stopped.
     """
-    if len(text) > MAX_CHARACTERS:
-        detail = f"the document has {len(text)} characters; at most {MAX_CHARACTERS} are allowed"
+    if len(text) > MAX_DOCUMENT_CHARACTERS:
+        detail = f"the document has {len(text)} characters; at most {MAX_DOCUMENT_CHARACTERS} are allowed"
         raise InvalidModel([Fault("", detail)])
     try:
-        return yaml.load(text, Loader=_Loader)
+        return yaml.load(text, Loader=_YamlLoader)
     except yaml.YAMLError as error:
-        raise InvalidModel([Fault("", _told(error))]) from None
+        raise InvalidModel([Fault("", _describe_yaml_error(error))]) from None
 
 
-def _told(error: yaml.YAMLError) -> str:
+def _describe_yaml_error(error: yaml.YAMLError) -> str:
     mark = getattr(error, "problem_mark", None)
     problem = str(getattr(error, "problem", None) or getattr(error, "reason", "unreadable"))
     if problem.startswith("but "):
@@ -103,36 +103,38 @@ def _told(error: yaml.YAMLError) -> str:
     return f"the YAML cannot be read: {place}{' '.join(problem.split())}"
 
 
-_SHORT = Repr()
-_SHORT.maxlevel, _SHORT.maxdict, _SHORT.maxlist = 2, 3, 3
-_SHORT.maxstring, _SHORT.maxother = 60, 60
+_SHORT_REPR = Repr()
+_SHORT_REPR.maxlevel, _SHORT_REPR.maxdict, _SHORT_REPR.maxlist = 2, 3, 3
+_SHORT_REPR.maxstring, _SHORT_REPR.maxother = 60, 60
 
 
-def shown(value: object) -> str:
+def quote_value(value: object) -> str:
     """A value as messages quote it: short, whatever was sent."""
-    return _SHORT.repr(value)
+    return _SHORT_REPR.repr(value)
 
 
-def _printable(text: str) -> str:
+def _replace_unprintable(text: str) -> str:
     """The text in one line: a name that was sent may hold anything."""
     return "".join(one if one.isprintable() else "�" for one in text)
 
 
-class Reader:
+class DocumentReader:
     """Takes values from a document and keeps every fault. Each method gives a usable default."""
 
     def __init__(self) -> None:
         self._faults: list[Fault] = []
 
-    def fault(self, place: str, detail: str, column: int | None = None) -> None:
+    def add_fault(self, place: str, detail: str, column: int | None = None) -> None:
         """Note something wrong."""
-        self._faults.append(Fault(_printable(place), _printable(detail), column))
+        self._faults.append(
+            Fault(_replace_unprintable(place), _replace_unprintable(detail), column)
+        )
 
-    def count(self) -> int:
+    def count_faults(self) -> int:
         """Faults so far."""
         return len(self._faults)
 
-    def finish(self) -> None:
+    def raise_faults(self) -> None:
         """Stop here if anything was wrong.
 
         Raises
@@ -143,7 +145,7 @@ class Reader:
         if self._faults:
             raise InvalidModel(self._faults)
 
-    def section(
+    def read_section(
         self, value: object, place: str, known: Iterable[str] | None = None, most: int = 256
     ) -> dict[str, Any]:
         """A mapping of names; None is an empty one.
@@ -161,10 +163,10 @@ class Reader:
         if value is None:
             return {}
         if not isinstance(value, Mapping):
-            self.fault(place, f"{shown(value)} is not a mapping of names to values")
+            self.add_fault(place, f"{quote_value(value)} is not a mapping of names to values")
             return {}
         if len(value) > most:
-            self.fault(place, f"has {len(value)} entries; at most {most} are allowed")
+            self.add_fault(place, f"has {len(value)} entries; at most {most} are allowed")
             return {}
         names = tuple(known) if known is not None else None
         fields: dict[str, Any] = {}
@@ -173,70 +175,78 @@ class Reader:
                 # YAML takes {lower: 0,2} for lower: 0 and a key 2 without a value
                 comma = item is None and isinstance(key, int) and not isinstance(key, bool)
                 meant = f", or write 0.{key} where 0,{key} was meant" if comma else ""
-                self.fault(place, f"the key {shown(key)} is not a text; put it in quotes{meant}")
+                self.add_fault(
+                    place, f"the key {quote_value(key)} is not a text; put it in quotes{meant}"
+                )
             elif names is not None and key not in names:
-                self.fault(place + join_pointer(key[:80]), f"unknown field{nearest(key, names)}")
+                self.add_fault(
+                    place + join_pointer(key[:80]), f"unknown field{suggest_name(key, names)}"
+                )
             else:
                 fields[key] = item
         return fields
 
-    def required(self, fields: Mapping[str, Any], name: str, place: str, what: str) -> Any:
+    def require_field(self, fields: Mapping[str, Any], name: str, place: str, what: str) -> Any:
         """A field that must be there; None if it is not."""
         if fields.get(name) is None:
-            self.fault(place + join_pointer(name), f"is missing; {what}")
+            self.add_fault(place + join_pointer(name), f"is missing; {what}")
         return fields.get(name)
 
-    def number(self, value: object, place: str, default: float = 0.0) -> float:
+    def read_number(self, value: object, place: str, default: float = 0.0) -> float:
         """A finite number."""
         if isinstance(value, bool) or not isinstance(value, int | float):
-            self.fault(place, f"{shown(value)} is not a number")
+            self.add_fault(place, f"{quote_value(value)} is not a number")
             return default
         if not -1e300 < value < 1e300:
-            self.fault(place, f"{shown(value)} is not a finite number")
+            self.add_fault(place, f"{quote_value(value)} is not a finite number")
             return default
         return float(value)
 
-    def whole(self, value: object, place: str, low: int, high: int) -> int:
+    def read_whole_number(self, value: object, place: str, low: int, high: int) -> int:
         """A whole number between two."""
-        found = self.number(value, place, float(low)) if not isinstance(value, int) else value
+        found = self.read_number(value, place, float(low)) if not isinstance(value, int) else value
         if isinstance(found, bool) or found != int(found) or not low <= found <= high:
-            self.fault(place, f"{shown(value)} is not a whole number from {low} to {high}")
+            self.add_fault(
+                place, f"{quote_value(value)} is not a whole number from {low} to {high}"
+            )
             return low
         return int(found)
 
-    def text(self, value: object, place: str, default: str = "", most: int = 4000) -> str:
+    def read_text(self, value: object, place: str, default: str = "", most: int = 4000) -> str:
         """A text; None is the default."""
         if value is None:
             return default
         if not isinstance(value, str):
-            self.fault(place, f"{shown(value)} is not a text")
+            self.add_fault(place, f"{quote_value(value)} is not a text")
             return default
         if len(value) > most:
-            self.fault(place, f"has {len(value)} characters; at most {most} are allowed")
+            self.add_fault(place, f"has {len(value)} characters; at most {most} are allowed")
             return default
         return " ".join(value.split())
 
-    def unit(self, value: object, place: str) -> str:
+    def read_unit(self, value: object, place: str) -> str:
         """A unit symbol; ``1`` for none."""
         if value is None or (value == 1 and not isinstance(value, bool)):
             return "1"
-        return self.text(value, place, "1", 40) or "1"
+        return self.read_text(value, place, "1", 40) or "1"
 
-    def choice(self, value: object, options: tuple[str, ...], place: str) -> str:
+    def read_choice(self, value: object, options: tuple[str, ...], place: str) -> str:
         """One of some words; the first if it is none of them."""
         if isinstance(value, str) and value in options:
             return value
         quoted = ", ".join(repr(option) for option in options)
-        hint = nearest(value, options) if isinstance(value, str) else ""
+        hint = suggest_name(value, options) if isinstance(value, str) else ""
         hint = hint if hint.startswith("; did") else ""
-        self.fault(place, f"{shown(value)} is not one of {quoted}{hint}")
+        self.add_fault(place, f"{quote_value(value)} is not one of {quoted}{hint}")
         return options[0]
 
-    def expression(self, value: object, place: str) -> str:
+    def read_expression(self, value: object, place: str) -> str:
         """The text of an expression; a bare number is one, too."""
         if isinstance(value, int | float) and not isinstance(value, bool):
-            return repr(self.number(value, place))
+            return repr(self.read_number(value, place))
         if not isinstance(value, str):
-            self.fault(place, f"{shown(value)} is not an expression; write a text such as 'a*x'")
+            self.add_fault(
+                place, f"{quote_value(value)} is not an expression; write a text such as 'a*x'"
+            )
             return "0"
         return value

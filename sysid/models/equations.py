@@ -3,14 +3,14 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from sysid.core.errors import join_pointer, nearest
-from sysid.language.checker import Checked, check
-from sysid.language.delays import past_values
-from sysid.language.intervals import bounds
+from sysid.core.errors import join_pointer, suggest_name
+from sysid.language.checker import CheckedExpression, check_expression
+from sysid.language.delays import collect_past_values
+from sysid.language.intervals import bound_expression
 from sysid.language.scope import Scope
-from sysid.language.tree import Expression, Number, Past
-from sysid.models.documents import Reader
-from sysid.models.model import Output, Quantity
+from sysid.language.tree import Expression, Number, PastValue
+from sysid.models.documents import DocumentReader
+from sysid.models.model import ModelSignal, Output
 from sysid.models.sections import MAX_EQUATIONS
 
 _ZERO = Number(0.0)
@@ -23,63 +23,71 @@ class OutputText(NamedTuple):
     unit: str | None
 
 
-def equations(
-    reader: Reader, value: object, scope: Scope
+def read_equations(
+    reader: DocumentReader, value: object, scope: Scope
 ) -> tuple[dict[str, str], tuple[Expression, ...]]:
     """Texts, and one tree per state in the states' order."""
-    fields = reader.section(value, "/equations", most=MAX_EQUATIONS)
+    fields = reader.read_section(value, "/equations", most=MAX_EQUATIONS)
     for name in fields:
         if name not in scope.states:
-            detail = f"there is no such state{nearest(name, scope.states)}"
-            reader.fault(join_pointer("equations", name), detail)
+            detail = f"there is no such state{suggest_name(name, scope.states)}"
+            reader.add_fault(join_pointer("equations", name), detail)
     texts, trees = {}, []
     for state in scope.states:
         place = join_pointer("equations", state)
         if fields.get(state) is None:
-            reader.fault(place, f"is missing; every state needs its equation, {_form(scope)}")
+            reader.add_fault(
+                place, f"is missing; every state needs its equation, {_describe_form(scope)}"
+            )
             continue
-        texts[state] = reader.expression(fields[state], place)
-        found = check(texts[state], scope)
-        note(reader, found, place)
-        _fault_own_present(reader, found, state, scope)
+        texts[state] = reader.read_expression(fields[state], place)
+        found = check_expression(texts[state], scope)
+        add_faults(reader, found, place)
+        _check_own_present(reader, found, state, scope)
         trees.append(found.tree or _ZERO)
     return texts, tuple(trees)
 
 
-def note(reader: Reader, found: Checked, place: str) -> None:
+def add_faults(reader: DocumentReader, found: CheckedExpression, place: str) -> None:
     """Hand the faults of a text to the reader."""
     for column, detail in found.faults:
-        reader.fault(place, detail, column)
+        reader.add_fault(place, detail, column)
 
 
-def outputs(
-    reader: Reader, value: object, scope: Scope, states: Sequence[Quantity]
+def read_outputs(
+    reader: DocumentReader, value: object, scope: Scope, states: Sequence[ModelSignal]
 ) -> tuple[tuple[str, ...], tuple[Output, ...]]:
     """Texts, and the outputs. One that is just a state has the state's unit."""
-    fields = reader.section(value, "/outputs", most=MAX_EQUATIONS)
+    fields = reader.read_section(value, "/outputs", most=MAX_EQUATIONS)
     if not fields:
-        reader.fault("/outputs", "is missing; name the measured channel, such as {y: x}")
+        reader.add_fault("/outputs", "is missing; name the measured channel, such as {y: x}")
     units = {state.name: state.unit for state in states}
     texts, found = [], []
     for name, entry in fields.items():
         place = join_pointer("outputs", name)
-        written = _output_text(reader, entry, place)
+        written = _read_output_text(reader, entry, place)
         at = place + "/expression" if isinstance(entry, Mapping) else place
-        checked = check(written.expression, scope)
-        note(reader, checked, at)
+        checked = check_expression(written.expression, scope)
+        add_faults(reader, checked, at)
         tree = checked.tree or _ZERO
-        own = units.get(tree.name) if isinstance(tree, Past) else None
+        own = units.get(tree.name) if isinstance(tree, PastValue) else None
         texts.append(written.expression)
         found.append(Output(name, tree, written.unit or own or "1"))
     return tuple(texts), tuple(found)
 
 
-def order(reader: Reader, trees: Sequence[Expression], scope: Scope) -> tuple[int, ...]:
+def order_states(
+    reader: DocumentReader, trees: Sequence[Expression], scope: Scope
+) -> tuple[int, ...]:
     """Indices of the states, each after those whose present value it uses."""
     if scope.form == "differential":
         return tuple(range(len(trees)))
     needs = {
-        number: {scope.states.index(v.name) for v in past_values(tree) if _is_present(v, scope)}
+        number: {
+            scope.states.index(v.name)
+            for v in collect_past_values(tree)
+            if _may_read_present(v, scope)
+        }
         for number, tree in enumerate(trees)
     }
     done: list[int] = []
@@ -88,46 +96,48 @@ def order(reader: Reader, trees: Sequence[Expression], scope: Scope) -> tuple[in
         if not ready:
             circle = ", ".join(scope.states[n] for n in needs if n not in done)
             detail = f"the present values of {circle} depend on each other; use (k-1) in one"
-            reader.fault("/equations", detail)
+            reader.add_fault("/equations", detail)
             return tuple(range(len(trees)))
         done.append(ready[0])
     return tuple(done)
 
 
-def memory(trees: Sequence[Expression]) -> int:
+def compute_memory(trees: Sequence[Expression]) -> int:
     """Largest fixed offset of any past value, in samples."""
-    return max((value.offset for tree in trees for value in past_values(tree)), default=0)
+    return max((value.offset for tree in trees for value in collect_past_values(tree)), default=0)
 
 
-def _form(scope: Scope) -> str:
+def _describe_form(scope: Scope) -> str:
     return "x(k) = …" if scope.form == "difference" else "dx/dt = …"
 
 
-def _is_present(value: Past, scope: Scope) -> bool:
+def _may_read_present(value: PastValue, scope: Scope) -> bool:
     """Whether a state's value may touch the sample that is being computed."""
     if value.kind == "input" or value.offset > 0:
         return False
-    return value.lag is None or bounds(value.lag, scope.parameters)[0] < 1
+    return value.delay is None or bound_expression(value.delay, scope.parameters)[0] < 1
 
 
-def _fault_own_present(reader: Reader, found: Checked, state: str, scope: Scope) -> None:
+def _check_own_present(
+    reader: DocumentReader, found: CheckedExpression, state: str, scope: Scope
+) -> None:
     if scope.form == "differential" or found.tree is None:
         return
     for value, column in found.uses:
-        if value.name == state and _is_present(value, scope):
-            what = "is" if value.lag is None else "may reach"
+        if value.name == state and _may_read_present(value, scope):
+            what = "is" if value.delay is None else "may reach"
             detail = (
                 f"this {what} the present {state}(k), which the equation is to give; "
                 f"write {state}(k-1…), or bounds that keep the lag at one sample or more"
             )
-            reader.fault(join_pointer("equations", state), detail, column)
+            reader.add_fault(join_pointer("equations", state), detail, column)
 
 
-def _output_text(reader: Reader, entry: object, place: str) -> OutputText:
+def _read_output_text(reader: DocumentReader, entry: object, place: str) -> OutputText:
     if not isinstance(entry, Mapping):
-        return OutputText(reader.expression(entry, place), None)
-    fields = reader.section(entry, place, ("expression", "unit"))
-    reader.required(fields, "expression", place, "say what is measured, such as x")
-    expression = reader.expression(fields.get("expression", "0"), place + "/expression")
+        return OutputText(reader.read_expression(entry, place), None)
+    fields = reader.read_section(entry, place, ("expression", "unit"))
+    reader.require_field(fields, "expression", place, "say what is measured, such as x")
+    expression = reader.read_expression(fields.get("expression", "0"), place + "/expression")
     unit = fields.get("unit")
-    return OutputText(expression, None if unit is None else reader.unit(unit, place + "/unit"))
+    return OutputText(expression, None if unit is None else reader.read_unit(unit, place + "/unit"))

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-from sysid.language.printer import text
-from sysid.language.tree import Expression, Past
+from sysid.language.printer import format_expression
+from sysid.language.tree import Expression, PastValue
 from sysid.models.parameters import Parameter
 
 Criterion = Literal["none", "bic"]
@@ -20,20 +20,20 @@ ErrorKind = Literal["one-step", "simulation"]
 class Term(NamedTuple):
     """A product of past values; the empty one is the constant 1."""
 
-    factors: tuple[Past, ...]
+    factors: tuple[PastValue, ...]
 
     @property
     def label(self) -> str:
         """Text of the product, such as ``y(k-1)**2*u(k-1-dk)``."""
         if not self.factors:
             return "1"
-        powers = {text(factor).replace(" ", ""): 0 for factor in self.factors}
+        powers = {format_expression(factor).replace(" ", ""): 0 for factor in self.factors}
         for factor in self.factors:
-            powers[text(factor).replace(" ", "")] += 1
+            powers[format_expression(factor).replace(" ", "")] += 1
         return "*".join(f"{name}**{n}" if n > 1 else name for name, n in powers.items())
 
     @property
-    def coefficient(self) -> str:
+    def coefficient_name(self) -> str:
         """Name of the term's coefficient: ``a[y(k-1)*u(k-1)]``."""
         return f"a[{self.label}]"
 
@@ -102,14 +102,14 @@ class Selection:
     samples: int = 0
 
 
-Form = Literal["difference", "differential", "polynomial"]
-Method = Literal["rk4", "euler", "semi-implicit"]
-History = Literal["constant", "zero"]
-Interpolation = Literal["linear", "cubic", "nearest"]
+ModelForm = Literal["difference", "differential", "polynomial"]
+SolverMethod = Literal["rk4", "euler", "semi-implicit"]
+HistoryKind = Literal["constant", "zero"]
+InterpolationKind = Literal["linear", "cubic", "nearest"]
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class ModelSignal:
     """A named signal and its unit (``"1"`` if it has none)."""
 
     name: str
@@ -149,7 +149,7 @@ class MeasuredInitial:
     """
 
 
-Initial = FixedInitial | EstimatedInitial | MeasuredInitial
+InitialState = FixedInitial | EstimatedInitial | MeasuredInitial
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,11 +171,11 @@ class Solver:
         How a value between two grid points is read.
     """
 
-    method: Method = "rk4"
+    method: SolverMethod = "rk4"
     step: float | None = None
     substeps: int = 1
-    history: History = "constant"
-    interpolation: Interpolation = "linear"
+    history: HistoryKind = "constant"
+    interpolation: InterpolationKind = "linear"
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,19 +190,19 @@ class Model:
     `document` is the normal form, from which the model can be built again.
 
     Of a polynomial, `terms` are its terms, in the order of their coefficients. With a `rule` they
-    are candidates only: `sysid.selection.select.selected` resolves it on records, and what it has
-    found is the resolved model's `selection`.
+    are candidates only: `sysid.selection.select.select_model_terms` resolves it on records, and
+    what it has found is the resolved model's `selection`.
     """
 
     name: str
     title: str
-    form: Form
-    inputs: tuple[Quantity, ...]
-    states: tuple[Quantity, ...]
+    form: ModelForm
+    inputs: tuple[ModelSignal, ...]
+    states: tuple[ModelSignal, ...]
     outputs: tuple[Output, ...]
     parameters: tuple[Parameter, ...]
     equations: tuple[Expression, ...]
-    initial: tuple[Initial, ...]
+    initial: tuple[InitialState, ...]
     order: tuple[int, ...]
     memory: int
     solver: Solver
@@ -212,15 +212,15 @@ class Model:
     selection: Selection | None = field(default=None, compare=False)
 
 
-def initial_name(state: str, experiment: int) -> str:
+def name_initial_state(state: str, experiment: int) -> str:
     """Name of an estimated initial state: ``x(0)``, in the second experiment ``x(0)[2]``."""
     return f"{state}(0)" if experiment == 0 else f"{state}(0)[{experiment + 1}]"
 
 
-def initial_parameters(model: Model, experiments: int) -> tuple[Parameter, ...]:
+def build_initial_parameters(model: Model, experiments: int) -> tuple[Parameter, ...]:
     """The initial states to be estimated, for each experiment on its own."""
     return tuple(
-        Parameter(initial_name(state.name, e), start.lower, start.upper, state.unit)
+        Parameter(name_initial_state(state.name, e), start.lower, start.upper, state.unit)
         for e in range(experiments)
         for state, start in zip(model.states, model.initial, strict=True)
         if isinstance(start, EstimatedInitial)

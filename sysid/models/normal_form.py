@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sysid.models.model import EstimatedInitial, FixedInitial, Initial, Model, Output
+from sysid.models.model import EstimatedInitial, FixedInitial, InitialState, Model, Output
 from sysid.models.parameters import Parameter
 
-_TEXTS = ("description", "source")
+_TEXT_FIELDS = ("description", "source")
 
 
-def normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
+def to_normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
     """Document from which the same model is built; it is its own normal form.
 
     Parameters
@@ -20,77 +20,81 @@ def normal_form(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
         What it describes.
     """
     head: dict[str, Any] = {"name": model.name, "title": model.title}
-    for key in _TEXTS:
+    for key in _TEXT_FIELDS:
         if fields.get(key):
             head[key] = " ".join(fields[key].split())
     head["form"] = model.form
     head["inputs"] = {signal.name: signal.unit for signal in model.inputs}
-    body = _polynomial(fields, model) if model.form == "polynomial" else _equations(fields, model)
+    body = (
+        _write_polynomial(fields, model)
+        if model.form == "polynomial"
+        else _write_equations(fields, model)
+    )
     declared = fields.get("parameters") or {}
     return {
         **head,
         **body,
         "parameters": {
-            p.name: _parameter(p, declared) for p in model.parameters if p.name in declared
+            p.name: _write_parameter(p, declared) for p in model.parameters if p.name in declared
         },
         "constants": {k: float(v) for k, v in (fields.get("constants") or {}).items()},
         "initial": {
-            state.name: _initial(start)
+            state.name: _write_initial_state(start)
             for state, start in zip(model.states, model.initial, strict=True)
         },
-        "solver": _solver(model),
+        "solver": _write_solver(model),
     }
 
 
-def _equations(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
+def _write_equations(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
     return {
         "states": {state.name: state.unit for state in model.states},
-        "equations": {s.name: _text(fields["equations"][s.name]) for s in model.states},
-        "outputs": {o.name: _output(o, fields["outputs"][o.name]) for o in model.outputs},
+        "equations": {s.name: _write_text(fields["equations"][s.name]) for s in model.states},
+        "outputs": {o.name: _write_output(o, fields["outputs"][o.name]) for o in model.outputs},
     }
 
 
-def _polynomial(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
+def _write_polynomial(fields: Mapping[str, Any], model: Model) -> dict[str, Any]:
     [state] = model.states
     body: dict[str, Any] = {"output": {state.name: state.unit}}
     if fields.get("degree") is not None:
         body["degree"] = int(fields["degree"])
     if fields.get("lags") is not None:
-        body["lags"] = {k: [_text(one) for one in v] for k, v in fields["lags"].items()}
-    body["coefficients"] = {k: _value(v) for k, v in fields["coefficients"].items()}
+        body["lags"] = {k: [_write_text(one) for one in v] for k, v in fields["lags"].items()}
+    body["coefficients"] = {k: _write_value(v) for k, v in fields["coefficients"].items()}
     body["constant"] = bool(fields.get("constant", False))
-    body["terms"] = _terms(fields.get("terms", "all"), model)
+    body["terms"] = _write_terms(fields.get("terms", "all"), model)
     return body
 
 
-def _terms(written: Any, model: Model) -> object:
+def _write_terms(written: Any, model: Model) -> object:
     if model.rule is None:
-        return written if isinstance(written, str) else [_text(one) for one in written]
+        return written if isinstance(written, str) else [_write_text(one) for one in written]
     rule: dict[str, Any] = {"select": written["select"], "keep": model.rule.keep}
     if model.rule.err is not None:
         rule["err"] = model.rule.err
     candidates = written.get("candidates", "all")
-    listed = candidates if isinstance(candidates, str) else [_text(one) for one in candidates]
+    listed = candidates if isinstance(candidates, str) else [_write_text(one) for one in candidates]
     rule |= {"criterion": model.rule.criterion, "exchange": model.rule.exchange}
     rule["error"] = model.rule.error
     return {**rule, "candidates": listed}
 
 
-def _text(written: object) -> str:
+def _write_text(written: object) -> str:
     return " ".join(written.split()) if isinstance(written, str) else repr(written)
 
 
-def _value(written: object) -> object:
+def _write_value(written: object) -> object:
     is_number = isinstance(written, int | float) and not isinstance(written, bool)
     return float(written) if is_number else written  # type: ignore[arg-type]
 
 
-def _output(output: Output, written: Any) -> dict[str, str]:
+def _write_output(output: Output, written: Any) -> dict[str, str]:
     text = written["expression"] if isinstance(written, Mapping) else written
-    return {"expression": _text(text), "unit": output.unit}
+    return {"expression": _write_text(text), "unit": output.unit}
 
 
-def _parameter(parameter: Parameter, declared: Mapping[str, Any]) -> dict[str, Any]:
+def _write_parameter(parameter: Parameter, declared: Mapping[str, Any]) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "lower": parameter.lower,
         "upper": parameter.upper,
@@ -100,13 +104,13 @@ def _parameter(parameter: Parameter, declared: Mapping[str, Any]) -> dict[str, A
     if parameter.fixed is not None:
         entry["fixed"] = parameter.fixed
     if parameter.tied is not None:
-        entry["tied"] = _text(parameter.tied)
+        entry["tied"] = _write_text(parameter.tied)
     if description := declared[parameter.name].get("description"):
         entry["description"] = " ".join(description.split())
     return entry
 
 
-def _initial(start: Initial) -> object:
+def _write_initial_state(start: InitialState) -> object:
     if isinstance(start, FixedInitial):
         return start.value
     if isinstance(start, EstimatedInitial):
@@ -114,7 +118,7 @@ def _initial(start: Initial) -> object:
     return "measured"
 
 
-def _solver(model: Model) -> dict[str, Any]:
+def _write_solver(model: Model) -> dict[str, Any]:
     solver = model.solver
     past = {"history": solver.history, "interpolation": solver.interpolation}
     if model.form == "polynomial":

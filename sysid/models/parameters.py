@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from math import isfinite
 from typing import Any, Literal
 
-from sysid.core.errors import InvalidBounds, InvalidSettings, nearest
+from sysid.core.errors import InvalidBounds, InvalidSettings, suggest_name
 
-Scale = Literal["linear", "log"]
+ParameterScale = Literal["linear", "log"]
 
-_START = re.compile(r"(\w+)\(0\)(?:\[\d+\])?")
+_INITIAL_STATE_NAME = re.compile(r"(\w+)\(0\)(?:\[\d+\])?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Parameter:
     lower: float
     upper: float
     unit: str = "1"
-    scale: Scale = "linear"
+    scale: ParameterScale = "linear"
     fixed: float | None = None
     tied: str | None = None
 
@@ -63,10 +63,10 @@ class Parameter:
         return self.fixed is None and self.tied is None
 
 
-_FIELDS = ("lower", "upper", "scale", "fixed", "tied")
+_CHANGEABLE_FIELDS = ("lower", "upper", "scale", "fixed", "tied")
 
 
-def override(
+def override_parameters(
     parameters: tuple[Parameter, ...], changes: Mapping[str, Mapping[str, Any]]
 ) -> tuple[Parameter, ...]:
     """Parameters with some bounds, scales, fixed values or ties replaced.
@@ -85,7 +85,8 @@ def override(
     for name, fields in changes.items():
         if name not in known:
             raise InvalidSettings(
-                f"/parameters/{name}", f"the model has no parameter {name!r}{_known(name, known)}"
+                f"/parameters/{name}",
+                f"the model has no parameter {name!r}{_suggest_parameter(name, known)}",
             )
         for field, value in fields.items():
             _check_field(f"/parameters/{name}/{field}", field, value)
@@ -94,14 +95,14 @@ def override(
             raise InvalidSettings(
                 f"/parameters/{name}", f"a tied parameter is not searched; leave out {others}"
             )
-    return tuple(_changed(p, changes.get(p.name, {})) for p in parameters)
+    return tuple(_change_parameter(p, changes.get(p.name, {})) for p in parameters)
 
 
-def _known(name: str, known: Set[str]) -> str:
+def _suggest_parameter(name: str, known: Set[str]) -> str:
     """What there is instead of an unknown name."""
-    start = _START.fullmatch(name)
+    start = _INITIAL_STATE_NAME.fullmatch(name)
     if start is None:
-        return nearest(name, known)
+        return suggest_name(name, known)
     state, first = start[1], f"{start[1]}(0)"
     if first in known:
         starts = sum(other == first or other.startswith(f"{first}[") for other in known)
@@ -113,8 +114,8 @@ def _known(name: str, known: Set[str]) -> str:
 
 
 def _check_field(pointer: str, field: str, value: object) -> None:
-    if field not in _FIELDS:
-        raise InvalidSettings(pointer, f"unknown field{nearest(field, _FIELDS)}")
+    if field not in _CHANGEABLE_FIELDS:
+        raise InvalidSettings(pointer, f"unknown field{suggest_name(field, _CHANGEABLE_FIELDS)}")
     if field == "tied":
         if not isinstance(value, str):
             raise InvalidSettings(pointer, f"{value!r} is not an expression, such as '2*a'")
@@ -125,7 +126,7 @@ def _check_field(pointer: str, field: str, value: object) -> None:
         raise InvalidSettings(pointer, f"{value!r} is not a number")
 
 
-def _changed(parameter: Parameter, fields: Mapping[str, Any]) -> Parameter:
+def _change_parameter(parameter: Parameter, fields: Mapping[str, Any]) -> Parameter:
     if "tied" in fields:
         return replace(parameter, tied=fields["tied"], fixed=None)
     values: dict[str, Any] = {k: v if k == "scale" else float(v) for k, v in fields.items()}

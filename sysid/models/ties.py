@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from sysid.core.errors import InvalidSettings
-from sysid.language.checker import check
+from sysid.language.checker import check_expression
 from sysid.language.delays import mentions_time
 from sysid.language.scope import Scope
 from sysid.language.transform import substitute
@@ -21,7 +21,7 @@ Ties = Mapping[str, Expression]
 """What each tied parameter is, in terms of free and fixed ones."""
 
 
-def ties_of(model: Model, parameters: Sequence[Parameter]) -> Ties:
+def resolve_ties(model: Model, parameters: Sequence[Parameter]) -> Ties:
     """The ties of a problem's parameters, resolved.
 
     Parameters
@@ -38,29 +38,31 @@ def ties_of(model: Model, parameters: Sequence[Parameter]) -> Ties:
         or leads back to its own parameter.
     """
     written = {
-        p.name: _parsed(model, parameters, p.name, p.tied) for p in parameters if p.tied is not None
+        p.name: _parse_tie(model, parameters, p.name, p.tied)
+        for p in parameters
+        if p.tied is not None
     }
     resolved: dict[str, Expression] = {}
     for name in written:
-        _resolve(name, written, resolved, ())
+        _resolve_tie(name, written, resolved, ())
     return resolved
 
 
-def tied_model(model: Model, ties: Ties) -> Model:
+def apply_ties(model: Model, ties: Ties) -> Model:
     """The model with every tied parameter replaced, in the lags of past values too."""
     if not ties:
         return model
     return replace(
         model,
-        equations=tuple(_replaced(tree, ties) for tree in model.equations),
+        equations=tuple(_substitute_ties(tree, ties) for tree in model.equations),
         outputs=tuple(
-            replace(output, expression=_replaced(output.expression, ties))
+            replace(output, expression=_substitute_ties(output.expression, ties))
             for output in model.outputs
         ),
     )
 
 
-def _replaced(tree: Expression, ties: Ties) -> Expression:
+def _substitute_ties(tree: Expression, ties: Ties) -> Expression:
     def tied(node: Expression) -> Expression | None:
         match node:
             case Symbol(name, "parameter"):
@@ -71,7 +73,7 @@ def _replaced(tree: Expression, ties: Ties) -> Expression:
     return substitute(tree, tied)
 
 
-def _parsed(model: Model, parameters: Sequence[Parameter], name: str, text: str) -> Expression:
+def _parse_tie(model: Model, parameters: Sequence[Parameter], name: str, text: str) -> Expression:
     pointer = f"/parameters/{name}/tied"
     own = {p.name for p in model.parameters}
     if name not in own:
@@ -80,7 +82,7 @@ def _parsed(model: Model, parameters: Sequence[Parameter], name: str, text: str)
         )
     others = {p.name: (p.lower, p.upper) for p in parameters if p.name in own}
     constants = {key: float(v) for key, v in model.document.get("constants", {}).items()}
-    found = check(text, Scope("differential", parameters=others, constants=constants))
+    found = check_expression(text, Scope("differential", parameters=others, constants=constants))
     if found.tree is None:
         column, detail = found.faults[0]
         raise InvalidSettings(pointer, f"column {column} of {text!r}: {detail}")
@@ -89,7 +91,7 @@ def _parsed(model: Model, parameters: Sequence[Parameter], name: str, text: str)
     return found.tree
 
 
-def _resolve(
+def _resolve_tie(
     name: str, written: Ties, resolved: dict[str, Expression], path: tuple[str, ...]
 ) -> None:
     """Put the ties that a tie names into it, theirs first."""
@@ -101,12 +103,12 @@ def _resolve(
         )
     if name in resolved:
         return
-    for other in sorted(names_in(written[name]) & set(written)):
-        _resolve(other, written, resolved, (*path, name))
-    resolved[name] = _replaced(written[name], resolved)
+    for other in sorted(collect_parameter_names(written[name]) & set(written)):
+        _resolve_tie(other, written, resolved, (*path, name))
+    resolved[name] = _substitute_ties(written[name], resolved)
 
 
-def names_in(tree: Expression) -> set[str]:
+def collect_parameter_names(tree: Expression) -> set[str]:
     """Names of the parameters in an expression, and in the lags of its past values."""
     return {
         node.name for node in walk(tree) if isinstance(node, Symbol) and node.kind == "parameter"

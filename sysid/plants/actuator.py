@@ -15,13 +15,13 @@ from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
 
-MOST_SAMPLES = 200_000
+MAX_SAMPLES = 200_000
 """Samples of one simulation at most: about ten seconds of work."""
 
-MOST_WORK = 300_000
+MAX_WORK = 300_000
 """Advances of the state in one simulation at most: about half a minute of one core."""
 
-_LONGEST = 1e-3  # s between looks for an event
+_MAX_PIECE = 1e-3  # s between looks for an event
 _HALVINGS = 50
 _THETA, _OMEGA, _P, _SUPPLY, _SLOPE, _ONE = range(6)
 
@@ -88,18 +88,18 @@ def simulate_actuator(actuator: Actuator, supply: Channel) -> Recording:
     Raises
     ------
     InvalidRecord
-        If a sample is missing, times repeat, or there are more than `MOST_SAMPLES`.
+        If a sample is missing, times repeat, or there are more than `MAX_SAMPLES`.
     InvalidSettings
-        If the simulation would take more than `MOST_WORK`, or diverges.
+        If the simulation would take more than `MAX_WORK`, or diverges.
     """
     times, values = supply.times, supply.values
-    if not 2 <= times.size <= MOST_SAMPLES:
-        raise InvalidRecord(f"found {times.size} samples; need from 2 to {MOST_SAMPLES}")
+    if not 2 <= times.size <= MAX_SAMPLES:
+        raise InvalidRecord(f"found {times.size} samples; need from 2 to {MAX_SAMPLES}")
     if not np.all(np.isfinite(values)) or np.any(np.diff(times) <= 0):
         raise InvalidRecord("the supply pressure needs a value at every time, and later times")
     _check_duration(float(times[-1]) - float(times[0]))
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told
-        found = _simulated(_Plant(actuator), supply)
+        found = _simulate_samples(_ActuatorState(actuator), supply)
     return Recording((
         Channel("P_a", times, values, "Pa", supply.hold),
         Channel("theta", times, found[:, 0].copy(), "rad"),
@@ -109,15 +109,15 @@ def simulate_actuator(actuator: Actuator, supply: Channel) -> Recording:
 
 def _check_duration(duration: float) -> None:
     """Refuse a record (s) whose pieces alone are more work than may be done."""
-    if not duration / _LONGEST <= MOST_WORK:
+    if not duration / _MAX_PIECE <= MAX_WORK:
         raise InvalidSettings(
             "/sample_time",
             f"the record lasts {duration:g} s; the actuator can be simulated for "
-            f"{MOST_WORK * _LONGEST:g} s at most: ask for fewer samples or a smaller sample_time",
+            f"{MAX_WORK * _MAX_PIECE:g} s at most: ask for fewer samples or a smaller sample_time",
         )
 
 
-def _simulated(plant: "_Plant", supply: Channel) -> FloatArray:
+def _simulate_samples(plant: "_ActuatorState", supply: Channel) -> FloatArray:
     """Angle and pressure, (samples, 2)."""
     times, values = supply.times, supply.values
     found = np.zeros((times.size, 2))
@@ -135,7 +135,7 @@ def _simulated(plant: "_Plant", supply: Channel) -> FloatArray:
     return found
 
 
-class _Plant:
+class _ActuatorState:
     """State and mode of the actuator: the way it slides (1, -1), or 0 while it sticks."""
 
     def __init__(self, actuator: Actuator) -> None:
@@ -143,44 +143,44 @@ class _Plant:
         self.state = np.zeros(6)
         self.state[_ONE] = 1.0
         self._way = 0
-        self._systems = {way: self._system(way) for way in (-1, 0, 1)}
+        self._systems = {way: self._build_system(way) for way in (-1, 0, 1)}
         self._known: dict[tuple[int, float], FloatArray] = {}
         self._work = 0
 
     def advance(self, supply: float, slope: float, time: float) -> None:
         """Go on for a time (s) in which the supply begins with a value (Pa) and slope (Pa/s)."""
         self.state[_SUPPLY], self.state[_SLOPE] = supply, slope
-        pieces = max(1, round(time / _LONGEST))
+        pieces = max(1, round(time / _MAX_PIECE))
         for _ in range(pieces):
             left = time / pieces
-            self._choose()
+            self._start_sliding()
             while left > 0:
-                left -= self._until_event(left)
+                left -= self._advance_until_event(left)
 
-    def _until_event(self, time: float) -> float:
+    def _advance_until_event(self, time: float) -> float:
         """Go on until something changes, at most for a time; gives the time that passed."""
-        after = self._after(time, keep=True)
-        if not self._is_over(after):
+        after = self._predict_state(time, keep=True)
+        if not self._has_mode_ended(after):
             self.state = after
             return time
         low, high = 0.0, time
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
-            if self._is_over(self._after(middle)):
+            if self._has_mode_ended(self._predict_state(middle)):
                 high = middle
             else:
                 low = middle
-        self.state = self._after(high)
-        self._end()
+        self.state = self._predict_state(high)
+        self._change_mode()
         return high
 
-    def _is_over(self, state: FloatArray) -> bool:
+    def _has_mode_ended(self, state: FloatArray) -> bool:
         """Whether the present mode has ended in a state that it would lead to."""
         if self._way == 0:
-            return self._breaks_away(state) != 0
+            return self._find_slide_direction(state) != 0
         return bool(state[_OMEGA] * self._way < 0 or state[_THETA] * self._way > self._a.theta_s)
 
-    def _breaks_away(self, state: FloatArray) -> int:
+    def _find_slide_direction(self, state: FloatArray) -> int:
         """The way in which an arm at rest begins to slide; 0 if it stays."""
         torque = self._a.A_m * state[_P]
         way = int(copysign(1, torque))
@@ -188,26 +188,26 @@ class _Plant:
             return 0
         return way
 
-    def _end(self) -> None:
+    def _change_mode(self) -> None:
         """At an event: come to rest, or begin to slide."""
         if self._way != 0:
             limit = self._a.theta_s
             self.state[_THETA] = min(max(self.state[_THETA], -limit), limit)
             self.state[_OMEGA] = 0.0
-        self._way = self._breaks_away(self.state)
+        self._way = self._find_slide_direction(self.state)
 
-    def _choose(self) -> None:
+    def _start_sliding(self) -> None:
         if self._way == 0:
-            self._way = self._breaks_away(self.state)
+            self._way = self._find_slide_direction(self.state)
 
-    def _after(self, time: float, keep: bool = False) -> FloatArray:
+    def _predict_state(self, time: float, keep: bool = False) -> FloatArray:
         """The state after a time in the present mode."""
         self._work += 1
-        if self._work > MOST_WORK:
+        if self._work > MAX_WORK:
             raise InvalidSettings(
                 "/samples",
                 f"the arm stops and breaks away so often that the state would be advanced more "
-                f"than {MOST_WORK} times; ask for fewer samples, or parameters nearer to its own",
+                f"than {MAX_WORK} times; ask for fewer samples, or parameters nearer to its own",
             )
         key = (self._way, time)
         matrix = self._known.get(key)
@@ -218,7 +218,7 @@ class _Plant:
         found: FloatArray = matrix @ self.state
         return found
 
-    def _system(self, way: int) -> FloatArray:
+    def _build_system(self, way: int) -> FloatArray:
         """Matrix of d/dt (theta, omega, P, supply, its slope, 1) in a mode."""
         a = self._a
         system = np.zeros((6, 6))

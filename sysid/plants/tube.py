@@ -16,31 +16,31 @@ import numpy as np
 from scipy.special import jn_zeros
 
 from sysid.core.errors import InvalidRecord, InvalidSettings
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
 
 ATMOSPHERE = 100_000.0
 """Pa; pressures of the records are above it."""
 
-GAS = 287.05  # J/kg/K, dry air
-GAMMA = 1.4
+GAS_CONSTANT = 287.05  # J/kg/K, dry air
+HEAT_CAPACITY_RATIO = 1.4
 VISCOSITY = 1.82e-5  # Pa·s
 PRANDTL = 0.71
 
-MOST_WORK = 2e8
+MAX_WORK = 2e8
 """Cells times steps of one simulation at most: about half a minute of one core."""
 
-MOST_SAMPLES = 5_000_000
+MAX_SAMPLES = 5_000_000
 """Samples of the command that a record's regulator follows, at most: about 400 MB."""
 
-_LONGEST_CELL = 5.0  # m; coarser ones carry no wave of the patterns
+_MAX_CELL_LENGTH = 5.0  # m; coarser ones carry no wave of the patterns
 
-_LAMINAR, _TURBULENT = 2000.0, 4000.0
+_LAMINAR_REYNOLDS, _TURBULENT_REYNOLDS = 2000.0, 4000.0
 _COURANT = 0.8 / 1.15
-_WALL_OF_VOLUME = 20.0  # W/m²/K
-_PILOT = 0.05  # s
-_VALVE, _MOST_IN, _MOST_OUT = 4e-7, 0.025, 0.020  # kg/s/Pa, kg/s
+_VOLUME_HEAT_TRANSFER = 20.0  # W/m²/K
+_PILOT_TIME_CONSTANT = 0.05  # s
+_VALVE_CONDUCTANCE, _MAX_INFLOW, _MAX_OUTFLOW = 4e-7, 0.025, 0.020  # kg/s/Pa, kg/s
 _VALVE_VOLUME = 30e-6  # m³
 
 
@@ -79,11 +79,11 @@ class Tube:
                 raise InvalidSettings(
                     f"/parameters/{name}", f"found {value:g}; need from {least:g} to {most:g}"
                 )
-        if self.cells and self.length_m > _LONGEST_CELL * self.cells:
+        if self.cells and self.length_m > _MAX_CELL_LENGTH * self.cells:
             raise InvalidSettings(
                 "/parameters/cells",
                 f"found {self.cells}, each {self.length_m / self.cells:g} m long; need "
-                f"{ceil(self.length_m / _LONGEST_CELL)} or more for {self.length_m:g} m, or 0: "
+                f"{ceil(self.length_m / _MAX_CELL_LENGTH)} or more for {self.length_m:g} m, or 0: "
                 "as many as are right for its length",
             )
 
@@ -93,9 +93,9 @@ class Tube:
         return self.cells or ceil(self.length_m / (0.5 if self.length_m >= 20 else 0.25) - 1e-9)
 
     @property
-    def step(self) -> float:
+    def max_step(self) -> float:
         """Longest step of the scheme in s."""
-        speed = sqrt(GAMMA * GAS * self.temperature)
+        speed = sqrt(HEAT_CAPACITY_RATIO * GAS_CONSTANT * self.temperature)
         return _COURANT * self.length_m / self.n_cells / speed
 
 
@@ -124,14 +124,14 @@ def simulate_tube(tube: Tube, inlet: Channel, *, regulator: bool = False) -> Rec
         If the simulation would take too long.
     """
     times, values = inlet.times, inlet.values
-    period = _period(inlet)
-    substeps = _substeps(tube, times.size, period)
+    period = _check_inlet_period(inlet)
+    substeps = _count_substeps(tube, times.size, period)
     dx = tube.length_m / tube.n_cells
     geometry = np.array([dx, tube.bore_m, tube.volume_m3, tube.temperature, period / substeps])
     zeros = np.zeros((2, tube.modes))  # j² of the friction and of the heat exchange
     if tube.modes:
         zeros[0], zeros[1] = jn_zeros(2, tube.modes) ** 2, jn_zeros(0, tube.modes) ** 2
-    found = _tube(geometry, zeros, values + ATMOSPHERE, substeps, tube.n_cells, regulator)
+    found = _simulate_flow(geometry, zeros, values + ATMOSPHERE, substeps, tube.n_cells, regulator)
     if not np.all(np.isfinite(found)):
         raise InvalidRecord(
             "the flow in the tube becomes too fast for this scheme; give smaller or slower "
@@ -144,20 +144,20 @@ def simulate_tube(tube: Tube, inlet: Channel, *, regulator: bool = False) -> Rec
     ))  # fmt: skip
 
 
-def _substeps(tube: Tube, samples: int, period: float) -> int:
+def _count_substeps(tube: Tube, samples: int, period: float) -> int:
     """Steps in a period, if they are not too many in all."""
-    substeps = period / tube.step  # not finite for the longest periods
+    substeps = period / tube.max_step  # not finite for the longest periods
     work = float(samples) * max(substeps, 1.0) * tube.n_cells * (1 + tube.modes / 4)
-    if not work <= MOST_WORK:
+    if not work <= MAX_WORK:
         raise InvalidSettings(
             "/samples",
             f"{samples} samples of {tube.n_cells} cells take {work:.2g} cell steps, and may "
-            f"take {MOST_WORK:.2g}; ask for fewer samples or cells",
+            f"take {MAX_WORK:.2g}; ask for fewer samples or cells",
         )
     return ceil(substeps)
 
 
-def _period(inlet: Channel) -> float:
+def _check_inlet_period(inlet: Channel) -> float:
     times, values = inlet.times, inlet.values
     if times.size < 2 or not inlet.sampling.is_regular:
         raise InvalidRecord("the inlet pressure needs two samples or more at regular times")
@@ -170,8 +170,8 @@ def _period(inlet: Channel) -> float:
     return float(times[-1] - times[0]) / (times.size - 1)
 
 
-@compiled
-def _tube(
+@jit_compile
+def _simulate_flow(
     geometry: FloatArray, zeros: FloatArray, command: FloatArray, substeps: int, n: int,
     regulator: bool,
 ) -> FloatArray:  # fmt: skip
@@ -179,7 +179,7 @@ def _tube(
     bore, wall, dt = geometry[1], geometry[3], geometry[4]
     gas = np.empty((3, n + 1))  # pressure, density, temperature at the nodes
     gas[0], gas[2] = command[0], wall
-    gas[1] = command[0] / (GAS * wall)
+    gas[1] = command[0] / (GAS_CONSTANT * wall)
     flow, lagged = np.zeros(n), np.zeros((zeros.shape[1], n))
     warmed = np.full((zeros.shape[1], n + 1), command[0])
     found = np.empty((command.size, 2))
@@ -189,22 +189,24 @@ def _tube(
     for k in range(command.size - 1):
         for j in range(substeps):
             if regulator:
-                pilot += dt / _PILOT * (command[k] - pilot)
-                given = min(max(_VALVE * (pilot - gas[0, 0]), -_MOST_OUT), _MOST_IN)
-                gas[0, 0] += dt * GAS * wall / filled * (given - flow[0])
+                pilot += dt / _PILOT_TIME_CONSTANT * (command[k] - pilot)
+                given = min(
+                    max(_VALVE_CONDUCTANCE * (pilot - gas[0, 0]), -_MAX_OUTFLOW), _MAX_INFLOW
+                )
+                gas[0, 0] += dt * GAS_CONSTANT * wall / filled * (given - flow[0])
             else:
                 part = (j + 0.5) / substeps
                 gas[0, 0] = command[k] + part * (command[k + 1] - command[k])
-            gas[1, 0] = gas[0, 0] / (GAS * wall)
-            _momentum(geometry, zeros[0], gas, flow, lagged)
-            _balances(geometry, zeros[1], gas, flow, warmed)
+            gas[1, 0] = gas[0, 0] / (GAS_CONSTANT * wall)
+            _step_momentum(geometry, zeros[0], gas, flow, lagged)
+            _step_balances(geometry, zeros[1], gas, flow, warmed)
         found[k + 1, 0] = gas[0, 0] if regulator else command[k + 1]
         found[k + 1, 1] = gas[0, n]
     return found
 
 
-@compiled
-def _momentum(
+@jit_compile
+def _step_momentum(
     geometry: FloatArray, zeros: FloatArray, gas: FloatArray, flow: FloatArray, lagged: FloatArray
 ) -> None:
     """One step of the mass flows; friction implicit, convection from the donor cell."""
@@ -226,7 +228,7 @@ def _momentum(
         elif i + 1 == n and flow[i] < 0:
             passes = 0.0  # what leaves the volume was at rest
         force = -area * (gas[0, i + 1] - gas[0, i]) / dx - (passes - carried) / dx
-        friction = _friction(abs(flow[i]) * bore / (area * VISCOSITY)) / (density * bore**2)
+        friction = _compute_friction(abs(flow[i]) * bore / (area * VISCOSITY)) / (density * bore**2)
         rate = VISCOSITY / density / (bore / 2) ** 2
         for mode in range(zeros.size):
             force -= 4 * rate * (flow[i] - lagged[mode, i])
@@ -237,33 +239,35 @@ def _momentum(
         before, carried = following, passes
 
 
-@compiled
-def _friction(reynolds: float) -> float:
+@jit_compile
+def _compute_friction(reynolds: float) -> float:
     """Friction times density and bore², Pa·s: laminar, then Blasius."""
-    return _blended(reynolds, 32 * VISCOSITY, 0.1582 * reynolds**0.75 * VISCOSITY)
+    return _blend_regimes(reynolds, 32 * VISCOSITY, 0.1582 * reynolds**0.75 * VISCOSITY)
 
 
-@compiled
-def _nusselt(reynolds: float) -> float:
+@jit_compile
+def _compute_nusselt(reynolds: float) -> float:
     """Laminar, then Dittus-Boelter."""
-    return _blended(reynolds, 8.0, 0.023 * reynolds**0.8 * PRANDTL**0.4)
+    return _blend_regimes(reynolds, 8.0, 0.023 * reynolds**0.8 * PRANDTL**0.4)
 
 
-@compiled
-def _blended(reynolds: float, laminar: float, turbulent: float) -> float:
+@jit_compile
+def _blend_regimes(reynolds: float, laminar: float, turbulent: float) -> float:
     """The laminar value, the turbulent one, and between them a line."""
-    part = (reynolds - _LAMINAR) / (_TURBULENT - _LAMINAR)
+    part = (reynolds - _LAMINAR_REYNOLDS) / (_TURBULENT_REYNOLDS - _LAMINAR_REYNOLDS)
     return laminar + min(max(part, 0.0), 1.0) * (turbulent - laminar)
 
 
-@compiled
-def _balances(
+@jit_compile
+def _step_balances(
     geometry: FloatArray, zeros: FloatArray, gas: FloatArray, flow: FloatArray, warmed: FloatArray
 ) -> None:
     """One step of mass and energy in every cell, then of the heat exchanged with its walls."""
     dx, bore, volume, wall, dt = geometry
     area, n = pi * bore**2 / 4, flow.size
-    conductivity = VISCOSITY * GAMMA * GAS / (GAMMA - 1) / PRANDTL
+    conductivity = (
+        VISCOSITY * HEAT_CAPACITY_RATIO * GAS_CONSTANT / (HEAT_CAPACITY_RATIO - 1) / PRANDTL
+    )
     entering = flow[0] * (gas[2, 0] if flow[0] >= 0 else gas[2, 1])
     for i in range(1, n + 1):
         is_last = i == n
@@ -274,23 +278,25 @@ def _balances(
         length = 0.5 * dx if is_last else dx
         cell = area * length + (volume if is_last else 0.0)
         gas[1, i] += dt / cell * (flow[i - 1] - leaving)
-        gain = dt * GAMMA * GAS / cell * (entering - donated)
+        gain = dt * HEAT_CAPACITY_RATIO * GAS_CONSTANT / cell * (entering - donated)
         reynolds = 0.5 * (abs(flow[i - 1]) + abs(leaving)) * bore / (area * VISCOSITY)
-        passed = _nusselt(reynolds) * conductivity * pi * length  # W/K
+        passed = _compute_nusselt(reynolds) * conductivity * pi * length  # W/K
         if zeros.size:
             passed = 0.0
-            gain = _layered(zeros, gas, i, dt, bore, gain, warmed, area * length / cell)
+            gain = _apply_boundary_layer(
+                zeros, gas, i, dt, bore, gain, warmed, area * length / cell
+            )
         if is_last:
-            passed += _WALL_OF_VOLUME * 4.84 * volume ** (2 / 3)
-        share = dt * passed / (gas[1, i] * cell * GAS / (GAMMA - 1))
-        temperature = ((gas[0, i] + gain) / (gas[1, i] * GAS) + share * wall) / (1 + share)
+            passed += _VOLUME_HEAT_TRANSFER * 4.84 * volume ** (2 / 3)
+        share = dt * passed / (gas[1, i] * cell * GAS_CONSTANT / (HEAT_CAPACITY_RATIO - 1))
+        temperature = ((gas[0, i] + gain) / (gas[1, i] * GAS_CONSTANT) + share * wall) / (1 + share)
         gas[2, i] = temperature
-        gas[0, i] = gas[1, i] * GAS * temperature
+        gas[0, i] = gas[1, i] * GAS_CONSTANT * temperature
         entering = donated
 
 
-@compiled
-def _layered(
+@jit_compile
+def _apply_boundary_layer(
     zeros: FloatArray, gas: FloatArray, i: int, dt: float, bore: float, gain: float,
     warmed: FloatArray, part: float,
 ) -> float:  # fmt: skip
@@ -307,10 +313,12 @@ def _layered(
         warmed[mode, i] += change
         slow += weight * change
         rest -= weight
-    return (gain - (GAMMA - 1) * part * slow) / (1 + (GAMMA - 1) * part * rest)
+    return (gain - (HEAT_CAPACITY_RATIO - 1) * part * slow) / (
+        1 + (HEAT_CAPACITY_RATIO - 1) * part * rest
+    )
 
 
-def excitation(pattern: int, length_m: float, times: FloatArray) -> FloatArray:
+def build_excitation(pattern: int, length_m: float, times: FloatArray) -> FloatArray:
     """Command of the regulator in Pa above atmosphere, as in the paper's two patterns.
 
     Pattern 1: ten holds of 3 s. Pattern 2: 0.25 ± 0.15 MPa, a pseudo-random binary sequence with
@@ -328,7 +336,7 @@ def excitation(pattern: int, length_m: float, times: FloatArray) -> FloatArray:
         return np.asarray(1e6 * levels[np.clip((clock / 3).astype(np.int64), 0, 9)])
     if pattern != 2:
         raise InvalidSettings("/parameters/pattern", f"found {pattern}; need 1 or 2")
-    bits = _binary_sequence(32)
+    bits = _generate_binary_sequence(32)
     places = np.floor((clock - 0.5) / 0.6).astype(np.int64)
     binary = np.where(places < 0, 0.0, bits[np.clip(places, 0, bits.size - 1)])
     late = np.clip(clock - 18.0, 0.0, 12.0) / 12.0
@@ -336,14 +344,14 @@ def excitation(pattern: int, length_m: float, times: FloatArray) -> FloatArray:
     return np.asarray(1e6 * (0.25 + 0.15 * np.where(clock < 18.0, binary, chirp)))
 
 
-def tube_record(tube: Tube, pattern: int, samples: int, period: float) -> Recording:
+def simulate_tube_record(tube: Tube, pattern: int, samples: int, period: float) -> Recording:
     """Pressures at both ends of a tube whose regulator follows one of the paper's patterns.
 
     Parameters
     ----------
     tube : Tube
     pattern : int
-        See `excitation`.
+        See `build_excitation`.
     samples : int
     period : float
         In s; the command is followed at a tenth of it, but no finer than 0.5 ms.
@@ -351,18 +359,18 @@ def tube_record(tube: Tube, pattern: int, samples: int, period: float) -> Record
     Raises
     ------
     InvalidSettings, InvalidRecord
-        As `simulate_tube` and `excitation`.
+        As `simulate_tube` and `build_excitation`.
     """
     finer = max(1, round(min(10.0, period / 5e-4)))
-    if samples * finer > MOST_SAMPLES:
+    if samples * finer > MAX_SAMPLES:
         raise InvalidSettings(
             "/samples",
             f"found {samples}, whose command has {finer} times as many; need at most "
-            f"{MOST_SAMPLES // finer} at a sample_time of {period:g} s",
+            f"{MAX_SAMPLES // finer} at a sample_time of {period:g} s",
         )
-    _substeps(tube, samples * finer, period / finer)
+    _count_substeps(tube, samples * finer, period / finer)
     times = np.arange((samples - 1) * finer + 1, dtype=np.float64) * (period / finer)
-    command = Channel("P1", times, excitation(pattern, tube.length_m, times), "Pa")
+    command = Channel("P1", times, build_excitation(pattern, tube.length_m, times), "Pa")
     whole = simulate_tube(tube, command, regulator=True)
     return Recording(tuple(
         replace(one, times=one.times[::finer].copy(), values=one.values[::finer].copy())
@@ -370,7 +378,7 @@ def tube_record(tube: Tube, pattern: int, samples: int, period: float) -> Record
     ))  # fmt: skip
 
 
-def _binary_sequence(count: int) -> FloatArray:
+def _generate_binary_sequence(count: int) -> FloatArray:
     """Bits ±1 of x⁷ + x⁶ + 1, from the second stage of a register that begins with ones."""
     register = [1] * 7
     bits = []
@@ -380,7 +388,7 @@ def _binary_sequence(count: int) -> FloatArray:
     return np.array(bits)
 
 
-def measured(recording: Recording, seed: int) -> Recording:
+def add_gauge_errors(recording: Recording, seed: int) -> Recording:
     """The pressures as gauges of 1 MPa with 12 bit and noise of 0.5 kPa tell them."""
     draws = np.random.Generator(np.random.Philox(seed))
     digit = 1e6 / 4096

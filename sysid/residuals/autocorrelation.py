@@ -8,20 +8,20 @@ import numpy as np
 from numpy.fft import irfft, rfft
 
 from sysid.core.types import BoolArray, FloatArray, IntArray
-from sysid.data.records import Channel, Hold, sampling_of
+from sysid.data.records import Channel, Hold, measure_sampling
 
 MAX_LAG = 25
-FEWEST = 20
+FEWEST_SAMPLES = 20
 """Samples: below, no test says anything."""
 
-ROUNDING = 1e-9
+ROUNDING_SHARE = 1e-9
 """Part of a signal below which what is left of it is rounding."""
 
-_GRID = 0.05  # of a period: so far from its place a sample may lie
-_GAPS = 0.5  # of the places of a grid are filled at least, else it is none
+_GRID_TOLERANCE = 0.05  # of a period: so far from its place a sample may lie
+_LEAST_FILLED = 0.5  # of the places of a grid are filled at least, else it is none
 
 
-class Laid(NamedTuple):
+class SpacedResiduals(NamedTuple):
     """Residuals one beside the other, zero where one is missing, with their times."""
 
     times: FloatArray
@@ -31,12 +31,12 @@ class Laid(NamedTuple):
     is_regular: bool
 
     @property
-    def lags(self) -> int:
+    def n_lags(self) -> int:
         """How many lags are looked at: 25, fewer of a short record."""
         return min(MAX_LAG, int(np.count_nonzero(self.present)) // 4)
 
 
-class _Grid(NamedTuple):
+class _TimeGrid(NamedTuple):
     """Places a period apart: their times (N,), and which of them (n,) the samples have."""
 
     times: FloatArray
@@ -44,20 +44,22 @@ class _Grid(NamedTuple):
     period: float
 
 
-def laid_out(times: FloatArray, values: FloatArray) -> Laid:
+def space_residuals(times: FloatArray, values: FloatArray) -> SpacedResiduals:
     """Residuals (N,) in places a period apart, those between missing; irregular ones in order."""
-    grid = _grid_of(np.asarray(times, dtype=np.float64).tobytes())
+    grid = _find_time_grid(np.asarray(times, dtype=np.float64).tobytes())
     if grid is not None:
         filled, present = np.zeros(grid.times.size), np.zeros(grid.times.size, dtype=np.bool_)
         filled[grid.places], present[grid.places] = values, True
-        return Laid(grid.times, filled, present, grid.period, is_regular=True)
+        return SpacedResiduals(grid.times, filled, present, grid.period, is_regular=True)
     distinct = max(np.unique(times).size - 1, 1)
     spacing = float(times[-1] - times[0]) / distinct
-    return Laid(times, values, np.ones(values.size, dtype=np.bool_), spacing, is_regular=False)
+    return SpacedResiduals(
+        times, values, np.ones(values.size, dtype=np.bool_), spacing, is_regular=False
+    )
 
 
 @lru_cache(maxsize=2)
-def _grid_of(written: bytes) -> _Grid | None:
+def _find_time_grid(written: bytes) -> _TimeGrid | None:
     """The grid of some times (n,), given as their bytes; None if they lie on none.
 
     Kept for the runs of a sweep, whose residuals alone differ.
@@ -72,16 +74,16 @@ def _grid_of(written: bytes) -> _Grid | None:
     exact = np.concatenate([[0.0], steps / period])
     places = np.concatenate([[0.0], rounded])
     far = np.abs(exact - np.rint(exact))
-    is_regular = bool(np.all(far <= _GRID) and np.all(np.rint(exact[1:]) >= 1))
+    is_regular = bool(np.all(far <= _GRID_TOLERANCE) and np.all(np.rint(exact[1:]) >= 1))
     n = int(places[-1]) + 1
-    if not (is_regular and times.size >= _GAPS * n):
+    if not (is_regular and times.size >= _LEAST_FILLED * n):
         return None
     taken = places.astype(np.intp)
     laid = times[0] + period * np.arange(n)
     laid[taken] = times
     for array in (laid, taken):
         array.flags.writeable = False
-    return _Grid(laid, taken, period)
+    return _TimeGrid(laid, taken, period)
 
 
 class Whiteness(NamedTuple):
@@ -92,19 +94,19 @@ class Whiteness(NamedTuple):
     statistic: float
 
 
-def whiteness(laid: Laid) -> Whiteness:
-    """How alike neighbouring residuals are, over `Laid.lags` lags; missing ones leave pairs out."""
+def compute_whiteness(laid: SpacedResiduals) -> Whiteness:
+    """How alike neighbouring residuals are, over `SpacedResiduals.n_lags` lags; missing ones leave pairs out."""
     n = np.count_nonzero(laid.present)
-    values = _products(laid.values, laid.lags) / float(laid.values @ laid.values)
+    values = _sum_lagged_products(laid.values, laid.n_lags) / float(laid.values @ laid.values)
     if n == laid.present.size:
-        pairs = n - np.arange(1.0, laid.lags + 1)
+        pairs = n - np.arange(1.0, laid.n_lags + 1)
     else:
-        pairs = _products(laid.present.astype(np.float64), laid.lags)
+        pairs = _sum_lagged_products(laid.present.astype(np.float64), laid.n_lags)
     deviation = np.sqrt(np.maximum(pairs, 1) / (n * (n + 2.0)))
     return Whiteness(values, deviation, float(np.sum(np.square(values / deviation))))
 
 
-def _products(values: FloatArray, lags: int) -> FloatArray:
+def _sum_lagged_products(values: FloatArray, lags: int) -> FloatArray:
     """Σ v(t) v(t + k) for k = 1 … lags."""
     return np.correlate(np.concatenate([values[1:], np.zeros(lags)]), values, "valid")
 
@@ -119,12 +121,16 @@ class LaggedSums(NamedTuple):
     deviation: FloatArray
 
 
-def lagged_sums(
-    laid: Laid, residual: FloatArray, colour: FloatArray, channel: Channel, lags: FloatArray
+def compute_lagged_sums(
+    laid: SpacedResiduals,
+    residual: FloatArray,
+    colour: FloatArray,
+    channel: Channel,
+    lags: FloatArray,
 ) -> LaggedSums | str:
     """The sums over these lags, or why there are none."""
     floats = (laid.times, channel.times, channel.values, lags)
-    shifted = _columns(
+    shifted = _build_lagged_inputs(
         laid.present.tobytes(), laid.period, channel.hold,
         *(np.asarray(one, dtype=np.float64).tobytes() for one in floats),
     )  # fmt: skip
@@ -140,7 +146,7 @@ def lagged_sums(
 
 
 @lru_cache(maxsize=2)
-def _columns(
+def _build_lagged_inputs(
     present: bytes, period: float, hold: Hold, times: bytes, moments: bytes, values: bytes,
     lags: bytes,
 ) -> tuple[FloatArray, FloatArray, BoolArray] | str:  # fmt: skip
@@ -150,24 +156,24 @@ def _columns(
     of arrays: `Laid.times` and `Laid.present`, times and values of the input, lags in periods.
     """
     there = np.frombuffer(present, dtype=np.bool_)
-    laid = Laid(np.frombuffer(times), np.zeros(0), there, period, is_regular=True)
+    laid = SpacedResiduals(np.frombuffer(times), np.zeros(0), there, period, is_regular=True)
     channel = Channel("", np.frombuffer(moments), np.frombuffer(values), hold=hold)
-    shifted = _shifted(laid, channel, np.frombuffer(lags) * period)
+    shifted = _shift_input(laid, channel, np.frombuffer(lags) * period)
     # Of every lag the same samples, so that no lag is judged by more than another.
     known = there & np.isfinite(shifted.sum(axis=0))
-    if np.count_nonzero(known) < FEWEST:
+    if np.count_nonzero(known) < FEWEST_SAMPLES:
         return "it overlaps the output too little"
     columns = np.where(known, shifted, 0.0)
     columns -= np.outer(columns.sum(axis=1) / np.count_nonzero(known), known)
     sizes = np.sqrt(np.einsum("kn,kn->k", columns, columns))
-    if not np.min(sizes) > ROUNDING * np.max(np.abs(channel.values)):
+    if not np.min(sizes) > ROUNDING_SHARE * np.max(np.abs(channel.values)):
         return "the input is constant there"
     for array in (columns, sizes, known):
         array.flags.writeable = False
     return columns, sizes, known
 
 
-def _shifted(laid: Laid, channel: Channel, lags: FloatArray) -> FloatArray:
+def _shift_input(laid: SpacedResiduals, channel: Channel, lags: FloatArray) -> FloatArray:
     """The input at the residuals' times less each lag (s), (n, N); nan where not recorded."""
     # A jump and the sample it is seen at may be a rounding apart: nearer than this, they are one.
     slack = 1e-6 * laid.period
@@ -176,14 +182,16 @@ def _shifted(laid: Laid, channel: Channel, lags: FloatArray) -> FloatArray:
     if channel.hold == "zero":
         place = np.searchsorted(channel.times, wanted + slack, side="right") - 1
         values = channel.values[np.clip(place, 0, channel.times.size - 1)]
-        period = sampling_of(channel.times).period
+        period = measure_sampling(channel.times).period
         last += period if np.isfinite(period) else 0.0  # the last value holds for a period
     else:
         values = np.interp(wanted, channel.times, channel.values)
     return np.asarray(np.where((wanted >= first) & (wanted <= last), values, np.nan))
 
 
-def colour_of(residual: FloatArray, present: BoolArray, room: int | None = None) -> FloatArray:
+def smooth_spectrum_root(
+    residual: FloatArray, present: BoolArray, room: int | None = None
+) -> FloatArray:
     """Root of the smoothed spectrum of residuals (N,), one value for each frequency of a transform.
 
     The covariance of Σ e(i) a(i) and Σ e(i) b(i) over the noise e is the product of the transforms
@@ -191,34 +199,34 @@ def colour_of(residual: FloatArray, present: BoolArray, room: int | None = None)
     as the window reaches: beyond, the record's beginning would be neighbour to its end.
     """
     n = residual.size
-    width = _width(residual, present)
+    width = _choose_window_width(residual, present)
     reach = min(ceil(width), n - 1)
-    length = padded(n + (reach if room is None else max(reach, room)))
-    autocovariance = _autocorrelated(residual, length)[: reach + 1] / n
+    length = pad_length(n + (reach if room is None else max(reach, room)))
+    autocovariance = _autocorrelate(residual, length)[: reach + 1] / n
     if not present.all():
-        pairs = np.rint(_autocorrelated(present.astype(np.float64), length)[: reach + 1])
+        pairs = np.rint(_autocorrelate(present.astype(np.float64), length)[: reach + 1])
         complete = np.arange(n, n - reach - 1.0, -1.0) / np.maximum(pairs, 1.0)
         autocovariance *= np.where(pairs > 0, complete, 0.0)  # as if no sample were missing
     kernel = np.zeros(length)
-    kernel[: reach + 1] = autocovariance * _parzen(reach + 1, width)
+    kernel[: reach + 1] = autocovariance * _make_parzen_window(reach + 1, width)
     kernel[length - reach :] = kernel[1 : reach + 1][::-1]
     spectrum = np.maximum(rfft(kernel).real, 0.0)
     spectrum[1:-1] *= 2.0  # each frequency stands for its negative too
     return np.asarray(np.sqrt(spectrum / length))
 
 
-def _autocorrelated(values: FloatArray, length: int) -> FloatArray:
+def _autocorrelate(values: FloatArray, length: int) -> FloatArray:
     """Σ v(t) v(t + k) for k from 0 on; right as long as the transform has room for k."""
     seen = rfft(values, length)
     return irfft(np.square(seen.real) + np.square(seen.imag), length)
 
 
-def padded(least: int) -> int:
+def pad_length(least: int) -> int:
     """The next even length that a fast transform likes: a power of two times 1, 3, 5, 9 or 15."""
     return min(one << max(1, (-(-least // one) - 1).bit_length()) for one in (1, 3, 5, 9, 15))
 
 
-def _width(residual: FloatArray, present: BoolArray) -> float:
+def _choose_window_width(residual: FloatArray, present: BoolArray) -> float:
     """Width of a Parzen window, by the rule of Andrews (1991) for first-order colour."""
     n = residual.size
     pairs = max(int(np.count_nonzero(present[1:] & present[:-1])), 1)
@@ -229,6 +237,6 @@ def _width(residual: FloatArray, present: BoolArray) -> float:
     return float(np.clip(2.66 * (curvature * n) ** 0.2, n ** (1 / 3), 0.25 * n))
 
 
-def _parzen(n: int, width: float) -> FloatArray:
+def _make_parzen_window(n: int, width: float) -> FloatArray:
     x = np.minimum(np.arange(n) / width, 1.0)
     return np.asarray(np.where(x <= 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3))

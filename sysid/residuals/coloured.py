@@ -28,41 +28,41 @@ from numpy.fft import rfft
 from numpy.typing import NDArray
 from scipy.special import chdtrc, stdtrit
 
-from sysid.core.types import RANK, FloatArray
+from sysid.core.types import RANK_TOLERANCE, FloatArray
 from sysid.residuals.autocorrelation import (
-    FEWEST,
-    ROUNDING,
-    Laid,
-    colour_of,
-    laid_out,
-    padded,
-    whiteness,
+    FEWEST_SAMPLES,
+    ROUNDING_SHARE,
+    SpacedResiduals,
+    compute_whiteness,
+    pad_length,
+    smooth_spectrum_root,
+    space_residuals,
 )
 from sysid.residuals.past_outputs import reads_outputs
-from sysid.residuals.restricted_likelihood import STEEPEST, Modelled, modelled
+from sysid.residuals.restricted_likelihood import LARGEST_POLE, NoiseColourModel, fit_noise_colour
 from sysid.simulation.problem import Problem
 
-_CHANCE = 1e-3
+_SIGNIFICANCE = 1e-3
 """That white residuals look as little white: below, they are taken for coloured.
 
 And that those of one variance look as uneven. It is that of χ²: of 25 lags of a short record the
 statistic varies more, and white ones are taken for coloured in 1 % of those of 50 to 100 samples
 (decision 19)."""
 
-QUANTILE = 3.841458820694124
+CHI_SQUARE_95 = 3.841458820694124
 """95 % of χ² with one degree of freedom."""
 
-_SHORT = 400
+_SHORT_RECORD = 400
 """Samples: fewer tell their colour by a model of it, where one holds, and more by its window."""
 
-_LONGEST = 25  # of the recursion: past values
+_LONGEST_RECURSION = 25  # of the recursion: past values
 
-_NARROWEST = 1e-3  # of the variance under white residuals: below is rounding
+_LEAST_WIDENING = 1e-3  # of the variance under white residuals: below is rounding
 
-_EVEN = 1e-3  # of a period: steps that differ by less are equal
+_EVEN_TOLERANCE = 1e-3  # of a period: steps that differ by less are equal
 
 
-class Coloured(NamedTuple):
+class ColouredCovariance(NamedTuple):
     """Ω (D, D) of the sandwich, and how many white samples would say as much.
 
     `drifts` where that number is not known: the residuals wander over the whole record. `is_white`
@@ -72,18 +72,18 @@ class Coloured(NamedTuple):
     """
 
     middle: FloatArray
-    samples: float
-    drifts: bool
+    equivalent_samples: float
+    is_drifting: bool
     is_white: bool = False
     series: tuple[tuple[FloatArray, float], ...] = ()
-    models: tuple[Modelled | None, ...] = ()
+    models: tuple[NoiseColourModel | None, ...] = ()
 
     @property
     def degrees(self) -> float:
         """Degrees of freedom of the t distribution: those of white samples, one at least."""
-        return max(self.samples - len(self.middle), 1.0)
+        return max(self.equivalent_samples - len(self.middle), 1.0)
 
-    def degrees_along(self, direction: FloatArray) -> float:
+    def compute_degrees(self, direction: FloatArray) -> float:
         """Those of the variance of one combination (D,) of Sᵀe (Satterthwaite 1946)."""
         each = np.array([direction @ middle @ direction for middle, _ in self.series])
         if not np.sum(each) > 0:
@@ -91,10 +91,10 @@ class Coloured(NamedTuple):
         degrees = np.array([one for _, one in self.series])
         for i, known in enumerate(self.models):
             if known is not None:
-                degrees[i] = 2.0 / known.variation(direction)
+                degrees[i] = 2.0 / known.compute_variation(direction)
         return max(float(np.sum(each) ** 2 / np.sum(each**2 / degrees)), 1.0)
 
-    def widening(self, direction: FloatArray, power: float, norm: float) -> float:
+    def compute_widening(self, direction: FloatArray, power: float, norm: float) -> float:
         """Square of how much wider than of white residuals an interval of one parameter is.
 
         Parameters
@@ -104,23 +104,23 @@ class Coloured(NamedTuple):
         power, norm : float
             Mean square of the residuals; sum of squares of that combination.
         """
-        told = max(float(direction @ self.middle @ direction) / (power * norm), _NARROWEST)
-        reach = float(stdtrit(self.degrees_along(direction), 0.975)) ** 2 / QUANTILE
-        return float(told * reach * self.samples / self.degrees)
+        told = max(float(direction @ self.middle @ direction) / (power * norm), _LEAST_WIDENING)
+        reach = float(stdtrit(self.compute_degrees(direction), 0.975)) ** 2 / CHI_SQUARE_95
+        return float(told * reach * self.equivalent_samples / self.degrees)
 
 
-class Part(NamedTuple):
+class ResidualPart(NamedTuple):
     """One output of one experiment: its scored samples among all of them, with their times."""
 
     output: str
     rows: slice
     times: FloatArray
-    size: float
+    largest_value: float
 
 
-def coloured(
+def estimate_coloured_covariance(
     problem: Problem, seen: FloatArray, columns: FloatArray, *, by_model: bool = True
-) -> Coloured | None:
+) -> ColouredCovariance | None:
     """The middle of the sandwich; None where the residuals may as well be one white noise.
 
     Parameters
@@ -132,54 +132,58 @@ def coloured(
     by_model : bool
         Whether short series may tell their colour by a model of it.
     """
-    found = [(part, _in_order(part, seen[part.rows])) for part in parts(problem)]
+    found = [(part, _order_residuals(part, seen[part.rows])) for part in iterate_parts(problem)]
     is_free = problem.prediction == "simulation" or not reads_outputs(problem.model)
-    told = [is_free and _is_coloured(laid, part.size) for part, laid in found]
-    if not any(told) and not _are_uneven([seen[part.rows] for part, _ in found]):
+    told = [is_free and _are_spaced_coloured(laid, part.largest_value) for part, laid in found]
+    if not any(told) and not _have_unequal_variances([seen[part.rows] for part, _ in found]):
         return None
     each = []
     for (part, _), has_colour in zip(found, told, strict=True):
         own, values = columns[part.rows], seen[part.rows]
         if has_colour:
-            each.append(_with_colour(laid_out(part.times, values), own, by_model))
+            each.append(
+                _estimate_series_covariance(space_residuals(part.times, values), own, by_model)
+            )
         else:
             mean = float(np.mean(np.square(values)))
-            each.append(Coloured(mean * (own.T @ own), float(values.size), drifts=False))
-    used = _used([columns[part.rows] for part, _ in found])
-    return _together(each, used)._replace(is_white=not any(told))
+            each.append(
+                ColouredCovariance(mean * (own.T @ own), float(values.size), is_drifting=False)
+            )
+    used = _count_used_degrees([columns[part.rows] for part, _ in found])
+    return _combine_series(each, used)._replace(is_white=not any(told))
 
 
-def _used(columns: Sequence[FloatArray]) -> FloatArray:
+def _count_used_degrees(columns: Sequence[FloatArray]) -> FloatArray:
     """How many of the degrees of freedom estimates of the parameters (D) take from each series."""
     own = [one.T @ one for one in columns]
-    inverse = np.linalg.pinv(np.sum(own, axis=0), rcond=RANK**2, hermitian=True)
+    inverse = np.linalg.pinv(np.sum(own, axis=0), rcond=RANK_TOLERANCE**2, hermitian=True)
     used = np.array([np.sum(inverse * one) for one in own])
     total = float(np.sum(used))  # 0 where nothing has an effect
     return np.asarray(used * (len(inverse) / total if total > 0 else 0.0))
 
 
-def _together(each: Sequence[Coloured], used: FloatArray) -> Coloured:
+def _combine_series(each: Sequence[ColouredCovariance], used: FloatArray) -> ColouredCovariance:
     """Ω of several series.
 
     Residuals of a series are smaller than its noise by the degrees of freedom that were taken from
     it; a model allows for that. What all have lost on average is not allowed for here.
     """
-    size, samples = len(each[0].middle), np.array([one.samples for one in each])
+    size, samples = len(each[0].middle), np.array([one.equivalent_samples for one in each])
     degrees = np.maximum(samples - used, 1.0)
     total = float(np.sum(samples))
     models = tuple(model for one in each for model in one.models or (None,))
     lost = np.where([one is None for one in models], samples / degrees, 1.0)
     grown = lost * (max(total - size, 1.0) / total)
     middles = [by * one.middle for one, by in zip(each, grown.tolist(), strict=True)]
-    return Coloured(
-        np.sum(middles, axis=0), total, any(one.drifts for one in each),
+    return ColouredCovariance(
+        np.sum(middles, axis=0), total, any(one.is_drifting for one in each),
         series=tuple(zip(middles, degrees.tolist(), strict=True)), models=models,
     )  # fmt: skip
 
 
-def _are_uneven(series: Sequence[FloatArray]) -> bool:
+def _have_unequal_variances(series: Sequence[FloatArray]) -> bool:
     """Whether residuals are clearly of unequal variance, by the test of Bartlett."""
-    long = [one for one in series if one.size >= FEWEST]
+    long = [one for one in series if one.size >= FEWEST_SAMPLES]
     variances = np.array([np.mean(np.square(one)) for one in long])
     if len(long) < 2 or not np.min(variances) > 0:
         return False
@@ -189,18 +193,18 @@ def _are_uneven(series: Sequence[FloatArray]) -> bool:
     statistic = total * np.log(pooled) - counts @ np.log(variances)
     others = len(long) - 1
     correction = 1.0 + (np.sum(1.0 / counts) - 1.0 / total) / (3.0 * others)
-    return float(chdtrc(others, statistic / correction)) < _CHANCE
+    return float(chdtrc(others, statistic / correction)) < _SIGNIFICANCE
 
 
-def is_coloured(part: Part, values: FloatArray) -> bool:
+def is_coloured(part: ResidualPart, values: FloatArray) -> bool:
     """Whether the residuals (n,) of a part are clearly not white."""
-    return _is_coloured(_in_order(part, values), part.size)
+    return _are_spaced_coloured(_order_residuals(part, values), part.largest_value)
 
 
-def parts(problem: Problem) -> Iterator[Part]:
+def iterate_parts(problem: Problem) -> Iterator[ResidualPart]:
     """The series of a problem's scored samples, in their order."""
-    measured = problem.split(problem.evaluator.weight * problem.evaluator.measured)
-    weights = problem.split(problem.evaluator.weight)
+    measured = problem.split_by_output(problem.evaluator.weight * problem.evaluator.measured)
+    weights = problem.split_by_output(problem.evaluator.weight)
     first = 0
     for record, weight, sizes in zip(problem.records, weights, measured, strict=True):
         times = {channel.name: channel.times for channel in record.outputs}
@@ -209,74 +213,82 @@ def parts(problem: Problem) -> Iterator[Part]:
             n = int(np.count_nonzero(scored))
             if n:
                 size = float(np.max(np.abs(sizes[output][scored])))
-                yield Part(output, slice(first, first + n), times[output][scored], size)
+                yield ResidualPart(output, slice(first, first + n), times[output][scored], size)
             first += n
 
 
-def _in_order(part: Part, values: FloatArray) -> Laid:
+def _order_residuals(part: ResidualPart, values: FloatArray) -> SpacedResiduals:
     """The residuals one after the other; laid out anew only where samples are missing."""
     steps = np.diff(part.times)
-    if steps.size and np.ptp(steps) > _EVEN * steps[0]:
-        return laid_out(part.times, values)
-    return Laid(part.times, values, np.ones(values.size, dtype=np.bool_), 1.0, is_regular=True)
+    if steps.size and np.ptp(steps) > _EVEN_TOLERANCE * steps[0]:
+        return space_residuals(part.times, values)
+    return SpacedResiduals(
+        part.times, values, np.ones(values.size, dtype=np.bool_), 1.0, is_regular=True
+    )
 
 
-def _is_coloured(laid: Laid, size: float) -> bool:
+def _are_spaced_coloured(laid: SpacedResiduals, size: float) -> bool:
     n = np.count_nonzero(laid.present)
-    if n < FEWEST or float(np.sqrt(laid.values @ laid.values / n)) <= ROUNDING * size:
+    if n < FEWEST_SAMPLES or float(np.sqrt(laid.values @ laid.values / n)) <= ROUNDING_SHARE * size:
         return False
-    found = whiteness(laid)
-    chance = float(chdtrc(laid.lags, found.statistic))
-    if n < _SHORT and found.values[0] > 0:  # there many lags hide what the first one says
+    found = compute_whiteness(laid)
+    chance = float(chdtrc(laid.n_lags, found.statistic))
+    if n < _SHORT_RECORD and found.values[0] > 0:  # there many lags hide what the first one says
         chance = min(chance, float(chdtrc(1, (found.values[0] / found.deviation[0]) ** 2)))
-    return chance < _CHANCE
+    return chance < _SIGNIFICANCE
 
 
-def _with_colour(laid: Laid, columns: FloatArray, by_model: bool) -> Coloured:
+def _estimate_series_covariance(
+    laid: SpacedResiduals, columns: FloatArray, by_model: bool
+) -> ColouredCovariance:
     """Of one series SᵀRS."""
-    root, pole = spectrum_root(laid)
-    is_short = np.count_nonzero(laid.present) < _SHORT
-    known = modelled(laid, columns) if by_model and is_short and pole <= STEEPEST else None
+    root, pole = estimate_spectrum_root(laid)
+    is_short = np.count_nonzero(laid.present) < _SHORT_RECORD
+    known = (
+        fit_noise_colour(laid, columns) if by_model and is_short and pole <= LARGEST_POLE else None
+    )
     if known is not None:
-        samples = laid.present.sum() * known.share
-        return Coloured(known.middle, float(samples), drifts=False, models=(known,))
-    moved = transformed(laid, columns, root)
-    slow = min(max(pole, 0.0), STEEPEST)
+        samples = laid.present.sum() * known.sample_share
+        return ColouredCovariance(known.middle, float(samples), is_drifting=False, models=(known,))
+    moved = transform_sensitivities(laid, columns, root)
+    slow = min(max(pole, 0.0), LARGEST_POLE)
     share = (1.0 - slow) / (1.0 + slow)
     n = np.count_nonzero(laid.present)
     # The same of any colour: the mean of its spectrum over what it is at frequency 0.
     lowest = float(root[0] ** 2) * 2 * (root.size - 1)
     if lowest > 0:
         share = min(share, float(laid.values @ laid.values) / n / lowest)
-    return Coloured(np.asarray((moved @ moved.conj().T).real), n * share, pole > STEEPEST)
+    return ColouredCovariance(
+        np.asarray((moved @ moved.conj().T).real), n * share, pole > LARGEST_POLE
+    )
 
 
-def spectrum_root(laid: Laid) -> tuple[FloatArray, float]:
-    """Root (F,) of the spectrum of a series as `colour_of` has it, and the pole of first order.
+def estimate_spectrum_root(laid: SpacedResiduals) -> tuple[FloatArray, float]:
+    """Root (F,) of the spectrum of a series as `smooth_spectrum_root` has it, and the pole of first order.
 
     Of what a recursion leaves, coloured again by it.
     """
     both = laid.present[1:] & laid.present[:-1]
     before, after = laid.values[:-1][both], laid.values[1:][both]
     found = float(before @ after / (before @ before))
-    weights = np.array([min(max(found, -STEEPEST), STEEPEST)])
-    if laid.present.all() and found <= STEEPEST:  # a longer one takes a drift for oscillations
-        longer = _recursion(laid.values)
+    weights = np.array([min(max(found, -LARGEST_POLE), LARGEST_POLE)])
+    if laid.present.all() and found <= LARGEST_POLE:  # a longer one takes a drift for oscillations
+        longer = _fit_recursion(laid.values)
         weights = weights if longer.size < 2 else longer
     kernel = np.concatenate([[1.0], -weights])
     filtered = np.convolve(laid.values, kernel)
     left = np.where(both, filtered[1 : laid.values.size], 0.0)
-    root = colour_of(left, both, room=2 * left.size)  # the recursion rings on
+    root = smooth_spectrum_root(left, both, room=2 * left.size)  # the recursion rings on
     root /= np.abs(rfft(kernel, 2 * (root.size - 1)))
     return root, found
 
 
-def _recursion(values: FloatArray) -> FloatArray:
+def _fit_recursion(values: FloatArray) -> FloatArray:
     """Weights (p,) of the past values in a recursion, by Burg; p by Akaike's criterion."""
     ahead, behind, weights = values[1:], values[:-1], np.zeros(0)
     power, best = float(np.mean(np.square(values))), np.zeros(0)
     least = values.size * np.log(power)
-    for order in range(1, min(_LONGEST, round(values.size ** (1 / 3))) + 1):
+    for order in range(1, min(_LONGEST_RECURSION, round(values.size ** (1 / 3))) + 1):
         both = float(ahead @ ahead + behind @ behind)
         if not both > 0:
             break
@@ -290,19 +302,23 @@ def _recursion(values: FloatArray) -> FloatArray:
         if told < least:
             least, best = told, weights
     steepest = float(np.max(np.abs(np.roots(np.append(1.0, -best))), initial=0.0))
-    return best * min(1.0, STEEPEST / max(steepest, STEEPEST)) ** np.arange(1, best.size + 1)
+    return best * min(1.0, LARGEST_POLE / max(steepest, LARGEST_POLE)) ** np.arange(
+        1, best.size + 1
+    )
 
 
-def white_root(laid: Laid) -> FloatArray:
-    """The same of a series taken for white: (F,), as many as `spectrum_root` has of its size."""
-    size = padded(3 * (laid.values.size - 1)) // 2 + 1
+def make_white_root(laid: SpacedResiduals) -> FloatArray:
+    """The same of a series taken for white: (F,), as many as `estimate_spectrum_root` has of its size."""
+    size = pad_length(3 * (laid.values.size - 1)) // 2 + 1
     mean = float(laid.values @ laid.values) / np.count_nonzero(laid.present)
     both_signs = np.full(size, 2.0)  # each frequency stands for its negative too
     both_signs[[0, -1]] = 1.0
     return np.asarray(np.sqrt(mean * both_signs / (2 * (size - 1))))
 
 
-def transformed(laid: Laid, columns: FloatArray, root: FloatArray) -> NDArray[np.complex128]:
+def transform_sensitivities(
+    laid: SpacedResiduals, columns: FloatArray, root: FloatArray
+) -> NDArray[np.complex128]:
     """Transforms (D, F) of the sensitivities (n, D) of a series, times a root (F,)."""
     spread = np.zeros((columns.shape[1], laid.values.size))
     spread[:, laid.present] = columns.T

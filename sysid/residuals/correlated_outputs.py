@@ -19,41 +19,43 @@ import numpy as np
 from scipy.special import chdtrc
 
 from sysid.core.types import FloatArray, IntArray
-from sysid.residuals.autocorrelation import FEWEST, laid_out
+from sysid.residuals.autocorrelation import FEWEST_SAMPLES, space_residuals
 from sysid.residuals.coloured import (
-    Coloured,
-    Part,
-    coloured,
+    ColouredCovariance,
+    ResidualPart,
+    estimate_coloured_covariance,
+    estimate_spectrum_root,
     is_coloured,
-    parts,
-    spectrum_root,
-    transformed,
-    white_root,
+    iterate_parts,
+    make_white_root,
+    transform_sensitivities,
 )
 from sysid.simulation.problem import Problem
 
-_CHANCE = 1e-3
+_SIGNIFICANCE = 1e-3
 """That residuals without anything in common look as correlated: below, they are taken to have."""
 
 
-class _Series(NamedTuple):
+class _SharedPart(NamedTuple):
     """A part at the times that it shares with another, and its rows among all samples."""
 
-    part: Part
+    part: ResidualPart
     rows: IntArray
 
 
-class _Pair(NamedTuple):
+class _CorrelatedPair(NamedTuple):
     """Two series at the same times, their correlation, and its chance if it were none."""
 
-    first: _Series
-    second: _Series
+    first: _SharedPart
+    second: _SharedPart
     correlation: float
     chance: float
 
 
-def coloured_jointly(problem: Problem, seen: FloatArray, columns: FloatArray) -> Coloured | None:
-    """What `coloured` gives, with the covariance of outputs; None: one white noise.
+def estimate_joint_covariance(
+    problem: Problem, seen: FloatArray, columns: FloatArray
+) -> ColouredCovariance | None:
+    """What `estimate_coloured_covariance` gives, with the covariance of outputs; None: one white noise.
 
     Parameters
     ----------
@@ -62,16 +64,18 @@ def coloured_jointly(problem: Problem, seen: FloatArray, columns: FloatArray) ->
     columns : FloatArray, shape (n, D)
         Their sensitivities.
     """
-    pairs = list(_pairs(problem, seen)) if len(problem.model.outputs) > 1 else []
-    whole = coloured(problem, seen, columns, by_model=not pairs)  # of all by the same means
+    pairs = list(_find_correlated_pairs(problem, seen)) if len(problem.model.outputs) > 1 else []
+    whole = estimate_coloured_covariance(
+        problem, seen, columns, by_model=not pairs
+    )  # of all by the same means
     if not pairs:
         return whole
     if whole is None:
         alone = float(np.mean(np.square(seen))) * (columns.T @ columns)
-        whole = Coloured(alone, float(seen.size), drifts=False, is_white=True)
+        whole = ColouredCovariance(alone, float(seen.size), is_drifting=False, is_white=True)
     middle, twice = whole.middle, 0.0
     for pair in pairs:
-        term = _cross(pair, seen, columns, whole.is_white)
+        term = _compute_cross_term(pair, seen, columns, whole.is_white)
         middle = middle + term + term.T
         twice += 2.0 * pair.first.rows.size * pair.correlation**2
     size, vectors = np.linalg.eigh(middle)
@@ -79,42 +83,44 @@ def coloured_jointly(problem: Problem, seen: FloatArray, columns: FloatArray) ->
         middle = (vectors * np.maximum(size, 0.0)) @ vectors.T
     counted = 1.0 / (1.0 + twice / seen.size)
     return whole._replace(
-        middle=middle, samples=whole.samples * counted,
+        middle=middle, equivalent_samples=whole.equivalent_samples * counted,
         series=tuple((one, max(counted * degrees, 1.0)) for one, degrees in whole.series),
     )  # fmt: skip
 
 
-def _pairs(problem: Problem, seen: FloatArray) -> Iterator[_Pair]:
+def _find_correlated_pairs(problem: Problem, seen: FloatArray) -> Iterator[_CorrelatedPair]:
     """The pairs of outputs of those experiments that have a noise in common.
 
     All of them: some alone might have correlations that no noise has.
     """
-    for group in _by_experiment(problem):
-        found = [_pair(one, other, seen) for one, other in combinations(group, 2)]
+    for group in _group_by_experiment(problem):
+        found = [_correlate_parts(one, other, seen) for one, other in combinations(group, 2)]
         known = [pair for pair in found if pair is not None]
-        if any(pair.chance < _CHANCE / len(known) for pair in known):
+        if any(pair.chance < _SIGNIFICANCE / len(known) for pair in known):
             yield from known
 
 
-def _pair(one: Part, other: Part, seen: FloatArray) -> _Pair | None:
+def _correlate_parts(
+    one: ResidualPart, other: ResidualPart, seen: FloatArray
+) -> _CorrelatedPair | None:
     times, i, j = np.intersect1d(one.times, other.times, return_indices=True)
-    if times.size < FEWEST:
+    if times.size < FEWEST_SAMPLES:
         return None
     first, second = (
-        _Series(part._replace(times=times), part.rows.start + at)
+        _SharedPart(part._replace(times=times), part.rows.start + at)
         for part, at in ((one, i), (other, j))
     )
-    found = _correlation(seen[first.rows], seen[second.rows])
-    return None if found is None else _Pair(first, second, *found)
+    found = _compute_correlation(seen[first.rows], seen[second.rows])
+    return None if found is None else _CorrelatedPair(first, second, *found)
 
 
-def _by_experiment(problem: Problem) -> Iterator[Sequence[Part]]:
-    every = parts(problem)
-    for weight in problem.split(problem.evaluator.weight):
+def _group_by_experiment(problem: Problem) -> Iterator[Sequence[ResidualPart]]:
+    every = iterate_parts(problem)
+    for weight in problem.split_by_output(problem.evaluator.weight):
         yield tuple(islice(every, sum(bool(np.any(one > 0)) for one in weight.values())))
 
 
-def _correlation(a: FloatArray, b: FloatArray) -> tuple[float, float] | None:
+def _compute_correlation(a: FloatArray, b: FloatArray) -> tuple[float, float] | None:
     """The correlation of two series (n,), and the chance that it is by chance; None: one is 0.
 
     Of series with poles p and q its variance is (1 + pq)/(1 - pq)/n (Bartlett 1935).
@@ -128,7 +134,9 @@ def _correlation(a: FloatArray, b: FloatArray) -> tuple[float, float] | None:
     return found, float(chdtrc(1, found**2 * a.size / widening))
 
 
-def _cross(pair: _Pair, seen: FloatArray, columns: FloatArray, is_white: bool) -> FloatArray:
+def _compute_cross_term(
+    pair: _CorrelatedPair, seen: FloatArray, columns: FloatArray, is_white: bool
+) -> FloatArray:
     """SᵢᵀE[eᵢeⱼᵀ]Sⱼ (D, D)."""
     both = pair.first, pair.second
     errors, slopes = ([of[one.rows] for one in both] for of in (seen, columns))
@@ -141,7 +149,7 @@ def _cross(pair: _Pair, seen: FloatArray, columns: FloatArray, is_white: bool) -
         return np.asarray(common * (slopes[0].T @ slopes[1]))
     moved = []
     for error, slope, has_colour in zip(errors, slopes, have_colour, strict=True):
-        laid = laid_out(pair.first.part.times, error)
-        root = spectrum_root(laid)[0] if has_colour else white_root(laid)
-        moved.append(transformed(laid, slope, root))
+        laid = space_residuals(pair.first.part.times, error)
+        root = estimate_spectrum_root(laid)[0] if has_colour else make_white_root(laid)
+        moved.append(transform_sensitivities(laid, slope, root))
     return np.asarray(pair.correlation * (moved[0] @ moved[1].conj().T).real)

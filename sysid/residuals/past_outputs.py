@@ -8,14 +8,22 @@ one degree of freedom from the test for each such coefficient. A free run reads 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from sysid.language.delays import past_values
-from sysid.language.tree import Binary, Call, Expression, Past, Symbol, Unary, match_plain_state
+from sysid.language.delays import collect_past_values
+from sysid.language.tree import (
+    Binary,
+    Expression,
+    FunctionCall,
+    PastValue,
+    Symbol,
+    Unary,
+    match_plain_state,
+)
 from sysid.models.model import Model
 from sysid.models.parameters import Parameter
-from sysid.models.ties import tied_model, ties_of
+from sysid.models.ties import apply_ties, resolve_ties
 
 
-class _Seen(NamedTuple):
+class _StateFactors(NamedTuple):
     """Of an expression: its parameters, those that multiply a state, and whether it has states."""
 
     names: frozenset[str] = frozenset()
@@ -28,7 +36,7 @@ def reads_outputs(model: Model) -> bool:
     return any(match_plain_state(output.expression) for output in model.outputs)
 
 
-def coefficients_on_past_outputs(model: Model, parameters: Sequence[Parameter]) -> dict[str, int]:
+def count_past_output_coefficients(model: Model, parameters: Sequence[Parameter]) -> dict[str, int]:
     """Of each output, how many free parameters multiply a state in the equations behind it.
 
     Parameters
@@ -37,45 +45,55 @@ def coefficients_on_past_outputs(model: Model, parameters: Sequence[Parameter]) 
     parameters : sequence of Parameter
         All of a problem's. A lag is no coefficient, whether it is free or not.
     """
-    model = tied_model(model, ties_of(model, parameters))
+    model = apply_ties(model, resolve_ties(model, parameters))
     free = {one.name for one in parameters if one.is_free}
     equations = dict(zip((one.name for one in model.states), model.equations, strict=True))
     found = {}
     for output in model.outputs:
-        behind = [_seen(equations[state]) for state in _behind(output.expression, equations)]
+        behind = [
+            _analyse_expression(equations[state])
+            for state in _list_dependencies(output.expression, equations)
+        ]
         found[output.name] = len(free & frozenset().union(*(one.multiply for one in behind)))
     return found
 
 
-def _behind(tree: Expression, equations: Mapping[str, Expression]) -> list[str]:
+def _list_dependencies(tree: Expression, equations: Mapping[str, Expression]) -> list[str]:
     """The states that an expression depends on, and those that these depend on."""
-    found = _states(tree)
+    found = _list_states(tree)
     for state in found:  # grows while it is walked
-        found += [one for one in _states(equations[state]) if one not in found]
+        found += [one for one in _list_states(equations[state]) if one not in found]
     return found
 
 
-def _states(tree: Expression) -> list[str]:
-    return list(dict.fromkeys(one.name for one in past_values(tree) if one.kind == "state"))
+def _list_states(tree: Expression) -> list[str]:
+    return list(dict.fromkeys(one.name for one in collect_past_values(tree) if one.kind == "state"))
 
 
-def _seen(tree: Expression) -> _Seen:
+def _analyse_expression(tree: Expression) -> _StateFactors:
     match tree:
         case Symbol(name, "parameter"):
-            return _Seen(names=frozenset({name}))
-        case Past(_, "state"):
-            return _Seen(has_state=True)
+            return _StateFactors(names=frozenset({name}))
+        case PastValue(_, "state"):
+            return _StateFactors(has_state=True)
         case Unary(_, operand):
-            return _seen(operand)
+            return _analyse_expression(operand)
         case Binary(operator, left, right):
-            return _together([_seen(left), _seen(right)], is_sum=operator in ("+", "-"))
-        case Call(_, arguments):
-            return _together([_seen(one) for one in arguments], is_sum=False, is_product=False)
+            return _combine_factors(
+                [_analyse_expression(left), _analyse_expression(right)],
+                is_sum=operator in ("+", "-"),
+            )
+        case FunctionCall(_, arguments):
+            return _combine_factors(
+                [_analyse_expression(one) for one in arguments], is_sum=False, is_product=False
+            )
         case _:
-            return _Seen()
+            return _StateFactors()
 
 
-def _together(parts: Sequence[_Seen], *, is_sum: bool, is_product: bool = True) -> _Seen:
+def _combine_factors(
+    parts: Sequence[_StateFactors], *, is_sum: bool, is_product: bool = True
+) -> _StateFactors:
     """Of a sum, a product, or else a function, in which every parameter acts on every state."""
     names = frozenset().union(*(one.names for one in parts))
     multiply = frozenset().union(*(one.multiply for one in parts))
@@ -85,4 +103,4 @@ def _together(parts: Sequence[_Seen], *, is_sum: bool, is_product: bool = True) 
             others = any(other.has_state for j, other in enumerate(parts) if j != i)
             if others or (one.has_state and not is_product):
                 multiply |= one.names
-    return _Seen(names, multiply, has_state)
+    return _StateFactors(names, multiply, has_state)

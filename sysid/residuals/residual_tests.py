@@ -34,30 +34,30 @@ from scipy.special import chdtrc
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.records import Channel
 from sysid.residuals.autocorrelation import (
-    FEWEST,
-    ROUNDING,
-    Laid,
-    colour_of,
-    lagged_sums,
-    laid_out,
-    whiteness,
+    FEWEST_SAMPLES,
+    ROUNDING_SHARE,
+    SpacedResiduals,
+    compute_lagged_sums,
+    compute_whiteness,
+    smooth_spectrum_root,
+    space_residuals,
 )
-from sysid.residuals.past_outputs import coefficients_on_past_outputs
-from sysid.residuals.whitening import Whitening, owed
+from sysid.residuals.past_outputs import count_past_output_coefficients
+from sysid.residuals.whitening import Whitening, compute_ar1_coefficient
 from sysid.simulation.loss import compute_influence
 
 if TYPE_CHECKING:  # the pages read these results without a compiler
     from sysid.simulation.problem import Problem
 
 
-LEVEL = 0.05
+TEST_LEVEL = 0.05
 """Chance that a true model with white noise fails one of its tests, all of them together."""
 
 _BAND95, _BAND99 = 1.959963984540054, 2.5758293035489004
-_MOST = 20_000  # consecutive samples that are enough for any test; bounds the time it takes
+_MOST_SAMPLES = 20_000  # consecutive samples that are enough for any test; bounds the time it takes
 
-Kind = Literal["whiteness", "independence"]
-Outcome = Literal["passed", "failed", "not tested"]
+ResidualTestKind = Literal["whiteness", "independence"]
+ResidualTestOutcome = Literal["passed", "failed", "not tested"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +82,9 @@ class ResidualTest:
 
     experiment: int
     output: str
-    kind: Kind
+    kind: ResidualTestKind
     input: str | None
-    outcome: Outcome
+    outcome: ResidualTestOutcome
     samples: int
     lags: int = 0
     inside95: float | None = None
@@ -105,7 +105,7 @@ class ResidualTests:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Correlation:
+class CorrelationFunction:
     """A correlation function with its bands, and the test made of it.
 
     Attributes
@@ -124,7 +124,7 @@ class Correlation:
     band99: FloatArray
 
 
-class Series(NamedTuple):
+class ResidualSeries(NamedTuple):
     """The residuals (N,) of one output in one experiment, as the loss sees them.
 
     `scored` tells which of them count; `size` is the largest measured value among those.
@@ -141,7 +141,7 @@ class Series(NamedTuple):
     coefficients: int = 0
 
 
-def residual_tests(
+def run_residual_tests(
     problem: "Problem", simulated: FloatArray, data: Literal["estimation", "validation"],
     correlation_times: Mapping[str, float] | None = None,
 ) -> ResidualTests:  # fmt: skip
@@ -149,15 +149,15 @@ def residual_tests(
 
     Of an output whose noise has a correlation time (s) they are whitened first.
     """
-    found = series_of(problem, simulated, correlation_times)
+    found = list_residual_series(problem, simulated, correlation_times)
     if data == "estimation" and problem.prediction == "one-step":
-        counts = coefficients_on_past_outputs(problem.model, problem.all_parameters)
+        counts = count_past_output_coefficients(problem.model, problem.all_parameters)
         found = [one._replace(coefficients=counts[one.output]) for one in found]
-    return verdict(correlations(found, both_sides=False), data)
+    return judge_tests(compute_correlations(found, both_sides=False), data)
 
 
-def verdict(
-    found: Sequence[Correlation], data: Literal["estimation", "validation"]
+def judge_tests(
+    found: Sequence[CorrelationFunction], data: Literal["estimation", "validation"]
 ) -> ResidualTests:
     """The tests of some correlation functions, and whether all of them passed."""
     tests = tuple(one.test for one in found)
@@ -166,13 +166,13 @@ def verdict(
     return ResidualTests(data, passed, tests)
 
 
-def series_of(
+def list_residual_series(
     problem: "Problem", simulated: FloatArray, correlation_times: Mapping[str, float] | None = None
-) -> list[Series]:
+) -> list[ResidualSeries]:
     """The residuals of every output of every experiment, from simulated values (M,)."""
     parts = zip(
-        problem.records, problem.split(simulated), problem.split(problem.evaluator.measured),
-        problem.split(problem.evaluator.weight), strict=True,
+        problem.records, problem.split_by_output(simulated), problem.split_by_output(problem.evaluator.measured),
+        problem.split_by_output(problem.evaluator.weight), strict=True,
     )  # fmt: skip
     names = {one.name for one in problem.model.inputs}
     found = []
@@ -182,18 +182,18 @@ def series_of(
         for output in (one.name for one in problem.model.outputs):
             factor = problem.output_weights[output]
             found.append(
-                series(number, output, times[output], factor * measured[output],
+                make_residual_series(number, output, times[output], factor * measured[output],
                        factor * model[output], weight[output] > 0, inputs, problem.loss_scale,
                        (correlation_times or {}).get(output, 0.0))
             )  # fmt: skip
     return found
 
 
-def series(
+def make_residual_series(
     experiment: int, output: str, times: FloatArray, measured: FloatArray, simulated: FloatArray,
     scored: BoolArray, inputs: tuple[Channel, ...], loss_scale: float = 0.0,
     correlation_time: float = 0.0,
-) -> Series:  # fmt: skip
+) -> ResidualSeries:  # fmt: skip
     """Residuals from weighted outputs (N,); of a long record the last 20 000 scored samples.
 
     `loss_scale` is that of a soft-l1 loss, 0 with squares; `correlation_time` (s) that of the
@@ -202,32 +202,36 @@ def series(
     with np.errstate(all="ignore"):  # a missing measurement, or a simulation that diverged
         error = measured - simulated
         seen = compute_influence(error, loss_scale)
-    where = np.flatnonzero(scored & np.isfinite(seen))[-_MOST:]
+    where = np.flatnonzero(scored & np.isfinite(seen))[-_MOST_SAMPLES:]
     usable = np.zeros(times.size, dtype=np.bool_)
     usable[where] = True
     if correlation_time > 0:
-        seen[where] = Whitening(owed(times[where], correlation_time)).of(seen[where])
+        seen[where] = Whitening(compute_ar1_coefficient(times[where], correlation_time)).whiten(
+            seen[where]
+        )
     kept = slice(int(where[0]), int(where[-1]) + 1) if where.size else slice(0, 0)
     size = float(np.max(np.abs(measured[where]), initial=0.0))
-    return Series(experiment, output, times[kept], seen[kept], usable[kept], size, inputs)
+    return ResidualSeries(experiment, output, times[kept], seen[kept], usable[kept], size, inputs)
 
 
-def correlations(
-    found: Sequence[Series], level: float = LEVEL, *, both_sides: bool = True
-) -> list[Correlation]:
+def compute_correlations(
+    found: Sequence[ResidualSeries], level: float = TEST_LEVEL, *, both_sides: bool = True
+) -> list[CorrelationFunction]:
     """Autocorrelation of each series and its correlation with each input, all tested together.
 
     `level` is shared out (Bonferroni): of n tests each is one at `level` / n. Without
     `both_sides` the correlation with inputs to come, which is not tested, is left out.
     """
-    count = sum(1 + len(one.inputs) for one in found if not _untestable(one))
+    count = sum(1 + len(one.inputs) for one in found if not _explain_untestable(one))
     each = level / max(count, 1)
     return [
-        curve for one in found for curve in _of_series(one, each, both_sides, _lost(one, found))
+        curve
+        for one in found
+        for curve in _correlate_series(one, each, both_sides, _count_lost_degrees(one, found))
     ]
 
 
-def _lost(one: Series, found: Sequence[Series]) -> float:
+def _count_lost_degrees(one: ResidualSeries, found: Sequence[ResidualSeries]) -> float:
     """Degrees of freedom that a series loses: its share by samples of the coefficients."""
     if not one.coefficients:
         return 0.0
@@ -235,72 +239,78 @@ def _lost(one: Series, found: Sequence[Series]) -> float:
     return one.coefficients * np.count_nonzero(one.scored) / max(total, 1)
 
 
-def _of_series(one: Series, level: float, both_sides: bool, lost: float) -> Iterator[Correlation]:
-    reason = _untestable(one)
+def _correlate_series(
+    one: ResidualSeries, level: float, both_sides: bool, lost: float
+) -> Iterator[CorrelationFunction]:
+    reason = _explain_untestable(one)
     if reason:
-        yield _not_tested(one, "whiteness", None, reason)
+        yield _make_untested(one, "whiteness", None, reason)
         for channel in one.inputs:
-            yield _not_tested(one, "independence", channel.name, reason)
+            yield _make_untested(one, "independence", channel.name, reason)
         return
-    laid = laid_out(one.times[one.scored], one.residual[one.scored])
-    yield _whiteness(one, laid, level, lost)
+    laid = space_residuals(one.times[one.scored], one.residual[one.scored])
+    yield _test_whiteness(one, laid, level, lost)
     for channel in one.inputs:
-        yield _independence(one, laid, channel, level, both_sides=both_sides)
+        yield _test_independence(one, laid, channel, level, both_sides=both_sides)
 
 
-def _untestable(one: Series) -> str:
+def _explain_untestable(one: ResidualSeries) -> str:
     n = int(np.count_nonzero(one.scored))
-    if n < FEWEST:
-        return f"{n} samples are too few; need {FEWEST} or more"
-    if float(np.sqrt(np.mean(np.square(one.residual[one.scored])))) <= ROUNDING * one.size:
+    if n < FEWEST_SAMPLES:
+        return f"{n} samples are too few; need {FEWEST_SAMPLES} or more"
+    if float(np.sqrt(np.mean(np.square(one.residual[one.scored])))) <= ROUNDING_SHARE * one.size:
         return "the residuals are rounding: the model reproduces the data exactly"
     return ""
 
 
-def _whiteness(one: Series, laid: Laid, level: float, lost: float) -> Correlation:
-    values, deviation, statistic = whiteness(laid)
-    degrees = max(laid.lags - lost, 1.0)
-    test = _test(one, "whiteness", None, values / deviation, statistic, degrees, level)
+def _test_whiteness(
+    one: ResidualSeries, laid: SpacedResiduals, level: float, lost: float
+) -> CorrelationFunction:
+    values, deviation, statistic = compute_whiteness(laid)
+    degrees = max(laid.n_lags - lost, 1.0)
+    test = _make_test(one, "whiteness", None, values / deviation, statistic, degrees, level)
     band = np.concatenate([[0.0], deviation])
-    return Correlation(
-        test, laid.period if laid.is_regular else None, np.arange(0.0, laid.lags + 1),
+    return CorrelationFunction(
+        test, laid.period if laid.is_regular else None, np.arange(0.0, laid.n_lags + 1),
         np.concatenate([[1.0], values]), _BAND95 * band, _BAND99 * band,
     )  # fmt: skip
 
 
-def _independence(
-    one: Series, laid: Laid, channel: Channel, level: float, *, both_sides: bool
-) -> Correlation:
+def _test_independence(
+    one: ResidualSeries, laid: SpacedResiduals, channel: Channel, level: float, *, both_sides: bool
+) -> CorrelationFunction:
     if not np.ptp(channel.values) > 0:
-        return _not_tested(one, "independence", channel.name, "the input is constant")
+        return _make_untested(one, "independence", channel.name, "the input is constant")
     residual = np.where(laid.present, laid.values - np.mean(laid.values[laid.present]), 0.0)
-    if not np.max(np.abs(residual)) > ROUNDING * np.max(np.abs(laid.values)):
+    if not np.max(np.abs(residual)) > ROUNDING_SHARE * np.max(np.abs(laid.values)):
         reason = "the residual is the same everywhere"
-        return _not_tested(one, "independence", channel.name, reason)
-    colour = colour_of(residual, laid.present)
-    past = lagged_sums(laid, residual, colour, channel, np.arange(laid.lags + 1.0))
+        return _make_untested(one, "independence", channel.name, reason)
+    colour = smooth_spectrum_root(residual, laid.present)
+    past = compute_lagged_sums(laid, residual, colour, channel, np.arange(laid.n_lags + 1.0))
     if isinstance(past, str):
-        return _not_tested(one, "independence", channel.name, past)
+        return _make_untested(one, "independence", channel.name, past)
     scaled = past.sums / past.deviation
     spread = past.covariance / np.outer(past.deviation, past.deviation)
     count, squares = scaled.size, float(np.sum(np.square(spread)))
     # A sum of squares with mean `count` and variance 2·`squares` is a χ² times squares/count.
     statistic = float(scaled @ scaled) * count / squares
     degrees = count * count / squares
-    test = _test(one, "independence", channel.name, scaled, statistic, degrees, level)
+    test = _make_test(one, "independence", channel.name, scaled, statistic, degrees, level)
     parts = [past]
     if both_sides:
-        future = lagged_sums(laid, residual, colour, channel, np.arange(-float(laid.lags), 0.0))
+        future = compute_lagged_sums(
+            laid, residual, colour, channel, np.arange(-float(laid.n_lags), 0.0)
+        )
         parts = [past] if isinstance(future, str) else [future, past]
     band = np.concatenate([part.deviation / part.norm for part in parts])
-    return Correlation(
+    return CorrelationFunction(
         test, laid.period, np.concatenate([part.lags for part in parts]),
         np.concatenate([part.sums / part.norm for part in parts]), _BAND95 * band, _BAND99 * band,
     )  # fmt: skip
 
 
-def _test(
-    one: Series, kind: Kind, channel: str | None, scaled: FloatArray, statistic: float,
+def _make_test(
+    one: ResidualSeries, kind: ResidualTestKind, channel: str | None, scaled: FloatArray, statistic: float,
     degrees: float, level: float,
 ) -> ResidualTest:  # fmt: skip
     p = float(chdtrc(degrees, statistic))
@@ -313,9 +323,11 @@ def _test(
     )  # fmt: skip
 
 
-def _not_tested(one: Series, kind: Kind, channel: str | None, reason: str) -> Correlation:
+def _make_untested(
+    one: ResidualSeries, kind: ResidualTestKind, channel: str | None, reason: str
+) -> CorrelationFunction:
     samples = int(np.count_nonzero(one.scored))
     test = ResidualTest(one.experiment, one.output, kind, channel, "not tested", samples,
                         reason=reason)  # fmt: skip
     none = np.zeros(0)
-    return Correlation(test, None, none, none, none, none)
+    return CorrelationFunction(test, None, none, none, none, none)

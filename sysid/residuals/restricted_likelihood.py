@@ -21,20 +21,20 @@ from scipy.special import chdtrc, expit
 
 from sysid.core.linear_algebra import truncated_svd
 from sysid.core.types import FloatArray, IntArray
-from sysid.residuals.autocorrelation import Laid, whiteness
+from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness
 
-STEEPEST = 0.97
+LARGEST_POLE = 0.97
 """Pole of a recursion: one nearer 1 would follow a single drift (Andrews and Monahan 1992)."""
 
-_STARTS = ((0.6, -1.5), (1.5, 0.0))
-_EVALUATIONS = 80  # of each of them
-_CLOSE = 0.02  # of the likelihood, and of the two numbers that it is searched over
-_STEP = 0.1  # of their differences
-_VAGUE = 0.05  # curvature: a likelihood that is flatter knows no more
-_WHITE = 0.05  # chance of what is left of the residuals, if it is white
+_SEARCH_STARTS = ((0.6, -1.5), (1.5, 0.0))
+_MOST_EVALUATIONS = 80  # of each of them
+_SEARCH_TOLERANCE = 0.02  # of the likelihood, and of the two numbers that it is searched over
+_DIFFERENCE_STEP = 0.1  # of their differences
+_LEAST_CURVATURE = 0.05  # curvature: a likelihood that is flatter knows no more
+_LEAST_CHANCE = 0.05  # chance of what is left of the residuals, if it is white
 
 
-class Modelled(NamedTuple):
+class NoiseColourModel(NamedTuple):
     """SᵀRS of one series, and how exact it is.
 
     Attributes
@@ -54,9 +54,9 @@ class Modelled(NamedTuple):
     slopes: FloatArray
     covariance: FloatArray
     degrees: float
-    share: float
+    sample_share: float
 
-    def variation(self, direction: FloatArray) -> float:
+    def compute_variation(self, direction: FloatArray) -> float:
         """Variance of the logarithm of the variance of a combination (D,) of Sᵀe."""
         size = float(direction @ self.middle @ direction)
         slope = np.einsum("d,kde,e->k", direction, self.slopes, direction)
@@ -64,7 +64,7 @@ class Modelled(NamedTuple):
         return known + 2.0 / self.degrees
 
 
-class _Series(NamedTuple):
+class _ObservedSeries(NamedTuple):
     """Values (n,) beside what the parameters can take of them (n, r), and periods between (n-1)."""
 
     values: FloatArray
@@ -72,7 +72,7 @@ class _Series(NamedTuple):
     gaps: IntArray
 
 
-def modelled(laid: Laid, columns: FloatArray) -> Modelled | None:
+def fit_noise_colour(laid: SpacedResiduals, columns: FloatArray) -> NoiseColourModel | None:
     """The model's colour; None where it is none of these residuals.
 
     Parameters
@@ -85,38 +85,40 @@ def modelled(laid: Laid, columns: FloatArray) -> Modelled | None:
     values = laid.values[laid.present]
     left, _, _, kept = truncated_svd(columns)
     basis = left[:, kept]
-    series = _Series(values, basis, np.diff(np.flatnonzero(laid.present)))
+    series = _ObservedSeries(values, basis, np.diff(np.flatnonzero(laid.present)))
     if values.size <= basis.shape[1] + 2:
         return None
     found = [
-        minimize(_deviance, start, (series,), method="Nelder-Mead",
-                 options={"maxfev": _EVALUATIONS, "xatol": _CLOSE, "fatol": _CLOSE})
-        for start in _STARTS
+        minimize(_compute_deviance, start, (series,), method="Nelder-Mead",
+                 options={"maxfev": _MOST_EVALUATIONS, "xatol": _SEARCH_TOLERANCE, "fatol": _SEARCH_TOLERANCE})
+        for start in _SEARCH_STARTS
     ]  # fmt: skip
     best = min(found, key=lambda one: float(one.fun)).x
-    innovations, power, _ = _left(best, series)
+    innovations, power, _ = _compute_innovations(best, series)
     if not power > 0 or not _are_white(innovations):
         return None
-    steps = _STEP * np.eye(2)
-    middles = [_middle(best + step, laid, columns, series) for step in (*steps, *-steps)]
-    slopes = np.array([(middles[i] - middles[i + 2]) / (2.0 * _STEP) for i in range(2)])
+    steps = _DIFFERENCE_STEP * np.eye(2)
+    middles = [_compute_middle(best + step, laid, columns, series) for step in (*steps, *-steps)]
+    slopes = np.array([(middles[i] - middles[i + 2]) / (2.0 * _DIFFERENCE_STEP) for i in range(2)])
     degrees = float(values.size - basis.shape[1])
-    a, w = _meant(best)
+    a, w = _to_pole_and_share(best)
     share = 1.0 / (1.0 + (1.0 - w) * 2.0 * a / (1.0 - a))
-    middle = _middle(best, laid, columns, series)
-    return Modelled(middle, slopes, _covariance(best, series), degrees, min(share, 1.0))
+    middle = _compute_middle(best, laid, columns, series)
+    return NoiseColourModel(
+        middle, slopes, _estimate_covariance(best, series), degrees, min(share, 1.0)
+    )
 
 
-def _meant(place: FloatArray) -> tuple[float, float]:
+def _to_pole_and_share(place: FloatArray) -> tuple[float, float]:
     """Pole and share of white noise."""
-    return STEEPEST * float(np.tanh(place[0])), float(expit(place[1]))
+    return LARGEST_POLE * float(np.tanh(place[0])), float(expit(place[1]))
 
 
-def _solved(place: FloatArray, series: _Series) -> tuple[FloatArray, float]:
+def _whiten_series(place: FloatArray, series: _ObservedSeries) -> tuple[FloatArray, float]:
     """Basis and values (n, r + 1) as of white noise, and ln of the determinant of R."""
     from scipy.linalg import cholesky_banded, solve_banded
 
-    a, w = _meant(place)
+    a, w = _to_pole_and_share(place)
     carried = a**series.gaps
     band = np.ones((2, series.values.size))
     band[0, 1:] = (1.0 - w) * (1.0 - carried**2) + w * (1.0 + carried**2)
@@ -128,35 +130,39 @@ def _solved(place: FloatArray, series: _Series) -> tuple[FloatArray, float]:
     return solve_banded((1, 0), root, both), 2.0 * float(np.sum(np.log(root[0])))
 
 
-def _left(place: FloatArray, series: _Series) -> tuple[FloatArray, float, float]:
+def _compute_innovations(
+    place: FloatArray, series: _ObservedSeries
+) -> tuple[FloatArray, float, float]:
     """White residuals (n,), their squares' sum, and ln of both determinants."""
-    both, size = _solved(place, series)
+    both, size = _whiten_series(place, series)
     basis, values = both[:, :-1], both[:, -1]
     gram = basis.T @ basis
     left = values - basis @ np.linalg.solve(gram, basis.T @ values)
     return left, float(left @ left), size + float(np.linalg.slogdet(gram)[1])
 
 
-def _deviance(place: FloatArray, series: _Series) -> float:
+def _compute_deviance(place: FloatArray, series: _ObservedSeries) -> float:
     """Minus twice the logarithm of the restricted likelihood, but for a constant."""
-    _, power, determinants = _left(place, series)
+    _, power, determinants = _compute_innovations(place, series)
     n, r = series.basis.shape
     return float((n - r) * np.log(max(power, float(np.finfo(float).tiny))) + determinants)
 
 
 def _are_white(values: FloatArray) -> bool:
     ones = np.ones(values.size, dtype=np.bool_)
-    laid = Laid(np.arange(float(values.size)), values, ones, 1.0, is_regular=True)
-    return float(chdtrc(laid.lags, whiteness(laid).statistic)) >= _WHITE
+    laid = SpacedResiduals(np.arange(float(values.size)), values, ones, 1.0, is_regular=True)
+    return float(chdtrc(laid.n_lags, compute_whiteness(laid).statistic)) >= _LEAST_CHANCE
 
 
-def _middle(place: FloatArray, laid: Laid, columns: FloatArray, series: _Series) -> FloatArray:
+def _compute_middle(
+    place: FloatArray, laid: SpacedResiduals, columns: FloatArray, series: _ObservedSeries
+) -> FloatArray:
     """SᵀRS (D, D)."""
     from scipy.linalg import solve_banded
 
-    a, w = _meant(place)
+    a, w = _to_pole_and_share(place)
     n, r = series.basis.shape
-    variance = _left(place, series)[1] / (n - r)
+    variance = _compute_innovations(place, series)[1] / (n - r)
     spread = np.zeros((laid.values.size, columns.shape[1]))
     spread[laid.present] = columns
     recursion = np.array([[1.0], [-a]]) * np.ones(laid.values.size)
@@ -167,16 +173,16 @@ def _middle(place: FloatArray, laid: Laid, columns: FloatArray, series: _Series)
     return np.asarray(0.5 * (middle + middle.T))
 
 
-def _covariance(place: FloatArray, series: _Series) -> FloatArray:
+def _estimate_covariance(place: FloatArray, series: _ObservedSeries) -> FloatArray:
     """Of the two numbers (2, 2), by the curvature of the likelihood."""
-    one, other = _STEP * np.eye(2)
+    one, other = _DIFFERENCE_STEP * np.eye(2)
 
     def at(move: FloatArray) -> float:
-        return 0.5 * _deviance(place + move, series)
+        return 0.5 * _compute_deviance(place + move, series)
 
     here = at(np.zeros(2))
     mixed = (at(one + other) - at(one - other) - at(other - one) + at(-one - other)) / 4.0
     straight = [at(step) - 2.0 * here + at(-step) for step in (one, other)]
-    curvature = np.array([[straight[0], mixed], [mixed, straight[1]]]) / _STEP**2
+    curvature = np.array([[straight[0], mixed], [mixed, straight[1]]]) / _DIFFERENCE_STEP**2
     size, rows = np.linalg.eigh(curvature)
-    return np.asarray((rows / np.maximum(size, _VAGUE)) @ rows.T)
+    return np.asarray((rows / np.maximum(size, _LEAST_CURVATURE)) @ rows.T)

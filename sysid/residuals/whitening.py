@@ -25,32 +25,32 @@ class Whitening:
         Correlation times that were estimated for it.
     """
 
-    owed: FloatArray
-    n_times: int = 0
+    ar1_coefficient: FloatArray
+    n_correlation_times: int = 0
 
-    def of(self, values: FloatArray) -> FloatArray:
+    def whiten(self, values: FloatArray) -> FloatArray:
         """Values (..., n) of samples without what they owe."""
         white = np.array(values)
-        white[..., 1:] -= self.owed[1:] * values[..., :-1]
-        return white / self._left
+        white[..., 1:] -= self.ar1_coefficient[1:] * values[..., :-1]
+        return white / self._innovation_deviation
 
     @property
     def log_determinant(self) -> float:
         """Logarithm of the determinant of the correlation matrix."""
-        return float(2.0 * np.sum(np.log(self._left)))
+        return float(2.0 * np.sum(np.log(self._innovation_deviation)))
 
     @property
-    def samples(self) -> float:
+    def equivalent_samples(self) -> float:
         """How many white samples would say as much of a mean (Bayley and Hammersley 1946)."""
-        return float(np.sum((1.0 - self.owed) / (1.0 + self.owed)))
+        return float(np.sum((1.0 - self.ar1_coefficient) / (1.0 + self.ar1_coefficient)))
 
     @property
-    def _left(self) -> FloatArray:
+    def _innovation_deviation(self) -> FloatArray:
         """Standard deviation of what is not owed, of that of the noise."""
-        return np.sqrt(1.0 - np.square(self.owed))
+        return np.sqrt(1.0 - np.square(self.ar1_coefficient))
 
 
-def owed(times: FloatArray, correlation_time: float) -> FloatArray:
+def compute_ar1_coefficient(times: FloatArray, correlation_time: float) -> FloatArray:
     """What samples (n,) at some times (s) owe to the one before, 0 for a `correlation_time` of 0.
 
     Samples at one time owe no more than those a thousandth of the mean step apart.

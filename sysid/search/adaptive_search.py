@@ -11,82 +11,93 @@ from the best of fresh individuals, and take in the rest by and by.
 
 import numpy as np
 
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, WordArray
-from sysid.search.basin_hopping import COUNTED, SINGLE, UNCOUNTED, hop, is_behind, is_coloured
-from sysid.search.levenberg_marquardt import damped_step, factored, spread
-from sysid.search.operators import (
-    DEVELOPMENT,
-    Draws,
-    below,
-    coded,
-    decoded,
-    draws,
-    normal,
-    rank,
-    unit,
+from sysid.search.basin_hopping import (
+    COUNTED_HOP,
+    SINGLE_PARAMETER_HOP,
+    UNCOUNTED_HOP,
+    hop_from_champion,
+    is_behind_champion,
+    is_champion_coloured,
 )
-from sysid.search.slopes import normal_equations, partial_fitness, slope_distance
-from sysid.search.state import SAME, IslandArrays, Plan, SearchRecord
-from sysid.simulation.evaluator import Evaluator, partial_predictions, population_fitness
-from sysid.simulation.scaling import located
+from sysid.search.levenberg_marquardt import factor_damped, write_damped_step, write_spread_place
+from sysid.search.operators import (
+    USE_LOCAL_SEARCH,
+    RandomWords,
+    decode,
+    draw_words,
+    encode,
+    sort_population,
+    to_integer,
+    to_normal,
+    to_uniform,
+)
+from sysid.search.slopes import build_normal_equations, choose_difference, evaluate_partial_fitness
+from sysid.search.state import SAME_OPTIMUM, IslandArrays, IslandPlan, SearchRecord
+from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_partially
+from sysid.simulation.scaling import from_unit
 
-TRIALS = 3
-FACTOR = 10.0  # between the dampings of two trials
+N_TRIALS = 3
+DAMPING_FACTOR = 10.0  # between the dampings of two trials
 FIRST_DAMPING = 1e-2
 EARLY_DAMPING = 1.0  # far from a minimum: a full step would leave the box
 EARLY_PLACES = 4  # of which an early fresh development begins with the best
 LONGEST_GROWTH = 4.0  # doublings
 N_GROWTHS = 3
-MOST_STEPS = 12
-ENOUGH = 1e-4  # relative gain of a step below which a full-record search ends
-ENOUGH_PART = 1e-2
-EARLY = 4  # developments that follow each other at once and are cheap, before the long ones
-FAR = 1.1  # of the champion's fitness: above, a search ends at the first small gain
-TURNS = 8  # developments after which the kinds repeat where the fitness jumps
-SCATTERS, GROWS_BESIDE = 2, 4  # of four the one that spreads, of eight that grows from beside
+MOST_SEARCH_STEPS = 12
+ENOUGH_GAIN = 1e-4  # relative gain of a step below which a full-record search ends
+ENOUGH_PART_GAIN = 1e-2
+EARLY_SEARCHES = (
+    4  # developments that follow each other at once and are cheap, before the long ones
+)
+FAR_FITNESS = 1.1  # of the champion's fitness: above, a search ends at the first small gain
+SEARCH_CYCLE = 8  # developments after which the kinds repeat where the fitness jumps
+SCATTER_TURN, GROWTH_TURN = 2, 4  # of four the one that spreads, of eight that grows from beside
 SHORT_GROWTH = 1.5  # doublings: beside the champion the later signs of velocities are right
 
 
-@compiled
-def _fresh(
-    evaluator: Evaluator, plan: Plan, shape: tuple[int, int], search: SearchRecord
+@jit_compile
+def _draw_best_start(
+    evaluator: Evaluator, plan: IslandPlan, shape: tuple[int, int], search: SearchRecord
 ) -> FloatArray:
     """The best of a population of random places, judged by the record up to the horizon."""
     places, horizon = np.empty(shape), search.horizon
     for p in range(shape[0]):
         for d in range(shape[1]):
             draw = 1 + p * shape[1] + d
-            word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, draw)
-            places[p, d] = unit(word[0])
+            word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, draw)
+            places[p, d] = to_uniform(word[0])
     search.evaluations += shape[0]
-    predicted = partial_predictions(evaluator, located(evaluator, places), horizon)
-    reached = partial_fitness(evaluator, plan, predicted, horizon)
+    predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
+    reached = evaluate_partial_fitness(evaluator, plan, predicted, horizon)
     return np.asarray(places[np.argmin(reached[: shape[0]])])
 
 
-@compiled
-def scatters(search: SearchRecord) -> bool:
+@jit_compile
+def has_scattered(search: SearchRecord) -> bool:
     """Whether the last development spread the population around the champion."""
-    return bool(search.local_searches % (TURNS // 2) == SCATTERS)
+    return bool(search.local_searches % (SEARCH_CYCLE // 2) == SCATTER_TURN)
 
 
-@compiled
-def _is_lost(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> bool:
+@jit_compile
+def _should_search_far(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> bool:
     """Whether this is a hop's turn that is better spent far away. Not where a budget ends."""
     search = island.search
-    turn = search.local_searches % TURNS
+    turn = search.local_searches % SEARCH_CYCLE
     if turn % 2 == 0 or turn == 1:
         return False
     if search.champion_converged == 0 or search.fitness_discontinuities == 0:
         return False
-    if search.evaluations + max(island.chromosomes.shape) + 2 > plan.evaluations:
+    if search.evaluations + max(island.chromosomes.shape) + 2 > plan.most_evaluations:
         return False
-    return is_coloured(evaluator, plan, island)
+    return is_champion_coloured(evaluator, plan, island)
 
 
-@compiled
-def _choose_beside(size: int, word: Draws, is_lost: bool, search: SearchRecord) -> int:
+@jit_compile
+def _choose_discontinuous_start(
+    size: int, word: RandomWords, is_lost: bool, search: SearchRecord
+) -> int:
     """The same where the fitness jumps: there most that is better lies beside the champion.
 
     Of eight developments four are hops, two of them of one parameter, two scatter, one grows from
@@ -94,89 +105,93 @@ def _choose_beside(size: int, word: Draws, is_lost: bool, search: SearchRecord) 
     fresh individuals. Both grow so fast that it costs little. Where the champion's errors are no
     noise, three of the hops give their turns to fresh individuals.
     """
-    turn = search.local_searches % TURNS
+    turn = search.local_searches % SEARCH_CYCLE
     search.wide_differences = 1
     if search.champion_converged == 0:  # the champion first, whole: what follows is drawn around it
         return 0
     if is_lost:
-        search.horizon = 0.5 ** (LONGEST_GROWTH * (1.0 + unit(word[0])) / 2.0)
+        search.horizon = 0.5 ** (LONGEST_GROWTH * (1.0 + to_uniform(word[0])) / 2.0)
         search.horizon_growth = 2.0
         return -1
     if turn % 2 == 1:
-        search.hop_kind = COUNTED + SINGLE if turn % 4 == 3 else COUNTED
+        search.hop_kind = COUNTED_HOP + SINGLE_PARAMETER_HOP if turn % 4 == 3 else COUNTED_HOP
         return 0
-    if scatters(search):
+    if has_scattered(search):
         search.probe_count = size
         return 0
     search.horizon_growth = 2.0
-    if turn == GROWS_BESIDE:
-        search.hop_kind = UNCOUNTED + SINGLE
-        search.horizon = 0.5 ** (SHORT_GROWTH * unit(word[0]))
+    if turn == GROWTH_TURN:
+        search.hop_kind = UNCOUNTED_HOP + SINGLE_PARAMETER_HOP
+        search.horizon = 0.5 ** (SHORT_GROWTH * to_uniform(word[0]))
         return 0
-    search.horizon = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
-    if below(word[1], 3) > 0:
+    search.horizon = 0.5 ** (LONGEST_GROWTH * to_uniform(word[0]))
+    if to_integer(word[1], 3) > 0:
         return -1
-    search.horizon_growth = 2.0 ** (0.5 ** (1 + below(word[3], N_GROWTHS)))
+    search.horizon_growth = 2.0 ** (0.5 ** (1 + to_integer(word[3], N_GROWTHS)))
     search.probe_count = size // 3
-    return below(word[2], size)
+    return to_integer(word[2], size)
 
 
-@compiled
-def _choose(plan: Plan, size: int, is_lost: bool, search: SearchRecord) -> int:
+@jit_compile
+def _choose_start(plan: IslandPlan, size: int, is_lost: bool, search: SearchRecord) -> int:
     """What kind of development comes next; gives the individual it begins with, -1: a fresh one."""
     number = search.local_searches
-    word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, 0)
-    if search.fitness_discontinuities > 0 and number > EARLY:
-        return _choose_beside(size, word, is_lost, search)
-    grows = number == EARLY or (number > EARLY and number % 2 == 0)
-    last_early = EARLY - search.is_warm_start  # behind an earlier result, the last of them is a hop
+    word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 0)
+    if search.fitness_discontinuities > 0 and number > EARLY_SEARCHES:
+        return _choose_discontinuous_start(size, word, is_lost, search)
+    grows = number == EARLY_SEARCHES or (number > EARLY_SEARCHES and number % 2 == 0)
+    last_early = (
+        EARLY_SEARCHES - search.is_warm_start
+    )  # behind an earlier result, the last of them is a hop
     settled = search.champion_converged == 1 and number > last_early
-    chosen = below(word[1], 3 * size) - size if grows else 0
+    chosen = to_integer(word[1], 3 * size) - size if grows else 0
     search.wide_differences = search.champion_converged == 1 or grows
-    if settled and (chosen >= size or number % 4 == 1 or number == EARLY):
-        search.hop_kind = COUNTED
+    if settled and (chosen >= size or number % 4 == 1 or number == EARLY_SEARCHES):
+        search.hop_kind = COUNTED_HOP
     elif grows:
-        search.horizon = 0.5 ** (LONGEST_GROWTH * unit(word[0]))
-        doublings = 1.0 if number == EARLY else 0.5 ** (1 + below(word[3], N_GROWTHS))
+        search.horizon = 0.5 ** (LONGEST_GROWTH * to_uniform(word[0]))
+        doublings = 1.0 if number == EARLY_SEARCHES else 0.5 ** (1 + to_integer(word[3], N_GROWTHS))
         search.horizon_growth = 2.0**doublings
-        search.probe_count = 0 if number == EARLY else size // 3  # in lanes that would idle
+        search.probe_count = (
+            0 if number == EARLY_SEARCHES else size // 3
+        )  # in lanes that would idle
     elif settled:
         search.probe_count = size
-    if 1 < number <= EARLY and not search.hop_kind:
+    if 1 < number <= EARLY_SEARCHES and not search.hop_kind:
         chosen = -1
     return chosen if chosen < size else 0
 
 
-@compiled
-def start_development(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
+@jit_compile
+def start_local_search(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """Choose the point to begin with, and how much of the record counts at first."""
     chromosomes, search = island.chromosomes, island.search
     search.local_searches += 1
     search.in_sequence_search, search.step_count, search.failed_steps = 1, 0, 0
     search.probe_count, search.from_random_start, search.hop_kind = 0, 0, 0
-    early = search.local_searches <= EARLY
+    early = search.local_searches <= EARLY_SEARCHES
     search.damping = EARLY_DAMPING if early else FIRST_DAMPING
     search.horizon, search.reached_fitness = 1.0, np.inf
-    is_lost = _is_lost(evaluator, plan, island)
-    chosen = _choose(plan, chromosomes.shape[0], is_lost, search)
+    is_lost = _should_search_far(evaluator, plan, island)
+    chosen = _choose_start(plan, chromosomes.shape[0], is_lost, search)
     # The places of a fresh start, or the slopes of a hop, would pass the budget.
-    if search.evaluations + max(chromosomes.shape) + 1 > plan.evaluations:
+    if search.evaluations + max(chromosomes.shape) + 1 > plan.most_evaluations:
         chosen, search.hop_kind = max(chosen, 0), 0
     if chosen >= 0:
         search.replaced_fitness = np.inf if search.hop_kind else island.fitness[chosen]
-        begin = decoded(chromosomes[chosen : chosen + 1], plan.bits)[0]
+        begin = decode(chromosomes[chosen : chosen + 1], plan.bits)[0]
     else:
         search.replaced_fitness, search.from_random_start = np.inf, 1
         drawn = min(EARLY_PLACES, chromosomes.shape[0]) if early else chromosomes.shape[0]
-        begin = _fresh(evaluator, plan, (drawn, chromosomes.shape[1]), search)
+        begin = _draw_best_start(evaluator, plan, (drawn, chromosomes.shape[1]), search)
     for d in range(begin.size):
         island.point[d] = begin[d]
     if search.hop_kind:
-        hop(evaluator, plan, island)
+        hop_from_champion(evaluator, plan, island)
 
 
-@compiled
-def _keep(island: IslandArrays, chromosome: WordArray, reached: float) -> None:
+@jit_compile
+def _replace_individual(island: IslandArrays, chromosome: WordArray, reached: float) -> None:
     """Put a developed individual in the place of its former self, else of the worst."""
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     place = fitness.size - 1
@@ -187,28 +202,30 @@ def _keep(island: IslandArrays, chromosome: WordArray, reached: float) -> None:
         for d in range(chromosome.size):
             chromosomes[place, d] = chromosome[d]
         fitness[place] = reached
-        rank(chromosomes, fitness)
+        sort_population(chromosomes, fitness)
         search.replaced_fitness = reached
 
 
-@compiled
-def _scatter(island: IslandArrays, proposals: WordArray, reached: FloatArray, best: int) -> None:
+@jit_compile
+def _scatter_population(
+    island: IslandArrays, proposals: WordArray, reached: FloatArray, best: int
+) -> None:
     """Let the probes take the places of all but the champion: the genetic search goes on there."""
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
     if search.probe_count < fitness.size:  # those of a growing record go on with each step
         return
     search.probe_count, search.stagnation = 0, 0
-    for p in range(1, min(fitness.size, reached.size - TRIALS + 1)):
-        t = TRIALS + p - 1
+    for p in range(1, min(fitness.size, reached.size - N_TRIALS + 1)):
+        t = N_TRIALS + p - 1
         if t != best:
             fitness[p] = reached[t]
             for d in range(chromosomes.shape[1]):
                 chromosomes[p, d] = proposals[t, d]
-    rank(chromosomes, fitness)
+    sort_population(chromosomes, fitness)
 
 
-@compiled
-def _next_part(search: SearchRecord, champion: float) -> None:
+@jit_compile
+def _extend_horizon(search: SearchRecord, champion: float) -> None:
     """Take in more of the record; at its end, the development ends.
 
     `champion` is the champion's fitness.
@@ -221,76 +238,78 @@ def _next_part(search: SearchRecord, champion: float) -> None:
     search.in_sequence_search, search.step_count = 0, 0
     if search.replaced_fitness == champion and search.local_searches > 1:
         search.champion_converged = 1
-    if search.hop_kind & COUNTED:
+    if search.hop_kind & COUNTED_HOP:
         search.hop_count += 1
-        search.returned_hops += abs(search.reached_fitness - champion) <= champion * SAME
+        search.returned_hops += abs(search.reached_fitness - champion) <= champion * SAME_OPTIMUM
     if search.from_random_start:
         search.random_starts += 1
-        search.confirmed_starts += search.reached_fitness <= champion * (1.0 + SAME)
+        search.confirmed_starts += search.reached_fitness <= champion * (1.0 + SAME_OPTIMUM)
 
 
-@compiled
-def _end_part(evaluator: Evaluator, plan: Plan, island: IslandArrays, reached: float) -> None:
+@jit_compile
+def _finish_part(
+    evaluator: Evaluator, plan: IslandPlan, island: IslandArrays, reached: float
+) -> None:
     """Go on to the next part; a growth from far away, beside jumps, not if it is behind already."""
     search = island.search
     races = search.horizon < 1.0 and search.fitness_discontinuities > 0 and search.hop_kind == 0
-    if races and is_behind(evaluator, plan, island, search.horizon, reached):
+    if races and is_behind_champion(evaluator, plan, island, search.horizon, reached):
         search.horizon = 1.0
-    _next_part(search, island.fitness[0])
+    _extend_horizon(search, island.fitness[0])
 
 
-@compiled
-def _trials(
-    plan: Plan, island: IslandArrays, matrix: FloatArray, gradient: FloatArray, base: float
+@jit_compile
+def _propose_places(
+    plan: IslandPlan, island: IslandArrays, matrix: FloatArray, gradient: FloatArray, base: float
 ) -> FloatArray:
     """Places to try: steps of several dampings, and probes spread as the estimate's covariance."""
     point, search = island.point, island.search
-    places = np.empty((TRIALS + search.probe_count, point.size))
-    for t in range(TRIALS):
-        damping = search.damping * FACTOR ** (t - 1)
-        damped_step(matrix, gradient, point, damping, places[t])
-    deviation, factor = np.empty(point.size), factored(matrix, gradient, point, 0.0)
-    for t in range(TRIALS, places.shape[0]):
+    places = np.empty((N_TRIALS + search.probe_count, point.size))
+    for t in range(N_TRIALS):
+        damping = search.damping * DAMPING_FACTOR ** (t - 1)
+        write_damped_step(matrix, gradient, point, damping, places[t])
+    deviation, factor = np.empty(point.size), factor_damped(matrix, gradient, point, 0.0)
+    for t in range(N_TRIALS, places.shape[0]):
         for d in range(point.size):
             draw = 1 + t * point.size + d
-            word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, draw)
-            deviation[d] = base * 10.0 ** (1.5 - 2.5 * unit(word[2])) * normal(word)
-        spread(factor, point, deviation, places[t])
+            word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, draw)
+            deviation[d] = base * 10.0 ** (1.5 - 2.5 * to_uniform(word[2])) * to_normal(word)
+        write_spread_place(factor, point, deviation, places[t])
     return places
 
 
-@compiled
-def adaptive_sequence(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
+@jit_compile
+def run_adaptive_sequence(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """One generation of the adaptive search: sensitivities, then several steps at once."""
     point, search = island.point, island.search
     horizon = search.horizon
     search.step_count += 1
-    search.evaluations += point.size + 1 + TRIALS + search.probe_count
-    difference = slope_distance(plan, search)
-    matrix, gradient, base = normal_equations(evaluator, plan, point, horizon, difference)
-    proposals = coded(_trials(plan, island, matrix, gradient, base), plan.bits)
-    places = decoded(proposals, plan.bits)
+    search.evaluations += point.size + 1 + N_TRIALS + search.probe_count
+    difference = choose_difference(plan, search)
+    matrix, gradient, base = build_normal_equations(evaluator, plan, point, horizon, difference)
+    proposals = encode(_propose_places(plan, island, matrix, gradient, base), plan.bits)
+    places = decode(proposals, plan.bits)
     if horizon < 1.0:
-        predicted = partial_predictions(evaluator, located(evaluator, places), horizon)
-        reached = partial_fitness(evaluator, plan, predicted, horizon)[: places.shape[0]]
+        predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
+        reached = evaluate_partial_fitness(evaluator, plan, predicted, horizon)[: places.shape[0]]
     else:
-        reached = population_fitness(evaluator, located(evaluator, places))
+        reached = evaluate_population(evaluator, from_unit(evaluator, places))
     best = np.argmin(reached)
-    _scatter(island, proposals, reached, int(best))
-    is_near = reached[best] < FAR * island.fitness[0]
+    _scatter_population(island, proposals, reached, int(best))
+    is_near = reached[best] < FAR_FITNESS * island.fitness[0]
     strict = is_near and horizon == 1.0 and search.local_searches > 1
-    enough = ENOUGH if strict else ENOUGH_PART
+    enough = ENOUGH_GAIN if strict else ENOUGH_PART_GAIN
     if reached[best] < base:
         for d in range(point.size):
             point[d] = places[best, d]
-        search.damping *= FACTOR ** float(min(int(best), TRIALS) - 2)
+        search.damping *= DAMPING_FACTOR ** float(min(int(best), N_TRIALS) - 2)
         if horizon == 1.0:
             search.reached_fitness = reached[best]
-            _keep(island, proposals[best], reached[best])
-        if reached[best] > base * (1.0 - enough) or search.step_count >= MOST_STEPS:
-            _end_part(evaluator, plan, island, reached[best])
+            _replace_individual(island, proposals[best], reached[best])
+        if reached[best] > base * (1.0 - enough) or search.step_count >= MOST_SEARCH_STEPS:
+            _finish_part(evaluator, plan, island, reached[best])
         return
-    search.damping *= FACTOR**TRIALS
+    search.damping *= DAMPING_FACTOR**N_TRIALS
     search.failed_steps += 1
     if search.failed_steps == 2 or not np.isfinite(base):
-        _end_part(evaluator, plan, island, base)
+        _finish_part(evaluator, plan, island, base)

@@ -2,138 +2,142 @@
 
 import numpy as np
 
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, WordArray
 from sysid.search.adaptive_search import (
-    EARLY,
-    TRIALS,
-    adaptive_sequence,
-    scatters,
-    start_development,
+    EARLY_SEARCHES,
+    N_TRIALS,
+    has_scattered,
+    run_adaptive_sequence,
+    start_local_search,
 )
 from sysid.search.operators import (
-    CHILDREN,
-    INITIAL,
-    RESTART,
-    STRATA,
-    below,
-    cross,
-    decoded,
-    draws,
-    flip,
-    rank,
-    reflected,
-    scheduled,
-    stepped,
-    two_of,
-    unit,
+    USE_CHILDREN,
+    USE_INITIAL,
+    USE_RESTART,
+    USE_STRATA,
+    cross_over,
+    decode,
+    draw_pair,
+    draw_words,
+    flip_bit,
+    get_mutation_rate,
+    mutate_by_step,
+    reflect_at_bounds,
+    sort_population,
+    to_integer,
+    to_uniform,
 )
-from sysid.search.sequence_search import fixed_sequence
+from sysid.search.sequence_search import run_fixed_sequence
 from sysid.search.state import (
-    AT_EVALUATIONS,
-    AT_GENERATION,
-    GENETIC,
-    IMPROVED,
-    LOCAL,
-    MIGRATION,
-    PHASE,
-    RMS,
-    SAME,
-    SIMPLE,
-    START,
-    VALUES,
+    COLUMN_EVALUATIONS,
+    COLUMN_GENERATION,
+    COLUMN_PHASE,
+    COLUMN_RMS,
+    COLUMN_VALUES,
+    METHOD_IMPROVED,
+    METHOD_SIMPLE,
+    PHASE_GENETIC,
+    PHASE_LOCAL,
+    PHASE_MIGRATION,
+    PHASE_START,
+    SAME_OPTIMUM,
     IslandArrays,
-    Plan,
+    IslandPlan,
     SearchRecord,
 )
-from sysid.simulation.evaluator import Evaluator, population_fitness
-from sysid.simulation.scaling import located
+from sysid.simulation.evaluator import Evaluator, evaluate_population
+from sysid.simulation.scaling import from_unit
 
 
-@compiled
-def initial_places(plan: Plan, individuals: int, n: int) -> FloatArray:
+@jit_compile
+def draw_initial_places(plan: IslandPlan, individuals: int, n: int) -> FloatArray:
     """Random places; for the improved method stratified over the whole archipelago.
 
     Stratified (Latin hypercube): each of the archipelago's `total` equal parts of every
     parameter's range holds one individual. All islands derive the same permutations.
     """
     places = np.empty((individuals, n))
-    order = np.arange(plan.total)
+    order = np.arange(plan.population)
     for d in range(n):
-        if plan.method >= IMPROVED:
-            for i in range(plan.total - 1, 0, -1):
-                j = below(draws(plan.seed, STRATA, 0, d, i)[0], i + 1)
+        if plan.method >= METHOD_IMPROVED:
+            for i in range(plan.population - 1, 0, -1):
+                j = to_integer(draw_words(plan.seed, USE_STRATA, 0, d, i)[0], i + 1)
                 order[i], order[j] = order[j], order[i]
         for p in range(individuals):
-            places[p, d] = unit(draws(plan.seed, INITIAL, plan.island, d, p)[0])
-            if plan.method >= IMPROVED:
-                places[p, d] = (order[plan.first + p] + places[p, d]) / plan.total
+            places[p, d] = to_uniform(draw_words(plan.seed, USE_INITIAL, plan.island, d, p)[0])
+            if plan.method >= METHOD_IMPROVED:
+                places[p, d] = (order[plan.first_individual + p] + places[p, d]) / plan.population
     return places
 
 
-@compiled
-def simple_generation(plan: Plan, island: IslandArrays) -> None:
+@jit_compile
+def breed_simple_children(plan: IslandPlan, island: IslandArrays) -> None:
     """Figure 4: the survivors stay unchanged, their children take the places of the others."""
     words, fitness = island.chromosomes, island.fitness
     generation, length = island.search.generation, words.shape[1] * plan.bits
-    rate = scheduled(plan.starts, plan.rates, generation)
+    rate = get_mutation_rate(plan.mutation_starts, plan.mutation_rates, generation)
     for p in range(plan.survivors, fitness.size):
-        word = draws(plan.seed, CHILDREN, plan.island, generation, 2 * p)
-        more = draws(plan.seed, CHILDREN, plan.island, generation, 2 * p + 1)
-        first, second = two_of(word[0], word[1], plan.survivors)
-        cross(words[p], words[first], words[second], 1 + below(word[2], length - 1), plan.bits)
-        if unit(word[3]) < rate:
-            flip(words[p], below(more[0], length), plan.bits)
+        word = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 2 * p)
+        more = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 2 * p + 1)
+        first, second = draw_pair(word[0], word[1], plan.survivors)
+        cross_over(
+            words[p], words[first], words[second], 1 + to_integer(word[2], length - 1), plan.bits
+        )
+        if to_uniform(word[3]) < rate:
+            flip_bit(words[p], to_integer(more[0], length), plan.bits)
         fitness[p] = np.nan
 
 
-@compiled
-def _breed(plan: Plan, places: FloatArray, parents: WordArray, generation: int, p: int,
+@jit_compile
+def _breed_child(plan: IslandPlan, places: FloatArray, parents: WordArray, generation: int, p: int,
            word: WordArray) -> None:  # fmt: skip
     """Write child `p`: by crossover, or by a difference of parents (differential evolution)."""
     bits, n = plan.bits, word.size
-    drawn = draws(plan.seed, CHILDREN, plan.island, generation, 3 * p)
-    more = draws(plan.seed, CHILDREN, plan.island, generation, 3 * p + 1)
-    last = draws(plan.seed, CHILDREN, plan.island, generation, 3 * p + 2)
-    first, second = two_of(drawn[0], drawn[1], plan.survivors)
-    crossed, third = more[0] & 1, below(more[1], places.shape[0])
-    cross(word, parents[first], parents[second], 1 + below(drawn[2], n * bits - 1), bits)
-    rate = scheduled(plan.starts, plan.rates, generation)
-    mutated = below(last[0], n) if unit(drawn[3]) < rate else -1
+    drawn = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p)
+    more = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 1)
+    last = draw_words(plan.seed, USE_CHILDREN, plan.island, generation, 3 * p + 2)
+    first, second = draw_pair(drawn[0], drawn[1], plan.survivors)
+    crossed, third = more[0] & 1, to_integer(more[1], places.shape[0])
+    cross_over(word, parents[first], parents[second], 1 + to_integer(drawn[2], n * bits - 1), bits)
+    rate = get_mutation_rate(plan.mutation_starts, plan.mutation_rates, generation)
+    mutated = to_integer(last[0], n) if to_uniform(drawn[3]) < rate else -1
     for d in range(n):
         place = word[d] / float((1 << bits) - 1)
         if not crossed:
-            length = 0.4 + 0.6 * unit(drawn[2])
-            place = reflected(places[p, d] + length * (places[first, d] - places[third, d]))
+            length = 0.4 + 0.6 * to_uniform(drawn[2])
+            place = reflect_at_bounds(places[p, d] + length * (places[first, d] - places[third, d]))
         if d == mutated:
-            place = stepped(place, last[1], last[2], bits)
+            place = mutate_by_step(place, last[1], last[2], bits)
         word[d] = np.uint32(round(place * float((1 << bits) - 1)))
 
 
-@compiled
-def improved_generation(plan: Plan, island: IslandArrays) -> WordArray:
+@jit_compile
+def breed_improved_children(plan: IslandPlan, island: IslandArrays) -> WordArray:
     """As many children as there are individuals, to compete with their parents."""
     parents = island.chromosomes
-    children, places = np.empty_like(parents), decoded(parents, plan.bits)
+    children, places = np.empty_like(parents), decode(parents, plan.bits)
     for p in range(parents.shape[0]):
-        _breed(plan, places, parents, island.search.generation, p, children[p])
+        _breed_child(plan, places, parents, island.search.generation, p, children[p])
     return children
 
 
-@compiled
-def restart(plan: Plan, island: IslandArrays) -> None:
+@jit_compile
+def redraw_population(plan: IslandPlan, island: IslandArrays) -> None:
     """All but the champion are drawn anew."""
     words, fitness = island.chromosomes, island.fitness
     largest, n = float((1 << plan.bits) - 1), words.shape[1]
     for p in range(1, fitness.size):
         fitness[p] = np.nan
         for d in range(n):
-            word = draws(plan.seed, RESTART, plan.island, island.search.generation, p * n + d)
-            words[p, d] = np.uint32(round(unit(word[0]) * largest))
+            word = draw_words(
+                plan.seed, USE_RESTART, plan.island, island.search.generation, p * n + d
+            )
+            words[p, d] = np.uint32(round(to_uniform(word[0]) * largest))
 
 
-@compiled
-def compete(island: IslandArrays, children: WordArray, reached: FloatArray) -> None:
+@jit_compile
+def select_fittest(island: IslandArrays, children: WordArray, reached: FloatArray) -> None:
     """Of parents and children the fittest stay; on equal fitness the parent does."""
     words, fitness = island.chromosomes, island.fitness
     size, n = words.shape
@@ -142,15 +146,17 @@ def compete(island: IslandArrays, children: WordArray, reached: FloatArray) -> N
         values[p], values[size + p] = fitness[p], reached[p]
         for d in range(n):
             everyone[p, d], everyone[size + p, d] = words[p, d], children[p, d]
-    rank(everyone, values)
+    sort_population(everyone, values)
     for p in range(size):
         fitness[p] = values[p]
         for d in range(n):
             words[p, d] = everyone[p, d]
 
 
-@compiled
-def evaluate(evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatArray) -> int:
+@jit_compile
+def evaluate_new_individuals(
+    evaluator: Evaluator, plan: IslandPlan, words: WordArray, fitness: FloatArray
+) -> int:
     """Simulate the individuals that are not evaluated yet (``nan``), and rank all.
 
     Gives the number of simulations.
@@ -162,91 +168,95 @@ def evaluate(evaluator: Evaluator, plan: Plan, words: WordArray, fitness: FloatA
     for i in range(waiting.size):
         for d in range(words.shape[1]):
             chosen[i, d] = words[waiting[i], d]
-    reached = population_fitness(evaluator, located(evaluator, decoded(chosen, plan.bits)))
+    reached = evaluate_population(evaluator, from_unit(evaluator, decode(chosen, plan.bits)))
     for i in range(waiting.size):
         fitness[waiting[i]] = reached[i]
-    rank(words, fitness)
+    sort_population(words, fitness)
     return waiting.size
 
 
-@compiled
-def _generation(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
+@jit_compile
+def _run_generation(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     chromosomes, fitness, search = island.chromosomes, island.fitness, island.search
-    if search.in_sequence_search and plan.method == IMPROVED:
-        adaptive_sequence(evaluator, plan, island)
+    if search.in_sequence_search and plan.method == METHOD_IMPROVED:
+        run_adaptive_sequence(evaluator, plan, island)
         # Two steps of a hop simulate no more than one generation of another kind.
         goes_on = search.in_sequence_search and search.probe_count == 0
         again = goes_on and search.fitness_discontinuities > 0
-        step = chromosomes.shape[1] + 1 + TRIALS
-        if again and search.evaluations + step <= plan.evaluations:
-            adaptive_sequence(evaluator, plan, island)
+        step = chromosomes.shape[1] + 1 + N_TRIALS
+        if again and search.evaluations + step <= plan.most_evaluations:
+            run_adaptive_sequence(evaluator, plan, island)
     elif search.in_sequence_search:
-        fixed_sequence(evaluator, plan, island)
-    elif plan.method < IMPROVED:
-        simple_generation(plan, island)
+        run_fixed_sequence(evaluator, plan, island)
+    elif plan.method < METHOD_IMPROVED:
+        breed_simple_children(plan, island)
     elif search.stagnation >= plan.stagnation:
         search.stagnation = 0
-        restart(plan, island)
+        redraw_population(plan, island)
     else:
         search.step_count += 1
-        children = improved_generation(plan, island)
+        children = breed_improved_children(plan, island)
         reached = np.full(fitness.size, np.nan)
-        search.evaluations += evaluate(evaluator, plan, children, reached)
-        compete(island, children, reached)
-    search.evaluations += evaluate(evaluator, plan, chromosomes, fitness)
+        search.evaluations += evaluate_new_individuals(evaluator, plan, children, reached)
+        select_fittest(island, children, reached)
+    search.evaluations += evaluate_new_individuals(evaluator, plan, chromosomes, fitness)
 
 
-@compiled
-def _turn(evaluator: Evaluator, plan: Plan, island: IslandArrays) -> None:
+@jit_compile
+def _switch_phase(evaluator: Evaluator, plan: IslandPlan, island: IslandArrays) -> None:
     """GA ⇒ sequence: where the genetic search stands still, local search takes over."""
     search = island.search
-    if search.in_sequence_search or plan.method == SIMPLE:
+    if search.in_sequence_search or plan.method == METHOD_SIMPLE:
         return
-    if plan.method == IMPROVED:
-        early = search.local_searches < EARLY
-        beside = search.fitness_discontinuities > 0 and not scatters(search)
+    if plan.method == METHOD_IMPROVED:
+        early = search.local_searches < EARLY_SEARCHES
+        beside = search.fitness_discontinuities > 0 and not has_scattered(search)
         if early or beside or search.step_count >= max(1, plan.stagnation // 10):
-            start_development(evaluator, plan, island)
+            start_local_search(evaluator, plan, island)
     elif search.stagnation >= plan.stagnation:
         search.in_sequence_search, search.stagnation = 1, 0
 
 
-@compiled
-def _note(
-    evaluator: Evaluator, plan: Plan, island: IslandArrays, phase: int, row: FloatArray
+@jit_compile
+def _record_improvement(
+    evaluator: Evaluator, plan: IslandPlan, island: IslandArrays, phase: int, row: FloatArray
 ) -> None:
-    values = located(evaluator, decoded(island.chromosomes[:1], plan.bits))[0]
+    values = from_unit(evaluator, decode(island.chromosomes[:1], plan.bits))[0]
     write_improvement(island.search, island.fitness[0], phase, values, row)
 
 
-@compiled
+@jit_compile
 def write_improvement(
     search: SearchRecord, rms: float, phase: int, values: FloatArray, row: FloatArray
 ) -> None:
     """Write the row of a better champion with these physical values (D,)."""
-    row[AT_GENERATION], row[AT_EVALUATIONS] = search.generation, search.evaluations
-    row[RMS], row[PHASE] = rms, phase
+    row[COLUMN_GENERATION], row[COLUMN_EVALUATIONS] = search.generation, search.evaluations
+    row[COLUMN_RMS], row[COLUMN_PHASE] = rms, phase
     for d in range(values.size):
-        row[VALUES + d] = values[d]
+        row[COLUMN_VALUES + d] = values[d]
 
 
-@compiled
+@jit_compile
 def reset_evidence(search: SearchRecord, rms: float, before: float) -> None:
     """Forget what spoke for the champion before, where the new one is another optimum."""
-    if rms < before * (1.0 - SAME):
+    if rms < before * (1.0 - SAME_OPTIMUM):
         search.confirmed_starts, search.champion_discontinuities = 0, 0
         search.hop_count, search.returned_hops = 0, 0
 
 
-@compiled
-def is_done(plan: Plan, search: SearchRecord, rms: float) -> bool:
+@jit_compile
+def is_done(plan: IslandPlan, search: SearchRecord, rms: float) -> bool:
     """Whether an island has used up its evaluations or reached the target RMS."""
-    return bool(search.evaluations >= plan.evaluations or rms <= plan.rms)
+    return bool(search.evaluations >= plan.most_evaluations or rms <= plan.target_rms)
 
 
-@compiled
-def generations(
-    evaluator: Evaluator, plan: Plan, count: int, island: IslandArrays, improvements: FloatArray
+@jit_compile
+def run_generations(
+    evaluator: Evaluator,
+    plan: IslandPlan,
+    count: int,
+    island: IslandArrays,
+    improvements: FloatArray,
 ) -> int:
     """Evolve in place by `count` generations; gives the number of improvements written.
 
@@ -258,24 +268,24 @@ def generations(
         # Not by the evaluations: finding the starts of a polynomial may have taken some.
         begins = np.all(np.isnan(fitness))
         best = np.inf if begins else np.nanmin(fitness)
-        phase = START if begins else MIGRATION
-        search.evaluations += evaluate(evaluator, plan, island.chromosomes, fitness)
+        phase = PHASE_START if begins else PHASE_MIGRATION
+        search.evaluations += evaluate_new_individuals(evaluator, plan, island.chromosomes, fitness)
         if fitness[0] < best:
-            _note(evaluator, plan, island, phase, improvements[0])
+            _record_improvement(evaluator, plan, island, phase, improvements[0])
             written = 1
     for _ in range(count):
         if is_done(plan, search, fitness[0]):
             break
-        _turn(evaluator, plan, island)
-        best, phase = fitness[0], LOCAL if search.in_sequence_search else GENETIC
-        _generation(evaluator, plan, island)
+        _switch_phase(evaluator, plan, island)
+        best, phase = fitness[0], PHASE_LOCAL if search.in_sequence_search else PHASE_GENETIC
+        _run_generation(evaluator, plan, island)
         search.generation += 1
         search.stagnation += 1
         if fitness[0] < best:
             search.stagnation = 0
             reset_evidence(search, fitness[0], best)
-            if phase == GENETIC:
+            if phase == PHASE_GENETIC:
                 search.champion_converged = 0
-            _note(evaluator, plan, island, phase, improvements[written])
+            _record_improvement(evaluator, plan, island, phase, improvements[written])
             written += 1
     return written

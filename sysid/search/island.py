@@ -8,19 +8,19 @@ import numpy as np
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray, WordArray
 from sysid.kernels.abi import LANES
-from sysid.search.adaptive_search import TRIALS
-from sysid.search.evolution import generations
+from sysid.search.adaptive_search import N_TRIALS
+from sysid.search.evolution import run_generations
 from sysid.search.state import (
-    AT_EVALUATIONS,
-    AT_GENERATION,
-    PHASE,
-    PHASES,
-    RMS,
+    COLUMN_EVALUATIONS,
+    COLUMN_GENERATION,
+    COLUMN_PHASE,
+    COLUMN_RMS,
+    COLUMN_VALUES,
+    PHASE_NAMES,
     SEARCH_RECORD,
-    VALUES,
     Improvement,
     IslandArrays,
-    Plan,
+    IslandPlan,
     SearchArray,
 )
 from sysid.simulation.evaluator import Evaluator
@@ -50,7 +50,7 @@ class Island:
 
     index: int
     seed: int
-    words: WordArray
+    chromosomes: WordArray
     fitness: FloatArray
     search: SearchArray
     point: FloatArray
@@ -74,35 +74,35 @@ class Island:
     @property
     def arrays(self) -> IslandArrays:
         """What compiled code reads and changes: not copies."""
-        return IslandArrays(self.words, self.fitness, self.search[()], self.point)
+        return IslandArrays(self.chromosomes, self.fitness, self.search[()], self.point)
 
 
-def evolve(evaluator: Evaluator, plan: Plan, island: Island, count: int) -> Island:
+def evolve(evaluator: Evaluator, plan: IslandPlan, island: Island, count: int) -> Island:
     """The island after `count` generations, fewer where it comes to rest.
 
     ``evolve(…, a + b)`` equals ``evolve(…, b)`` of ``evolve(…, a)``, bit for bit.
     """
     after = replace(
         island,
-        words=island.words.copy(),
+        chromosomes=island.chromosomes.copy(),
         fitness=island.fitness.copy(),
         search=island.search.copy(),
         point=island.point.copy(),
     )
-    rows = np.empty((count + 1, VALUES + island.point.size))
-    written = generations(evaluator, plan, count, after.arrays, rows)
-    better = tuple(improvement(row) for row in rows[:written].tolist())
+    rows = np.empty((count + 1, COLUMN_VALUES + island.point.size))
+    written = run_generations(evaluator, plan, count, after.arrays, rows)
+    better = tuple(to_improvement(row) for row in rows[:written].tolist())
     return replace(after, history=island.history + better)
 
 
-def improvement(row: Sequence[float]) -> Improvement:
+def to_improvement(row: Sequence[float]) -> Improvement:
     """An improvement, of the row that compiled code wrote of it."""
     return Improvement(
-        int(row[AT_GENERATION]),
-        int(row[AT_EVALUATIONS]),
-        row[RMS],
-        PHASES[int(row[PHASE])],
-        tuple(row[VALUES:]),
+        int(row[COLUMN_GENERATION]),
+        int(row[COLUMN_EVALUATIONS]),
+        row[COLUMN_RMS],
+        PHASE_NAMES[int(row[COLUMN_PHASE])],
+        tuple(row[COLUMN_VALUES:]),
     )
 
 
@@ -112,16 +112,16 @@ def stack_search(islands: Sequence[Island]) -> SearchArray:
 
 
 _UNLIMITED = 2**62
-NEVER = -1.0
+NO_TARGET_RMS = -1.0
 
 
-def sizes(algorithm: GeneticAlgorithm) -> tuple[int, ...]:
+def split_population(algorithm: GeneticAlgorithm) -> tuple[int, ...]:
     """Individuals of each island: the population dealt as evenly as possible."""
     each, more = divmod(algorithm.population, algorithm.n_islands)
     return tuple(each + (i < more) for i in range(algorithm.n_islands))
 
 
-def of_island(algorithm: GeneticAlgorithm, index: int) -> GeneticAlgorithm:
+def get_island_settings(algorithm: GeneticAlgorithm, index: int) -> GeneticAlgorithm:
     """The settings of one island, where islands differ."""
     if not isinstance(algorithm.islands, tuple):
         return algorithm
@@ -134,7 +134,7 @@ def of_island(algorithm: GeneticAlgorithm, index: int) -> GeneticAlgorithm:
     )
 
 
-def search_budget(algorithm: GeneticAlgorithm, n: int) -> int:
+def compute_search_budget(algorithm: GeneticAlgorithm, n: int) -> int:
     """Simulations that the islands may run: all but a tenth kept for the refinement.
 
     At least a few steps of the refinement (of n + 1 simulations) and at most half are kept, and
@@ -149,7 +149,7 @@ def search_budget(algorithm: GeneticAlgorithm, n: int) -> int:
     return limit - min(max(limit // 10, 4 * (n + 2)) + beyond, limit // 2)
 
 
-def analysis_budget(n: int) -> int:
+def compute_analysis_budget(n: int) -> int:
     """Simulations kept for the standard errors of n parameters.
 
     They take two a parameter, beside jumps of the output ten more, and a look at what cannot be
@@ -158,26 +158,28 @@ def analysis_budget(n: int) -> int:
     return 14 * n + 1
 
 
-def _island_budget(algorithm: GeneticAlgorithm, n: int, size: int) -> int:
+def _compute_island_budget(algorithm: GeneticAlgorithm, n: int, size: int) -> int:
     """Simulations from which on an island begins no other generation.
 
-    Its share of `search_budget`; of a tiny budget less, so that its last generation does not take
-    it beyond its share of what the standard errors leave.
+    Its share of `compute_search_budget`; of a tiny budget less, so that its last generation does
+    not take it beyond its share of what the standard errors leave.
     """
     limit = algorithm.stop.evaluations
     if limit is None:
         return _UNLIMITED
-    share = search_budget(algorithm, n) * size // algorithm.population
-    left = max(limit - analysis_budget(n), algorithm.population) * size // algorithm.population
-    return max(1, min(share, left - _generation(n, size) + 1))
+    share = compute_search_budget(algorithm, n) * size // algorithm.population
+    left = (
+        max(limit - compute_analysis_budget(n), algorithm.population) * size // algorithm.population
+    )
+    return max(1, min(share, left - _count_generation_evaluations(n, size) + 1))
 
 
-def _generation(n: int, size: int) -> int:
+def _count_generation_evaluations(n: int, size: int) -> int:
     """Simulations of one generation of an island at most."""
-    return size + n + 1 + TRIALS
+    return size + n + 1 + N_TRIALS
 
 
-def budget_before(algorithm: GeneticAlgorithm, n: int) -> int:
+def compute_start_budget(algorithm: GeneticAlgorithm, n: int) -> int:
     """What the islands and the standard errors leave of the budget to the finding of starts.
 
     It counts as the first island's work, which may be less than its share for that.
@@ -186,7 +188,7 @@ def budget_before(algorithm: GeneticAlgorithm, n: int) -> int:
     if limit is None:
         return _UNLIMITED
     taken = 0
-    for size in sizes(algorithm)[1:]:
-        rests = _island_budget(algorithm, n, size)
-        taken += size if rests <= size else rests - 1 + _generation(n, size)
-    return max(0, limit - (2 * n + 1) - sizes(algorithm)[0] - taken)
+    for size in split_population(algorithm)[1:]:
+        rests = _compute_island_budget(algorithm, n, size)
+        taken += size if rests <= size else rests - 1 + _count_generation_evaluations(n, size)
+    return max(0, limit - (2 * n + 1) - split_population(algorithm)[0] - taken)

@@ -17,26 +17,26 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray, make_record_dtype
 from sysid.search.levenberg_marquardt import (
     FINE_DIFFERENCE,
+    compute_inner_product,
     compute_loss,
-    damped_step,
     form_normal_equations,
-    product,
     step_aside,
+    write_damped_step,
 )
-from sysid.simulation.evaluator import Evaluator, partial_predictions
-from sysid.simulation.scaling import located
+from sysid.simulation.evaluator import Evaluator, predict_partially
+from sysid.simulation.scaling import from_unit
 
 _DAMPINGS = np.array([0.0, 1e-4, 1e-2, 1.0, 1e2])
 """Tried in one batch, times the present damping; 0 stands for the least one."""
-TRIED = _DAMPINGS.size
+N_TRIED = _DAMPINGS.size
 """Simulations of a batch of steps; the Jacobian takes one for each parameter besides."""
-_FIRST, _LEAST, _MOST = 1e-3, 1e-11, 1e12
-_STOPPED = 2  # steps in a row that gain next to nothing
-_AT_ONCE = 10_000_000  # steps of integration or recursion in one compiled call: about 0.1 s
+_FIRST, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-11, 1e12
+_MOST_IDLE_STEPS = 2  # steps in a row that gain next to nothing
+_STEPS_PER_CALL = 10_000_000  # steps of integration or recursion in one compiled call: about 0.1 s
 
 
 class _Progress(Protocol):
@@ -53,7 +53,7 @@ class _Progress(Protocol):
 _PROGRESS = make_record_dtype(_Progress)
 
 
-class Scored(NamedTuple):
+class ScoredSamples(NamedTuple):
     """A problem's scored samples: which of the M measured values, and the weight of each.
 
     Attributes
@@ -92,7 +92,7 @@ class _Descent(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solution:
+class LeastSquaresSolution:
     """Where the search ended.
 
     Attributes
@@ -117,10 +117,10 @@ class Solution:
     is_cut_short: bool = False
 
 
-def solve(
-    scored: Scored, place: FloatArray, scale: float, *, steps: int, at_once: int,
+def solve_least_squares(
+    scored: ScoredSamples, place: FloatArray, scale: float, *, steps: int, at_once: int,
     tolerance: float = 1e-10, is_late: Callable[[], bool] | None = None,
-) -> Solution:  # fmt: skip
+) -> LeastSquaresSolution:  # fmt: skip
     """The local minimum that Levenberg-Marquardt finds from a place (D,).
 
     Parameters
@@ -140,11 +140,11 @@ def solve(
     size, is_cut_short = scored.rows.size, False
     descent = _Descent(np.array(place), np.empty(size), np.empty((place.size, size)), progress[()])
     while steps > 0 and not progress.has_ended and not is_cut_short:
-        _descend(scored, descent, scale, min(steps, at_once), tolerance)
+        _run_steps(scored, descent, scale, min(steps, at_once), tolerance)
         steps -= at_once
         goes_on = steps > 0 and not progress.has_ended
         is_cut_short = goes_on and is_late is not None and is_late()
-    return Solution(
+    return LeastSquaresSolution(
         descent.place,
         bool(progress.has_ended),
         int(progress.evaluations),
@@ -158,67 +158,69 @@ def steps_at_once(n_parameters: int, n_steps: int) -> int:
 
     A simulation takes `n_steps` steps of integration or recursion.
     """
-    return max(1, _AT_ONCE // ((n_parameters + TRIED) * n_steps))
+    return max(1, _STEPS_PER_CALL // ((n_parameters + N_TRIED) * n_steps))
 
 
-@compiled
-def _descend(scored: Scored, descent: _Descent, scale: float, steps: int, tolerance: float) -> None:
+@jit_compile
+def _run_steps(
+    scored: ScoredSamples, descent: _Descent, scale: float, steps: int, tolerance: float
+) -> None:
     """Go some steps on, in place."""
     place, progress = descent.place, descent.progress
     if progress.evaluations == 0:
-        descent.error[:] = residuals(scored, place.reshape((1, place.size)))[0]
-        progress.loss, progress.damping = _total(descent.error, scale), _FIRST
+        descent.error[:] = compute_residuals(scored, place.reshape((1, place.size)))[0]
+        progress.loss, progress.damping = _sum_loss(descent.error, scale), _FIRST
         progress.evaluations = 1
     for _ in range(steps):
         if not progress.has_ended:
-            _step(scored, descent, scale, tolerance)
+            _take_step(scored, descent, scale, tolerance)
 
 
-@compiled
-def _step(scored: Scored, descent: _Descent, scale: float, tolerance: float) -> None:
+@jit_compile
+def _take_step(scored: ScoredSamples, descent: _Descent, scale: float, tolerance: float) -> None:
     """One step, the best of those tried; or a larger damping where none gains."""
     place, progress = descent.place, descent.progress
     if not progress.has_jacobian:
         fill_jacobian(scored, place, descent.error, descent.columns)
         progress.has_jacobian = 1
         progress.evaluations += place.size
-    tried = np.maximum(_DAMPINGS * progress.damping, _LEAST)
-    places, promised = _proposals(descent, tried, scale)
+    tried = np.maximum(_DAMPINGS * progress.damping, _LEAST_DAMPING)
+    places, promised = _propose_places(descent, tried, scale)
     if promised <= tolerance * progress.loss:
         progress.has_ended = 1
         return
-    errors = residuals(scored, places)
-    progress.evaluations += TRIED
-    best, value = _least(errors, progress.loss, scale)
+    errors = compute_residuals(scored, places)
+    progress.evaluations += N_TRIED
+    best, value = _find_best(errors, progress.loss, scale)
     if best < 0:
         progress.damping *= 1e3
-        progress.has_ended = progress.damping > _MOST  # rounding is all that is left
+        progress.has_ended = progress.damping > _MOST_DAMPING  # rounding is all that is left
         return
     gained = (progress.loss - value) / progress.loss
     place[:], descent.error[:] = places[best], errors[best]
     progress.loss, progress.has_jacobian = value, 0
     damping = tried[best] if best > 0 else progress.damping * 1e-2
-    progress.damping = min(max(damping, _LEAST), _MOST)
+    progress.damping = min(max(damping, _LEAST_DAMPING), _MOST_DAMPING)
     progress.idle_steps = progress.idle_steps + 1 if gained <= tolerance else 0
-    progress.has_ended = progress.idle_steps == _STOPPED
+    progress.has_ended = progress.idle_steps == _MOST_IDLE_STEPS
 
 
-@compiled
-def _least(errors: FloatArray, value: float, scale: float) -> tuple[int, float]:
+@jit_compile
+def _find_best(errors: FloatArray, value: float, scale: float) -> tuple[int, float]:
     """Which residuals (P, n) have the least loss below `value`, -1 if none has, and that loss."""
     best = -1
     for p in range(errors.shape[0]):
-        total = _total(errors[p], scale)
+        total = _sum_loss(errors[p], scale)
         if total < value:
             best, value = p, total
     return best, value
 
 
-@compiled
-def residuals(scored: Scored, places: FloatArray) -> FloatArray:
+@jit_compile
+def compute_residuals(scored: ScoredSamples, places: FloatArray) -> FloatArray:
     """Weighted residuals (P, n) of the scored values at places (P, D)."""
     evaluator = scored.evaluator
-    predicted = partial_predictions(evaluator, located(evaluator, places), 1.0)
+    predicted = predict_partially(evaluator, from_unit(evaluator, places), 1.0)
     errors = np.empty((places.shape[0], scored.rows.size))
     for i in range(scored.rows.size):
         row = scored.rows[i]
@@ -228,7 +230,7 @@ def residuals(scored: Scored, places: FloatArray) -> FloatArray:
     return errors
 
 
-@compiled
+@jit_compile
 def _whiten(owed: FloatArray, errors: FloatArray) -> None:
     """Take out of residuals (P, n), in place, what they owe to those before them."""
     for i in range(owed.size - 1, 0, -1):
@@ -238,27 +240,27 @@ def _whiten(owed: FloatArray, errors: FloatArray) -> None:
                 errors[p, i] = (errors[p, i] - owed[i] * errors[p, i - 1]) / left
 
 
-@compiled
+@jit_compile
 def fill_jacobian(
-    scored: Scored, place: FloatArray, error: FloatArray, columns: FloatArray
+    scored: ScoredSamples, place: FloatArray, error: FloatArray, columns: FloatArray
 ) -> None:
     """Write the slopes (D, n) of the residuals (n,) at a place (D,); 0 where a neighbour diverges.
 
     By forward differences, one batch of D simulations.
     """
     places, steps = step_aside(place, FINE_DIFFERENCE)
-    errors = residuals(scored, places[1:])
+    errors = compute_residuals(scored, places[1:])
     for d in range(place.size):
         for i in range(error.size):
             slope = (errors[d, i] - error[i]) / steps[d]
             columns[d, i] = slope if np.isfinite(slope) else 0.0
 
 
-@compiled
-def _total(error: FloatArray, scale: float) -> float:
+@jit_compile
+def _sum_loss(error: FloatArray, scale: float) -> float:
     """The loss of residuals (n,); ``inf`` where one is not finite."""
     if scale == 0.0:
-        total = product(error, error, error.size)
+        total = compute_inner_product(error, error, error.size)
     else:
         total = 0.0
         for m in range(error.size):
@@ -266,13 +268,15 @@ def _total(error: FloatArray, scale: float) -> float:
     return total if np.isfinite(total) else np.inf
 
 
-@compiled
-def _proposals(descent: _Descent, damping: FloatArray, scale: float) -> tuple[FloatArray, float]:
+@jit_compile
+def _propose_places(
+    descent: _Descent, damping: FloatArray, scale: float
+) -> tuple[FloatArray, float]:
     """Places (P, D) after the step of each damping (P,), and the largest gain that one promises."""
     place, promised = descent.place, 0.0
     matrix, gradient = form_normal_equations(descent.error, descent.columns, scale)
     places = np.empty((damping.size, place.size))
     for p in range(damping.size):
-        gain = damped_step(matrix, gradient, place, damping[p], places[p])
+        gain = write_damped_step(matrix, gradient, place, damping[p], places[p])
         promised = max(promised, gain)
     return places, promised

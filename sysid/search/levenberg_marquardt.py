@@ -6,18 +6,18 @@ squares).
 
 import numpy as np
 
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
 from sysid.simulation import loss
 
-compute_loss = compiled(loss.compute_loss)
-_compute_loss_weight = compiled(loss.compute_loss_weight)
+compute_loss = jit_compile(loss.compute_loss)
+_compute_loss_weight = jit_compile(loss.compute_loss_weight)
 
 FINE_DIFFERENCE = 1e-6  # of the range: far above rounding, far below what curvature needs
 
 
-@compiled
-def product(one: FloatArray, other: FloatArray, count: int) -> float:
+@jit_compile
+def compute_inner_product(one: FloatArray, other: FloatArray, count: int) -> float:
     """Inner product of the first `count` entries, as four sums that do not wait for each other."""
     a, b, c, d = 0.0, 0.0, 0.0, 0.0
     whole = count // 4 * 4
@@ -31,7 +31,7 @@ def product(one: FloatArray, other: FloatArray, count: int) -> float:
     return (a + b) + (c + d)
 
 
-@compiled
+@jit_compile
 def step_aside(point: FloatArray, distance: float) -> tuple[FloatArray, FloatArray]:
     """A point (D,) and its D neighbours (D + 1, D), each one parameter off, and these' distances.
 
@@ -47,7 +47,7 @@ def step_aside(point: FloatArray, distance: float) -> tuple[FloatArray, FloatArr
     return places, steps
 
 
-@compiled
+@jit_compile
 def form_normal_equations(
     error: FloatArray, columns: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray]:
@@ -63,14 +63,14 @@ def form_normal_equations(
         error, columns = rooted, rows
     matrix, gradient = np.zeros((d, d)), np.empty(d)
     for i in range(d):
-        gradient[i] = product(columns[i], error, n)
+        gradient[i] = compute_inner_product(columns[i], error, n)
         for j in range(i + 1):
-            matrix[i, j] = product(columns[i], columns[j], n)
+            matrix[i, j] = compute_inner_product(columns[i], columns[j], n)
     return matrix, gradient
 
 
-@compiled
-def factored(
+@jit_compile
+def factor_damped(
     matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float
 ) -> FloatArray:
     """Lower Cholesky factor of A + λ diag A, with zero rows for parameters that stay.
@@ -95,8 +95,8 @@ def factored(
     return factor
 
 
-@compiled
-def _back(factor: FloatArray, vector: FloatArray) -> None:
+@jit_compile
+def _solve_transposed(factor: FloatArray, vector: FloatArray) -> None:
     """Solve Lᵀ x = v in place; parameters that stay get zero."""
     for d in range(vector.size - 1, -1, -1):
         for k in range(d + 1, vector.size):
@@ -104,14 +104,14 @@ def _back(factor: FloatArray, vector: FloatArray) -> None:
         vector[d] = vector[d] / factor[d, d] if factor[d, d] > 0.0 else 0.0
 
 
-@compiled
-def _shift(point: FloatArray, step: FloatArray, place: FloatArray) -> None:
+@jit_compile
+def _move_within_bounds(point: FloatArray, step: FloatArray, place: FloatArray) -> None:
     for d in range(point.size):
         place[d] = min(max(point[d] + step[d], 0.0), 1.0)
 
 
-@compiled
-def solved(factor: FloatArray, gradient: FloatArray) -> FloatArray:
+@jit_compile
+def solve_step(factor: FloatArray, gradient: FloatArray) -> FloatArray:
     """The step p (D,) of L Lᵀ p = −g; parameters that stay get zero."""
     step = np.zeros(gradient.size)
     for d in range(gradient.size):
@@ -120,30 +120,32 @@ def solved(factor: FloatArray, gradient: FloatArray) -> FloatArray:
             for k in range(d):
                 value -= factor[d, k] * step[k]
             step[d] = value / factor[d, d]
-    _back(factor, step)
+    _solve_transposed(factor, step)
     return step
 
 
-@compiled
-def damped_step(matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float,
+@jit_compile
+def write_damped_step(matrix: FloatArray, gradient: FloatArray, point: FloatArray, damping: float,
                 place: FloatArray) -> float:  # fmt: skip
     """Write the place after the step p of (A + λ diag A) p = −g, kept inside [0, 1].
 
     Gives −gᵀ of what is left of the step there: its promised gain, in the loss's linear part.
     """
-    step = solved(factored(matrix, gradient, point, damping), gradient)
-    _shift(point, step, place)
+    step = solve_step(factor_damped(matrix, gradient, point, damping), gradient)
+    _move_within_bounds(point, step, place)
     promised = 0.0
     for d in range(point.size):
         promised -= gradient[d] * (place[d] - point[d])
     return promised
 
 
-@compiled
-def spread(factor: FloatArray, point: FloatArray, deviation: FloatArray, place: FloatArray) -> None:
+@jit_compile
+def write_spread_place(
+    factor: FloatArray, point: FloatArray, deviation: FloatArray, place: FloatArray
+) -> None:
     """Write a place whose distance from `point` has covariance A⁻¹, for normal `deviation`.
 
     Long where the output is insensitive, short across the valley. `factor` is that of A.
     """
-    _back(factor, deviation)
-    _shift(point, deviation, place)
+    _solve_transposed(factor, deviation)
+    _move_within_bounds(point, deviation, place)

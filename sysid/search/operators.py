@@ -16,14 +16,21 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray, WordArray
 
-Draws: TypeAlias = tuple[Any, Any, Any, Any]
+RandomWords: TypeAlias = tuple[Any, Any, Any, Any]
 """Four independent words of 32 bits, as whole numbers."""
 
 # Uses of random numbers: the first word of the counter.
-INITIAL, STRATA, CHILDREN, DEVELOPMENT, RESTART, WARM = 1, 2, 3, 4, 5, 6
+USE_INITIAL, USE_STRATA, USE_CHILDREN, USE_LOCAL_SEARCH, USE_RESTART, USE_WARM_START = (
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+)
 
 _MASK = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
@@ -31,8 +38,8 @@ _MULTIPLIER_0, _MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _WEYL_0, _WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 
 
-@compiled
-def draws(seed: int, use: int, island: int, generation: int, draw: int) -> Draws:
+@jit_compile
+def draw_words(seed: int, use: int, island: int, generation: int, draw: int) -> RandomWords:
     """Four words of 32 bits that belong to this place of this run."""
     k0, k1 = np.uint64(seed) & _MASK, np.uint64(seed) >> _HALF
     c0, c1 = np.uint64(draw) & _MASK, np.uint64(generation) & _MASK
@@ -44,26 +51,28 @@ def draws(seed: int, use: int, island: int, generation: int, draw: int) -> Draws
     return np.int64(c0), np.int64(c1), np.int64(c2), np.int64(c3)
 
 
-@compiled
-def unit(word: int) -> float:
+@jit_compile
+def to_uniform(word: int) -> float:
     """A drawn word as a number in (0, 1)."""
     return (word + 0.5) / 4294967296.0
 
 
-@compiled
-def below(word: int, n: int) -> int:
+@jit_compile
+def to_integer(word: int, n: int) -> int:
     """A drawn word as a whole number 0 … n − 1 (n is far below 2³², so the bias is nil)."""
     return (word * n) >> 32
 
 
-@compiled
-def normal(word: Draws) -> float:
+@jit_compile
+def to_normal(word: RandomWords) -> float:
     """A normal number of standard deviation 1 from the first two of four drawn words."""
-    return float(np.sqrt(-2.0 * np.log(unit(word[0]))) * np.cos(2.0 * np.pi * unit(word[1])))
+    return float(
+        np.sqrt(-2.0 * np.log(to_uniform(word[0]))) * np.cos(2.0 * np.pi * to_uniform(word[1]))
+    )
 
 
-@compiled
-def coded(places: FloatArray, bits: int) -> WordArray:
+@jit_compile
+def encode(places: FloatArray, bits: int) -> WordArray:
     """Nearest chromosomes of places in [0, 1]."""
     largest = float((1 << bits) - 1)
     words = np.empty(places.shape, np.uint32)
@@ -73,9 +82,9 @@ def coded(places: FloatArray, bits: int) -> WordArray:
     return words
 
 
-@compiled
-def decoded(words: WordArray, bits: int) -> FloatArray:
-    """Places of chromosomes; the inverse of `coded`."""
+@jit_compile
+def decode(words: WordArray, bits: int) -> FloatArray:
+    """Places of chromosomes; the inverse of `encode`."""
     largest = float((1 << bits) - 1)
     places = np.empty(words.shape)
     for p in range(words.shape[0]):
@@ -84,8 +93,8 @@ def decoded(words: WordArray, bits: int) -> FloatArray:
     return places
 
 
-@compiled
-def rank(words: WordArray, fitness: FloatArray) -> None:
+@jit_compile
+def sort_population(words: WordArray, fitness: FloatArray) -> None:
     """Sort a population in place, fittest first; equals keep their order.
 
     By insertion: populations are small, and after a generation half of them is in order.
@@ -108,8 +117,8 @@ def rank(words: WordArray, fitness: FloatArray) -> None:
             words[place, d] = held[d]
 
 
-@compiled
-def cross(child: WordArray, first: WordArray, second: WordArray, cut: int, bits: int) -> None:
+@jit_compile
+def cross_over(child: WordArray, first: WordArray, second: WordArray, cut: int, bits: int) -> None:
     """One-point crossover of the whole bit string: `cut` bits of `first`, the rest of `second`.
 
     The string is the words one after the other, each from its highest bit.
@@ -120,14 +129,14 @@ def cross(child: WordArray, first: WordArray, second: WordArray, cut: int, bits:
         child[d] = (first[d] & ~low) | (second[d] & low)
 
 
-@compiled
-def flip(child: WordArray, position: int, bits: int) -> None:
+@jit_compile
+def flip_bit(child: WordArray, position: int, bits: int) -> None:
     """Mutation: one bit of the string changes."""
     child[position // bits] ^= np.uint32(1 << (bits - 1 - position % bits))
 
 
-@compiled
-def scheduled(starts: IntArray, rates: FloatArray, generation: int) -> float:
+@jit_compile
+def get_mutation_rate(starts: IntArray, rates: FloatArray, generation: int) -> float:
     """Mutation rate at a generation: that of the last entry that has begun."""
     rate = float(rates[0])
     for i in range(starts.size):
@@ -136,27 +145,27 @@ def scheduled(starts: IntArray, rates: FloatArray, generation: int) -> float:
     return rate
 
 
-@compiled
-def reflected(place: float) -> float:
+@jit_compile
+def reflect_at_bounds(place: float) -> float:
     """A place of at most one range outside, mirrored at the bound it has passed."""
     inside = abs(place)
     return inside if inside <= 1.0 else max(2.0 - inside, 0.0)
 
 
-@compiled
-def stepped(place: float, size: int, sign: int, bits: int) -> float:
+@jit_compile
+def mutate_by_step(place: float, size: int, sign: int, bits: int) -> float:
     """Scale-free mutation: a step whose size is uniform in its logarithm, reflected at a bound.
 
     A flipped bit also changes a parameter by a power of two, but of the code, so that some
     neighbours are far apart (Hamming cliffs); a step on the axis has none.
     """
-    step = float(2.0 ** (-unit(size) * bits))
-    return reflected(place + (step if sign & 1 else -step))
+    step = float(2.0 ** (-to_uniform(size) * bits))
+    return reflect_at_bounds(place + (step if sign & 1 else -step))
 
 
-@compiled
-def two_of(a: int, b: int, n: int) -> tuple[int, int]:
+@jit_compile
+def draw_pair(a: int, b: int, n: int) -> tuple[int, int]:
     """Two different numbers below n (n ≥ 2) from two drawn words."""
-    first = below(a, n)
-    second = below(b, n - 1)
+    first = to_integer(a, n)
+    second = to_integer(b, n - 1)
     return first, second + (1 if second >= first else 0)

@@ -5,7 +5,7 @@ The sensitivities come from forward differences, all columns in one call of the 
 
 import numpy as np
 
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray
 from sysid.search.levenberg_marquardt import (
     FINE_DIFFERENCE,
@@ -13,15 +13,15 @@ from sysid.search.levenberg_marquardt import (
     form_normal_equations,
     step_aside,
 )
-from sysid.search.operators import DEVELOPMENT, draws, unit
-from sysid.search.state import Plan, SearchRecord
-from sysid.simulation.evaluator import Evaluator, partial_predictions
-from sysid.simulation.scaling import located
+from sysid.search.operators import USE_LOCAL_SEARCH, draw_words, to_uniform
+from sysid.search.state import IslandPlan, SearchRecord
+from sysid.simulation.evaluator import Evaluator, predict_partially
+from sysid.simulation.scaling import from_unit
 
 
-@compiled
-def partial_fitness(
-    evaluator: Evaluator, plan: Plan, predicted: FloatArray, horizon: float
+@jit_compile
+def evaluate_partial_fitness(
+    evaluator: Evaluator, plan: IslandPlan, predicted: FloatArray, horizon: float
 ) -> FloatArray:
     """Fitness of each column of predictions (M, P) by the samples up to `horizon` (1: all)."""
     totals, count = np.zeros(predicted.shape[1]), 0
@@ -38,8 +38,8 @@ def partial_fitness(
     return totals
 
 
-@compiled
-def slope_distance(plan: Plan, search: SearchRecord) -> float:
+@jit_compile
+def choose_difference(plan: IslandPlan, search: SearchRecord) -> float:
     """Distance (of the range) over which the next slopes are taken.
 
     The first searches take derivatives, the others slopes over a distance that each step draws
@@ -48,17 +48,17 @@ def slope_distance(plan: Plan, search: SearchRecord) -> float:
     """
     if search.wide_differences == 0:
         return FINE_DIFFERENCE
-    word = draws(plan.seed, DEVELOPMENT, plan.island, search.generation, 0)
-    return float(10.0 ** (-2.0 - 4.0 * unit(word[2])))
+    word = draw_words(plan.seed, USE_LOCAL_SEARCH, plan.island, search.generation, 0)
+    return float(10.0 ** (-2.0 - 4.0 * to_uniform(word[2])))
 
 
-@compiled
-def normal_equations(
-    evaluator: Evaluator, plan: Plan, point: FloatArray, horizon: float, difference: float
+@jit_compile
+def build_normal_equations(
+    evaluator: Evaluator, plan: IslandPlan, point: FloatArray, horizon: float, difference: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """JᵀJ, Jᵀe and the fitness at a point, over the samples up to `horizon`: D + 1 simulations."""
     n, (places, steps) = point.size, step_aside(point, difference)
-    predicted = partial_predictions(evaluator, located(evaluator, places), horizon)
+    predicted = predict_partially(evaluator, from_unit(evaluator, places), horizon)
     scored = np.flatnonzero((evaluator.weight != 0.0) & (plan.progress <= horizon))
     error, columns, total = np.empty(scored.size), np.empty((n, scored.size)), 0.0
     per_step = 1.0 / steps

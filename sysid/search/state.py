@@ -5,7 +5,7 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
 from sysid.core.types import FloatArray, IntArray, WordArray, make_record_dtype
 
-Phase = Literal["start", "genetic", "sequence", "migration", "refinement"]
+SearchPhase = Literal["start", "genetic", "sequence", "migration", "refinement"]
 
 
 class Improvement(NamedTuple):
@@ -17,7 +17,7 @@ class Improvement(NamedTuple):
     generation: int
     evaluations: int
     rms: float
-    phase: Phase
+    phase: SearchPhase
     parameters: tuple[float, ...]
 
 
@@ -43,7 +43,7 @@ class IslandSummary:
     evaluations: int
 
 
-SIMPLE, PAPER, IMPROVED, IMPROVED_PAPER_STEPS = 0, 1, 2, 3
+METHOD_SIMPLE, METHOD_PAPER, METHOD_IMPROVED, METHOD_IMPROVED_FIXED_SEQUENCE = 0, 1, 2, 3
 """Methods: simple GA; with the fixed sequence; improved with adaptive, with fixed sequence."""
 
 
@@ -105,14 +105,14 @@ class IslandArrays(NamedTuple):
 
 
 # Columns of an improvement; the D physical values follow.
-AT_GENERATION, AT_EVALUATIONS, RMS, PHASE, VALUES = range(5)
-START, GENETIC, LOCAL, MIGRATION = range(4)
-PHASES: tuple[Phase, ...] = ("start", "genetic", "sequence", "migration")
+COLUMN_GENERATION, COLUMN_EVALUATIONS, COLUMN_RMS, COLUMN_PHASE, COLUMN_VALUES = range(5)
+PHASE_START, PHASE_GENETIC, PHASE_LOCAL, PHASE_MIGRATION = range(4)
+PHASE_NAMES: tuple[SearchPhase, ...] = ("start", "genetic", "sequence", "migration")
 
-SAME = 1e-4  # relative: champions this near in fitness are one optimum
+SAME_OPTIMUM = 1e-4  # relative: champions this near in fitness are one optimum
 
 
-class Plan(NamedTuple):
+class IslandPlan(NamedTuple):
     """How one island searches, as compiled code reads it.
 
     Attributes
@@ -122,7 +122,7 @@ class Plan(NamedTuple):
     first, total : int
         Number of its first individual among the `total` of the archipelago.
     method : int
-        One of `SIMPLE`, `PAPER`, `IMPROVED`, `IMPROVED_PAPER_STEPS`.
+        One of `METHOD_SIMPLE`, `METHOD_PAPER`, `METHOD_IMPROVED`, `METHOD_IMPROVED_FIXED_SEQUENCE`.
     bits, survivors, stagnation : int
     relative : int
         1: `beta` is relative to the value (Eq. 12); 0: to the range.
@@ -141,17 +141,17 @@ class Plan(NamedTuple):
 
     seed: int
     island: int
-    first: int
-    total: int
+    first_individual: int
+    population: int
     method: int
     bits: int
     survivors: int
     stagnation: int
-    relative: int
-    evaluations: int
+    is_relative: int
+    most_evaluations: int
     beta: float
-    rms: float
+    target_rms: float
     loss_scale: float
-    starts: IntArray
-    rates: FloatArray
+    mutation_starts: IntArray
+    mutation_rates: FloatArray
     progress: FloatArray

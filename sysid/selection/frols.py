@@ -16,15 +16,17 @@ import numpy as np
 from sysid.core.types import FloatArray
 from sysid.models.model import TermRule
 
-_DEPENDENT = 1e-20  # of a column's squares: less is rounding, the column depends on the others
-_EXPLAINED = 1e-24  # of the output's squares: less is rounding, nothing is left to explain
-_GAIN = 1e-6  # of what is unexplained: an exchange that gains less is not made
-_ROUNDS = 20
+_DEPENDENT_SHARE = (
+    1e-20  # of a column's squares: less is rounding, the column depends on the others
+)
+_EXPLAINED_SHARE = 1e-24  # of the output's squares: less is rounding, nothing is left to explain
+_LEAST_GAIN = 1e-6  # of what is unexplained: an exchange that gains less is not made
+_MOST_ROUNDS = 20
 _MOST_BACKWARD = 120  # terms from which some are given back
-_OPERATIONS = 4e9  # of all exchanges together, about
+_MOST_OPERATIONS = 4e9  # of all exchanges together, about
 
 
-class Forward(NamedTuple):
+class ForwardSelection(NamedTuple):
     """Terms in the order of selection.
 
     Attributes
@@ -38,21 +40,23 @@ class Forward(NamedTuple):
 
     order: tuple[int, ...] = ()
     ratios: tuple[float, ...] = ()
-    left: tuple[float, ...] = ()
+    unexplained_shares: tuple[float, ...] = ()
 
     @property
     def unexplained(self) -> float:
         """Share of the output's squares that all of them leave."""
-        return self.left[-1] if self.left else 1.0
+        return self.unexplained_shares[-1] if self.unexplained_shares else 1.0
 
-    def first(self, keep: int) -> "Forward":
+    def keep_first(self, keep: int) -> "ForwardSelection":
         """Only the first terms."""
-        return Forward(self.order[:keep], self.ratios[:keep], self.left[:keep])
+        return ForwardSelection(
+            self.order[:keep], self.ratios[:keep], self.unexplained_shares[:keep]
+        )
 
 
-def forward(
+def select_forward(
     triangle: FloatArray, keep: int, err: float | None = None, among: Sequence[int] | None = None
-) -> Forward:
+) -> ForwardSelection:
     """Take terms until `keep` are taken, the unexplained share is below `err`, or none helps.
 
     Parameters
@@ -68,19 +72,23 @@ def forward(
     whole, squares = float(target @ target), np.sum(np.square(left), axis=0)
     free = np.zeros(squares.size, dtype=np.bool_)
     free[list(range(squares.size) if among is None else among)] = True
-    found = Forward()
-    stop = max(_EXPLAINED, err or 0.0)
-    while len(found.order) < keep and whole > 0 and not (found.left and found.unexplained < stop):
-        chosen = _best(left, target, free, squares)
+    found = ForwardSelection()
+    stop = max(_EXPLAINED_SHARE, err or 0.0)
+    while (
+        len(found.order) < keep
+        and whole > 0
+        and not (found.unexplained_shares and found.unexplained < stop)
+    ):
+        chosen = _find_best_term(left, target, free, squares)
         if chosen is None:
             break
         direction = left[:, chosen] / np.linalg.norm(left[:, chosen])
         part = float(direction @ target)
         target = target - part * direction
-        found = Forward(
+        found = ForwardSelection(
             (*found.order, chosen),
             (*found.ratios, part * part / whole),
-            (*found.left, float(target @ target) / whole),
+            (*found.unexplained_shares, float(target @ target) / whole),
         )
         free[chosen] = False
         for _ in range(2):  # twice is enough: the second pass takes out what rounding left
@@ -88,44 +96,44 @@ def forward(
     return found
 
 
-def _best(
+def _find_best_term(
     left: FloatArray, target: FloatArray, free: FloatArray, squares: FloatArray
 ) -> int | None:
     """The free column that explains most of the target; None if all depend on those taken."""
     norms = np.sum(np.square(left), axis=0)
-    usable = free & (norms > _DEPENDENT * squares) & (norms > 0)
+    usable = free & (norms > _DEPENDENT_SHARE * squares) & (norms > 0)
     if not np.any(usable):
         return None
     gains = np.where(usable, np.square(left.T @ target) / np.where(usable, norms, 1.0), -1.0)
     return int(np.argmax(gains))
 
 
-def exchanged(triangle: FloatArray, order: Sequence[int]) -> tuple[int, ...]:
+def exchange_terms(triangle: FloatArray, order: Sequence[int]) -> tuple[int, ...]:
     """The terms after exchanges, each of which explains more than the term it replaces."""
     chosen = list(order)
-    least = _left_over(triangle, chosen)
+    least = _compute_unexplained(triangle, chosen)
     squares = np.sum(np.square(triangle[:, :-1]), axis=0)
-    floor = _EXPLAINED * float(triangle[:, -1] @ triangle[:, -1])
+    floor = _EXPLAINED_SHARE * float(triangle[:, -1] @ triangle[:, -1])
     one_round = 4 * max(len(chosen), 1) ** 2 * triangle.shape[1] ** 2
-    for _ in range(min(_ROUNDS, int(_OPERATIONS / one_round))):
+    for _ in range(min(_MOST_ROUNDS, int(_MOST_OPERATIONS / one_round))):
         before = least
         for place in range(len(chosen)):
             others = chosen[:place] + chosen[place + 1 :]
-            left = _orthogonal(triangle, others)
+            left = _orthogonalise(triangle, others)
             free = np.ones(squares.size, dtype=np.bool_)
             free[others] = False
-            better = _best(left[:, :-1], left[:, -1], free, squares)
+            better = _find_best_term(left[:, :-1], left[:, -1], free, squares)
             if better is None or better == chosen[place] or least <= floor:
                 continue
-            value = _left_over(triangle, [*others, better])
-            if value < (1.0 - _GAIN) * least:
+            value = _compute_unexplained(triangle, [*others, better])
+            if value < (1.0 - _LEAST_GAIN) * least:
                 chosen[place], least = better, value
         if least == before:
             break
     return tuple(chosen)
 
 
-def _orthogonal(triangle: FloatArray, taken: Sequence[int]) -> FloatArray:
+def _orthogonalise(triangle: FloatArray, taken: Sequence[int]) -> FloatArray:
     """All columns less their parts in the span of those taken."""
     if not taken:
         return triangle
@@ -135,12 +143,14 @@ def _orthogonal(triangle: FloatArray, taken: Sequence[int]) -> FloatArray:
     return found
 
 
-def _left_over(triangle: FloatArray, taken: Sequence[int]) -> float:
-    left = _orthogonal(triangle, taken)[:, -1]
+def _compute_unexplained(triangle: FloatArray, taken: Sequence[int]) -> float:
+    left = _orthogonalise(triangle, taken)[:, -1]
     return float(left @ left)
 
 
-def solved(triangle: FloatArray, taken: Sequence[int], ridge: float = 0.0) -> FloatArray:
+def solve_coefficients(
+    triangle: FloatArray, taken: Sequence[int], ridge: float = 0.0
+) -> FloatArray:
     """Least-squares coefficients (M,) with the taken terms, zero for the others.
 
     Columns are scaled to length 1; `ridge` is added to their squares. Of terms that depend on
@@ -160,7 +170,7 @@ def solved(triangle: FloatArray, taken: Sequence[int], ridge: float = 0.0) -> Fl
     return found
 
 
-def backward(triangle: FloatArray, order: Sequence[int]) -> dict[int, tuple[int, ...]]:
+def select_backward(triangle: FloatArray, order: Sequence[int]) -> dict[int, tuple[int, ...]]:
     """Of each number of terms a set: from all of `order`, the least needed given back in turn.
 
     Giving back term i leaves aᵢ² / (G⁻¹)ᵢᵢ more, G the inner products of the terms.
@@ -177,48 +187,50 @@ def backward(triangle: FloatArray, order: Sequence[int]) -> dict[int, tuple[int,
     return found
 
 
-def select(triangle: FloatArray, rule: TermRule, samples: int) -> Forward:
+def select_terms(triangle: FloatArray, rule: TermRule, samples: int) -> ForwardSelection:
     """The terms by a rule, in the order in which they explain most."""
     if not rule.exchange:
-        found = forward(triangle, rule.keep, rule.err)
-        return found.first(_number(found.left, rule, samples))
-    taken = forward(triangle, min(2 * rule.keep + 2, max(rule.keep, _MOST_BACKWARD))).order
-    given_back = backward(triangle, taken) if len(taken) <= _MOST_BACKWARD else {}
+        found = select_forward(triangle, rule.keep, rule.err)
+        return found.keep_first(_count_terms(found.unexplained_shares, rule, samples))
+    taken = select_forward(triangle, min(2 * rule.keep + 2, max(rule.keep, _MOST_BACKWARD))).order
+    given_back = select_backward(triangle, taken) if len(taken) <= _MOST_BACKWARD else {}
     sets = [
         [taken[:k], given_back.get(k, taken[:k])] for k in range(1, min(rule.keep, len(taken)) + 1)
     ]
     whole = float(triangle[:, -1] @ triangle[:, -1])
-    left = [min(_left_over(triangle, one) for one in pair) / whole for pair in sets]
-    number = _number(left, rule, samples)
-    better = [exchanged(triangle, one) for one in sets[number - 1]] if number else [()]
-    best = min(better, key=lambda one: _left_over(triangle, one))
-    return forward(triangle, number, among=best)
+    left = [min(_compute_unexplained(triangle, one) for one in pair) / whole for pair in sets]
+    number = _count_terms(left, rule, samples)
+    better = [exchange_terms(triangle, one) for one in sets[number - 1]] if number else [()]
+    best = min(better, key=lambda one: _compute_unexplained(triangle, one))
+    return select_forward(triangle, number, among=best)
 
 
-def _number(left: Sequence[float], rule: TermRule, samples: int) -> int:
+def _count_terms(left: Sequence[float], rule: TermRule, samples: int) -> int:
     """How many terms a rule asks for; `left`: the share unexplained with 1, 2, … terms.
 
     ``bic``: as many as have the least n ln(S / n) + k ln n, S the squares left with k terms.
     """
-    enough = [k for k, share in enumerate(left, 1) if share < max(_EXPLAINED, rule.err or 0.0)]
+    enough = [
+        k for k, share in enumerate(left, 1) if share < max(_EXPLAINED_SHARE, rule.err or 0.0)
+    ]
     number = min(enough, default=len(left))
     if rule.criterion == "none" or number == 0:
         return number
-    values = [_bic(share, k, samples) for k, share in enumerate(left[:number], 1)]
+    values = [_compute_bic(share, k, samples) for k, share in enumerate(left[:number], 1)]
     return int(np.argmin(values)) + 1
 
 
-def _bic(share: float, terms: int, samples: int) -> float:
-    return float(samples * np.log(max(share, _EXPLAINED)) + terms * np.log(max(samples, 1)))
+def _compute_bic(share: float, terms: int, samples: int) -> float:
+    return float(samples * np.log(max(share, _EXPLAINED_SHARE)) + terms * np.log(max(samples, 1)))
 
 
-def merit(rule: TermRule, share: float, terms: int, samples: int) -> tuple[float, ...]:
+def rate_terms(rule: TermRule, share: float, terms: int, samples: int) -> tuple[float, ...]:
     """How good a set of terms is by a rule, to be compared with another's; smaller is better.
 
     With `criterion` that criterion; with `err` the fewest terms that leave less than it; else,
     and of as many terms, what they leave.
     """
     if rule.criterion == "bic":
-        return (_bic(share, terms, samples),)
-    is_enough = share < max(_EXPLAINED, rule.err or 0.0)
+        return (_compute_bic(share, terms, samples),)
+    is_enough = share < max(_EXPLAINED_SHARE, rule.err or 0.0)
     return (0.0, float(terms), share) if is_enough else (1.0, share)

@@ -11,31 +11,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.language.intervals import bounds
+from sysid.language.intervals import bound_expression
 from sysid.models.model import Model
 from sysid.models.parameters import Parameter
-from sysid.models.sections import interval
-from sysid.selection.regression import lag_parameters
+from sysid.models.sections import get_interval
+from sysid.selection.regression import find_lag_parameters
 
-_FULL = 4_000  # combinations up to which all are tried, if their cost allows
-_READING = 150.0  # operations that making one value of a column is worth
-_FEWEST = 60
-_COARSE = 0.1  # share of the trials that the coarse grid may take
-_OPERATIONS = 4e9  # of all trials together, about
-_BEGINNINGS = 3
-_ROUNDS = 6
+_FULL_SEARCH = 4_000  # combinations up to which all are tried, if their cost allows
+_READ_COST = 150.0  # operations that making one value of a column is worth
+_FEWEST_TRIALS = 60
+_COARSE_SHARE = 0.1  # share of the trials that the coarse grid may take
+_MOST_OPERATIONS = 4e9  # of all trials together, about
+_DESCENTS = 3
+_MOST_ROUNDS = 6
 
-Score = Callable[[Mapping[str, float]], float]
+LagScore = Callable[[Mapping[str, float]], float]
 
 
-class Tried(NamedTuple):
+class LagTrial(NamedTuple):
     """Values of the lags, and the share of the output's squares left unexplained."""
 
     share: float
     lags: dict[str, float]
 
 
-def lag_values(
+def list_lag_values(
     model: Model, parameters: Sequence[Parameter], period: float
 ) -> dict[str, tuple[float, ...]]:
     """Values of each parameter of a lag at which that lag is a whole number of samples.
@@ -43,22 +43,27 @@ def lag_values(
     A parameter that is fixed has the one value; where no value inside the bounds makes the lag
     whole, the middle.
     """
-    named = lag_parameters(model)
-    spans = {one.name: interval(one) for one in parameters if one.name in named}
+    named = find_lag_parameters(model)
+    spans = {one.name: get_interval(one) for one in parameters if one.name in named}
     found: dict[str, tuple[float, ...]] = {}
     for name, (low, high) in spans.items():
         middle = {other: (0.5 * sum(ends),) * 2 for other, ends in spans.items()}
         slopes = [(0.0, 0.0)]
         for past in {factor for term in model.terms for factor in term.factors}:
-            if past.lag is not None:
-                ends = [bounds(past.lag, middle | {name: (x, x)}, period)[0] for x in (low, high)]
+            if past.delay is not None:
+                ends = [
+                    bound_expression(past.delay, middle | {name: (x, x)}, period)[0]
+                    for x in (low, high)
+                ]
                 slopes.append((abs(ends[1] - ends[0]), ends[0]))
         reach, begin = max(slopes)
-        found[name] = _whole(low, high, reach, begin) if reach > 0 else (0.5 * (low + high),)
+        found[name] = (
+            _list_whole_lags(low, high, reach, begin) if reach > 0 else (0.5 * (low + high),)
+        )
     return found
 
 
-def _whole(low: float, high: float, reach: float, begin: float) -> tuple[float, ...]:
+def _list_whole_lags(low: float, high: float, reach: float, begin: float) -> tuple[float, ...]:
     """Values between two bounds that move a lag by whole samples, `reach` in all."""
     step = (high - low) / reach
     first = low + (ceil(begin - 1e-9) - begin) * step
@@ -68,23 +73,25 @@ def _whole(low: float, high: float, reach: float, begin: float) -> tuple[float, 
     return tuple(min(max(first + i * step, low), high) for i in range(count))
 
 
-class Effort(NamedTuple):
+class SearchEffort(NamedTuple):
     """How many combinations may be tried, and on how many rows."""
 
     trials: int
     rows: int
 
 
-def affordable(values: Mapping[str, Sequence[float]], terms: int) -> Effort:
+def plan_effort(values: Mapping[str, Sequence[float]], terms: int) -> SearchEffort:
     """So much that all trials together stay cheap."""
     least = max(5 * terms, 500)
-    each = 2.0 * (terms + 1) ** 2 + _READING * (terms + 1)
-    trials = int(min(max(_OPERATIONS / (each * least), _FEWEST), _FULL))
+    each = 2.0 * (terms + 1) ** 2 + _READ_COST * (terms + 1)
+    trials = int(min(max(_MOST_OPERATIONS / (each * least), _FEWEST_TRIALS), _FULL_SEARCH))
     expected = min(trials, prod(len(axis) for axis in values.values()))
-    return Effort(trials, max(least, int(_OPERATIONS / (each * max(expected, 1)))))
+    return SearchEffort(trials, max(least, int(_MOST_OPERATIONS / (each * max(expected, 1)))))
 
 
-def search(values: Mapping[str, Sequence[float]], score: Score, trials: int = _FULL) -> list[Tried]:
+def search_lags(
+    values: Mapping[str, Sequence[float]], score: LagScore, trials: int = _FULL_SEARCH
+) -> list[LagTrial]:
     """The combinations that were tried, best first; about `trials` of them at most."""
     names = list(values)
     axes = [list(values[name]) for name in names]
@@ -101,19 +108,21 @@ def search(values: Mapping[str, Sequence[float]], score: Score, trials: int = _F
         for place in product(*(range(size) for size in sizes)):
             look(place)
     else:
-        coarse = product(*_coarse(sizes, max(_COARSE * trials, _FEWEST / 2)))
+        coarse = product(
+            *_choose_coarse_grid(sizes, max(_COARSE_SHARE * trials, _FEWEST_TRIALS / 2))
+        )
         for place in islice(coarse, trials):  # of many lags, even two values each are too many
             look(place)
-        for begin in sorted(known, key=lambda p: (known[p], p))[:_BEGINNINGS]:
-            _descend(begin, sizes, look, lambda: len(known) >= trials)
+        for begin in sorted(known, key=lambda p: (known[p], p))[:_DESCENTS]:
+            _descend_axes(begin, sizes, look, lambda: len(known) >= trials)
     ranked = sorted(known, key=lambda p: (known[p], p))
     return [
-        Tried(known[place], {n: a[i] for n, a, i in zip(names, axes, place, strict=True)})
+        LagTrial(known[place], {n: a[i] for n, a, i in zip(names, axes, place, strict=True)})
         for place in ranked
     ]
 
 
-def _coarse(sizes: Sequence[int], combinations: float) -> list[list[int]]:
+def _choose_coarse_grid(sizes: Sequence[int], combinations: float) -> list[list[int]]:
     """Evenly spread places on each axis, about so many combinations in all."""
     each = max(2, floor(combinations ** (1.0 / len(sizes))))
     return [
@@ -122,18 +131,18 @@ def _coarse(sizes: Sequence[int], combinations: float) -> list[list[int]]:
     ]
 
 
-def _descend(
+def _descend_axes(
     place: tuple[int, ...],
     sizes: Sequence[int],
     look: Callable[[tuple[int, ...]], float],
     is_over: Callable[[], bool],
 ) -> None:
     """One axis at a time: its best place, the others kept, until nothing gets better."""
-    for _ in range(_ROUNDS):
+    for _ in range(_MOST_ROUNDS):
         before = place
         for axis, size in enumerate(sizes):
             reach = max(1, size // 64)
-            for line in (_line(size), [place[axis] + i for i in range(-reach, reach + 1)]):
+            for line in (_choose_line(size), [place[axis] + i for i in range(-reach, reach + 1)]):
                 if is_over():
                     return
                 inside = [i for i in line if 0 <= i < size]
@@ -143,6 +152,6 @@ def _descend(
             return
 
 
-def _line(size: int) -> list[int]:
+def _choose_line(size: int) -> list[int]:
     """Places of one axis: all of a short one, 64 of a long one."""
     return sorted({int(i) for i in np.round(np.linspace(0, size - 1, min(size, 64)))})

@@ -15,24 +15,24 @@ import numpy as np
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.interpolation import FineInput
 from sysid.data.records import Record
-from sysid.language.intervals import bounds
-from sysid.language.tree import Past
-from sysid.models.model import Model, Term, initial_parameters
+from sysid.language.intervals import bound_expression
+from sysid.language.tree import PastValue
+from sysid.models.model import Model, Term, build_initial_parameters
 from sysid.models.parameters import Parameter
-from sysid.models.sections import interval
-from sysid.models.ties import names_in
-from sysid.simulation.experiments import Experiment, lay_out
+from sysid.models.sections import get_interval
+from sysid.models.ties import collect_parameter_names
+from sysid.simulation.experiments import GridExperiment, place_on_grid
 
-BLOCK = 4096
+BLOCK_ROWS = 4096
 """Rows folded in at once."""
 
-_WHOLE = 1e-9  # samples: nearer, a lag is a whole number of them
+_WHOLE_TOLERANCE = 1e-9  # samples: nearer, a lag is a whole number of them
 
-Reading = Callable[[Past], FloatArray]
+PastReader = Callable[[PastValue], FloatArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Piece:
+class RegressionExperiment:
     """One experiment of a regression.
 
     Attributes
@@ -56,10 +56,10 @@ class Piece:
 class Regression:
     """A polynomial's regression on some experiments, for any values of its lags."""
 
-    pieces: tuple[Piece, ...]
+    experiments: tuple[RegressionExperiment, ...]
 
     @classmethod
-    def of(
+    def from_records(
         cls, model: Model, records: Sequence[Record], parameters: Sequence[Parameter], skip: int = 0
     ) -> "Regression":
         """Lay the records out, with a polynomial's parameters and their bounds.
@@ -69,38 +69,42 @@ class Regression:
         InvalidRecord, RecordTooShort
             If a record does not have what the model needs.
         """
-        everything = (*parameters, *initial_parameters(model, len(records)))
+        everything = (*parameters, *build_initial_parameters(model, len(records)))
         weights = {output.name: 1.0 for output in model.outputs}
         laid = [
-            lay_out(model, record, e, everything, weights, skip) for e, record in enumerate(records)
+            place_on_grid(model, record, e, everything, weights, skip)
+            for e, record in enumerate(records)
         ]
-        return cls.laid(model, records, laid, parameters)
+        return cls.from_experiments(model, records, laid, parameters)
 
     @classmethod
-    def laid(
-        cls, model: Model, records: Sequence[Record], experiments: Sequence[Experiment],
+    def from_experiments(
+        cls, model: Model, records: Sequence[Record], experiments: Sequence[GridExperiment],
         parameters: Sequence[Parameter],
     ) -> "Regression":  # fmt: skip
         """The regression on records that are laid out already."""
-        spans = {one.name: interval(one) for one in parameters}
+        spans = {one.name: get_interval(one) for one in parameters}
         pairs = zip(records, experiments, strict=True)
-        return cls(tuple(_piece(model, record, one, spans) for record, one in pairs))
+        return cls(
+            tuple(_make_regression_experiment(model, record, one, spans) for record, one in pairs)
+        )
 
     @property
-    def samples(self) -> int:
+    def most_rows(self) -> int:
         """Rows at most: those with missing regressors are still among them."""
-        return sum(piece.rows.size for piece in self.pieces)
+        return sum(piece.rows.size for piece in self.experiments)
 
-    def thinned(self, most: int) -> "Regression":
+    def thin_rows(self, most: int) -> "Regression":
         """At most about that many rows, evenly taken."""
-        stride = max(1, ceil(self.samples / max(most, 1)))
+        stride = max(1, ceil(self.most_rows / max(most, 1)))
         return Regression(
             tuple(
-                Piece(one.output, one.inputs, one.period, one.rows[::stride]) for one in self.pieces
+                RegressionExperiment(one.output, one.inputs, one.period, one.rows[::stride])
+                for one in self.experiments
             )
         )
 
-    def triangle(
+    def factor_terms(
         self, terms: Sequence[Term], lags: Mapping[str, float],
         simulated: Sequence[FloatArray] | None = None,
     ) -> tuple[FloatArray, int]:  # fmt: skip
@@ -111,29 +115,32 @@ class Regression:
         """
         width = (1 if simulated is None else 2) * len(terms) + 1
         folded, count = np.zeros((0, width)), 0
-        for number, piece in enumerate(self.pieces):
+        for number, piece in enumerate(self.experiments):
             outputs = [piece.output]
             if simulated is not None:
                 outputs.insert(0, simulated[number])
-            for first in range(0, piece.rows.size, BLOCK):
-                rows = piece.rows[first : first + BLOCK]
-                parts = [columns(terms, past_of(piece, lags, rows, y), rows.size) for y in outputs]
+            for first in range(0, piece.rows.size, BLOCK_ROWS):
+                rows = piece.rows[first : first + BLOCK_ROWS]
+                parts = [
+                    evaluate_terms(terms, make_past_reader(piece, lags, rows, y), rows.size)
+                    for y in outputs
+                ]
                 block = np.column_stack([*parts, piece.output[rows]])
                 block = block[np.all(np.isfinite(block), axis=1)]
                 count += block.shape[0]
-                folded = fold(folded, block)
+                folded = fold_rows(folded, block)
         short = max(width - folded.shape[0], 0)
         return np.vstack([folded, np.zeros((short, width))]), count
 
 
-def fold(folded: FloatArray, block: FloatArray) -> FloatArray:
+def fold_rows(folded: FloatArray, block: FloatArray) -> FloatArray:
     """R of the QR decomposition of all rows so far, with a block of further rows in it."""
     return np.asarray(np.linalg.qr(np.vstack([folded, block]), mode="r"))
 
 
-def columns(terms: Sequence[Term], read: Reading, rows: int) -> FloatArray:
+def evaluate_terms(terms: Sequence[Term], read: PastReader, rows: int) -> FloatArray:
     """The terms' values, (rows, M), each past value read once."""
-    known: dict[Past, FloatArray] = {}
+    known: dict[PastValue, FloatArray] = {}
     matrix = np.empty((rows, len(terms)))
     with np.errstate(over="ignore", invalid="ignore"):
         for column, term in enumerate(terms):
@@ -146,38 +153,44 @@ def columns(terms: Sequence[Term], read: Reading, rows: int) -> FloatArray:
     return matrix
 
 
-def past_of(piece: Piece, lags: Mapping[str, float], rows: IntArray, output: FloatArray) -> Reading:
+def make_past_reader(
+    piece: RegressionExperiment, lags: Mapping[str, float], rows: IntArray, output: FloatArray
+) -> PastReader:
     """How past values are read at rows, those of the output from `output`."""
 
-    def read(past: Past) -> FloatArray:
-        lag = lag_of(past, lags, piece.period)
+    def read(past: PastValue) -> FloatArray:
+        lag = evaluate_lag(past, lags, piece.period)
         if past.kind == "state":
-            return _between(output, np.asarray(rows - past.offset - lag, dtype=np.float64))
+            return _interpolate_places(
+                output, np.asarray(rows - past.offset - lag, dtype=np.float64)
+            )
         signal = piece.inputs[past.name]
         # At a jump the fine grid holds the mean of both sides: without lag, read behind it.
-        jump = signal.begin if past.lag is None else 0
-        places = signal.zero + (rows - past.offset - lag) * signal.points + jump
-        return _between(signal.values, np.asarray(places, dtype=np.float64))
+        jump = signal.begin if past.delay is None else 0
+        places = signal.start_index + (rows - past.offset - lag) * signal.points_per_step + jump
+        return _interpolate_places(signal.values, np.asarray(places, dtype=np.float64))
 
     return read
 
 
-def lag_parameters(model: Model) -> set[str]:
+def find_lag_parameters(model: Model) -> set[str]:
     """Names of the parameters in a polynomial's lags."""
-    lags = {factor.lag for term in model.terms for factor in term.factors}
-    return {name for lag in lags if lag is not None for name in names_in(lag)}
+    lags = {factor.delay for term in model.terms for factor in term.factors}
+    return {name for lag in lags if lag is not None for name in collect_parameter_names(lag)}
 
 
-def lag_of(past: Past, lags: Mapping[str, float], period: float) -> float:
+def evaluate_lag(past: PastValue, lags: Mapping[str, float], period: float) -> float:
     """The unknown part of a lag in samples, for values of the parameters in it."""
-    if past.lag is None:
+    if past.delay is None:
         return 0.0
-    value = bounds(past.lag, {name: (one, one) for name, one in lags.items()}, period)[0]
+    value = bound_expression(past.delay, {name: (one, one) for name, one in lags.items()}, period)[
+        0
+    ]
     whole = round(value)
-    return float(whole) if abs(value - whole) < _WHOLE else value
+    return float(whole) if abs(value - whole) < _WHOLE_TOLERANCE else value
 
 
-def _between(values: FloatArray, places: FloatArray) -> FloatArray:
+def _interpolate_places(values: FloatArray, places: FloatArray) -> FloatArray:
     places = np.clip(places, 0.0, values.size - 1.0)
     older = np.floor(places).astype(np.int64)
     share = places - older
@@ -188,9 +201,12 @@ def _between(values: FloatArray, places: FloatArray) -> FloatArray:
     return found
 
 
-def _piece(
-    model: Model, record: Record, experiment: Experiment, spans: Mapping[str, tuple[float, float]]
-) -> Piece:
+def _make_regression_experiment(
+    model: Model,
+    record: Record,
+    experiment: GridExperiment,
+    spans: Mapping[str, tuple[float, float]],
+) -> RegressionExperiment:
     [samples] = experiment.outputs
     [channel] = [one for one in record.outputs if one.name == model.outputs[0].name]
     grid = experiment.grid
@@ -199,11 +215,13 @@ def _piece(
     output[places] = np.where(np.isfinite(channel.values), channel.values, np.nan)
     longest = 0.0
     for past in {factor for term in model.terms for factor in term.factors}:
-        upper = 0.0 if past.lag is None else bounds(past.lag, spans, grid.step)[1]
+        upper = 0.0 if past.delay is None else bound_expression(past.delay, spans, grid.step)[1]
         longest = max(longest, past.offset + upper)
     scored = np.sort(places[samples.weights > 0])
     inputs = {
         quantity.name: signal
         for quantity, signal in zip(model.inputs, experiment.inputs, strict=True)
     }
-    return Piece(output, inputs, grid.step, scored[scored >= ceil(longest - _WHOLE)])
+    return RegressionExperiment(
+        output, inputs, grid.step, scored[scored >= ceil(longest - _WHOLE_TOLERANCE)]
+    )

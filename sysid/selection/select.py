@@ -5,22 +5,22 @@ from dataclasses import replace
 from typing import Any
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.threads import one_thread
+from sysid.core.threads import use_one_thread
 from sysid.data.records import Record
 from sysid.models.model import Model, SelectedTerm, Selection, TermRule
-from sysid.models.parameters import Parameter, override
-from sysid.models.parse import with_terms
-from sysid.models.polynomial import check_samples
-from sysid.selection.free_run import reselected
-from sysid.selection.frols import Forward, forward, select, solved
-from sysid.selection.lag_search import affordable, lag_values, search
+from sysid.models.parameters import Parameter, override_parameters
+from sysid.models.parse import keep_terms
+from sysid.models.polynomial import check_candidate_count
+from sysid.selection.free_run import select_by_free_run
+from sysid.selection.frols import ForwardSelection, select_forward, select_terms, solve_coefficients
+from sysid.selection.lag_search import list_lag_values, plan_effort, search_lags
 from sysid.selection.regression import Regression
 
-Changes = Mapping[str, Mapping[str, Any]]
+ParameterChanges = Mapping[str, Mapping[str, Any]]
 
 
-def selected(
-    model: Model, records: Sequence[Record], changes: Changes | None = None, skip: int = 0
+def select_model_terms(
+    model: Model, records: Sequence[Record], changes: ParameterChanges | None = None, skip: int = 0
 ) -> tuple[Model, dict[str, Mapping[str, Any]]]:
     """The model with the terms that its rule selects on the records; another as it is.
 
@@ -55,54 +55,58 @@ def selected(
     if model.rule is None or not records:
         return model, given
     own = {parameter.name for parameter in model.parameters}
-    parameters = override(
+    parameters = override_parameters(
         model.parameters, {name: fields for name, fields in given.items() if name in own}
     )
-    with one_thread():  # so that the last bit does not depend on the number of cores
-        found, lags, coefficients, samples = _found(model, model.rule, records, parameters, skip)
+    with use_one_thread():  # so that the last bit does not depend on the number of cores
+        found, lags, coefficients, samples = _select_one_step(
+            model, model.rule, records, parameters, skip
+        )
         if model.rule.error == "simulation":
-            better = reselected(model, model.rule, records, given, skip, found.order, lags)
+            better = select_by_free_run(model, model.rule, records, given, skip, found.order, lags)
             if better is not None:
-                found, lags = better.found, better.lags
+                found, lags = better.forward_selection, better.lags
                 coefficients = better.coefficients.tolist()
-    resolved = with_terms(model, [model.terms[i].label for i in found.order])
+    resolved = keep_terms(model, [model.terms[i].label for i in found.order])
     dropped = frozenset(own - {parameter.name for parameter in resolved.parameters})
-    selection = Selection(_told(model, found, coefficients), lags, samples)
+    selection = Selection(_list_selected_terms(model, found, coefficients), lags, samples)
     kept = {name: fields for name, fields in given.items() if name not in dropped}
     return replace(resolved, selection=selection), kept
 
 
-def _found(
+def _select_one_step(
     model: Model, rule: TermRule, records: Sequence[Record],
     parameters: Sequence[Parameter], skip: int,
-) -> tuple[Forward, dict[str, float], list[float], int]:  # fmt: skip
-    regression = Regression.of(model, records, parameters, skip)
-    check_samples(len(model.terms), regression.samples)
-    values = lag_values(model, parameters, regression.pieces[0].period)
+) -> tuple[ForwardSelection, dict[str, float], list[float], int]:  # fmt: skip
+    regression = Regression.from_records(model, records, parameters, skip)
+    check_candidate_count(len(model.terms), regression.most_rows)
+    values = list_lag_values(model, parameters, regression.experiments[0].period)
     lags: dict[str, float] = {}
     if values:
-        effort = affordable(values, len(model.terms))
-        few = regression.thinned(effort.rows)
+        effort = plan_effort(values, len(model.terms))
+        few = regression.thin_rows(effort.rows)
 
         def unexplained(tried: Mapping[str, float]) -> float:
-            triangle, _ = few.triangle(model.terms, tried)
-            return forward(triangle, rule.keep, rule.err).unexplained
+            triangle, _ = few.factor_terms(model.terms, tried)
+            return select_forward(triangle, rule.keep, rule.err).unexplained
 
-        lags = search(values, unexplained, effort.trials)[0].lags
-    triangle, samples = regression.triangle(model.terms, lags)
-    check_samples(len(model.terms), samples)
-    found = select(triangle, rule, samples)
+        lags = search_lags(values, unexplained, effort.trials)[0].lags
+    triangle, samples = regression.factor_terms(model.terms, lags)
+    check_candidate_count(len(model.terms), samples)
+    found = select_terms(triangle, rule, samples)
     if not found.order:
         raise InvalidSettings(
             "/model/terms",
             "the output, or every candidate, is zero where it is scored; there is nothing to "
             "explain, so no term can be selected",
         )
-    return found, lags, solved(triangle, found.order).tolist(), samples
+    return found, lags, solve_coefficients(triangle, found.order).tolist(), samples
 
 
-def _told(model: Model, found: Forward, coefficients: Sequence[float]) -> tuple[SelectedTerm, ...]:
+def _list_selected_terms(
+    model: Model, found: ForwardSelection, coefficients: Sequence[float]
+) -> tuple[SelectedTerm, ...]:
     return tuple(
         SelectedTerm(model.terms[i].label, ratio, 1.0 - left, coefficients[i])
-        for i, ratio, left in zip(found.order, found.ratios, found.left, strict=True)
+        for i, ratio, left in zip(found.order, found.ratios, found.unexplained_shares, strict=True)
     )

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.types import FloatArray, IntArray
-from sysid.kernels.abi import FEW, call_kernel
-from sysid.kernels.layout import HEAD
+from sysid.kernels.abi import NARROW_LANES, call_kernel
+from sysid.kernels.layout import HEAD_FIELDS
 
 
 class Evaluator(NamedTuple):
@@ -49,87 +49,89 @@ class Evaluator(NamedTuple):
 
     kernel: int
     template: FloatArray
-    rows: IntArray
+    free_rows: IntArray
     lower: FloatArray
     upper: FloatArray
-    log: IntArray
-    plans: IntArray
+    is_log: IntArray
+    offsets: IntArray
     ints: IntArray
     floats: FloatArray
     n_work: int
     n_measured: int
     weight: FloatArray
     measured: FloatArray
-    n_weight: float
+    n_scored: float
 
 
-_LAST = HEAD.index("last")
+_LAST_STEP = HEAD_FIELDS.index("last")
 
 
-@compiled
-def expanded(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+@jit_compile
+def expand_individuals(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """All parameters of (P, D) individuals as the kernel wants them: (K, P rounded up)."""
     individuals, free = theta.shape
-    stride = (individuals + FEW - 1) // FEW * FEW
+    stride = (individuals + NARROW_LANES - 1) // NARROW_LANES * NARROW_LANES
     full = np.empty((evaluator.template.size, stride))
     for row in range(evaluator.template.size):
         full[row, :] = evaluator.template[row]
     for column in range(free):
-        row = evaluator.rows[column]
+        row = evaluator.free_rows[column]
         for p in range(stride):
             full[row, p] = theta[min(p, individuals - 1), column]
     return full
 
 
-@compiled
-def _run(
+@jit_compile
+def _run_kernels(
     evaluator: Evaluator, ints: IntArray, full: FloatArray, predictions: FloatArray
 ) -> FloatArray:
     loss = np.zeros(full.shape[1])
     if full.shape[1] == 0:
         return loss
     work = np.empty(evaluator.n_work)
-    for e in range(evaluator.plans.shape[0]):
+    for e in range(evaluator.offsets.shape[0]):
         call_kernel(
             evaluator.kernel, full,
-            ints, evaluator.plans[e, 0], evaluator.floats, evaluator.plans[e, 1],
-            work, predictions, evaluator.plans[e, 2], loss,
+            ints, evaluator.offsets[e, 0], evaluator.floats, evaluator.offsets[e, 1],
+            work, predictions, evaluator.offsets[e, 2], loss,
         )  # fmt: skip
     return loss
 
 
-@compiled
-def population_fitness(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+@jit_compile
+def evaluate_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """J of each individual (Eq. 10; smaller is better): (P, D) → (P,), inf where it diverges."""
-    loss = _run(evaluator, evaluator.ints, expanded(evaluator, theta), np.empty((0, 1)))
+    loss = _run_kernels(
+        evaluator, evaluator.ints, expand_individuals(evaluator, theta), np.empty((0, 1))
+    )
     fitness = np.empty(theta.shape[0])
     for p in range(theta.shape[0]):
-        value = np.sqrt(loss[p] / evaluator.n_weight)
+        value = np.sqrt(loss[p] / evaluator.n_scored)
         fitness[p] = value if np.isfinite(value) else np.inf
     return fitness
 
 
-@compiled
-def population_predictions(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+@jit_compile
+def predict_population(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
     """Simulated value at each measured time: (P, D) → (P, M); not finite where it diverges."""
-    full = expanded(evaluator, theta)
+    full = expand_individuals(evaluator, theta)
     predictions = np.empty((evaluator.n_measured, full.shape[1]))
-    _run(evaluator, evaluator.ints, full, predictions)
+    _run_kernels(evaluator, evaluator.ints, full, predictions)
     return np.ascontiguousarray(predictions[:, : theta.shape[0]].T)
 
 
-@compiled
-def partial_predictions(evaluator: Evaluator, theta: FloatArray, horizon: float) -> FloatArray:
+@jit_compile
+def predict_partially(evaluator: Evaluator, theta: FloatArray, horizon: float) -> FloatArray:
     """Simulated values (M, P rounded up) of each experiment up to a part of its time.
 
     The simulation ends `horizon` (0 … 1) of the steps after its beginning, and costs that part.
     Values of later samples and in columns from P on are arbitrary.
     """
     ints = evaluator.ints.copy()
-    for e in range(evaluator.plans.shape[0]):
-        last = evaluator.plans[e, 0] + _LAST
+    for e in range(evaluator.offsets.shape[0]):
+        last = evaluator.offsets[e, 0] + _LAST_STEP
         ints[last] = int(np.ceil(horizon * ints[last]))
-    full = expanded(evaluator, theta)
+    full = expand_individuals(evaluator, theta)
     predictions = np.empty((evaluator.n_measured, full.shape[1]))
-    _run(evaluator, ints, full, predictions)
+    _run_kernels(evaluator, ints, full, predictions)
     return predictions

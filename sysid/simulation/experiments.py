@@ -5,23 +5,34 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.core.errors import InvalidRecord, InvalidSettings, RecordTooShort, nearest
+from sysid.core.errors import InvalidRecord, InvalidSettings, RecordTooShort, suggest_name
 from sysid.core.types import BoolArray, FloatArray
 from sysid.data.interpolation import FineInput
 from sysid.data.records import Channel, Record
 from sysid.kernels.reads import is_difference
-from sysid.language.tree import Past, match_plain_state
-from sysid.models.model import EstimatedInitial, FixedInitial, MeasuredInitial, Model, initial_name
+from sysid.language.tree import PastValue, match_plain_state
+from sysid.models.model import (
+    EstimatedInitial,
+    FixedInitial,
+    MeasuredInitial,
+    Model,
+    name_initial_state,
+)
 from sysid.models.parameters import Parameter
-from sysid.simulation.grid import Grid, grid_of, sample_places
-from sysid.simulation.packing import Samples, Start, fine_inputs, largest_lags
+from sysid.simulation.grid import Grid, locate_samples, make_grid
+from sysid.simulation.packing import (
+    OutputSamples,
+    StateStart,
+    find_largest_delays,
+    interpolate_inputs,
+)
 
 # Beyond these, a weight is a mistake, and squares of weighted residuals might not be numbers.
 _LEAST_WEIGHT, _MOST_WEIGHT = 1e-100, 1e100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Experiment:
+class GridExperiment:
     """One record laid out for a model.
 
     Attributes
@@ -35,12 +46,12 @@ class Experiment:
 
     grid: Grid
     inputs: tuple[FineInput, ...]
-    outputs: tuple[Samples, ...]
-    starts: tuple[Start, ...]
-    lag: float
+    outputs: tuple[OutputSamples, ...]
+    starts: tuple[StateStart, ...]
+    largest_delay_steps: float
 
 
-def output_weights(
+def compute_output_weights(
     model: Model, records: Sequence[Record], weights: Mapping[str, float] | None, skip: int
 ) -> dict[str, float]:
     """Weight of each output: 1 for one output, else as given or 1 / its standard deviation.
@@ -59,7 +70,7 @@ def output_weights(
     for name, weight in (weights or {}).items():
         if name not in names:
             raise InvalidSettings(
-                f"/weights/{name}", f"the model has no output {name!r}{nearest(name, names)}"
+                f"/weights/{name}", f"the model has no output {name!r}{suggest_name(name, names)}"
             )
         if not _LEAST_WEIGHT <= weight <= _MOST_WEIGHT:
             need = f"need a number from {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g}"
@@ -68,13 +79,15 @@ def output_weights(
         return {names[0]: 1.0}
     given = weights or {}
     return {
-        name: given[name] if name in given else _reciprocal_deviation(name, records, skip)
+        name: given[name] if name in given else _compute_reciprocal_deviation(name, records, skip)
         for name in names
     }
 
 
-def _reciprocal_deviation(name: str, records: Sequence[Record], skip: int) -> float:
-    values = np.concatenate([_channel(r.outputs, name, "output").values[skip:] for r in records])
+def _compute_reciprocal_deviation(name: str, records: Sequence[Record], skip: int) -> float:
+    values = np.concatenate(
+        [_find_channel(r.outputs, name, "output").values[skip:] for r in records]
+    )
     seen = values[np.isfinite(values)]
     if not seen.size:
         raise InvalidRecord(
@@ -90,11 +103,11 @@ def _reciprocal_deviation(name: str, records: Sequence[Record], skip: int) -> fl
     return 1.0 / deviation
 
 
-def lay_out(
+def place_on_grid(
     model: Model, record: Record, experiment: int, parameters: Sequence[Parameter],
     weights: Mapping[str, float], skip: int, simulates_only: bool = False,
     scored_from: float = -np.inf,
-) -> Experiment:  # fmt: skip
+) -> GridExperiment:  # fmt: skip
     """Lay one record out for a model; samples before `scored_from` (s) are not scored.
 
     Raises
@@ -102,13 +115,13 @@ def lay_out(
     InvalidRecord, RecordTooShort, InvalidSettings
         If the record does not have what the model needs.
     """
-    inputs = [_input(record, quantity.name) for quantity in model.inputs]
-    outputs = _outputs(model, record, None if simulates_only else (skip, scored_from))
-    grid = grid_of(model, inputs, outputs)
-    if is_difference(model) and grid.last < model.memory:
+    inputs = [_find_input(record, quantity.name) for quantity in model.inputs]
+    outputs = _select_outputs(model, record, None if simulates_only else (skip, scored_from))
+    grid = make_grid(model, inputs, outputs)
+    if is_difference(model) and grid.last_step < model.memory:
         needed = model.memory * grid.integration_step
         raise RecordTooShort(grid.duration, needed, "the model's memory")
-    since = _scored_since(model, grid, scored_from)
+    since = _find_scoring_starts(model, grid, scored_from)
     if not simulates_only:
         for channel in outputs:
             _check_scored(channel, skip, since[channel.name])
@@ -116,51 +129,53 @@ def lay_out(
         p.name: (p.lower, p.upper) if p.fixed is None else (p.fixed, p.fixed) for p in parameters
     }
     rows = {p.name: i for i, p in enumerate(parameters)}
-    return Experiment(
+    return GridExperiment(
         grid,
-        tuple(fine_inputs(model, inputs, spans, grid)),
-        tuple(_samples(model, grid, c, weights[c.name], skip, since[c.name]) for c in outputs),
-        tuple(_starts(model, grid, outputs, experiment, rows)),
-        max([0.0, *largest_lags(model, "state", spans, grid).values()]),
+        tuple(interpolate_inputs(model, inputs, spans, grid)),
+        tuple(_make_samples(model, grid, c, weights[c.name], skip, since[c.name]) for c in outputs),
+        tuple(_make_starts(model, grid, outputs, experiment, rows)),
+        max([0.0, *find_largest_delays(model, "state", spans, grid).values()]),
     )
 
 
-def measured_anew(
-    laid: Experiment, model: Model, record: Record, experiment: int,
+def replace_outputs(
+    laid: GridExperiment, model: Model, record: Record, experiment: int,
     parameters: Sequence[Parameter], weights: Mapping[str, float], skip: int, scored_from: float,
-) -> Experiment:  # fmt: skip
-    """What `lay_out` makes of a record whose inputs and times are those of one laid out before."""
-    outputs, grid = _outputs(model, record, (skip, scored_from)), laid.grid
-    since = _scored_since(model, grid, scored_from)
+) -> GridExperiment:  # fmt: skip
+    """What `place_on_grid` makes of a record whose inputs and times are those of one laid out before."""
+    outputs, grid = _select_outputs(model, record, (skip, scored_from)), laid.grid
+    since = _find_scoring_starts(model, grid, scored_from)
     rows = {p.name: i for i, p in enumerate(parameters)}
     return replace(
         laid,
         outputs=tuple(
-            _samples(model, grid, c, weights[c.name], skip, since[c.name]) for c in outputs
+            _make_samples(model, grid, c, weights[c.name], skip, since[c.name]) for c in outputs
         ),
-        starts=tuple(_starts(model, grid, outputs, experiment, rows)),
+        starts=tuple(_make_starts(model, grid, outputs, experiment, rows)),
     )
 
 
-def _outputs(model: Model, record: Record, scored: tuple[int, float] | None) -> list[Channel]:
+def _select_outputs(
+    model: Model, record: Record, scored: tuple[int, float] | None
+) -> list[Channel]:
     """The measured outputs in the model's order; each has samples that count, if any are to."""
-    outputs = [_channel(record.outputs, output.name, "output") for output in model.outputs]
+    outputs = [_find_channel(record.outputs, output.name, "output") for output in model.outputs]
     if scored is not None:
         for channel in outputs:
             _check_scored(channel, *scored)
     return outputs
 
 
-def _channel(channels: Sequence[Channel], name: str, role: str) -> Channel:
+def _find_channel(channels: Sequence[Channel], name: str, role: str) -> Channel:
     for channel in channels:
         if channel.name == name:
             return channel
     known = [channel.name for channel in channels]
-    raise InvalidRecord(f"the record has no {role} {name!r}{nearest(name, known)}")
+    raise InvalidRecord(f"the record has no {role} {name!r}{suggest_name(name, known)}")
 
 
-def _input(record: Record, name: str) -> Channel:
-    channel = _channel(record.inputs, name, "input")
+def _find_input(record: Record, name: str) -> Channel:
+    channel = _find_channel(record.inputs, name, "input")
     bad = np.flatnonzero(~np.isfinite(channel.values))
     if bad.size:
         raise InvalidRecord(
@@ -179,7 +194,7 @@ def _check_scored(channel: Channel, skip: int, scored_from: float) -> None:
         )
 
 
-def _scored_since(model: Model, grid: Grid, scored_from: float) -> dict[str, float]:
+def _find_scoring_starts(model: Model, grid: Grid, scored_from: float) -> dict[str, float]:
     """For each output the time (s) from which on its samples are scored.
 
     A recursion that starts at measured values repeats them: they say nothing about the model.
@@ -201,21 +216,21 @@ def _is_scored(channel: Channel, skip: int, scored_from: float) -> BoolArray:
     return np.asarray(np.isfinite(channel.values) & late)
 
 
-def _samples(
+def _make_samples(
     model: Model, grid: Grid, channel: Channel, weight: float, skip: int, scored_from: float
-) -> Samples:
+) -> OutputSamples:
     weights = np.where(_is_scored(channel, skip, scored_from), weight, 0.0)
     values = np.where(np.isfinite(channel.values), channel.values, 0.0)
-    return Samples(sample_places(grid, model, channel), values, weights,
-                   _on_grid(grid, channel))  # fmt: skip
+    return OutputSamples(locate_samples(grid, model, channel), values, weights,
+                   _interpolate_to_grid(grid, channel))  # fmt: skip
 
 
-def _on_grid(grid: Grid, channel: Channel) -> FloatArray:
+def _interpolate_to_grid(grid: Grid, channel: Channel) -> FloatArray:
     """The measurement at the grid points."""
-    return _measured_at(grid.times, channel)
+    return _interpolate_measurement(grid.times, channel)
 
 
-def _measured_at(times: FloatArray, channel: Channel) -> FloatArray:
+def _interpolate_measurement(times: FloatArray, channel: Channel) -> FloatArray:
     """The measurement at any times, on a line between its samples; 0 if it has none."""
     known = np.isfinite(channel.values)
     if not np.any(known):
@@ -223,23 +238,25 @@ def _measured_at(times: FloatArray, channel: Channel) -> FloatArray:
     return np.interp(times, channel.times[known], channel.values[known])
 
 
-def _starts(
+def _make_starts(
     model: Model, grid: Grid, outputs: Sequence[Channel], experiment: int,
     rows: Mapping[str, int],
-) -> list[Start]:  # fmt: skip
+) -> list[StateStart]:  # fmt: skip
     starts = []
     for i, initial in enumerate(model.initial):
         if isinstance(initial, FixedInitial):
-            starts.append(Start(np.array([initial.value])))
+            starts.append(StateStart(np.array([initial.value])))
         elif isinstance(initial, EstimatedInitial):
-            row = rows[initial_name(model.states[i].name, experiment)]
-            starts.append(Start(np.zeros(1), row))
+            row = rows[name_initial_state(model.states[i].name, experiment)]
+            starts.append(StateStart(np.zeros(1), row))
         else:
-            starts.append(Start(_measured_start(model, i, grid, outputs)))
+            starts.append(StateStart(_read_measured_start(model, i, grid, outputs)))
     return starts
 
 
-def _measured_start(model: Model, state: int, grid: Grid, outputs: Sequence[Channel]) -> FloatArray:
+def _read_measured_start(
+    model: Model, state: int, grid: Grid, outputs: Sequence[Channel]
+) -> FloatArray:
     """First values of a measured state; of its rate, the first difference.
 
     Raises
@@ -254,17 +271,17 @@ def _measured_start(model: Model, state: int, grid: Grid, outputs: Sequence[Chan
     count = max(model.memory, 1) if is_difference(model) else 1
     if name in measured:
         times = grid.start + grid.integration_step * np.arange(count, dtype=np.float64)
-        return _measured_at(times, measured[name])
+        return _interpolate_measurement(times, measured[name])
     for other, equation in zip(model.states, model.equations, strict=True):
-        if equation == Past(name, "state") and other.name in measured:
-            return _first_slope(measured[other.name])
+        if equation == PastValue(name, "state") and other.name in measured:
+            return _compute_first_slope(measured[other.name])
     raise InvalidRecord(
         f"state {name!r} is to start at its measured value, but no output measures it or what it "
         "is the rate of; give its initial value or bounds to estimate it in"
     )
 
 
-def _first_slope(channel: Channel) -> FloatArray:
+def _compute_first_slope(channel: Channel) -> FloatArray:
     known = np.isfinite(channel.values)
     times, values = channel.times[known], channel.values[known]
     later = np.flatnonzero(np.diff(times) > 0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.types import FloatArray
-from sysid.data.interpolation import sampling_period
+from sysid.data.interpolation import estimate_sampling_period
 from sysid.data.records import Channel
 from sysid.kernels.reads import is_difference
 from sysid.models.model import Model
@@ -17,8 +17,10 @@ MOST_STEPS = 20_000_000
 """Integration steps of one experiment at most."""
 
 _JITTER = 0.05  # of a sampling period, that a recursion forgives
-_FINER = 4  # grid points in the median distance of irregular samples, for what lies between
-_ON_GRID = 0.01  # of a grid step, within which a sample counts as on the point
+_POINTS_PER_SAMPLE = (
+    4  # grid points in the median distance of irregular samples, for what lies between
+)
+_GRID_TOLERANCE = 0.01  # of a grid step, within which a sample counts as on the point
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +38,7 @@ class Grid:
         return self.step / self.substeps
 
     @property
-    def last(self) -> int:
+    def last_step(self) -> int:
         """Number of the last integration step."""
         return (self.points - 1) * self.substeps
 
@@ -50,15 +52,15 @@ class Grid:
         """From the first grid point to the last, in s."""
         return self.step * (self.points - 1)
 
-    def places(self, times: FloatArray) -> FloatArray:
+    def locate_times(self, times: FloatArray) -> FloatArray:
         """Places of times in grid steps from the start; whole where they are on the grid."""
         places = (times - self.start) / self.step
         whole = np.round(places)
-        found: FloatArray = np.where(np.abs(places - whole) < _ON_GRID, whole, places)
+        found: FloatArray = np.where(np.abs(places - whole) < _GRID_TOLERANCE, whole, places)
         return np.clip(found, 0.0, self.points - 1.0)
 
 
-def grid_of(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel]) -> Grid:
+def make_grid(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel]) -> Grid:
     """The grid on which a model is compared with an experiment.
 
     Raises
@@ -69,21 +71,21 @@ def grid_of(model: Model, inputs: Sequence[Channel], outputs: Sequence[Channel])
         If the grid would be too long.
     """
     if is_difference(model):
-        return _sample_grid(outputs, model.solver.substeps)
-    step = model.solver.step or _simulation_step(outputs)
+        return _make_sample_grid(outputs, model.solver.substeps)
+    step = model.solver.step or _choose_simulation_step(outputs)
     first = min(float(channel.times[0]) for channel in outputs)
     begin = min([first, *(float(channel.times[0]) for channel in inputs)])
     end = max(float(channel.times[-1]) for channel in outputs)
     _check_length((end - begin) / step * model.solver.substeps)
     start = first - ceil((first - begin) / step - 1e-6) * step
-    points = ceil((end - start) / step - _ON_GRID) + 1
+    points = ceil((end - start) / step - _GRID_TOLERANCE) + 1
     return Grid(start, step, points, model.solver.substeps)
 
 
-def sample_places(grid: Grid, model: Model, channel: Channel) -> FloatArray:
+def locate_samples(grid: Grid, model: Model, channel: Channel) -> FloatArray:
     """Places of an output's samples on the grid; a recursion's are whole."""
     if not is_difference(model):
-        return grid.places(channel.times)
+        return grid.locate_times(channel.times)
     places = (channel.times - grid.start) / grid.step
     whole: FloatArray = np.round(places)
     worst = int(np.argmax(np.abs(places - whole)))
@@ -107,27 +109,27 @@ def is_on_grid(places: FloatArray) -> bool:
     return bool(np.all(places == np.round(places)) and np.all(np.diff(places) > 0))
 
 
-def _sample_grid(outputs: Sequence[Channel], substeps: int) -> Grid:
-    period = _output_period(outputs)
+def _make_sample_grid(outputs: Sequence[Channel], substeps: int) -> Grid:
+    period = _find_output_period(outputs)
     start = min(float(channel.times[0]) for channel in outputs)
     end = max(float(channel.times[-1]) for channel in outputs)
     _check_length((end - start) / period * substeps)
     return Grid(start, period, round((end - start) / period) + 1, substeps)
 
 
-def _simulation_step(outputs: Sequence[Channel]) -> float:
+def _choose_simulation_step(outputs: Sequence[Channel]) -> float:
     """The outputs' period; a part of it where their samples lie anywhere between its multiples."""
-    period = _output_period(outputs)
+    period = _find_output_period(outputs)
     first = min(float(channel.times[0]) for channel in outputs)
     for channel in outputs:
         places = (channel.times - first) / period
         if np.any(np.abs(places - np.round(places)) > _JITTER):
-            return period / _FINER
+            return period / _POINTS_PER_SAMPLE
     return period
 
 
-def _output_period(outputs: Sequence[Channel]) -> float:
-    periods = [p for p in (_period(channel) for channel in outputs) if p is not None]
+def _find_output_period(outputs: Sequence[Channel]) -> float:
+    periods = [p for p in (_estimate_period(channel) for channel in outputs) if p is not None]
     if not periods:
         raise InvalidRecord(
             f"output {outputs[0].name!r} has samples at one time only; need two times or more"
@@ -135,13 +137,13 @@ def _output_period(outputs: Sequence[Channel]) -> float:
     return min(periods)
 
 
-def _period(channel: Channel) -> float | None:
+def _estimate_period(channel: Channel) -> float | None:
     """Sampling period; of irregular samples the median distance.
 
     Times are often written with few digits, which makes every distance, and so their median, a
     little wrong: over 20,000 samples it adds up to whole periods. The mean over all is right.
     """
-    median = sampling_period(channel)
+    median = estimate_sampling_period(channel)
     if median is None:
         return None
     counts = np.concatenate([[0.0], np.cumsum(np.round(np.diff(channel.times) / median))])

@@ -12,7 +12,7 @@ def rms(residual: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(residual))))
 
 
-def fit_percent(measured: FloatArray, simulated: FloatArray) -> float:
+def compute_fit_percent(measured: FloatArray, simulated: FloatArray) -> float:
     """100 (1 - ‖y - ŷ‖ / ‖y - mean y‖): 100 is perfect, 0 as good as the mean.
 
     ``nan`` for a constant measurement, against which no fit can be told.

@@ -8,40 +8,46 @@ from typing import Literal
 import numpy as np
 
 from sysid.core.types import FloatArray, IntArray, Interval
-from sysid.data.interpolation import FineInput, fine_input
+from sysid.data.interpolation import FineInput, interpolate_input
 from sysid.data.records import Channel
 from sysid.kernels.abi import LANES
-from sysid.kernels.layout import Layout, Variant
-from sysid.kernels.reads import averaged_inputs, furthest, is_difference, lags, with_history
-from sysid.language.intervals import bounds
-from sysid.models.delays import check_length
+from sysid.kernels.layout import ExperimentLayout, KernelVariant
+from sysid.kernels.reads import (
+    find_averaged_inputs,
+    find_furthest_offset,
+    is_difference,
+    list_delayed_values,
+    list_states_with_history,
+)
+from sysid.language.intervals import bound_expression
+from sysid.models.delays import check_record_length
 from sysid.models.model import Model
 from sysid.simulation.grid import Grid, is_on_grid
 
-_SLACK = 512  # rows of history besides those that lags reach back: how often they are moved
+_HISTORY_SLACK = 512  # rows of history besides those that lags reach back: how often they are moved
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Samples:
+class OutputSamples:
     """Measured samples of one output: places on the grid, values (0: missing), weights."""
 
     places: FloatArray
     values: FloatArray
     weights: FloatArray
-    on_grid: FloatArray
+    grid_values: FloatArray
     """The measurement interpolated to the grid points; empty where it is not needed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
+class StateStart:
     """How a state starts: given first values, and the row of theta if it is estimated."""
 
-    given: FloatArray
+    first_values: FloatArray
     row: int = -1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Numbers:
+class PackedExperiment:
     """What a kernel gets for one experiment."""
 
     ints: IntArray
@@ -49,7 +55,7 @@ class Numbers:
     n_work: int
 
 
-def largest_lags(
+def find_largest_delays(
     model: Model, kind: str, parameters: Mapping[str, Interval], grid: Grid
 ) -> dict[str, float]:
     """Largest lag of each lagged signal of a kind, in integration steps, inside the bounds.
@@ -61,37 +67,39 @@ def largest_lags(
     """
     largest: dict[str, float] = {}
     step = grid.integration_step
-    for past in lags(model, kind):
-        if past.lag is None:
+    for past in list_delayed_values(model, kind):
+        if past.delay is None:
             continue
-        check_length(model, past, parameters, step, grid.duration)
-        upper = bounds(past.lag, parameters, step)[1]
+        check_record_length(model, past, parameters, step, grid.duration)
+        upper = bound_expression(past.delay, parameters, step)[1]
         steps = upper if is_difference(model) else upper / step
         largest[past.name] = max(steps, largest.get(past.name, 0.0))
     return largest
 
 
-def fine_inputs(
+def interpolate_inputs(
     model: Model, channels: Sequence[Channel], parameters: Mapping[str, Interval], grid: Grid
 ) -> list[FineInput]:
     """The inputs between their samples, as far back as the lags may reach."""
-    reach = largest_lags(model, "input", parameters, grid)
-    back = furthest(model)
+    reach = find_largest_delays(model, "input", parameters, grid)
+    back = find_furthest_offset(model)
     mean: Literal["around", "after"] = "after" if is_difference(model) else "around"
-    averaged = averaged_inputs(model)
+    averaged = find_averaged_inputs(model)
     laid = []
     for quantity, channel in zip(model.inputs, channels, strict=True):
         name = quantity.name
         lag = reach.get(name, 0.0) + back + 1
         how = mean if name in averaged else None
-        laid.append(fine_input(channel, grid.start, grid.integration_step, grid.last, lag, how))
+        laid.append(
+            interpolate_input(channel, grid.start, grid.integration_step, grid.last_step, lag, how)
+        )
     return laid
 
 
-def numbers(
-    model: Model, variant: Variant, grid: Grid, inputs: Sequence[FineInput],
-    outputs: Sequence[Samples], starts: Sequence[Start], lag: float, scale: float,
-) -> Numbers:  # fmt: skip
+def pack_experiment(
+    model: Model, variant: KernelVariant, grid: Grid, inputs: Sequence[FineInput],
+    outputs: Sequence[OutputSamples], starts: Sequence[StateStart], lag: float, scale: float,
+) -> PackedExperiment:  # fmt: skip
     """Lay out one experiment.
 
     Parameters
@@ -101,33 +109,33 @@ def numbers(
     scale : float
         Scale of the soft-l1 loss.
     """
-    page = _Page(Layout.of(model))
+    page = _ArrayBuilder(ExperimentLayout.from_model(model))
     cap = ceil(lag)  # a lag rounded to whole steps may exceed its bound by part of one
-    reach = cap + furthest(model) + 5
-    rows = max(min(grid.last + reach + 3, 2 * reach + _SLACK), 2 * reach + 3)
-    page.ints[:3] = [grid.last, reach, rows]
+    reach = cap + find_furthest_offset(model) + 5
+    rows = max(min(grid.last_step + reach + 3, 2 * reach + _HISTORY_SLACK), 2 * reach + 3)
+    page.ints[:3] = [grid.last_step, reach, rows]
     page.floats[:3] = [grid.integration_step, cap, scale]
     for i, start in enumerate(starts):
-        page.floats[page.layout.initial(i)] = start.given[0]
-        page.put("state", i, row=start.row, given=page.add_floats(start.given))
+        page.floats[page.layout.locate_initial(i)] = start.first_values[0]
+        page.write_entries("state", i, row=start.row, given=page.add_floats(start.first_values))
     for i, signal in enumerate(inputs):
         place = page.add_floats(signal.values)
-        page.put("input", i, zero=place + signal.zero, points=signal.points, begin=signal.begin,
-                 end=signal.end, cap=signal.cap)  # fmt: skip
+        page.write_entries("input", i, zero=place + signal.start_index, points=signal.points_per_step, begin=signal.begin,
+                 end=signal.end, cap=signal.max_delay)  # fmt: skip
     first = 0
     for i, samples in enumerate(outputs):
-        add = _on_grid if variant.on_grid else _between_grid
+        add = _pack_grid_samples if variant.on_grid else _pack_scattered_samples
         add(page, i, samples, grid, first)
-        page.put("output", i, first=first, grid=page.add_floats(samples.on_grid))
+        page.write_entries("output", i, first=first, grid=page.add_floats(samples.grid_values))
         first += samples.places.size
-    n_work = max(len(with_history(model)) * rows * LANES, 1)
-    return Numbers(*page.arrays(), n_work)
+    n_work = max(len(list_states_with_history(model)) * rows * LANES, 1)
+    return PackedExperiment(*page.build_arrays(), n_work)
 
 
-class _Page:
+class _ArrayBuilder:
     """The two arrays, growing behind their heads."""
 
-    def __init__(self, layout: Layout) -> None:
+    def __init__(self, layout: ExperimentLayout) -> None:
         self.layout = layout
         self.ints = [0] * layout.n_ints
         self.floats = [0.0] * layout.n_floats
@@ -135,9 +143,9 @@ class _Page:
         self._more_floats: list[FloatArray] = []
         self._n_ints, self._n_floats = layout.n_ints, layout.n_floats
 
-    def put(self, kind: str, number: int, **fields: int) -> None:
+    def write_entries(self, kind: str, number: int, **fields: int) -> None:
         """Write entries of a state, an input or an output into the head."""
-        place = getattr(self.layout, kind)
+        place = getattr(self.layout, f"locate_{kind}")
         for field, value in fields.items():
             self.ints[place(number, field)] = value
 
@@ -153,39 +161,43 @@ class _Page:
         self._n_floats += values.size
         return self._n_floats - values.size
 
-    def arrays(self) -> tuple[IntArray, FloatArray]:
+    def build_arrays(self) -> tuple[IntArray, FloatArray]:
         """Both arrays as a whole."""
         ints = np.concatenate([np.array(self.ints, dtype=np.int64), *self._more_ints])
         return ints, np.concatenate([np.array(self.floats), *self._more_floats])
 
 
-def _on_grid(page: _Page, i: int, samples: Samples, grid: Grid, first: int) -> None:
+def _pack_grid_samples(
+    page: _ArrayBuilder, i: int, samples: OutputSamples, grid: Grid, first: int
+) -> None:
     """Dense arrays over the grid points: row of the prediction or -1, value, weight."""
     points = samples.places.astype(np.int64)
     rows = np.full(grid.points, -1, dtype=np.int64)
     rows[points] = first + np.arange(points.size)
     values, weights = np.zeros(grid.points), np.zeros(grid.points)
     values[points], weights[points] = samples.values, samples.weights
-    page.put("output", i, samples=page.add_ints(rows), measured=page.add_floats(values),
+    page.write_entries("output", i, samples=page.add_ints(rows), measured=page.add_floats(values),
              weight=page.add_floats(weights))  # fmt: skip
 
 
-def _between_grid(page: _Page, i: int, samples: Samples, grid: Grid, first: int) -> None:
+def _pack_scattered_samples(
+    page: _ArrayBuilder, i: int, samples: OutputSamples, grid: Grid, first: int
+) -> None:
     """Per grid interval (n - 1, n]: the bounds of its samples and their positions inside it."""
     interval = np.ceil(samples.places)
     fraction = samples.places - (interval - 1.0)
     bounds_ = np.searchsorted(interval, np.arange(grid.points + 1), side="left")
-    page.put("output", i, samples=page.add_ints(bounds_.astype(np.int64)),
+    page.write_entries("output", i, samples=page.add_ints(bounds_.astype(np.int64)),
              fraction=page.add_floats(fraction), measured=page.add_floats(samples.values),
              weight=page.add_floats(samples.weights))  # fmt: skip
 
 
-def fits_grid(outputs: Sequence[Samples]) -> bool:
+def are_on_grid(outputs: Sequence[OutputSamples]) -> bool:
     """Whether every output has its samples on grid points of their own."""
     return all(is_on_grid(samples.places) for samples in outputs)
 
 
-def has_weights(outputs: Sequence[Samples], grid: Grid, on_grid: bool) -> bool:
+def has_weights(outputs: Sequence[OutputSamples], grid: Grid, on_grid: bool) -> bool:
     """Whether some weight is not 1; a grid point without a sample has weight 0."""
     return any(
         bool(np.any(samples.weights != 1.0)) or (on_grid and samples.places.size != grid.points)

@@ -9,21 +9,26 @@ from typing import Any
 import numpy as np
 
 from sysid.core.errors import InvalidRecord, InvalidSettings
-from sysid.core.settings import FitSettings, Loss, Prediction
+from sysid.core.settings import FitSettings, Loss, PredictionKind
 from sysid.core.types import FloatArray, IntArray
 from sysid.data.records import Record
-from sysid.kernels.build import kernel_address
-from sysid.kernels.layout import Variant
-from sysid.models.delays import check_lags
-from sysid.models.model import Model, initial_parameters
-from sysid.models.parameters import Parameter, override
-from sysid.models.ties import Ties, tied_model, ties_of
-from sysid.simulation.evaluator import Evaluator, population_fitness, population_predictions
-from sysid.simulation.experiments import Experiment, lay_out, measured_anew, output_weights
-from sysid.simulation.metrics import ChannelMetrics, Metrics, fit_percent, rms
-from sysid.simulation.packing import Numbers, fits_grid, has_weights, numbers
+from sysid.kernels.build import get_kernel_address
+from sysid.kernels.layout import KernelVariant
+from sysid.models.delays import check_delays
+from sysid.models.model import Model, build_initial_parameters
+from sysid.models.parameters import Parameter, override_parameters
+from sysid.models.ties import Ties, apply_ties, resolve_ties
+from sysid.simulation.evaluator import Evaluator, evaluate_population, predict_population
+from sysid.simulation.experiments import (
+    GridExperiment,
+    compute_output_weights,
+    place_on_grid,
+    replace_outputs,
+)
+from sysid.simulation.metrics import ChannelMetrics, Metrics, compute_fit_percent, rms
+from sysid.simulation.packing import PackedExperiment, are_on_grid, has_weights, pack_experiment
 
-_Rebuild = tuple[Callable[..., "Problem"], tuple[Any, ...]]
+_ReduceResult = tuple[Callable[..., "Problem"], tuple[Any, ...]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +67,9 @@ class Problem:
     records: tuple[Record, ...]
     settings: FitSettings
     all_parameters: tuple[Parameter, ...]
-    space: tuple[Parameter, ...]
+    free_parameters: tuple[Parameter, ...]
     evaluator: Evaluator
-    experiments: tuple[Experiment, ...]
+    experiments: tuple[GridExperiment, ...]
     output_weights: Mapping[str, float]
     ties: Ties
     simulates_only: bool = False
@@ -76,7 +81,7 @@ class Problem:
         records: Sequence[Record],
         *,
         parameters: Mapping[str, Mapping[str, Any]] | None = None,
-        prediction: Prediction = "simulation",
+        prediction: PredictionKind = "simulation",
         loss: Loss | None = None,
         weights: Mapping[str, float] | None = None,
         skip: int = 0,
@@ -111,15 +116,17 @@ class Problem:
                 "/scored_from",
                 f"found {len(since)} times for {len(records)} records; need one each",
             )
-        everything = override(
-            (*model.parameters, *initial_parameters(model, len(records))), settings.parameters
+        everything = override_parameters(
+            (*model.parameters, *build_initial_parameters(model, len(records))), settings.parameters
         )
-        ties = ties_of(model, everything)
-        tied = tied_model(model, ties)
-        check_lags(tied, everything)
-        per_output = output_weights(tied, records, settings.weights, settings.skip)
+        ties = resolve_ties(model, everything)
+        tied = apply_ties(model, ties)
+        check_delays(tied, everything)
+        per_output = compute_output_weights(tied, records, settings.weights, settings.skip)
         experiments = tuple(
-            lay_out(tied, record, e, everything, per_output, settings.skip, scored_from=since[e])
+            place_on_grid(
+                tied, record, e, everything, per_output, settings.skip, scored_from=since[e]
+            )
             for e, record in enumerate(records)
         )
         return cls(
@@ -128,8 +135,8 @@ class Problem:
             records=records,
             settings=settings,
             all_parameters=everything,
-            space=tuple(parameter for parameter in everything if parameter.is_free),
-            evaluator=_evaluator(tied, experiments, everything, settings),
+            free_parameters=tuple(parameter for parameter in everything if parameter.is_free),
+            evaluator=_build_evaluator(tied, experiments, everything, settings),
             experiments=experiments,
             output_weights=per_output,
             ties=ties,
@@ -149,7 +156,7 @@ class Problem:
         )
 
     @property
-    def prediction(self) -> Prediction:
+    def prediction(self) -> PredictionKind:
         """Free run or one step ahead."""
         return self.settings.prediction
 
@@ -166,26 +173,26 @@ class Problem:
     @cached_property
     def free_names(self) -> tuple[str, ...]:
         """Names of the free parameters, D."""
-        return tuple(parameter.name for parameter in self.space)
+        return tuple(parameter.name for parameter in self.free_parameters)
 
-    def __reduce__(self) -> _Rebuild:
+    def __reduce__(self) -> _ReduceResult:
         if self.simulates_only:
-            return simulation_problem, (self.untied_model, self.records[0])
+            return build_simulation_problem, (self.untied_model, self.records[0])
         return Problem.from_settings, (self.untied_model, self.records, self.settings)
 
-    def measured_anew(self, records: Sequence[Record]) -> "Problem":
+    def replace_outputs(self, records: Sequence[Record]) -> "Problem":
         """What `build` would make of records that differ in the values of their outputs only.
 
         Where their noise is all that runs have of their own, most of the work is done once.
         """
         skip, since = self.settings.skip, self.settings.scored_from
-        per_output = output_weights(self.model, records, self.settings.weights, skip)
+        per_output = compute_output_weights(self.model, records, self.settings.weights, skip)
         experiments = tuple(
-            measured_anew(laid, self.model, record, e, self.all_parameters, per_output, skip,
+            replace_outputs(laid, self.model, record, e, self.all_parameters, per_output, skip,
                           -np.inf if since is None else since[e])
             for e, (laid, record) in enumerate(zip(self.experiments, records, strict=True))
         )  # fmt: skip
-        evaluator = _evaluator(self.model, experiments, self.all_parameters, self.settings)
+        evaluator = _build_evaluator(self.model, experiments, self.all_parameters, self.settings)
         return replace(
             self,
             records=tuple(records),
@@ -194,15 +201,19 @@ class Problem:
             output_weights=per_output,
         )
 
-    def fitness(self, theta: FloatArray) -> FloatArray:
+    def evaluate_fitness(self, theta: FloatArray) -> FloatArray:
         """J of individuals (P, D) → (P,), smaller is better; ``inf`` where one diverges."""
-        return population_fitness(self.evaluator, _population(theta, len(self.space)))
+        return evaluate_population(
+            self.evaluator, _check_population(theta, len(self.free_parameters))
+        )
 
-    def predictions(self, theta: FloatArray) -> FloatArray:
+    def predict(self, theta: FloatArray) -> FloatArray:
         """Simulated values at the measured times, (P, D) → (P, M)."""
-        return population_predictions(self.evaluator, _population(theta, len(self.space)))
+        return predict_population(
+            self.evaluator, _check_population(theta, len(self.free_parameters))
+        )
 
-    def split(self, values: FloatArray) -> list[dict[str, FloatArray]]:
+    def split_by_output(self, values: FloatArray) -> list[dict[str, FloatArray]]:
         """Values (M,) as one array for each output of each experiment."""
         parts: list[dict[str, FloatArray]] = []
         first = 0
@@ -220,14 +231,14 @@ class Problem:
         return self.model.outputs[0].unit if len(self.model.outputs) == 1 else "1"
 
     @cached_property
-    def scored(self) -> IntArray:
+    def scored_rows(self) -> IntArray:
         """Which of the M measured values enter J."""
         return np.flatnonzero(self.evaluator.weight > 0)
 
     @property
     def n_scored(self) -> int:
         """Number of samples that enter J."""
-        return self.scored.size
+        return self.scored_rows.size
 
     @cached_property
     def n_steps(self) -> int:
@@ -238,30 +249,32 @@ class Problem:
     def output_scale(self) -> float:
         """J of a simulation that gives each output's mean: what a model should stay well below."""
         total = 0.0
-        for measured, weight in self._channels(self.evaluator.measured):
+        for measured, weight in self._list_channels(self.evaluator.measured):
             scored = weight > 0
             if np.any(scored):
                 centred = measured[scored] - np.mean(measured[scored])
                 total += float(np.sum(np.square(weight[scored] * centred)))
         return sqrt(total / max(self.n_scored, 1))
 
-    def metrics(self, theta: FloatArray) -> Metrics:
+    def evaluate_metrics(self, theta: FloatArray) -> Metrics:
         """Agreement of one individual (D,) with the records; what `skip` leaves out is not in."""
-        simulated = self.predictions(np.atleast_2d(theta))[0]
-        return metrics_of(self, simulated)
+        simulated = self.predict(np.atleast_2d(theta))[0]
+        return compute_metrics(self, simulated)
 
-    def _channels(self, values: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
-        pairs = zip(self.split(values), self.split(self.evaluator.weight), strict=True)
+    def _list_channels(self, values: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+        pairs = zip(
+            self.split_by_output(values), self.split_by_output(self.evaluator.weight), strict=True
+        )
         return [(value[name], weight[name]) for value, weight in pairs for name in value]
 
 
-def metrics_of(problem: Problem, simulated: FloatArray) -> Metrics:
+def compute_metrics(problem: Problem, simulated: FloatArray) -> Metrics:
     """Agreement of simulated values (M,) with the records of a problem."""
     weight = problem.evaluator.weight
     error = weight * (problem.evaluator.measured - simulated)
     one = len(problem.model.outputs) == 1
     with np.errstate(all="ignore"):  # a diverged simulation has an infinite residual
-        channels = tuple(_channel_metrics(problem, simulated))
+        channels = tuple(_compute_channel_metrics(problem, simulated))
         scored = weight > 0
         total = rms((error / np.where(scored, weight, 1.0) if one else error)[scored])
         scale = problem.output_scale
@@ -269,7 +282,7 @@ def metrics_of(problem: Problem, simulated: FloatArray) -> Metrics:
     return Metrics(total, problem.unit, fit, channels)
 
 
-def rms_against(
+def compute_reference_rms(
     problem: Problem, simulated: Sequence[Sequence[FloatArray]], records: Sequence[Record]
 ) -> float:
     """J of simulated outputs against other values at the same samples, such as noise-free ones.
@@ -283,7 +296,7 @@ def rms_against(
     """
     one, errors = len(problem.model.outputs) == 1, []
     for part, outputs, record in zip(
-        problem.split(problem.evaluator.weight), simulated, records, strict=True
+        problem.split_by_output(problem.evaluator.weight), simulated, records, strict=True
     ):
         for (name, values), channel in zip(
             zip(part, outputs, strict=True), record.outputs, strict=True
@@ -294,11 +307,11 @@ def rms_against(
     return rms(np.concatenate(errors))
 
 
-def _channel_metrics(problem: Problem, simulated: FloatArray) -> list[ChannelMetrics]:
+def _compute_channel_metrics(problem: Problem, simulated: FloatArray) -> list[ChannelMetrics]:
     found = []
     parts = zip(
-        problem.split(problem.evaluator.measured), problem.split(simulated),
-        problem.split(problem.evaluator.weight), strict=True,
+        problem.split_by_output(problem.evaluator.measured), problem.split_by_output(simulated),
+        problem.split_by_output(problem.evaluator.weight), strict=True,
     )  # fmt: skip
     for experiment, (measured, model, weight) in enumerate(parts):
         for output in problem.model.outputs:
@@ -307,16 +320,16 @@ def _channel_metrics(problem: Problem, simulated: FloatArray) -> list[ChannelMet
                 y, computed = measured[output.name][scored], model[output.name][scored]
                 found.append(
                     ChannelMetrics(experiment, output.name, output.unit, int(y.size),
-                                   rms(y - computed), fit_percent(y, computed),
+                                   rms(y - computed), compute_fit_percent(y, computed),
                                    (float(np.min(y)), float(np.max(y))))
                 )  # fmt: skip
     return found
 
 
-def simulation_problem(model: Model, record: Record) -> Problem:
+def build_simulation_problem(model: Model, record: Record) -> Problem:
     """A problem that only simulates: every parameter is fixed, and nothing is compared."""
     weights = {output.name: 1.0 for output in model.outputs}
-    experiment = lay_out(model, record, 0, model.parameters, weights, 0, simulates_only=True)
+    experiment = place_on_grid(model, record, 0, model.parameters, weights, 0, simulates_only=True)
     settings = FitSettings(weights=weights)
     return Problem(
         model=model,
@@ -324,8 +337,8 @@ def simulation_problem(model: Model, record: Record) -> Problem:
         records=(record,),
         settings=settings,
         all_parameters=model.parameters,
-        space=(),
-        evaluator=_evaluator(model, (experiment,), model.parameters, settings),
+        free_parameters=(),
+        evaluator=_build_evaluator(model, (experiment,), model.parameters, settings),
         experiments=(experiment,),
         output_weights=weights,
         ties={},
@@ -333,19 +346,21 @@ def simulation_problem(model: Model, record: Record) -> Problem:
     )
 
 
-def _evaluator(
+def _build_evaluator(
     model: Model,
-    experiments: Sequence[Experiment],
+    experiments: Sequence[GridExperiment],
     parameters: Sequence[Parameter],
     settings: FitSettings,
 ) -> Evaluator:
-    on_grid = all(fits_grid(experiment.outputs) for experiment in experiments)
+    on_grid = all(are_on_grid(experiment.outputs) for experiment in experiments)
     weighted = any(has_weights(e.outputs, e.grid, on_grid) for e in experiments)
     loss = settings.loss
     one_step, is_robust = settings.prediction == "one-step", loss.kind == "soft-l1"
-    variant = Variant(one_step, is_robust, on_grid, weighted)
+    variant = KernelVariant(one_step, is_robust, on_grid, weighted)
     laid = [
-        numbers(model, variant, e.grid, e.inputs, e.outputs, e.starts, e.lag, loss.scale)
+        pack_experiment(
+            model, variant, e.grid, e.inputs, e.outputs, e.starts, e.largest_delay_steps, loss.scale
+        )
         for e in experiments
     ]
     rows = [i for i, parameter in enumerate(parameters) if parameter.is_free]
@@ -353,24 +368,26 @@ def _evaluator(
     samples = [samples for e in experiments for samples in e.outputs]
     weight = np.concatenate([s.weights for s in samples])
     return Evaluator(
-        kernel=kernel_address(model, variant),
+        kernel=get_kernel_address(model, variant),
         template=np.array([p.lower if p.fixed is None else p.fixed for p in parameters]),
-        rows=np.array(rows, dtype=np.int64),
+        free_rows=np.array(rows, dtype=np.int64),
         lower=np.array([p.lower for p in free], dtype=np.float64),
         upper=np.array([p.upper for p in free], dtype=np.float64),
-        log=np.array([p.scale == "log" for p in free], dtype=np.int64),
-        plans=_plans(laid, experiments),
+        is_log=np.array([p.scale == "log" for p in free], dtype=np.int64),
+        offsets=_locate_experiments(laid, experiments),
         ints=np.concatenate([one.ints for one in laid]),
         floats=np.concatenate([one.floats for one in laid]),
         n_work=max(one.n_work for one in laid),
         n_measured=weight.size,
         weight=weight,
         measured=np.concatenate([s.values for s in samples]),
-        n_weight=max(float(np.count_nonzero(weight)), 1.0),
+        n_scored=max(float(np.count_nonzero(weight)), 1.0),
     )
 
 
-def _plans(laid: Sequence[Numbers], experiments: Sequence[Experiment]) -> Any:
+def _locate_experiments(
+    laid: Sequence[PackedExperiment], experiments: Sequence[GridExperiment]
+) -> Any:
     """Where each experiment's numbers and its measured values begin."""
     lengths = [
         (one.ints.size, one.floats.size, sum(s.places.size for s in e.outputs))
@@ -380,7 +397,7 @@ def _plans(laid: Sequence[Numbers], experiments: Sequence[Experiment]) -> Any:
     return np.ascontiguousarray(np.vstack([np.zeros((1, 3), dtype=np.int64), ends[:-1]]))
 
 
-def _population(theta: FloatArray, free: int) -> FloatArray:
+def _check_population(theta: FloatArray, free: int) -> FloatArray:
     values = np.ascontiguousarray(theta, dtype=np.float64)
     if values.ndim != 2 or values.shape[1] != free:
         raise InvalidSettings(
@@ -391,7 +408,7 @@ def _population(theta: FloatArray, free: int) -> FloatArray:
     return values
 
 
-def record_progress(problem: Problem) -> FloatArray:
+def compute_record_progress(problem: Problem) -> FloatArray:
     """Part of its experiment (0 … 1) that has to be simulated for each of the M measured values."""
     return np.concatenate([
         np.ceil(samples.places) / max(experiment.grid.points - 1, 1)

@@ -6,14 +6,14 @@ from math import isfinite
 
 import numpy as np
 
-from sysid.core.errors import InvalidRecord, InvalidSettings, nearest
+from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record, Recording
-from sysid.language.evaluation import value as value_of
-from sysid.models.model import FixedInitial, Initial, Model, initial_name
+from sysid.language.evaluation import evaluate_expression as value_of
+from sysid.models.model import FixedInitial, InitialState, Model, name_initial_state
 from sysid.models.parameters import Parameter
-from sysid.models.ties import ties_of
-from sysid.simulation.problem import simulation_problem
+from sysid.models.ties import resolve_ties
+from sysid.simulation.problem import build_simulation_problem
 
 
 def simulate(
@@ -45,42 +45,44 @@ def simulate(
     InvalidRecord, RecordTooShort
         If an input is missing or the times are too short for the model's lags.
     """
-    _check(model, values)
-    values = completed(model, values)
-    known = tuple(_known(parameter, values[parameter.name]) for parameter in model.parameters)
+    _check_values(model, values)
+    values = complete_values(model, values)
+    known = tuple(
+        _fix_parameter(parameter, values[parameter.name]) for parameter in model.parameters
+    )
     initial = tuple(
-        _start(start, state.name, values)
+        _fix_initial(start, state.name, values)
         for start, state in zip(model.initial, model.states, strict=True)
     )
     if times.ndim != 1 or times.size < 2:
         raise InvalidRecord(f"times have shape {times.shape}; need two times or more")
     missing = np.full(times.size, np.nan)
     outputs = tuple(Channel(o.name, times, missing, o.unit) for o in model.outputs)
-    problem = simulation_problem(
+    problem = build_simulation_problem(
         replace(model, parameters=known, initial=initial), Record(tuple(inputs), outputs)
     )
-    found = problem.split(problem.predictions(np.empty((1, 0)))[0])[0]
+    found = problem.split_by_output(problem.predict(np.empty((1, 0)))[0])[0]
     return Recording(tuple(replace(c, values=found[c.name].copy()) for c in outputs))
 
 
-def completed(model: Model, values: Mapping[str, float]) -> dict[str, float]:
+def complete_values(model: Model, values: Mapping[str, float]) -> dict[str, float]:
     """The values, and those of fixed and tied parameters that are not among them."""
     fixed = {one.name: one.fixed for one in model.parameters if one.fixed is not None}
     known = {**fixed, **values}
     free = [replace(p, tied=None) if p.name in known else p for p in model.parameters]
-    ties = {name: value_of(tie, known) for name, tie in ties_of(model, free).items()}
+    ties = {name: value_of(tie, known) for name, tie in resolve_ties(model, free).items()}
     return {**ties, **known}
 
 
-def _check(model: Model, values: Mapping[str, float]) -> None:
+def _check_values(model: Model, values: Mapping[str, float]) -> None:
     names = [parameter.name for parameter in model.parameters]
     free = [parameter.name for parameter in model.parameters if parameter.is_free]
-    starts = [initial_name(state.name, 0) for state in model.states]
+    starts = [name_initial_state(state.name, 0) for state in model.states]
     for name, value in values.items():
         if name not in names and name not in starts:
             raise InvalidSettings(
                 f"/parameters/{name}",
-                f"the model has no parameter {name!r}{nearest(name, [*names, *starts])}",
+                f"the model has no parameter {name!r}{suggest_name(name, [*names, *starts])}",
             )
         if not isfinite(value):
             raise InvalidSettings(f"/parameters/{name}", f"{value!r} is not a finite number")
@@ -89,15 +91,15 @@ def _check(model: Model, values: Mapping[str, float]) -> None:
             raise InvalidSettings(f"/parameters/{name}", "a value is missing")
 
 
-def _known(parameter: Parameter, value: float) -> Parameter:
+def _fix_parameter(parameter: Parameter, value: float) -> Parameter:
     """The parameter fixed at a value, which may lie outside its bounds."""
     value = float(value)
     lower, upper = min(parameter.lower, value), max(parameter.upper, value)
     return replace(parameter, lower=lower, upper=upper, fixed=value, scale="linear", tied=None)
 
 
-def _start(start: Initial, state: str, values: Mapping[str, float]) -> FixedInitial:
-    name = initial_name(state, 0)
+def _fix_initial(start: InitialState, state: str, values: Mapping[str, float]) -> FixedInitial:
+    name = name_initial_state(state, 0)
     if name in values:
         return FixedInitial(float(values[name]))
     if isinstance(start, FixedInitial):

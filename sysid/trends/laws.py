@@ -16,19 +16,19 @@ import numpy as np
 
 from sysid.core.types import FloatArray
 
-LawName = Literal["line", "power"]
-FORMULAS: dict[LawName, str] = {"line": "a + b·x", "power": "a·x^b"}
+LawKind = Literal["line", "power"]
+FORMULAS: dict[LawKind, str] = {"line": "a + b·x", "power": "a·x^b"}
 
-_FITTED = 3  # two coefficients and the scale of the errors
+_N_FITTED = 3  # two coefficients and the scale of the errors
 _EXPONENTS = np.linspace(-8.0, 8.0, 161)
-_STEPS, _HALVINGS = 60, 30
-_MOST = 300.0  # exponents of e beyond which doubles overflow, squared still in range
+_MAX_STEPS, _MAX_HALVINGS = 60, 30
+_MAX_LOG = 300.0  # exponents of e beyond which doubles overflow, squared still in range
 _ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
-_SINGULAR = 1e-14
+_MIN_DETERMINANT = 1e-14
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Law:
+class TrendLaw:
     """A fitted law: y = c + b (x - x₀), or y = c (x/x₀)^b.
 
     The centre x₀ keeps c and b nearly uncorrelated.
@@ -52,7 +52,7 @@ class Law:
        Springer 2002, §2.2 and §2.4.
     """
 
-    kind: LawName
+    kind: LawKind
     centre: float
     theta: FloatArray
     covariance: FloatArray
@@ -62,22 +62,22 @@ class Law:
     aicc: float
 
     @property
-    def birge(self) -> float:
+    def birge_ratio(self) -> float:
         """√(χ²/ν): 1 where the points scatter as their errors say."""
         return sqrt(self.chi_squared / self.degrees)
 
     @property
-    def widening(self) -> float:
+    def error_factor(self) -> float:
         """By what the stated errors are multiplied: the Birge ratio, never less than 1."""
-        return max(1.0, self.birge)
+        return max(1.0, self.birge_ratio)
 
-    def values(self, x: FloatArray) -> FloatArray:
+    def evaluate_law(self, x: FloatArray) -> FloatArray:
         """The law at x."""
-        return _values(self.kind, x, self.centre, self.theta)
+        return _evaluate_kind(self.kind, x, self.centre, self.theta)
 
-    def stated(self, x: FloatArray) -> FloatArray:
+    def evaluate_stderr(self, x: FloatArray) -> FloatArray:
         """Standard errors of the law at x, as the stated errors say."""
-        slopes = _slopes(self.kind, x, self.centre, self.theta)
+        slopes = _differentiate_kind(self.kind, x, self.centre, self.theta)
         variance = np.einsum("ni,ij,nj->n", slopes, self.covariance, slopes)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -91,26 +91,26 @@ class Law:
             share = float(np.exp(-b * log(self.centre)))  # may be large: it is never squared
             a, slopes = c * share, np.array([1.0, -c * log(self.centre)])
         variance = max(float(slopes @ self.covariance @ slopes), 0.0)
-        error = self.widening * sqrt(variance) * share
-        return ("a", a, error), ("b", b, self.widening * sqrt(float(self.covariance[1, 1])))
+        error = self.error_factor * sqrt(variance) * share
+        return ("a", a, error), ("b", b, self.error_factor * sqrt(float(self.covariance[1, 1])))
 
 
-def fit_line(x: FloatArray, y: FloatArray, stderr: FloatArray) -> Law | None:
+def fit_line(x: FloatArray, y: FloatArray, stderr: FloatArray) -> TrendLaw | None:
     """The straight line through points (n ≥ 3, of three different x or more).
 
     None where it is not determined in doubles, as where squares of x overflow.
     """
     weight = (np.min(stderr) / stderr) ** 2  # at most 1: no overflow where errors are tiny
     centre = float(weight @ x / np.sum(weight))
-    slopes = _slopes("line", x, centre, np.zeros(2))
+    slopes = _differentiate_kind("line", x, centre, np.zeros(2))
     mean = float(weight @ y / np.sum(weight))
     # y less its mean: else the rounding of the centre of x would enter times that mean
     product = weight @ (slopes[:, 1] * (y - mean))
     theta = np.array([mean, float(product / (weight @ slopes[:, 1] ** 2))])
-    return _made("line", x, y, stderr, centre, theta)
+    return _build_law("line", x, y, stderr, centre, theta)
 
 
-def fit_power(x: FloatArray, y: FloatArray, stderr: FloatArray) -> Law | None:
+def fit_power(x: FloatArray, y: FloatArray, stderr: FloatArray) -> TrendLaw | None:
     """The power law through points of x > 0; None where it does not exist or is not determined.
 
     The exponent is first scanned, since c follows from it linearly; then Gauss and Newton's
@@ -120,18 +120,18 @@ def fit_power(x: FloatArray, y: FloatArray, stderr: FloatArray) -> Law | None:
         return None
     centre = exp(float(np.mean(np.log(x))))
     weight = np.min(stderr) / stderr
-    theta = _scanned(x, y, weight, centre)
-    for _ in range(_STEPS):
-        following = _stepped(x, y, weight, centre, theta)
+    theta = _scan_exponents(x, y, weight, centre)
+    for _ in range(_MAX_STEPS):
+        following = _take_step(x, y, weight, centre, theta)
         if following is None:
             break
         theta = following
-    return _made("power", x, y, stderr, centre, theta)
+    return _build_law("power", x, y, stderr, centre, theta)
 
 
-def _scanned(x: FloatArray, y: FloatArray, weight: FloatArray, centre: float) -> FloatArray:
+def _scan_exponents(x: FloatArray, y: FloatArray, weight: FloatArray, centre: float) -> FloatArray:
     """The best of many exponents, each with its best c."""
-    powers = np.clip(np.outer(_EXPONENTS, np.log(x / centre)), -_MOST, _MOST)
+    powers = np.clip(np.outer(_EXPONENTS, np.log(x / centre)), -_MAX_LOG, _MAX_LOG)
     shapes = weight * np.exp(powers)
     factors = shapes @ (weight * y) / np.sum(shapes**2, axis=1)
     losses = np.sum((weight * y - factors[:, None] * shapes) ** 2, axis=1)
@@ -139,73 +139,77 @@ def _scanned(x: FloatArray, y: FloatArray, weight: FloatArray, centre: float) ->
     return np.array([factors[best], _EXPONENTS[best]])
 
 
-def _stepped(
+def _take_step(
     x: FloatArray, y: FloatArray, weight: FloatArray, centre: float, theta: FloatArray
 ) -> FloatArray | None:
     """A step that lowers the loss, halved until it does; None at the minimum."""
-    slopes = weight[:, None] * _slopes("power", x, centre, theta)
-    residual = weight * (y - _values("power", x, centre, theta))
+    slopes = weight[:, None] * _differentiate_kind("power", x, centre, theta)
+    residual = weight * (y - _evaluate_kind("power", x, centre, theta))
     if not (np.all(np.isfinite(slopes)) and np.all(np.isfinite(residual))):
         return None
     step = np.linalg.lstsq(slopes, residual, rcond=None)[0]
     before = float(residual @ residual)
-    for _ in range(_HALVINGS):
-        if _loss(x, y, weight, centre, theta + step) < before:
+    for _ in range(_MAX_HALVINGS):
+        if _compute_loss(x, y, weight, centre, theta + step) < before:
             return np.asarray(theta + step)
         step = 0.5 * step
     return None
 
 
-def _loss(
+def _compute_loss(
     x: FloatArray, y: FloatArray, weight: FloatArray, centre: float, theta: FloatArray
 ) -> float:
-    residual = weight * (y - _values("power", x, centre, theta))
+    residual = weight * (y - _evaluate_kind("power", x, centre, theta))
     return float(residual @ residual)
 
 
-def _values(kind: LawName, x: FloatArray, centre: float, theta: FloatArray) -> FloatArray:
+def _evaluate_kind(kind: LawKind, x: FloatArray, centre: float, theta: FloatArray) -> FloatArray:
     if kind == "line":
         return np.asarray(theta[0] + theta[1] * (x - centre))
-    return np.asarray(theta[0] * np.exp(np.clip(theta[1] * np.log(x / centre), -_MOST, _MOST)))
+    return np.asarray(
+        theta[0] * np.exp(np.clip(theta[1] * np.log(x / centre), -_MAX_LOG, _MAX_LOG))
+    )
 
 
-def _slopes(kind: LawName, x: FloatArray, centre: float, theta: FloatArray) -> FloatArray:
+def _differentiate_kind(
+    kind: LawKind, x: FloatArray, centre: float, theta: FloatArray
+) -> FloatArray:
     """Derivatives (n, 2) by c and b."""
     if kind == "line":
         return np.column_stack([np.ones_like(x), x - centre])
-    share = _values(kind, x, centre, np.array([1.0, float(theta[1])]))
+    share = _evaluate_kind(kind, x, centre, np.array([1.0, float(theta[1])]))
     return np.column_stack([share, theta[0] * share * np.log(x / centre)])
 
 
-def _made(
-    kind: LawName, x: FloatArray, y: FloatArray, stderr: FloatArray, centre: float,
+def _build_law(
+    kind: LawKind, x: FloatArray, y: FloatArray, stderr: FloatArray, centre: float,
     theta: FloatArray,
-) -> Law | None:  # fmt: skip
+) -> TrendLaw | None:  # fmt: skip
     least = float(np.min(stderr))
-    slopes = _slopes(kind, x, centre, theta) * (least / stderr)[:, None]
+    slopes = _differentiate_kind(kind, x, centre, theta) * (least / stderr)[:, None]
     size = np.sqrt(np.sum(slopes**2, axis=0))
     if not np.all(size > 0):
         return None  # a curve of zero has no exponent
     normal = (slopes / size).T @ (slopes / size)
-    if not np.linalg.det(normal) > _SINGULAR:
+    if not np.linalg.det(normal) > _MIN_DETERMINANT:
         return None
     covariance = np.linalg.inv(normal) / np.outer(size / least, size / least)
-    residual = (y - _values(kind, x, centre, theta)) / stderr
+    residual = (y - _evaluate_kind(kind, x, centre, theta)) / stderr
     # What rounding leaves of an exact law is no evidence for it.
-    chi_squared = max(float(residual @ residual), rounding(y, stderr))
+    chi_squared = max(float(residual @ residual), compute_rounding_floor(y, stderr))
     if not (np.isfinite(chi_squared) and np.all(np.isfinite(covariance))):
         return None
-    aic, aicc = _criteria(chi_squared, x.size)
-    law = Law(kind, centre, theta, covariance, chi_squared, x.size - 2, aic, aicc)
+    aic, aicc = _compute_criteria(chi_squared, x.size)
+    law = TrendLaw(kind, centre, theta, covariance, chi_squared, x.size - 2, aic, aicc)
     return law if np.all(np.isfinite([one[1:] for one in law.coefficients])) else None
 
 
-def rounding(y: FloatArray, stderr: FloatArray) -> float:
+def compute_rounding_floor(y: FloatArray, stderr: FloatArray) -> float:
     """χ² that rounding of the values alone may give."""
     return float(np.sum((_ROUNDING * np.max(np.abs(y)) / stderr) ** 2)) + 1e-300
 
 
-def _criteria(chi_squared: float, n: int) -> tuple[float, float]:
-    aic = n * log(chi_squared / n) + 2 * _FITTED
-    left = n - _FITTED - 1
-    return aic, aic + 2 * _FITTED * (_FITTED + 1) / left if left > 0 else inf
+def _compute_criteria(chi_squared: float, n: int) -> tuple[float, float]:
+    aic = n * log(chi_squared / n) + 2 * _N_FITTED
+    left = n - _N_FITTED - 1
+    return aic, aic + 2 * _N_FITTED * (_N_FITTED + 1) / left if left > 0 else inf

@@ -15,27 +15,29 @@ import numpy as np
 from scipy.special import chdtrc, stdtr, stdtrit
 
 from sysid.core.types import FloatArray
-from sysid.trends.laws import Law, fit_line, fit_power, rounding
+from sysid.trends.laws import TrendLaw, compute_rounding_floor, fit_line, fit_power
 
-LEAST_PLACES = 3
+MIN_DISTINCT_X = 3
 """Different values of x from which a law has errors."""
 
-_OUTLIER = 0.05  # of all batches without an outlier, the part that are told of one
-_DRIFT = 2.0 * (1.0 - NormalDist().cdf(3.0))  # outside three standard deviations
-_CHANCE = 0.05  # of batches whose errors are right, the part whose scatter these do not explain
+_OUTLIER_PROBABILITY = 0.05  # of all batches without an outlier, the part that are told of one
+_DRIFT_PROBABILITY = 2.0 * (1.0 - NormalDist().cdf(3.0))  # outside three standard deviations
+_SCATTER_PROBABILITY = (
+    0.05  # of batches whose errors are right, the part whose scatter these do not explain
+)
 _NORMAL_95 = NormalDist().inv_cdf(0.975)
 _BAND_POINTS = 101
-_NEARLY_ONE = 1.0 - 1e-9
+_MAX_LEVERAGE = 1.0 - 1e-9
 
 
-class Estimate(NamedTuple):
+class TrendEstimate(NamedTuple):
     """A value and its standard error."""
 
     value: float
     stderr: float
 
 
-class Place(NamedTuple):
+class TrendPoint(NamedTuple):
     """A law at one x: value, 95 % interval, and whether x lies outside the measured range."""
 
     x: float
@@ -82,11 +84,11 @@ class Trend:
         With intervals for a new estimate: what the law is unsure of and the scatter about it.
     """
 
-    laws: tuple[Law, ...] = ()
-    chosen: Law | None = None
+    laws: tuple[TrendLaw, ...] = ()
+    best_law: TrendLaw | None = None
     influences: tuple[Influence, ...] = ()
-    band: tuple[Place, ...] = ()
-    predictions: tuple[Place, ...] = ()
+    band: tuple[TrendPoint, ...] = ()
+    predictions: tuple[TrendPoint, ...] = ()
     reason: str = ""
 
 
@@ -106,10 +108,10 @@ def fit_trend(
     """
     places, values, errors = (np.asarray(one, dtype=np.float64) for one in (x, y, stderr))
     different = np.unique(places).size
-    if different < LEAST_PLACES:
+    if different < MIN_DISTINCT_X:
         return Trend(
             reason=f"found {different} different {'value' if different == 1 else 'values'} of x "
-            f"with a standard error; a law with errors needs {LEAST_PLACES} or more"
+            f"with a standard error; a law with errors needs {MIN_DISTINCT_X} or more"
         )
     with np.errstate(all="ignore"):  # what does not fit into doubles gives no law
         fitted = fit_line(places, values, errors), fit_power(places, values, errors)
@@ -123,36 +125,38 @@ def fit_trend(
         chosen = min(laws, key=lambda law: law.aic)  # of equals the line, which comes first
         return Trend(
             laws=laws,
-            chosen=chosen,
-            influences=_influences(chosen, places, values, errors),
-            band=_band(chosen, places),
-            predictions=predictions(chosen, places, errors, np.asarray(predict, dtype=np.float64)),
+            best_law=chosen,
+            influences=_compute_influences(chosen, places, values, errors),
+            band=_compute_band(chosen, places),
+            predictions=predict_estimates(
+                chosen, places, errors, np.asarray(predict, dtype=np.float64)
+            ),
         )
 
 
-def half_width(law: Law) -> float:
+def compute_half_width(law: TrendLaw) -> float:
     """Half of a 95 % interval in standard errors.
 
     That of the normal distribution where the stated errors hold; that of Student's t where the
     size of the errors is taken from the scatter of few points.
     """
-    return _NORMAL_95 if law.birge <= 1.0 else float(stdtrit(law.degrees, 0.975))
+    return _NORMAL_95 if law.birge_ratio <= 1.0 else float(stdtrit(law.degrees, 0.975))
 
 
-def _band(law: Law, x: FloatArray) -> tuple[Place, ...]:
+def _compute_band(law: TrendLaw, x: FloatArray) -> tuple[TrendPoint, ...]:
     at = np.linspace(float(np.min(x)), float(np.max(x)), _BAND_POINTS)
-    errors = law.widening * law.stated(at)
-    reach = half_width(law) * errors
-    found = zip(at, law.values(at), errors, reach, strict=True)
+    errors = law.error_factor * law.evaluate_stderr(at)
+    reach = compute_half_width(law) * errors
+    found = zip(at, law.evaluate_law(at), errors, reach, strict=True)
     return tuple(
-        Place(float(p), float(v), float(e), float(v - r), float(v + r), False)
+        TrendPoint(float(p), float(v), float(e), float(v - r), float(v + r), False)
         for p, v, e, r in found
     )
 
 
-def predictions(
-    law: Law, x: FloatArray, stderr: FloatArray, at: FloatArray
-) -> tuple[Place, ...]:  # fmt: skip
+def predict_estimates(
+    law: TrendLaw, x: FloatArray, stderr: FloatArray, at: FloatArray
+) -> tuple[TrendPoint, ...]:  # fmt: skip
     """What estimates at new places would be, with their 95 % intervals.
 
     Their own stated error is interpolated (geometrically) between those of the points; outside
@@ -166,44 +170,48 @@ def predictions(
     at : FloatArray, shape (m,)
         The new places.
     """
-    reach, low, high = half_width(law), float(np.min(x)), float(np.max(x))
+    reach, low, high = compute_half_width(law), float(np.min(x)), float(np.max(x))
     known = np.ones(at.shape, dtype=bool) if law.kind == "line" else at > 0
     inside = np.where(known, at, law.centre)
-    values = law.values(inside)
-    errors = law.widening * np.hypot(law.stated(inside), _own(x, stderr, inside))
+    values = law.evaluate_law(inside)
+    errors = law.error_factor * np.hypot(
+        law.evaluate_stderr(inside), _interpolate_stderr(x, stderr, inside)
+    )
     return tuple(
-        Place(p, v, e, v - reach * e, v + reach * e, not low <= p <= high)
+        TrendPoint(p, v, e, v - reach * e, v + reach * e, not low <= p <= high)
         if is_known
-        else Place(p, nan, inf, -inf, inf, True)
+        else TrendPoint(p, nan, inf, -inf, inf, True)
         for p, v, e, is_known in zip(
             at.tolist(), values.tolist(), errors.tolist(), known.tolist(), strict=True
         )
     )
 
 
-def _own(x: FloatArray, stderr: FloatArray, at: FloatArray) -> FloatArray:
+def _interpolate_stderr(x: FloatArray, stderr: FloatArray, at: FloatArray) -> FloatArray:
     """The stated errors that estimates at some places would have."""
     places, which = np.unique(x, return_inverse=True)
     logs = np.bincount(which, np.log(stderr)) / np.bincount(which)
     return np.asarray(np.exp(np.interp(at, places, logs)))
 
 
-def _influences(
-    law: Law, x: FloatArray, y: FloatArray, stderr: FloatArray
+def _compute_influences(
+    law: TrendLaw, x: FloatArray, y: FloatArray, stderr: FloatArray
 ) -> tuple[Influence, ...]:
-    residuals = (y - law.values(x)) / stderr
-    leverages = (law.stated(x) / stderr) ** 2
-    floor = rounding(y, stderr)
+    residuals = (y - law.evaluate_law(x)) / stderr
+    leverages = (law.evaluate_stderr(x) / stderr) ** 2
+    floor = compute_rounding_floor(y, stderr)
     return tuple(
-        _influence(law, float(e), min(float(h), 1.0), x.size, floor)
+        _compute_influence(law, float(e), min(float(h), 1.0), x.size, floor)
         for e, h in zip(residuals, leverages, strict=True)
     )
 
 
-def _influence(law: Law, residual: float, leverage: float, n: int, floor: float) -> Influence:
+def _compute_influence(
+    law: TrendLaw, residual: float, leverage: float, n: int, floor: float
+) -> Influence:
     """The deleted residual follows from the whole fit: t = e/(s₍ᵢ₎ √(1 - h))."""
     degrees = law.degrees - 1
-    if degrees < 1 or not leverage <= _NEARLY_ONE:
+    if degrees < 1 or not leverage <= _MAX_LEVERAGE:
         return Influence(residual, None, None, False)
     square = residual**2 / (1.0 - leverage)
     others = max(law.chi_squared - square, 0.0) / degrees
@@ -212,11 +220,13 @@ def _influence(law: Law, residual: float, leverage: float, n: int, floor: float)
     else:
         t = residual / sqrt(others * (1.0 - leverage))
     p_value = min(1.0, n * 2.0 * float(stdtr(degrees, -abs(t))))
-    is_explained = sqrt(square) <= -NormalDist().inv_cdf(_OUTLIER / (2.0 * n))
-    return Influence(residual, t, p_value, p_value < _OUTLIER and not is_explained)
+    is_explained = sqrt(square) <= -NormalDist().inv_cdf(_OUTLIER_PROBABILITY / (2.0 * n))
+    return Influence(residual, t, p_value, p_value < _OUTLIER_PROBABILITY and not is_explained)
 
 
-def pooled(groups: Sequence[Sequence[Estimate]]) -> tuple[tuple[Estimate, ...], float]:
+def pool_estimates(
+    groups: Sequence[Sequence[TrendEstimate]],
+) -> tuple[tuple[TrendEstimate, ...], float]:
     """One estimate for each group of runs of one label, and how much these scatter.
 
     Within a group the weighted mean. How much runs of one label differ beyond their stated
@@ -229,10 +239,12 @@ def pooled(groups: Sequence[Sequence[Estimate]]) -> tuple[tuple[Estimate, ...], 
         The means, and the ratio; 1 where no group has two runs.
     """
     with np.errstate(over="ignore"):  # a ratio beyond doubles is infinite
-        return _pooled(groups)
+        return _pool_groups(groups)
 
 
-def _pooled(groups: Sequence[Sequence[Estimate]]) -> tuple[tuple[Estimate, ...], float]:
+def _pool_groups(
+    groups: Sequence[Sequence[TrendEstimate]],
+) -> tuple[tuple[TrendEstimate, ...], float]:
     means, square, degrees = [], 0.0, 0
     for group in groups:
         errors = np.array([one.stderr for one in group])
@@ -240,11 +252,11 @@ def _pooled(groups: Sequence[Sequence[Estimate]]) -> tuple[tuple[Estimate, ...],
         least = float(np.min(errors))
         weights = (least / errors) ** 2  # at most 1: no overflow where errors are tiny
         mean = float(weights @ values / np.sum(weights))
-        means.append(Estimate(mean, least * float(np.sum(weights)) ** -0.5))
+        means.append(TrendEstimate(mean, least * float(np.sum(weights)) ** -0.5))
         square += float(np.sum(((values - mean) / errors) ** 2))
         degrees += len(group) - 1
     ratio = sqrt(square / degrees) if degrees else 1.0
-    return tuple(Estimate(v, max(1.0, ratio) * s) for v, s in means), ratio
+    return tuple(TrendEstimate(v, max(1.0, ratio) * s) for v, s in means), ratio
 
 
 class Drift(NamedTuple):
@@ -259,7 +271,7 @@ class Drift(NamedTuple):
     limit: float
 
 
-def drift_limit(law: Law | None = None, comparisons: int = 1) -> float:
+def compute_drift_limit(law: TrendLaw | None = None, comparisons: int = 1) -> float:
     """From how many standard errors on an estimate has drifted.
 
     Three; of many comparisons more, so that a batch that has not changed is flagged as seldom as
@@ -268,22 +280,22 @@ def drift_limit(law: Law | None = None, comparisons: int = 1) -> float:
     wider by as much as Student's 95 % interval is. Student's own tail that far out comes from
     batches that happen to scatter little, and these have their stated errors.
     """
-    limit = -NormalDist().inv_cdf(_DRIFT / (2.0 * comparisons))
-    if law is None or chdtrc(law.degrees, law.chi_squared) >= _CHANCE:
+    limit = -NormalDist().inv_cdf(_DRIFT_PROBABILITY / (2.0 * comparisons))
+    if law is None or chdtrc(law.degrees, law.chi_squared) >= _SCATTER_PROBABILITY:
         return limit
     return limit * float(stdtrit(law.degrees, 0.975)) / _NORMAL_95
 
 
-def drift(new: Estimate, old: Estimate, comparisons: int = 1) -> Drift:
+def compute_drift(new: TrendEstimate, old: TrendEstimate, comparisons: int = 1) -> Drift:
     """An estimate against that of a reference run."""
     difference, error = new.value - old.value, hypot(new.stderr, old.stderr)
-    limit = drift_limit(None, comparisons)
-    z = _ratio(difference, error)
+    limit = compute_drift_limit(None, comparisons)
+    z = _standardise_difference(difference, error)
     return Drift(difference, z, abs(z) > limit, limit)
 
 
-def drifts_from_law(
-    new: Sequence[Estimate], law: Law, x: FloatArray, stderr: FloatArray, at: FloatArray,
+def compute_law_drifts(
+    new: Sequence[TrendEstimate], law: TrendLaw, x: FloatArray, stderr: FloatArray, at: FloatArray,
     comparisons: int = 1,
 ) -> tuple[Drift, ...]:  # fmt: skip
     """Estimates against what the trend of a reference batch predicts at their places.
@@ -298,27 +310,27 @@ def drifts_from_law(
         The places of the estimates. Where the law says nothing, no number is told.
     """
     with np.errstate(all="ignore"):
-        told = predictions(law, x, stderr, at)
-        known = (law.widening * law.stated(at)).tolist()
-    limit = drift_limit(law, comparisons)
+        told = predict_estimates(law, x, stderr, at)
+        known = (law.error_factor * law.evaluate_stderr(at)).tolist()
+    limit = compute_drift_limit(law, comparisons)
     return tuple(
-        _drift_from(one, place, error, limit)
+        _compute_point_drift(one, place, error, limit)
         for one, place, error in zip(new, told, known, strict=True)
     )
 
 
-def _drift_from(new: Estimate, told: Place, known: float, limit: float) -> Drift:
+def _compute_point_drift(new: TrendEstimate, told: TrendPoint, known: float, limit: float) -> Drift:
     if not (isfinite(told.value) and isfinite(told.stderr)):
         return Drift(nan, nan, False, limit)
     # Its own error is the larger of what it says and what points of that batch scatter.
     scatter = sqrt(max(told.stderr**2 - known**2, 0.0))
     error = hypot(known, max(scatter, new.stderr))
     difference = new.value - told.value
-    z = _ratio(difference, error)
+    z = _standardise_difference(difference, error)
     return Drift(difference, z, abs(z) > limit, limit)
 
 
-def _ratio(difference: float, error: float) -> float:
+def _standardise_difference(difference: float, error: float) -> float:
     if error > 0:
         return difference / error
     return float(np.copysign(inf, difference)) if difference else 0.0

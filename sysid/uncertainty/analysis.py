@@ -27,19 +27,24 @@ import numpy as np
 from scipy.special import stdtrit
 
 from sysid.core.linear_algebra import truncated_svd
-from sysid.core.types import RANK, BoolArray, FloatArray
-from sysid.identifiability.active_bounds import Pull, is_pulled, pulls
-from sysid.identifiability.bound_limits import reach
-from sysid.identifiability.combinations import Block, untold, weighed, written
-from sysid.identifiability.exchange import Exchanges
-from sysid.identifiability.scaling import scalings
-from sysid.identifiability.translations import translations
-from sysid.residuals.coloured import Coloured
-from sysid.residuals.correlated_outputs import coloured_jointly
+from sysid.core.types import RANK_TOLERANCE, BoolArray, FloatArray
+from sysid.identifiability.active_bounds import ActiveBound, is_active, rank_active_bounds
+from sysid.identifiability.bound_limits import find_widest_bounds
+from sysid.identifiability.combinations import (
+    ParameterBlock,
+    classify_directions,
+    express_combinations,
+    find_unidentified,
+)
+from sysid.identifiability.exchange import ExchangeGroups
+from sysid.identifiability.scaling import find_scalings
+from sysid.identifiability.translations import find_translations
+from sysid.residuals.coloured import ColouredCovariance
+from sysid.residuals.correlated_outputs import estimate_joint_covariance
 from sysid.residuals.whitening import Whitening
 from sysid.simulation.loss import compute_influence, compute_loss_weight
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import is_at_bounds, placed
+from sysid.simulation.scaling import is_at_bounds, to_unit
 from sysid.uncertainty.estimates import (
     Criteria,
     Estimate,
@@ -47,9 +52,9 @@ from sysid.uncertainty.estimates import (
     NoiseColour,
     Uncertainty,
 )
-from sysid.uncertainty.intervals import Known, estimates_of
-from sysid.uncertainty.linear_model import Linear, linear_model
-from sysid.uncertainty.sensitivities import BudgetSpentError, Sensitivities, sensitivities
+from sysid.uncertainty.intervals import LocalStatistics, make_estimates
+from sysid.uncertainty.linear_model import LinearOutputModel, linearise_outputs
+from sysid.uncertainty.sensitivities import BudgetSpentError, Sensitivities, compute_sensitivities
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,19 +78,19 @@ class Analysis:
     possible_gain: float
     evaluations: int
     criteria: Criteria
-    pulls: tuple[Pull, ...] = ()
+    active_bounds: tuple[ActiveBound, ...] = ()
     """Bounds to widen together, the costliest first."""
-    linear: Linear | None = None
+    linear_model: LinearOutputModel | None = None
     """None where there is no uncertainty or the loss is not that of squares."""
-    exchanges: Exchanges = ()
+    exchanges: ExchangeGroups = ()
     """Parameters that can change places."""
     is_cut_short: bool = False
     """Whether minima beside the estimate were not looked for because the time was over."""
-    slopes: tuple[FloatArray, FloatArray] | None = None
+    residuals_and_sensitivities: tuple[FloatArray, FloatArray] | None = None
     """Residuals (n,) and sensitivities (n, D) that are not whitened."""
 
 
-def analyse(
+def analyse_estimate(
     problem: Problem, theta: FloatArray, most: int | None = None, white: Whitening | None = None
 ) -> Analysis:
     """Standard errors, correlations and identifiability at an estimate (D,).
@@ -94,118 +99,132 @@ def analyse(
     With a whitening all is of the whitened residuals and sensitivities.
     """
     try:
-        sensitive = sensitivities(problem, theta, most)
+        sensitive = compute_sensitivities(problem, theta, most)
     except BudgetSpentError as spent:
-        return _unexplored(problem, theta, spent, white)
+        return _analyse_without_sensitivities(problem, theta, spent, white)
     if white is not None:
-        columns = white.of(sensitive.columns.T).T
-        sensitive = sensitive._replace(error=white.of(sensitive.error), columns=columns)
-    analysis = _analysed(problem, theta, sensitive, most, white)
+        columns = white.whiten(sensitive.columns.T).T
+        sensitive = sensitive._replace(residuals=white.whiten(sensitive.residuals), columns=columns)
+    analysis = _analyse_sensitivities(problem, theta, sensitive, most, white)
     if white is not None:
         return analysis
-    return replace(analysis, slopes=(sensitive.error, sensitive.columns))
+    return replace(analysis, residuals_and_sensitivities=(sensitive.residuals, sensitive.columns))
 
 
-def _unexplored(
+def _analyse_without_sensitivities(
     problem: Problem, theta: FloatArray, spent: BudgetSpentError, white: Whitening | None
 ) -> Analysis:
     """What is known without a look at the neighbours of the estimate.
 
     With nothing left it is that of the simulation that a result shows: no budget counts it.
     """
-    error = spent.error
+    error = spent.residuals
     if error is None:
         weight = problem.evaluator.weight
-        errors = weight * (problem.predictions(theta[None])[0] - problem.evaluator.measured)
+        errors = weight * (problem.predict(theta[None])[0] - problem.evaluator.measured)
         error = errors[weight > 0]
-    criteria = criteria_of(error if white is None else white.of(error), theta.size, white)
+    criteria = compute_criteria(error if white is None else white.whiten(error), theta.size, white)
     reason = "the budget of simulations left too few for standard errors"
-    return Analysis(_without(problem, theta, reason), None, 0.0, spent.evaluations, criteria)
+    return Analysis(
+        _make_estimates_without_stderr(problem, theta, reason),
+        None,
+        0.0,
+        spent.evaluations,
+        criteria,
+    )
 
 
-def _analysed(
+def _analyse_sensitivities(
     problem: Problem, theta: FloatArray, sensitive: Sensitivities, most: int | None,
     white: Whitening | None = None,
 ) -> Analysis:  # fmt: skip
     error, columns, plateau, one_sided, aside, count = sensitive
     n, d = columns.shape
-    criteria = criteria_of(error, d, white)
+    criteria = compute_criteria(error, d, white)
     if n <= d:
         reason = f"{n} samples are not more than {d} parameters"
-        return Analysis(_without(problem, theta, reason), None, 0.0, count, criteria)
-    place = placed(problem.evaluator, theta[None])[0]
+        return Analysis(
+            _make_estimates_without_stderr(problem, theta, reason), None, 0.0, count, criteria
+        )
+    place = to_unit(problem.evaluator, theta[None])[0]
     # No step of least squares gains from a parameter on a plateau: there the loss is flat.
     sloping = np.where(plateau > 0, 0.0, columns)
     influence = compute_influence(error, problem.loss_scale)
-    gain = _possible_gain(influence, sloping, place)
-    pulled = is_pulled(influence, sloping, place)
-    scale = physical_scale(problem, theta)
-    powers = scalings(problem.model, problem.all_parameters)
+    gain = _compute_possible_gain(influence, sloping, place)
+    pulled = is_active(influence, sloping, place)
+    scale = compute_physical_scale(problem, theta)
+    powers = find_scalings(problem.model, problem.all_parameters)
     left = None if most is None else most - count
-    shifts, more = translations(problem, theta, columns, scale, left)
+    shifts, more = find_translations(problem, theta, columns, scale, left)
     count += more
-    columns, known = without_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
+    columns, known = remove_symmetries(columns, np.vstack([powers * theta, shifts]) / scale)
     _, singular, rows, kept = truncated_svd(columns)
     kept[d - known :] = False
     inverse = (rows[kept].T / singular[kept] ** 2) @ rows[kept]
-    colour = coloured_jointly(problem, influence, columns)
-    covariance, noise = _covariance(error, columns, inverse, problem.loss_scale, colour)
+    colour = estimate_joint_covariance(problem, influence, columns)
+    covariance, noise = _estimate_covariance(error, columns, inverse, problem.loss_scale, colour)
     # A factor that is 0 is not moved by what scales it: the others are, without any effect.
-    moved = _moved(powers * theta) | _moved(shifts)
-    directions = weighed(singular, rows, ~kept, moved, covariance, noise)
+    moved = _find_moved_parameters(powers * theta) | _find_moved_parameters(shifts)
+    directions = classify_directions(singular, rows, ~kept, moved, covariance, noise)
     physical = (covariance + np.diag(plateau**2 / 12.0)) * np.outer(scale, scale)
-    found = untold(directions)
+    found = find_unidentified(directions)
     names = problem.free_names
     uncertainty = Uncertainty(
         names=names,
         covariance=physical,
-        correlation=_correlation(physical),
-        alike=_correlation(inverse * np.outer(scale, scale)),
+        correlation=_to_correlation(physical),
+        sensitivity_correlation=_to_correlation(inverse * np.outer(scale, scale)),
         condition=float(singular[0] / singular[-1]) if kept.all() else float("inf"),
         singular_values=singular,
         noise_sd=noise,
-        noise_colour=_named(colour, white),
-        groups=tuple(g for one in found for g in written(one, names, theta, scale, physical)),
+        noise_colour=_classify_noise_colour(colour, white),
+        groups=tuple(
+            g for one in found for g in express_combinations(one, names, theta, scale, physical)
+        ),
     )
     combined = {name for group in uncertainty.groups for name in group.members}
-    statuses = _statuses(place, found, pulled, np.array([name in combined for name in names]))
-    told = Known(
-        theta, statuses, physical, stdtrit(_told_by(n, inverse, colour, white), 0.975),
-        directions.member, uncertainty.groups, rows[~kept], scale,
+    statuses = _classify_parameters(
+        place, found, pulled, np.array([name in combined for name in names])
+    )
+    told = LocalStatistics(
+        theta, statuses, physical, stdtrit(_compute_degrees_of_freedom(n, inverse, colour, white), 0.975),
+        directions.is_null_member, uncertainty.groups, rows[~kept], scale,
     )  # fmt: skip
-    estimates = _beside_jumps(problem, estimates_of(problem, told), one_sided, aside * scale)
+    estimates = _correct_for_jumps(problem, make_estimates(problem, told), one_sided, aside * scale)
     linear = None
     if problem.loss_scale == 0.0:
         stated = np.diag(covariance)
         root = singular[:, None] * rows
-        linear = linear_model(error, columns, plateau > 0, place, stated, scale, inverse, root)
-    held = _held_back(problem, influence, sloping, place) if pulled.any() else ()
+        linear = linearise_outputs(error, columns, plateau > 0, place, stated, scale, inverse, root)
+    held = _find_active_bounds(problem, influence, sloping, place) if pulled.any() else ()
     return Analysis(estimates, uncertainty, min(gain, 1.0), count, criteria, held, linear)
 
 
-def _moved(directions: FloatArray) -> BoolArray:
+def _find_moved_parameters(directions: FloatArray) -> BoolArray:
     """Which parameters (D,) any of some directions (m, D) moves."""
     return np.asarray(np.any(directions != 0.0, axis=0))
 
 
-def _held_back(
+def _find_active_bounds(
     problem: Problem, influence: FloatArray, columns: FloatArray, place: FloatArray
-) -> tuple[Pull, ...]:
+) -> tuple[ActiveBound, ...]:
     at_end = np.logical_or(*is_at_bounds(place))
     reaches = tuple(
-        reach(problem, one) if asked else (one.lower, one.upper)
-        for one, asked in zip(problem.space, at_end, strict=True)
+        find_widest_bounds(problem, one) if asked else (one.lower, one.upper)
+        for one, asked in zip(problem.free_parameters, at_end, strict=True)
     )
-    return pulls(problem.space, reaches, influence, columns, place)
+    return rank_active_bounds(problem.free_parameters, reaches, influence, columns, place)
 
 
-def criteria_of(error: FloatArray, parameters: int, white: Whitening | None = None) -> Criteria:
+def compute_criteria(
+    error: FloatArray, parameters: int, white: Whitening | None = None
+) -> Criteria:
     """Information criteria from the weighted residuals (n,); see `Criteria` for the formulae.
 
     Of whitened residuals the likelihood is still that of the outputs, so that criteria with and
     without a noise model compare; correlation times count as parameters.
     """
-    n, counted = error.size, parameters + 1 + (0 if white is None else white.n_times)
+    n, counted = error.size, parameters + 1 + (0 if white is None else white.n_correlation_times)
     mean = float(error @ error) / n
     twice = -n * (np.log(2.0 * np.pi * mean) + 1.0) if mean > 0 else np.inf  # 2 ln ℓ
     twice -= 0.0 if white is None else white.log_determinant
@@ -216,7 +235,7 @@ def criteria_of(error: FloatArray, parameters: int, white: Whitening | None = No
     return Criteria(float(aic), None if aicc is None else float(aicc), float(bic), n, parameters)
 
 
-def without_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[FloatArray, int]:
+def remove_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[FloatArray, int]:
     """Sensitivities that do not change at all along the directions (k, D), and their number.
 
     By differences they would change a little, and where friction breaks away more than that.
@@ -226,28 +245,30 @@ def without_symmetries(columns: FloatArray, directions: FloatArray) -> tuple[Flo
     lengths = np.linalg.norm(directions, axis=1, keepdims=True)
     size, rows = np.linalg.svd(directions / np.where(lengths > 0, lengths, 1.0),
                                full_matrices=False)[1:]  # fmt: skip
-    rows = rows[size > RANK]
+    rows = rows[size > RANK_TOLERANCE]
     return columns - (columns @ rows.T) @ rows, rows.shape[0]
 
 
-def _beside_jumps(
+def _correct_for_jumps(
     problem: Problem, estimates: tuple[Estimate, ...], one_sided: BoolArray, aside: FloatArray
 ) -> tuple[Estimate, ...]:
     """Estimates of parameters whose output changes in jumps only."""
     names = problem.free_names
     blind = {name for name, one in zip(names, one_sided, strict=True) if one}
     moved = {name: float(by) for name, by in zip(names, aside, strict=True) if by}
-    seen = (_on_one_side(one) if one.name in blind else one for one in estimates)
-    return tuple(_centred(one, moved[one.name]) if one.name in moved else one for one in seen)
+    seen = (_remove_stderr(one) if one.name in blind else one for one in estimates)
+    return tuple(
+        _centre_on_plateau(one, moved[one.name]) if one.name in moved else one for one in seen
+    )
 
 
-def _on_one_side(estimate: Estimate) -> Estimate:
+def _remove_stderr(estimate: Estimate) -> Estimate:
     """An estimate whose slope is not known because the output jumps on one side of it only."""
     reason = "the output changes with it in jumps, and here on one side only"
     return replace(estimate, stderr=None, interval95=None, reason=reason)
 
 
-def _centred(estimate: Estimate, aside: float) -> Estimate:
+def _centre_on_plateau(estimate: Estimate, aside: float) -> Estimate:
     """An estimate whose interval is around the middle of its plateau, which lies so far above it.
 
     On a plateau the loss is the same, so where on it the search ended says nothing.
@@ -258,7 +279,7 @@ def _centred(estimate: Estimate, aside: float) -> Estimate:
     return replace(estimate, interval95=(lower + aside, upper + aside))
 
 
-def _possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray) -> float:
+def _compute_possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray) -> float:
     """Part of Σψ² in the span of those sensitivities along which the parameters may move.
 
     It is zero at a local optimum. A parameter at its bound whose slope leads out of the bounds
@@ -274,27 +295,29 @@ def _possible_gain(influence: FloatArray, columns: FloatArray, place: FloatArray
     return float(np.sum((left[:, kept].T @ influence) ** 2)) / total
 
 
-def _covariance(
+def _estimate_covariance(
     error: FloatArray, columns: FloatArray, inverse: FloatArray, scale: float,
-    colour: Coloured | None,
+    colour: ColouredCovariance | None,
 ) -> tuple[FloatArray, float]:  # fmt: skip
     """Covariance of the places, and the standard deviation of the noise."""
     n, d = columns.shape
-    widening = n / (n - d) if colour is None else colour.samples / colour.degrees
+    widening = n / (n - d) if colour is None else colour.equivalent_samples / colour.degrees
     if scale == 0.0:
         variance = float(error @ error) / (n - d)
         if colour is not None:
             return widening * inverse @ colour.middle @ inverse, float(np.sqrt(variance))
         return variance * inverse, float(np.sqrt(variance))
     influence, share = compute_influence(error, scale), compute_loss_weight(error, scale)
-    bread = np.linalg.pinv((columns.T * share**3) @ columns, rcond=RANK**2, hermitian=True)
+    bread = np.linalg.pinv(
+        (columns.T * share**3) @ columns, rcond=RANK_TOLERANCE**2, hermitian=True
+    )
     filling = (columns.T * influence**2) @ columns if colour is None else colour.middle
     noise = 1.4826 * float(np.median(np.abs(error)))  # of the bulk, not of the outliers
     return widening * bread @ filling @ bread, noise
 
 
-def _told_by(
-    n: int, inverse: FloatArray, colour: Coloured | None, white: Whitening | None
+def _compute_degrees_of_freedom(
+    n: int, inverse: FloatArray, colour: ColouredCovariance | None, white: Whitening | None
 ) -> FloatArray:
     """Degrees of freedom of the intervals (D,): of whitened samples too, what a mean would have.
 
@@ -303,18 +326,20 @@ def _told_by(
     d = len(inverse)
     degrees = np.full(d, float(n - d))
     if colour is not None:
-        degrees = np.array([colour.degrees_along(row) for row in inverse])
-    return degrees if white is None else np.minimum(degrees, max(white.samples - d, 1.0))
+        degrees = np.array([colour.compute_degrees(row) for row in inverse])
+    return degrees if white is None else np.minimum(degrees, max(white.equivalent_samples - d, 1.0))
 
 
-def _named(colour: Coloured | None, white: Whitening | None) -> NoiseColour:
+def _classify_noise_colour(
+    colour: ColouredCovariance | None, white: Whitening | None
+) -> NoiseColour:
     if colour is None or colour.is_white:
         return "white" if white is None else "first-order"
-    return "drifting" if colour.drifts else "coloured"
+    return "drifting" if colour.is_drifting else "coloured"
 
 
-def _statuses(
-    place: FloatArray, found: tuple[Block, ...], pulled: BoolArray, combined: BoolArray
+def _classify_parameters(
+    place: FloatArray, found: tuple[ParameterBlock, ...], pulled: BoolArray, combined: BoolArray
 ) -> tuple[EstimateStatus, ...]:
     """What the data say of each parameter: see `EstimateStatus`.
 
@@ -332,14 +357,14 @@ def _statuses(
     return tuple(statuses)
 
 
-def physical_scale(problem: Problem, theta: FloatArray) -> FloatArray:
+def compute_physical_scale(problem: Problem, theta: FloatArray) -> FloatArray:
     """∂θ/∂p: the range, or on a log scale θ ln(upper/lower)."""
     lower, upper = problem.evaluator.lower, problem.evaluator.upper
-    ratio = np.where(problem.evaluator.log > 0, upper / np.where(lower > 0, lower, 1.0), 1.0)
-    return np.asarray(np.where(problem.evaluator.log > 0, theta * np.log(ratio), upper - lower))
+    ratio = np.where(problem.evaluator.is_log > 0, upper / np.where(lower > 0, lower, 1.0), 1.0)
+    return np.asarray(np.where(problem.evaluator.is_log > 0, theta * np.log(ratio), upper - lower))
 
 
-def _correlation(covariance: FloatArray) -> FloatArray:
+def _to_correlation(covariance: FloatArray) -> FloatArray:
     deviation = np.sqrt(np.diag(covariance))
     safe = np.where(deviation > 0, deviation, 1.0)
     correlation = covariance / np.outer(safe, safe)
@@ -347,12 +372,14 @@ def _correlation(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.clip(correlation, -1.0, 1.0))
 
 
-def _without(problem: Problem, theta: FloatArray, reason: str) -> tuple[Estimate, ...]:
+def _make_estimates_without_stderr(
+    problem: Problem, theta: FloatArray, reason: str
+) -> tuple[Estimate, ...]:
     """Estimates of which nothing more is known than their values."""
     d = theta.size
     statuses: list[EstimateStatus] = ["unidentifiable"] * d
     blind = np.ones(d, dtype=np.bool_)
-    known = Known(
+    known = LocalStatistics(
         theta,
         tuple(statuses),
         np.zeros((d, d)),
@@ -363,4 +390,4 @@ def _without(problem: Problem, theta: FloatArray, reason: str) -> tuple[Estimate
         np.ones(d),
         reason,
     )
-    return estimates_of(problem, known)
+    return make_estimates(problem, known)

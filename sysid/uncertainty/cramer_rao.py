@@ -19,16 +19,16 @@ import numpy as np
 from sysid.core.errors import InvalidSettings
 from sysid.core.linear_algebra import truncated_svd
 from sysid.core.types import FloatArray
-from sysid.identifiability.combinations import NULL_MEMBER
-from sysid.identifiability.scaling import scalings
-from sysid.identifiability.translations import translations
+from sysid.identifiability.combinations import NULL_SHARE
+from sysid.identifiability.scaling import find_scalings
+from sysid.identifiability.translations import find_translations
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import physical_scale, without_symmetries
-from sysid.uncertainty.sensitivities import sensitivities
+from sysid.uncertainty.analysis import compute_physical_scale, remove_symmetries
+from sysid.uncertainty.sensitivities import compute_sensitivities
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Floor:
+class CramerRaoBound:
     """Least standard deviations for noise of σ = 1.
 
     Attributes
@@ -46,11 +46,11 @@ class Floor:
 
     names: tuple[str, ...]
     stderr: FloatArray
-    response: float
+    response_rms: float
     samples: int
 
 
-def floor(problem: Problem, theta: FloatArray) -> Floor:
+def cramer_rao_bound(problem: Problem, theta: FloatArray) -> CramerRaoBound:
     """The floor at true parameters (D,), inside their bounds.
 
     The problem must weigh every output with 1, since the noise is the same on each.
@@ -63,21 +63,23 @@ def floor(problem: Problem, theta: FloatArray) -> Floor:
     odd = [name for name, weight in problem.output_weights.items() if weight != 1.0]
     if odd:
         raise InvalidSettings(f"/weights/{odd[0]}", "the floor is that of outputs of weight 1")
-    found = sensitivities(problem, theta)
-    scale = physical_scale(problem, theta)
-    powers = scalings(problem.model, problem.all_parameters)
-    shifts, _ = translations(problem, theta, found.columns, scale)
-    columns, known = without_symmetries(found.columns, np.vstack([powers * theta, shifts]) / scale)
+    found = compute_sensitivities(problem, theta)
+    scale = compute_physical_scale(problem, theta)
+    powers = find_scalings(problem.model, problem.all_parameters)
+    shifts, _ = find_translations(problem, theta, found.columns, scale)
+    columns, known = remove_symmetries(found.columns, np.vstack([powers * theta, shifts]) / scale)
     n, d = columns.shape
     # Rows of zeros make the directions complete where there are fewer samples than parameters.
     square = np.vstack([columns, np.zeros((max(d - n, 0), d))])
     _, singular, rows, kept = truncated_svd(square)
     kept[d - known :] = False
     variance = np.sum((rows[kept] / singular[kept, None]) ** 2, axis=0)
-    untold = np.any(rows[~kept] ** 2 > NULL_MEMBER, axis=0) | found.one_sided
-    untold |= np.any(powers != 0.0, axis=0) | np.any(shifts != 0.0, axis=0) | (found.plateau > 0)
+    untold = np.any(rows[~kept] ** 2 > NULL_SHARE, axis=0) | found.one_sided
+    untold |= (
+        np.any(powers != 0.0, axis=0) | np.any(shifts != 0.0, axis=0) | (found.plateau_width > 0)
+    )
     stderr = np.where(untold, np.inf, np.sqrt(variance) * np.abs(scale))
-    return Floor(
+    return CramerRaoBound(
         problem.free_names, stderr,
         float(np.sqrt(np.count_nonzero(kept) / n)), n,
     )  # fmt: skip

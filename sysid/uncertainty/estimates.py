@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from sysid.core.types import FloatArray
-from sysid.identifiability.combinations import Group
+from sysid.identifiability.combinations import IdentifiableCombination
 
 NoiseColour = Literal["white", "first-order", "coloured", "drifting"]
 EstimateStatus = Literal["identified", "group", "at bound", "unidentifiable", "fixed", "tied"]
@@ -71,9 +71,9 @@ class Uncertainty:
     names: tuple[str, ...]
     covariance: FloatArray
     correlation: FloatArray
-    alike: FloatArray
+    sensitivity_correlation: FloatArray
     condition: float
     singular_values: FloatArray
     noise_sd: float
-    groups: tuple[Group, ...] = ()
+    groups: tuple[IdentifiableCombination, ...] = ()
     noise_colour: NoiseColour = "white"

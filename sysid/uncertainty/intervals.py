@@ -6,20 +6,20 @@ from math import sqrt
 import numpy as np
 
 from sysid.core.types import BoolArray, FloatArray
-from sysid.identifiability.combinations import Group
-from sysid.language.evaluation import value as worth
+from sysid.identifiability.combinations import IdentifiableCombination
+from sysid.language.evaluation import evaluate_expression as worth
 from sysid.language.tree import Expression
 from sysid.models.parameters import Parameter
 from sysid.simulation.problem import Problem
 from sysid.uncertainty.estimates import Estimate, EstimateStatus
 
-_STEP = 1e-6  # of the range: slopes of ties
-_BLIND = 1e-4  # share of a tie's slope along directions that have no effect
-_TOLD = 4  # groups that a reason names
+_TIE_STEP = 1e-6  # of the range: slopes of ties
+_NULL_SHARE = 1e-4  # share of a tie's slope along directions that have no effect
+_MAX_NAMED_GROUPS = 4  # groups that a reason names
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Known:
+class LocalStatistics:
     """What the analysis found.
 
     Attributes
@@ -44,44 +44,49 @@ class Known:
     theta: FloatArray
     statuses: tuple[EstimateStatus, ...]
     covariance: FloatArray
-    quantile: FloatArray
-    blind: BoolArray
-    groups: tuple[Group, ...]
-    null: FloatArray
+    t_quantile: FloatArray
+    lacks_stderr: BoolArray
+    groups: tuple[IdentifiableCombination, ...]
+    null_directions: FloatArray
     scale: FloatArray
     reason: str = ""
 
 
-def estimates_of(problem: Problem, known: Known) -> tuple[Estimate, ...]:
+def make_estimates(problem: Problem, known: LocalStatistics) -> tuple[Estimate, ...]:
     """All parameters in the problem's order."""
-    free = {p.name: _free(p, known, d) for d, p in enumerate(problem.space)}
-    return tuple(free.get(p.name) or _given(problem, known, p) for p in problem.all_parameters)
+    free = {p.name: _make_free_estimate(p, known, d) for d, p in enumerate(problem.free_parameters)}
+    return tuple(
+        free.get(p.name) or _make_fixed_or_tied_estimate(problem, known, p)
+        for p in problem.all_parameters
+    )
 
 
-def _free(parameter: Parameter, known: Known, d: int) -> Estimate:
+def _make_free_estimate(parameter: Parameter, known: LocalStatistics, d: int) -> Estimate:
     value, status = float(known.theta[d]), known.statuses[d]
-    blind = bool(known.blind[d])
-    reason = known.reason or _reason(parameter.name, status, blind, known.groups)
+    blind = bool(known.lacks_stderr[d])
+    reason = known.reason or _explain_status(parameter.name, status, blind, known.groups)
     error = None if blind else sqrt(max(float(known.covariance[d, d]), 0.0))
-    return _estimate(parameter, value, error, float(known.quantile[d]), status, reason)
+    return _make_estimate(parameter, value, error, float(known.t_quantile[d]), status, reason)
 
 
-def _given(problem: Problem, known: Known, parameter: Parameter) -> Estimate:
+def _make_fixed_or_tied_estimate(
+    problem: Problem, known: LocalStatistics, parameter: Parameter
+) -> Estimate:
     if parameter.name not in problem.ties:
         value = parameter.fixed or 0.0
-        return _estimate(parameter, value, None, 0.0, "fixed", "its value was given")
+        return _make_estimate(parameter, value, None, 0.0, "fixed", "its value was given")
     tree, reason = problem.ties[parameter.name], f"tied to {parameter.tied}"
-    value, slope = _tied(problem, tree, known.theta, known.scale)
-    blind = known.null @ (slope * known.scale)
-    if np.linalg.norm(blind) > _BLIND * np.linalg.norm(slope * known.scale):
+    value, slope = _linearise_tie(problem, tree, known.theta, known.scale)
+    blind = known.null_directions @ (slope * known.scale)
+    if np.linalg.norm(blind) > _NULL_SHARE * np.linalg.norm(slope * known.scale):
         why = known.reason or "the data do not tell what it is tied to"
-        return _estimate(parameter, value, None, 0.0, "tied", f"{reason}; {why}")
+        return _make_estimate(parameter, value, None, 0.0, "tied", f"{reason}; {why}")
     error = sqrt(max(float(slope @ known.covariance @ slope), 0.0))
-    quantile = float(np.max(known.quantile[slope != 0.0], initial=0.0))
-    return _estimate(parameter, value, error, quantile, "tied", reason)
+    quantile = float(np.max(known.t_quantile[slope != 0.0], initial=0.0))
+    return _make_estimate(parameter, value, error, quantile, "tied", reason)
 
 
-def _tied(
+def _linearise_tie(
     problem: Problem, tree: Expression, theta: FloatArray, scale: FloatArray
 ) -> tuple[float, FloatArray]:
     """Value of a tied parameter, and its slopes in the free ones by central differences."""
@@ -90,16 +95,22 @@ def _tied(
     def at(place: FloatArray) -> float:
         return worth(tree, {**given, **dict(zip(problem.free_names, place.tolist(), strict=True))})
 
-    steps = np.diag(_STEP * scale)
+    steps = np.diag(_TIE_STEP * scale)
     slope = [(at(theta + one) - at(theta - one)) / (2.0 * one.sum()) for one in steps]
     return at(theta), np.array(slope)
 
 
-def _reason(name: str, status: EstimateStatus, blind: bool, groups: tuple[Group, ...]) -> str:
+def _explain_status(
+    name: str, status: EstimateStatus, blind: bool, groups: tuple[IdentifiableCombination, ...]
+) -> str:
     """Why there is no standard error, or what to think of it."""
     if status == "group":
         told = [group.expression for group in groups if name in group.members]
-        others = f": {', '.join(told[:_TOLD])}{', …' if len(told) > _TOLD else ''}" if told else ""
+        others = (
+            f": {', '.join(told[:_MAX_NAMED_GROUPS])}{', …' if len(told) > _MAX_NAMED_GROUPS else ''}"
+            if told
+            else ""
+        )
         if blind:
             return f"only a combination with other parameters has an effect on the output{others}"
         return f"the data say little of it apart from a combination with other parameters{others}"
@@ -111,7 +122,7 @@ def _reason(name: str, status: EstimateStatus, blind: bool, groups: tuple[Group,
     }.get(status, "")
 
 
-def _estimate(
+def _make_estimate(
     parameter: Parameter, value: float, stderr: float | None, quantile: float,
     status: EstimateStatus, reason: str,
 ) -> Estimate:  # fmt: skip

@@ -8,11 +8,11 @@ from sysid.core.linear_algebra import truncated_svd
 from sysid.core.types import BoolArray, FloatArray
 from sysid.simulation.scaling import is_at_bounds
 
-_STREAM = 2**63
+_RANDOM_STREAM = 2**63
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Linear:
+class LinearOutputModel:
     """The sum of squares that linear outputs would have around an estimate.
 
     A parameter on a plateau is held: from plateau to plateau the outputs are no line.
@@ -32,20 +32,20 @@ class Linear:
     """
 
     covariance: FloatArray
-    root: FloatArray
-    slope: FloatArray
-    error: float
-    share: FloatArray
+    information_root: FloatArray
+    outward_slope: FloatArray
+    sum_of_squares: float
+    variance_ratio: FloatArray
 
-    def excess(self, moves: FloatArray) -> FloatArray:
+    def predict_relative_increase(self, moves: FloatArray) -> FloatArray:
         """By what part of itself the sum grows for moves (P, D) of the parameters, (P,)."""
-        turned = moves @ self.root.T
-        gains = np.einsum("pk,pk->p", turned, turned) + 2.0 * moves @ self.slope
+        turned = moves @ self.information_root.T
+        gains = np.einsum("pk,pk->p", turned, turned) + 2.0 * moves @ self.outward_slope
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(gains / self.error)
+            return np.asarray(gains / self.sum_of_squares)
 
 
-def drawn_along(covariance: FloatArray) -> FloatArray:
+def factor_covariance(covariance: FloatArray) -> FloatArray:
     """R (D, D) of RRᵀ, the covariance: R times standard normal numbers are moves with it.
 
     By the eigenvalues of the correlation: of parameters whose units differ by many decades those
@@ -57,18 +57,18 @@ def drawn_along(covariance: FloatArray) -> FloatArray:
     return np.asarray(deviation[:, None] * rows * np.sqrt(np.maximum(size, 0.0)))
 
 
-def moves_of(seed: int) -> np.random.Generator:
+def make_move_generator(seed: int) -> np.random.Generator:
     """Numbers for moves around an estimate: others than those that noise of that seed is made of.
 
     `sysid.data.noise` numbers its streams by channels.
     """
-    return np.random.Generator(np.random.Philox(key=[seed, _STREAM]))
+    return np.random.Generator(np.random.Philox(key=[seed, _RANDOM_STREAM]))
 
 
-def linear_model(
+def linearise_outputs(
     error: FloatArray, columns: FloatArray, held: BoolArray, place: FloatArray,
     stated: FloatArray, scale: FloatArray, inverse: FloatArray, root: FloatArray,
-) -> Linear:  # fmt: skip
+) -> LinearOutputModel:  # fmt: skip
     """The linear model in the parameters' units.
 
     Parameters
@@ -96,20 +96,20 @@ def linear_model(
     white = variance * np.diag(inverse)
     slope = np.where(held, 0.0, columns.T @ error)
     if held.any():
-        inverse, root = _without(root, held)
+        inverse, root = _remove_parameters(root, held)
     at_lower, at_upper = is_at_bounds(place)
     leads_out = (at_lower & (slope > 0)) | (at_upper & (slope < 0))
     unit = np.where(scale > 0, scale, 1.0)
-    return Linear(
+    return LinearOutputModel(
         covariance=variance * inverse * np.outer(scale, scale),
-        root=root / unit,
-        slope=np.where(leads_out, slope, 0.0) / unit,
-        error=total,
-        share=np.where(told, white, np.nan) / np.where(told, stated, 1.0),
+        information_root=root / unit,
+        outward_slope=np.where(leads_out, slope, 0.0) / unit,
+        sum_of_squares=total,
+        variance_ratio=np.where(told, white, np.nan) / np.where(told, stated, 1.0),
     )
 
 
-def _without(root: FloatArray, held: BoolArray) -> tuple[FloatArray, FloatArray]:
+def _remove_parameters(root: FloatArray, held: BoolArray) -> tuple[FloatArray, FloatArray]:
     """The same without the parameters held."""
     root = np.where(held, 0.0, root)
     _, singular, rows, kept = truncated_svd(root)

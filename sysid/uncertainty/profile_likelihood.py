@@ -23,24 +23,26 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sysid.core.errors import InvalidRecord, InvalidSettings, nearest
+from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
 from sysid.core.types import FloatArray
-from sysid.identifiability.exchange import Exchanges, exchanges, ordered
-from sysid.residuals.coloured import QUANTILE
-from sysid.residuals.correlated_outputs import coloured_jointly
-from sysid.search.refine import Refined, refine
+from sysid.identifiability.exchange import ExchangeGroups, find_exchanges, order_exchangeable
+from sysid.residuals.coloured import CHI_SQUARE_95
+from sysid.residuals.correlated_outputs import estimate_joint_covariance
+from sysid.search.refine import RefinedCandidate, refine_candidates
 from sysid.simulation.loss import compute_influence
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import located, placed
-from sysid.uncertainty.sensitivities import sensitivities
+from sysid.simulation.scaling import from_unit, to_unit
+from sysid.uncertainty.sensitivities import compute_sensitivities
 
-_SPAN = 1.5  # of the half width that the covariance promises: where the outermost value lies
-_BEYOND = 1.3  # growth of a step that does not reach the threshold, and how often
-_MOST, _LEAST = 40, 3
-_EXACT = 1e-9  # of the outputs' size: residuals that are rounding
-_ALONE = 1e-14  # of the square of a slope: below, nothing of it is the parameter's own
-_SLIT = 1e-6  # of the range: what is left to a parameter that another one holds at its bound
-_ROOTS = 6  # halvings of the gap in which the ratio crosses the threshold
+_SPAN_FACTOR = 1.5  # of the half width that the covariance promises: where the outermost value lies
+_STEP_GROWTH = 1.3  # growth of a step that does not reach the threshold, and how often
+_MAX_STEPS, _MIN_POINTS = 40, 3
+_ROUNDING_RMS = 1e-9  # of the outputs' size: residuals that are rounding
+_OWN_SLOPE_TOLERANCE = (
+    1e-14  # of the square of a slope: below, nothing of it is the parameter's own
+)
+_MIN_RANGE = 1e-6  # of the range: what is left to a parameter that another one holds at its bound
+_MAX_BISECTIONS = 6  # halvings of the gap in which the ratio crosses the threshold
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +72,7 @@ class Profile:
     name: str
     unit: str
     values: FloatArray
-    ratio: FloatArray
+    likelihood_ratio: FloatArray
     rms: FloatArray
     others: FloatArray
     interval: tuple[float | None, float | None]
@@ -79,7 +81,7 @@ class Profile:
     is_complete: bool
 
 
-def profile(
+def compute_profile(
     problem: Problem,
     theta: FloatArray,
     name: str,
@@ -105,47 +107,49 @@ def profile(
     """
     names = problem.free_names
     if name not in names:
-        raise InvalidSettings("/parameters", f"no free parameter {name!r}{nearest(name, names)}")
+        raise InvalidSettings(
+            "/parameters", f"no free parameter {name!r}{suggest_name(name, names)}"
+        )
     if problem.loss.noise_model == "ar1":
         raise InvalidSettings(
             "/loss/noise_model",
             f"profiles are of plain squares, not of those under {problem.loss.noise_model}; fit "
             "with the noise model 'white', or use the standard errors",
         )
-    if points < _LEAST:
-        raise InvalidSettings("/points", f"found {points}; need {_LEAST} or more")
-    best = _best(problem, np.array(theta, dtype=np.float64))
-    groups, spent = exchanges(problem, best.theta)
-    here = ordered(problem, best.theta, groups)
-    walk = _Walk(problem, here, names.index(name), groups, should_stop)
+    if points < _MIN_POINTS:
+        raise InvalidSettings("/points", f"found {points}; need {_MIN_POINTS} or more")
+    best = _refine_estimate(problem, np.array(theta, dtype=np.float64))
+    groups, spent = find_exchanges(problem, best.theta)
+    here = order_exchangeable(problem, best.theta, groups)
+    walk = _ProfileSearch(problem, here, names.index(name), groups, should_stop)
     walk.evaluations += best.evaluations + spent
-    step = _SPAN * walk.half_width / (points // 2)
-    walk.go(-step, points // 2)
-    walk.go(step, points // 2)
-    low, high = walk.end(-1.0), walk.end(1.0)
-    return walk.told(low, high)
+    step = _SPAN_FACTOR * walk.half_width / (points // 2)
+    walk.extend_side(-step, points // 2)
+    walk.extend_side(step, points // 2)
+    low, high = walk.find_interval_end(-1.0), walk.find_interval_end(1.0)
+    return walk.to_profile(low, high)
 
 
-def _best(problem: Problem, theta: FloatArray) -> Refined:
+def _refine_estimate(problem: Problem, theta: FloatArray) -> RefinedCandidate:
     """The optimum beside an estimate, if intervals can be measured from it."""
-    samples, free = problem.n_scored, len(problem.space)
+    samples, free = problem.n_scored, len(problem.free_parameters)
     if samples <= free:
         raise InvalidRecord(f"{samples} samples are not more than {free} parameters; need more")
-    found = refine(problem, [theta])[0]
+    found = refine_candidates(problem, [theta])[0]
     if found is None:
         raise InvalidRecord("the simulation diverges at the estimate, so it has no profile")
-    if found.rms <= _EXACT * problem.output_scale:
+    if found.rms <= _ROUNDING_RMS * problem.output_scale:
         raise InvalidRecord(
             "the simulation equals the records but for rounding; a profile needs residuals"
         )
     return found
 
 
-class _Walk:
+class _ProfileSearch:
     """Values of one parameter, as places in [0, 1], with the others estimated anew at each."""
 
     def __init__(
-        self, problem: Problem, theta: FloatArray, d: int, groups: Exchanges,
+        self, problem: Problem, theta: FloatArray, d: int, groups: ExchangeGroups,
         should_stop: Callable[[], bool] | None,
     ) -> None:  # fmt: skip
         self._problem, self._d, self._should_stop = problem, d, should_stop
@@ -153,56 +157,61 @@ class _Walk:
         beside = [(i, theta[i] - theta[d] or d - i) for one in columns for i in one if i != d]
         self._larger = [i for i, above in beside if above > 0]
         self._smaller = [i for i, above in beside if above < 0]
-        self.stopped, self.evaluations = False, 1
-        self._place = float(placed(problem.evaluator, theta[None])[0, d])
-        rms = float(problem.fitness(theta[None])[0])
-        self._known = {self._place: (theta, rms)}
-        self.half_width = self._half_width(theta)
+        self.is_stopped, self.evaluations = False, 1
+        self._place = float(to_unit(problem.evaluator, theta[None])[0, d])
+        rms = float(problem.evaluate_fitness(theta[None])[0])
+        self._fits = {self._place: (theta, rms)}
+        self.half_width = self._predict_half_width(theta)
 
-    def go(self, step: float, count: int) -> None:
+    def extend_side(self, step: float, count: int) -> None:
         """Walk from the estimate to one side, until the threshold is passed or a bound is met."""
         place, taken = self._place, 0
-        while taken < _MOST and not self._is_over(place, taken, count):
+        while taken < _MAX_STEPS and not self._is_side_complete(place, taken, count):
             nearer, place = place, min(max(place + step, 0.0), 1.0)
             if place == nearer:
                 return  # at the bound
-            self._try(place, nearer)
+            self._fit_others(place, nearer)
             taken += 1
-            step *= _BEYOND if taken >= count else 1.0
+            step *= _STEP_GROWTH if taken >= count else 1.0
 
-    def end(self, side: float) -> float | None:
+    def find_interval_end(self, side: float) -> float | None:
         """Place at which the ratio crosses the threshold; None if it does not."""
-        inside = min(self._known, key=lambda place: self._known[place][1])
-        places = sorted((p for p in self._known if side * (p - inside) > 0), key=lambda p: side * p)
+        inside = min(self._fits, key=lambda place: self._fits[place][1])
+        places = sorted((p for p in self._fits if side * (p - inside) > 0), key=lambda p: side * p)
         for outside in places:
-            if self._ratio(outside) >= QUANTILE:
-                return self._crossing(inside, outside)
+            if self._compute_ratio(outside) >= CHI_SQUARE_95:
+                return self._find_crossing(inside, outside)
             inside = outside
         return None
 
-    def told(self, low: float | None, high: float | None) -> Profile:
+    def to_profile(self, low: float | None, high: float | None) -> Profile:
         """What was found, in the parameter's unit."""
-        parameter = self._problem.space[self._d]
-        order = sorted(self._known)
-        found = np.array([self._known[place][0] for place in order])
-        best = min(self._known, key=lambda place: self._known[place][1])
-        low_, high_ = (None if end is None else self._value(end) for end in (low, high))
+        parameter = self._problem.free_parameters[self._d]
+        order = sorted(self._fits)
+        found = np.array([self._fits[place][0] for place in order])
+        best = min(self._fits, key=lambda place: self._fits[place][1])
+        low_, high_ = (
+            None if end is None else self._to_parameter_value(end) for end in (low, high)
+        )
         return Profile(
             name=parameter.name,
             unit=parameter.unit,
             values=found[:, self._d],
-            ratio=np.array([self._ratio(place) for place in order]),
-            rms=np.array([self._known[place][1] for place in order]),
+            likelihood_ratio=np.array([self._compute_ratio(place) for place in order]),
+            rms=np.array([self._fits[place][1] for place in order]),
             others=np.delete(found, self._d, axis=1),
             interval=(low_, high_),
-            estimate=self._value(best),
+            estimate=self._to_parameter_value(best),
             evaluations=self.evaluations,
-            is_complete=not self.stopped,
+            is_complete=not self.is_stopped,
         )
 
-    def _half_width(self, theta: FloatArray) -> float:
+    def _predict_half_width(self, theta: FloatArray) -> float:
         """What the covariance promises, at most the range and at least what can be told apart."""
-        columns, error = (sensed := sensitivities(self._problem, theta)).columns, sensed.error
+        columns, error = (
+            (sensed := compute_sensitivities(self._problem, theta)).columns,
+            sensed.residuals,
+        )
         self.evaluations += sensed.evaluations
         direction = np.zeros(columns.shape[1])
         direction[self._d] = 1.0
@@ -213,45 +222,45 @@ class _Walk:
         own = columns @ direction
         # What the others make up for but for rounding has no direction of its own.
         norm = float(own @ own)
-        if norm <= _ALONE * float(columns[:, self._d] @ columns[:, self._d]):
+        if norm <= _OWN_SLOPE_TOLERANCE * float(columns[:, self._d] @ columns[:, self._d]):
             norm = 0.0
-        self._factor = self._scaling(error, columns, direction, norm)
+        self._factor = self._compute_ratio_scale(error, columns, direction, norm)
         spread = float(np.linalg.norm(error)) / np.sqrt(max(error.size - columns.shape[1], 1))
-        wide = np.sqrt(QUANTILE / (norm * self._factor)) * spread if norm > 0 else 1.0
+        wide = np.sqrt(CHI_SQUARE_95 / (norm * self._factor)) * spread if norm > 0 else 1.0
         return float(min(max(wide, 1e-9), 1.0))
 
-    def _scaling(
+    def _compute_ratio_scale(
         self, error: FloatArray, columns: FloatArray, direction: FloatArray, norm: float
     ) -> float:
         """What makes n ln(R/R₀) a ratio of χ², also where the residuals are coloured."""
         scale = self._problem.loss_scale
         seen = compute_influence(error, scale)
-        colour = coloured_jointly(self._problem, seen, columns)
-        factor = _factor(error, scale)
+        colour = estimate_joint_covariance(self._problem, seen, columns)
+        factor = _compute_robust_factor(error, scale)
         if colour is None or not norm > 0:
             return factor
-        return factor / colour.widening(direction, float(np.mean(np.square(seen))), norm)
+        return factor / colour.compute_widening(direction, float(np.mean(np.square(seen))), norm)
 
-    def _is_over(self, place: float, taken: int, count: int) -> bool:
-        self.stopped = self.stopped or bool(self._should_stop and self._should_stop())
-        return self.stopped or (taken >= count and self._ratio(place) > QUANTILE)
+    def _is_side_complete(self, place: float, taken: int, count: int) -> bool:
+        self.is_stopped = self.is_stopped or bool(self._should_stop and self._should_stop())
+        return self.is_stopped or (taken >= count and self._compute_ratio(place) > CHI_SQUARE_95)
 
-    def _try(self, place: float, nearer: float) -> None:
+    def _fit_others(self, place: float, nearer: float) -> None:
         """Estimate the others at a place, beginning with what they were at a nearer one."""
-        d, start = self._d, self._known[nearer][0].copy()
-        start[d] = self._value(place)
-        held = _holding(self._in_order(float(start[d])), d, float(start[d]))
+        d, start = self._d, self._fits[nearer][0].copy()
+        start[d] = self._to_parameter_value(place)
+        held = _fix_parameter(self._restrict_exchanges(float(start[d])), d, float(start[d]))
         rest = np.clip(np.delete(start, d), held.evaluator.lower, held.evaluator.upper)
-        rms = float(held.fitness(rest[None])[0])
+        rms = float(held.evaluate_fitness(rest[None])[0])
         self.evaluations += 1
         if rest.size:
-            end = refine(held, [rest])[0]
+            end = refine_candidates(held, [rest])[0]
             if end is not None:
                 rest, rms = end.theta, end.rms
                 self.evaluations += end.evaluations
-        self._known[place] = (np.insert(rest, d, start[d]), rms)
+        self._fits[place] = (np.insert(rest, d, start[d]), rms)
 
-    def _in_order(self, value: float) -> Problem:
+    def _restrict_exchanges(self, value: float) -> Problem:
         """The problem with what can be exchanged with the parameter on its side of a value.
 
         Beyond, the profile would be that of the other copy of the estimate.
@@ -260,49 +269,49 @@ class _Walk:
             return self._problem
         evaluator = self._problem.evaluator
         lower, upper = evaluator.lower.copy(), evaluator.upper.copy()
-        least = _SLIT * (upper - lower)
+        least = _MIN_RANGE * (upper - lower)
         for i in self._larger:
             lower[i] = min(max(lower[i], value), upper[i] - least[i])
         for i in self._smaller:
             upper[i] = max(min(upper[i], value), lower[i] + least[i])
         return replace(self._problem, evaluator=evaluator._replace(lower=lower, upper=upper))
 
-    def _crossing(self, inside: float, outside: float) -> float:
+    def _find_crossing(self, inside: float, outside: float) -> float:
         """Where the ratio, nearly a parabola, reaches the threshold."""
-        for _ in range(_ROOTS):
-            if self.stopped or abs(outside - inside) < 1e-3 * self.half_width:
+        for _ in range(_MAX_BISECTIONS):
+            if self.is_stopped or abs(outside - inside) < 1e-3 * self.half_width:
                 break
-            middle = self._between(inside, outside)
-            nearer = min(self._known, key=lambda p: abs(p - middle))
-            if middle in self._known:
+            middle = self._interpolate_crossing(inside, outside)
+            nearer = min(self._fits, key=lambda p: abs(p - middle))
+            if middle in self._fits:
                 break
-            self._try(middle, nearer)
-            if self._ratio(middle) >= QUANTILE:
+            self._fit_others(middle, nearer)
+            if self._compute_ratio(middle) >= CHI_SQUARE_95:
                 outside = middle
             else:
                 inside = middle
-        return self._between(inside, outside)
+        return self._interpolate_crossing(inside, outside)
 
-    def _between(self, inside: float, outside: float) -> float:
-        a, b = (np.sqrt(min(self._ratio(p), 1e12)) for p in (inside, outside))
-        share = (np.sqrt(QUANTILE) - a) / (b - a) if b > a else 0.5
+    def _interpolate_crossing(self, inside: float, outside: float) -> float:
+        a, b = (np.sqrt(min(self._compute_ratio(p), 1e12)) for p in (inside, outside))
+        share = (np.sqrt(CHI_SQUARE_95) - a) / (b - a) if b > a else 0.5
         return float(inside + min(max(share, 0.02), 0.98) * (outside - inside))
 
-    def _ratio(self, place: float) -> float:
-        best = min(rms for _, rms in self._known.values())
-        rms = self._known[place][1]
+    def _compute_ratio(self, place: float) -> float:
+        best = min(rms for _, rms in self._fits.values())
+        rms = self._fits[place][1]
         if rms == best:
             return 0.0
         return 2.0 * self._factor * self._problem.n_scored * float(np.log(rms / best))
 
-    def _value(self, place: float) -> float:
-        if place in self._known:
-            return float(self._known[place][0][self._d])
-        every = np.full((1, len(self._problem.space)), place)
-        return float(located(self._problem.evaluator, every)[0, self._d])
+    def _to_parameter_value(self, place: float) -> float:
+        if place in self._fits:
+            return float(self._fits[place][0][self._d])
+        every = np.full((1, len(self._problem.free_parameters)), place)
+        return float(from_unit(self._problem.evaluator, every)[0, self._d])
 
 
-def _factor(error: FloatArray, scale: float) -> float:
+def _compute_robust_factor(error: FloatArray, scale: float) -> float:
     """What makes n ln(R/R₀) a ratio of χ²: 1 for squares."""
     if scale == 0.0:
         return 1.0
@@ -311,14 +320,14 @@ def _factor(error: FloatArray, scale: float) -> float:
     return least * float(np.mean(root**-1.5)) / float(np.mean(error**2 / root))
 
 
-def _holding(problem: Problem, d: int, value: float) -> Problem:
+def _fix_parameter(problem: Problem, d: int, value: float) -> Problem:
     """The problem with one free parameter held at a value; nothing else changes."""
     old = problem.evaluator
     template = old.template.copy()
-    template[old.rows[d]] = value
+    template[old.free_rows[d]] = value
     evaluator = old._replace(
-        template=template, rows=np.delete(old.rows, d), lower=np.delete(old.lower, d),
-        upper=np.delete(old.upper, d), log=np.delete(old.log, d),
+        template=template, free_rows=np.delete(old.free_rows, d), lower=np.delete(old.lower, d),
+        upper=np.delete(old.upper, d), is_log=np.delete(old.is_log, d),
     )  # fmt: skip
-    space = (*problem.space[:d], *problem.space[d + 1 :])
-    return replace(problem, space=space, evaluator=evaluator)
+    space = (*problem.free_parameters[:d], *problem.free_parameters[d + 1 :])
+    return replace(problem, free_parameters=space, evaluator=evaluator)

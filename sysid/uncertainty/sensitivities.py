@@ -15,15 +15,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.types import BoolArray, FloatArray, IntArray
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import located, placed
+from sysid.simulation.scaling import from_unit, to_unit
 
-_DIFFERENCE = 1e-5  # of the range
-_ALIKE = 0.1  # of a slope: two that differ by less do not straddle a jump
-_EDGES = np.array([1e-6, _DIFFERENCE, 1e-4, 1e-3, 1e-2])  # of segments, of the range
-_GROWTH, _LARGEST = 4.0, 0.7  # of the step of the search for a jump; the largest, of the range
+_DIFFERENCE_STEP = 1e-5  # of the range
+_SLOPE_AGREEMENT = 0.1  # of a slope: two that differ by less do not straddle a jump
+_SEGMENT_EDGES = np.array([1e-6, _DIFFERENCE_STEP, 1e-4, 1e-3, 1e-2])  # of segments, of the range
+_STEP_GROWTH, _MAX_STEP = (
+    4.0,
+    0.7,
+)  # of the step of the search for a jump; the largest, of the range
 _HALVINGS = 6  # a jump's place is then known to about 1 % of its distance
 
 
@@ -44,11 +47,11 @@ class Sensitivities(NamedTuple):
     evaluations : int
     """
 
-    error: FloatArray
+    residuals: FloatArray
     columns: FloatArray
-    plateau: FloatArray
+    plateau_width: FloatArray
     one_sided: BoolArray
-    middle: FloatArray
+    plateau_offset: FloatArray
     evaluations: int
 
 
@@ -60,10 +63,12 @@ class BudgetSpentError(Exception):
 
     def __init__(self, evaluations: int, error: FloatArray | None) -> None:
         super().__init__(f"{evaluations} simulations were not enough")
-        self.evaluations, self.error = evaluations, error
+        self.evaluations, self.residuals = evaluations, error
 
 
-def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) -> Sensitivities:
+def compute_sensitivities(
+    problem: Problem, theta: FloatArray, most: int | None = None
+) -> Sensitivities:
     """Central differences at an estimate (D,); beside a bound one-sided.
 
     Raises
@@ -71,20 +76,22 @@ def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) 
     BudgetSpentError
         If they take more than `most` simulations.
     """
-    probe = _Probe(problem, theta, most)
+    probe = _OutputProbe(problem, theta, most)
     d = probe.place.size
     plateau, middle = np.zeros(d), np.zeros(d)
     one_sided = np.zeros(d, dtype=np.bool_)
     both = np.arange(2 * d)
-    steps, beside = probe.at(both % d, np.where(both < d, -_DIFFERENCE, _DIFFERENCE))
-    columns, moves, differ = _central(probe.predicted, steps, beside)
+    steps, beside = probe.simulate_steps(
+        both % d, np.where(both < d, -_DIFFERENCE_STEP, _DIFFERENCE_STEP)
+    )
+    columns, moves, differ = _compute_central_differences(probe.predicted, steps, beside)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for d in np.flatnonzero(moves & differ).tolist():
-            columns[:, d] = _slope_beside_jumps(probe, d)
+            columns[:, d] = _estimate_slope_near_jumps(probe, d)
         jumping = np.flatnonzero(~moves)
         if jumping.size:
-            down, below = probe.jumps(jumping, -1.0)
-            up, above = probe.jumps(jumping, 1.0)
+            down, below = probe.find_jumps(jumping, -1.0)
+            up, above = probe.find_jumps(jumping, 1.0)
             both = np.isfinite(down) & np.isfinite(up)
             width = np.where(both, up + down, 0.0)
             plateau[jumping], one_sided[jumping] = width, np.isfinite(down) != np.isfinite(up)
@@ -92,12 +99,12 @@ def sensitivities(problem: Problem, theta: FloatArray, most: int | None = None) 
             steps = np.where(both, 2.0 * width, np.inf)
             columns[:, jumping] = np.where(both, (above - below) / steps, 0.0)
         columns = probe.weight[:, None] * np.where(np.isfinite(columns), columns, 0.0)
-        error = probe.error
+        error = probe.residuals
     return Sensitivities(error, columns, plateau, one_sided, middle, probe.evaluations)
 
 
-@compiled
-def _central(
+@jit_compile
+def _compute_central_differences(
     here: FloatArray, steps: FloatArray, beside: FloatArray
 ) -> tuple[FloatArray, BoolArray, BoolArray]:
     """Central differences (n, D); whether the output moves on both sides at once, whether unlike.
@@ -120,28 +127,30 @@ def _central(
             down, up = (here[i] - below) / -low, (above - here[i]) / high
             left, right, apart = left + down**2, right + up**2, apart + (up - down) ** 2
         moves[j] = falls and rises
-        differ[j] = not apart <= _ALIKE**2 * min(left, right)  # also where there is one side only
+        differ[j] = not apart <= _SLOPE_AGREEMENT**2 * min(
+            left, right
+        )  # also where there is one side only
         if moves[j]:
             for i in range(here.size):
                 slopes[i, j] = (beside[i, d + j] - beside[i, j]) / (high - low)
     return slopes, moves, differ
 
 
-def _slope_beside_jumps(probe: "_Probe", d: int) -> FloatArray:
+def _estimate_slope_near_jumps(probe: "_OutputProbe", d: int) -> FloatArray:
     """Slope (n,) in one parameter: the mean of those sides of the estimate that show one."""
-    sides = [_slope_of_side(probe, d, side) for side in (-1.0, 1.0)]
+    sides = [_estimate_side_slope(probe, d, side) for side in (-1.0, 1.0)]
     best = min(doubt for doubt, _ in sides)
-    kept = [slope for doubt, slope in sides if doubt <= max(best, _ALIKE)]
+    kept = [slope for doubt, slope in sides if doubt <= max(best, _SLOPE_AGREEMENT)]
     return np.asarray(np.mean(kept, axis=0))
 
 
-def _slope_of_side(probe: "_Probe", d: int, side: float) -> tuple[float, FloatArray]:
+def _estimate_side_slope(probe: "_OutputProbe", d: int, side: float) -> tuple[float, FloatArray]:
     """How far the two neighbouring segments that agree best differ, and their slope (n,)."""
     room = 1.0 - probe.place[d] if side > 0 else probe.place[d]
-    ends = side * _EDGES[room >= _EDGES]
+    ends = side * _SEGMENT_EDGES[room >= _SEGMENT_EDGES]
     if ends.size < 2:
         return np.inf, np.zeros(probe.predicted.size)
-    steps, outputs = probe.at(np.full(ends.size, d), ends)
+    steps, outputs = probe.simulate_steps(np.full(ends.size, d), ends)
     lengths = np.diff(steps, prepend=0.0)
     slopes = (np.diff(outputs, prepend=probe.predicted[:, None]) / lengths).T
     sizes = np.linalg.norm(slopes, axis=1)
@@ -151,52 +160,52 @@ def _slope_of_side(probe: "_Probe", d: int, side: float) -> tuple[float, FloatAr
     return float(doubt[best]), slopes[best + 1]
 
 
-class _Probe:
+class _OutputProbe:
     """The scored output beside an estimate, one parameter moved at a time."""
 
     def __init__(self, problem: Problem, theta: FloatArray, most: int | None) -> None:
         if most is not None and most < 1:
             raise BudgetSpentError(0, None)
         self._problem, self._most = problem, most
-        self.weight = problem.evaluator.weight[problem.scored]
-        self.measured = problem.evaluator.measured[problem.scored]
-        self.place = placed(problem.evaluator, theta[None])[0]
-        self.predicted = problem.predictions(theta[None])[0][problem.scored]
+        self.weight = problem.evaluator.weight[problem.scored_rows]
+        self.measured = problem.evaluator.measured[problem.scored_rows]
+        self.place = to_unit(problem.evaluator, theta[None])[0]
+        self.predicted = problem.predict(theta[None])[0][problem.scored_rows]
         self.evaluations = 1
 
     @property
-    def error(self) -> FloatArray:
+    def residuals(self) -> FloatArray:
         """Weighted residuals (n,) at the estimate."""
         return np.asarray(self.weight * (self.predicted - self.measured))
 
-    def at(self, which: IntArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def simulate_steps(self, which: IntArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Steps taken, cut off at the bounds, and the outputs there: (n, number of `which`)."""
         if self._most is not None and self.evaluations + which.size > self._most:
-            raise BudgetSpentError(self.evaluations, self.error)
+            raise BudgetSpentError(self.evaluations, self.residuals)
         moved = np.clip(self.place[which] + steps, 0.0, 1.0)
         around = np.repeat(self.place[None], which.size, axis=0)
         around[np.arange(which.size), which] = moved
-        predicted = self._problem.predictions(located(self._problem.evaluator, around))
+        predicted = self._problem.predict(from_unit(self._problem.evaluator, around))
         self.evaluations += which.size
-        scored = predicted[:, self._problem.scored]
+        scored = predicted[:, self._problem.scored_rows]
         return moved - self.place[which], np.ascontiguousarray(scored.T)
 
-    def jumps(self, which: IntArray, side: float) -> tuple[FloatArray, FloatArray]:
+    def find_jumps(self, which: IntArray, side: float) -> tuple[FloatArray, FloatArray]:
         """Distance of each parameter's nearest jump on one side, and the outputs beyond it.
 
         The distance is infinite where there is none.
         """
         near, far = np.zeros(which.size), np.full(which.size, np.inf)
         beyond = np.repeat(self.predicted[:, None], which.size, axis=1)
-        step = _DIFFERENCE
-        while step < _LARGEST and np.any(np.isinf(far)):
-            self._try(which, side, np.full(which.size, step), near, far, beyond)
-            step *= _GROWTH
+        step = _DIFFERENCE_STEP
+        while step < _MAX_STEP and np.any(np.isinf(far)):
+            self._narrow_jumps(which, side, np.full(which.size, step), near, far, beyond)
+            step *= _STEP_GROWTH
         for _ in range(_HALVINGS):
-            self._try(which, side, 0.5 * (near + far), near, far, beyond)
+            self._narrow_jumps(which, side, 0.5 * (near + far), near, far, beyond)
         return far, beyond
 
-    def _try(
+    def _narrow_jumps(
         self, which: IntArray, side: float, steps: FloatArray,
         near: FloatArray, far: FloatArray, beyond: FloatArray,
     ) -> None:  # fmt: skip
@@ -204,7 +213,7 @@ class _Probe:
         open_ = np.flatnonzero((near < steps) & (steps < far))
         if open_.size == 0:
             return
-        taken, predicted = self.at(which[open_], side * steps[open_])
+        taken, predicted = self.simulate_steps(which[open_], side * steps[open_])
         moved = np.any(predicted != self.predicted[:, None], axis=0)
         far[open_[moved]] = np.abs(taken[moved])
         beyond[:, open_[moved]] = predicted[:, moved]

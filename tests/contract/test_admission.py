@@ -1,10 +1,11 @@
 """Which waiting job is next, and how much a project may have unfinished; on both databases."""
 
-from service.queue.admission import Admission, Unfinished, unfinished
-from service.queue.leases import Queue
-from service.queue.notifications import look
+from service.core.states import JobState
+from service.queue.admission import Admission, UnfinishedWork, count_unfinished
+from service.queue.leases import LeaseQueue
+from service.queue.notifications import read_queue_status
 from service.repositories.jobs import JobRepository, NewJob
-from service.storage.tables import Project, State
+from service.storage.tables import Project
 from tests.stored import claim, submit
 
 
@@ -19,7 +20,7 @@ def submit_for(database, project, **values):
 
 def claim_within(database, admission):
     with database.write() as session:
-        claimed = Queue(session).claim("d1", admission=admission)
+        claimed = LeaseQueue(session).claim_job("d1", admission=admission)
         return None if claimed is None else claimed.job.id
 
 
@@ -36,15 +37,15 @@ def test_a_priority_comes_before_the_projects_turn(database):
 
 
 def test_a_full_dispatcher_sees_and_takes_only_short_or_urgent_jobs(database):
-    full = Admission(most_runs=8, above=3)
+    full = Admission(max_runs=8, above_priority=3)
     sweep = submit(database, n_runs=9, priority=3)
     with database.read() as session:
-        assert not look(session, "d1", full).is_waiting
-        assert look(session, "d1").is_waiting
+        assert not read_queue_status(session, "d1", full).has_waiting_job
+        assert read_queue_status(session, "d1").has_waiting_job
     assert claim_within(database, full) is None
     short, urgent = submit(database, n_runs=8), submit(database, n_runs=100_000, priority=4)
     with database.read() as session:
-        assert look(session, "d1", full).is_waiting
+        assert read_queue_status(session, "d1", full).has_waiting_job
     assert [claim_within(database, full) for _ in range(3)] == [urgent, short, None]
     assert claim_within(database, None) == sweep
 
@@ -54,9 +55,9 @@ def test_unfinished_work_is_counted_by_project_and_only_while_it_is_open(databas
     submit_for(database, "a", n_runs=5)
     submit_for(database, "b", n_runs=7)
     with database.read() as session:
-        assert unfinished(session, "a") == Unfinished(2, 15)
-        assert unfinished(session, "nobody") == Unfinished(0, 0)
+        assert count_unfinished(session, "a") == UnfinishedWork(2, 15)
+        assert count_unfinished(session, "nobody") == UnfinishedWork(0, 0)
     with database.write() as session:
-        assert JobRepository(session, "a").cancel(first).state is State.CANCELLED
+        assert JobRepository(session, "a").cancel(first).state is JobState.CANCELLED
     with database.read() as session:
-        assert unfinished(session, "a") == Unfinished(1, 5)
+        assert count_unfinished(session, "a") == UnfinishedWork(1, 5)

@@ -4,24 +4,24 @@ import threading
 
 import pytest
 
-from service.queue.leases import Queue
-from service.queue.run_writes import RunLedger, RunOutcome
+from service.core.states import JobState
+from service.queue.leases import LeaseQueue
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
-from service.storage.errors import Conflict, NotFound
-from service.storage.tables import State
+from service.storage.errors import RowConflict, RowNotFound
 from tests.stored import claim, claimed, job_of, runs_of, state_of, submit
 
 
 def finish(database, lease, state):
     with database.write() as session:
-        Queue(session).finish(lease, state)
+        LeaseQueue(session).finish_job(lease, state)
 
 
 def test_a_queued_job_is_cancelled_at_once(database):
     job_id = submit(database)
     with database.write() as session:
-        assert JobRepository(session).cancel(job_id).state is State.CANCELLED
+        assert JobRepository(session).cancel(job_id).state is JobState.CANCELLED
     assert claim(database) is None
 
 
@@ -29,25 +29,25 @@ def test_a_running_job_goes_on_until_its_dispatcher_cancels_it(database):
     got, _ = claimed(database)
     with database.write() as session:
         job = JobRepository(session).cancel(got.job.id)
-        assert (job.state, job.cancel_requested) == (State.RUNNING, True)
-    finish(database, got.lease, State.CANCELLED)
-    assert state_of(database, got.job.id) is State.CANCELLED
+        assert (job.state, job.cancel_requested) == (JobState.RUNNING, True)
+    finish(database, got.lease, JobState.CANCELLED)
+    assert state_of(database, got.job.id) is JobState.CANCELLED
 
 
 def test_cancelling_twice_is_as_cancelling_once(database):
     job_id = submit(database)
     for _ in range(2):
         with database.write() as session:
-            assert JobRepository(session).cancel(job_id).state is State.CANCELLED
+            assert JobRepository(session).cancel(job_id).state is JobState.CANCELLED
 
 
-@pytest.mark.parametrize("end", [State.SUCCEEDED, State.FAILED])
+@pytest.mark.parametrize("end", [JobState.SUCCEEDED, JobState.FAILED])
 def test_a_finished_job_cannot_be_cancelled(database, end):
     got, (run_id,) = claimed(database)
     with database.write() as session:
-        RunLedger(session, got.lease).record([RunOutcome(run_id=run_id, state=end)])
-        Queue(session).finish(got.lease, end)
-    with pytest.raises(Conflict, match=end.value), database.write() as session:
+        RunWriter(session, got.lease).record_outcomes([RunOutcome(run_id=run_id, state=end)])
+        LeaseQueue(session).finish_job(got.lease, end)
+    with pytest.raises(RowConflict, match=end.value), database.write() as session:
         JobRepository(session).cancel(got.job.id)
 
 
@@ -67,7 +67,7 @@ def test_cancel_and_claim_at_once_never_lose_the_wish(database):
         thread.join()
         job = job_of(database, job_id)
         assert job.cancel_requested
-        assert job.state is (State.RUNNING if got else State.CANCELLED)
+        assert job.state is (JobState.RUNNING if got else JobState.CANCELLED)
 
 
 def test_cancel_and_finish_at_once_end_in_one_state_and_one_end_event(database):
@@ -80,19 +80,21 @@ def test_cancel_and_finish_at_once_end_in_one_state_and_one_end_event(database):
             try:
                 with database.write() as session:
                     JobRepository(session).cancel(job_id)
-            except Conflict:
+            except RowConflict:
                 pass
 
         thread = threading.Thread(target=cancel)
         thread.start()
         start.wait()
         with database.write() as session:
-            RunLedger(session, got.lease).record([RunOutcome(run_id=run_id, state=State.SUCCEEDED)])
-            Queue(session).finish(got.lease, State.SUCCEEDED)
+            RunWriter(session, got.lease).record_outcomes(
+                [RunOutcome(run_id=run_id, state=JobState.SUCCEEDED)]
+            )
+            LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED)
         thread.join()
-        assert state_of(database, got.job.id) is State.SUCCEEDED
+        assert state_of(database, got.job.id) is JobState.SUCCEEDED
         with database.read() as session:
-            kinds = [event.kind for event in EventRepository(session).after(got.job.id)]
+            kinds = [event.kind for event in EventRepository(session).list_after(got.job.id)]
         assert kinds.count("end") == 1
         assert kinds[-1] == "end"
 
@@ -100,22 +102,22 @@ def test_cancel_and_finish_at_once_end_in_one_state_and_one_end_event(database):
 def test_a_resumed_job_runs_again_only_what_did_not_succeed(database):
     got, (done, bad, _) = claimed(database, n_runs=3)
     with database.write() as session:
-        RunLedger(session, got.lease).record(
-            [RunOutcome(run_id=done, state=State.SUCCEEDED, best_rms=0.1),
-             RunOutcome(run_id=bad, state=State.FAILED, error="diverged")]
+        RunWriter(session, got.lease).record_outcomes(
+            [RunOutcome(run_id=done, state=JobState.SUCCEEDED, best_rms=0.1),
+             RunOutcome(run_id=bad, state=JobState.FAILED, error="diverged")]
         )  # fmt: skip
-        Queue(session).finish(got.lease, State.FAILED, "1 run failed")
+        LeaseQueue(session).finish_job(got.lease, JobState.FAILED, "1 run failed")
     with database.write() as session:
         job = JobRepository(session).resume(got.job.id)
-        assert (job.state, job.n_done, job.n_failed, job.error) == (State.QUEUED, 1, 0, None)
+        assert (job.state, job.n_done, job.n_failed, job.error) == (JobState.QUEUED, 1, 0, None)
     states = [run.state for run in runs_of(database, got.job.id)]
-    assert states == [State.SUCCEEDED, State.QUEUED, State.QUEUED]
+    assert states == [JobState.SUCCEEDED, JobState.QUEUED, JobState.QUEUED]
     assert claim(database).lease.attempt == 2
 
 
 def test_only_a_failed_or_cancelled_job_can_be_resumed(database):
     job_id = submit(database)
-    with pytest.raises(Conflict, match="queued"), database.write() as session:
+    with pytest.raises(RowConflict, match="queued"), database.write() as session:
         JobRepository(session).resume(job_id)
-    with pytest.raises(NotFound), database.write() as session:
+    with pytest.raises(RowNotFound), database.write() as session:
         JobRepository(session).resume("job_none")

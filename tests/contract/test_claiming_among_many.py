@@ -6,14 +6,15 @@ from types import SimpleNamespace
 import pytest
 from sqlalchemy import Connection, Engine, event, insert, text
 
-from service.api.events import _look
+from service.api.events import _read_events
+from service.core.states import JobState
 from service.jobs.schemas import JobIn
 from service.queue.admission import Admission
-from service.queue.leases import Owners, Progress, Queue
-from service.queue.notifications import look
+from service.queue.leases import JobProgress, LeaseOwners, LeaseQueue
+from service.queue.notifications import read_queue_status
 from service.repositories.jobs import JobRepository
 from service.storage.columns import utc_now
-from service.storage.tables import Job, Project, State
+from service.storage.tables import Job, Project
 from tests.stored import claimed
 
 PROJECTS = [f"p{number}" for number in range(4)]
@@ -23,14 +24,18 @@ N_ENDED, N_QUEUED, N_RUNNING = 4000, 400, 128
 @pytest.fixture
 def crowded(database):
     """A database with thousands of ended jobs, hundreds of queued ones, and many that run."""
-    states = [State.SUCCEEDED] * N_ENDED + [State.QUEUED] * N_QUEUED + [State.RUNNING] * N_RUNNING
+    states = (
+        [JobState.SUCCEEDED] * N_ENDED
+        + [JobState.QUEUED] * N_QUEUED
+        + [JobState.RUNNING] * N_RUNNING
+    )
     until = utc_now() + timedelta(hours=1)
-    spec = JobIn.model_validate({"model": "tube", "datasets": ["ds_1"]}).normal_form()
+    spec = JobIn.model_validate({"model": "tube", "datasets": ["ds_1"]}).to_normal_form()
     rows = [
         {"id": f"job_{number:05d}", "project_id": PROJECTS[number % 3], "name": "j",
          "spec": spec, "n_runs": 1, "state": state, "priority": 0,
-         "lease_owner": "d1" if state is State.RUNNING else None,
-         "lease_until": until if state is State.RUNNING else None}
+         "lease_owner": "d1" if state is JobState.RUNNING else None,
+         "lease_until": until if state is JobState.RUNNING else None}
         for number, state in enumerate(states)
     ]  # fmt: skip
     with database.write() as session:
@@ -64,7 +69,7 @@ def plans_of(database, work) -> list[str]:
 
 def claim(database, admission=None):
     with database.write() as session:
-        return Queue(session).claim("d2", admission=admission)
+        return LeaseQueue(session).claim_job("d2", admission=admission)
 
 
 @pytest.mark.parametrize("admission", [None, Admission(8, 0)], ids=["all", "short"])
@@ -81,7 +86,7 @@ def test_a_claim_scans_no_table_and_counts_running_jobs_once(crowded, admission)
 def test_a_look_at_the_queue_scans_no_table(crowded) -> None:
     def work() -> None:
         with crowded.read() as session:
-            look(session, "d1")
+            read_queue_status(session, "d1")
 
     plans = plans_of(crowded, work)
     assert len(plans) == 2
@@ -103,7 +108,7 @@ def test_a_claim_reads_each_running_job_once_and_not_for_every_waiting_one(crowd
 
     with crowded.write() as session:
         session.connection().connection.driver_connection.set_progress_handler(count, 100)
-        assert Queue(session).claim("d2") is not None
+        assert LeaseQueue(session).claim_job("d2") is not None
         session.connection().connection.driver_connection.set_progress_handler(None, 0)
     assert 100 * steps < 100 * (N_QUEUED + N_RUNNING)
 
@@ -138,14 +143,14 @@ def test_a_job_that_is_held_told_of_reaped_or_watched_does_not_bring_its_specifi
 
     def work() -> None:
         with database.write() as session:
-            queue = Queue(session)
-            queue.hold(got.lease)
-            queue.report(got.lease, Progress(1))
-            queue.tell(got.lease, "log", {"message": "told"})
-            queue.reap(Owners(gone=frozenset({got.lease.owner})))
+            queue = LeaseQueue(session)
+            queue.lock_job(got.lease)
+            queue.write_progress(got.lease, JobProgress(1))
+            queue.append_event(got.lease, "log", {"message": "told"})
+            queue.reap_expired(LeaseOwners(ended=frozenset({got.lease.owner})))
         with database.read() as session:
-            assert JobRepository(session).state_of(got.job.id) is State.QUEUED
-        _look(SimpleNamespace(database=database), got.job.id, 0)
+            assert JobRepository(session).get_state(got.job.id) is JobState.QUEUED
+        _read_events(SimpleNamespace(database=database), got.job.id, 0)
 
     found = statements_of(database, work)
     assert len(found) > 5

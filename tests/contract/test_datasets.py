@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from service.queue.dispatchers import LEASE_SECONDS, DispatcherRepository
+from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
 from service.repositories.datasets import DatasetRepository
-from service.repositories.lineage import Edge, LineageRepository
+from service.repositories.lineage import LineageLink, LineageRepository
 from service.repositories.models import ModelRepository
-from service.storage.errors import NotFound
+from service.storage.errors import RowNotFound
 from tests.stored import Clock, new_dataset
 
 
@@ -62,9 +62,9 @@ def test_a_deleted_dataset_is_gone_and_its_source_may_come_again(database):
         DatasetRepository(session).delete(first)
     second = add(database)
     assert second != first
-    with database.read() as session, pytest.raises(NotFound, match=first):
+    with database.read() as session, pytest.raises(RowNotFound, match=first):
         DatasetRepository(session).get(first)
-    with database.read() as session, pytest.raises(NotFound, match=second):
+    with database.read() as session, pytest.raises(RowNotFound, match=second):
         DatasetRepository(session, "proj_other").get(second)
 
 
@@ -73,15 +73,15 @@ def test_datasets_come_in_the_order_asked_for_and_the_missing_one_is_named(datab
     with database.read() as session:
         repository = DatasetRepository(session)
         assert [one.id for one in repository.get_all([b, a, b])] == [b, a, b]
-        with pytest.raises(NotFound, match="ds_none"):
+        with pytest.raises(RowNotFound, match="ds_none"):
             repository.get_all([a, "ds_none"])
 
 
 def test_pages_of_datasets_are_latest_first_without_gap_or_repeat(database):
     ids = [add(database, source_key=str(i)) for i in range(5)]
     with database.read() as session:
-        first = DatasetRepository(session).page(limit=3)
-        second = DatasetRepository(session).page(limit=3, cursor=first.next)
+        first = DatasetRepository(session).list_page(limit=3)
+        second = DatasetRepository(session).list_page(limit=3, cursor=first.next)
     assert [one.id for one in first.items + second.items] == ids[::-1]
     assert second.next is None
 
@@ -93,24 +93,24 @@ def test_lineage_leads_from_a_dataset_to_all_it_was_made_from_and_all_made_of_it
     both = add(database, [cut, other], source_key="both")
     with database.write() as session:
         lineage = LineageRepository(session)
-        lineage.link("job_1", [both], "estimation")
-        lineage.link("job_1", [both], "estimation")  # once more is as once
-        up, down = lineage.ancestors("job_1"), lineage.descendants(raw)
+        lineage.add_links("job_1", [both], "estimation")
+        lineage.add_links("job_1", [both], "estimation")  # once more is as once
+        up, down = lineage.list_ancestors("job_1"), lineage.list_descendants(raw)
     assert set(up) == {
-        Edge("job_1", both, "estimation"), Edge(both, cut, "derived"),
-        Edge(both, other, "derived"), Edge(cut, raw, "derived"),
+        LineageLink("job_1", both, "estimation"), LineageLink(both, cut, "derived"),
+        LineageLink(both, other, "derived"), LineageLink(cut, raw, "derived"),
     }  # fmt: skip
     assert set(down) == {one for one in up if one.parent != other}
     with database.read() as session:
-        assert LineageRepository(session, "proj_other").ancestors("job_1") == []
+        assert LineageRepository(session, "proj_other").list_ancestors("job_1") == []
 
 
 def test_a_circle_of_lineage_ends(database):
     with database.write() as session:
         lineage = LineageRepository(session)
-        lineage.link("ds_a", ["ds_b"], "derived")
-        lineage.link("ds_b", ["ds_a"], "derived")
-        assert len(lineage.ancestors("ds_a")) == 2
+        lineage.add_links("ds_a", ["ds_b"], "derived")
+        lineage.add_links("ds_b", ["ds_a"], "derived")
+        assert len(lineage.list_ancestors("ds_a")) == 2
 
 
 def test_a_model_has_numbered_versions_and_its_name_means_the_latest(database):
@@ -135,7 +135,7 @@ def test_a_model_has_numbered_versions_and_its_name_means_the_latest(database):
 def test_an_unknown_model_or_version_is_not_found(database, reference):
     with database.write() as session:
         ModelRepository(session).add("pump", {"order": 1})
-        with pytest.raises(NotFound, match="no model"):
+        with pytest.raises(RowNotFound, match="no model"):
             ModelRepository(session).get(reference)
 
 
@@ -144,7 +144,7 @@ def test_a_deleted_version_keeps_its_number(database):
         models = ModelRepository(session)
         models.add("pump", {"order": 1})
         models.delete("pump")
-        assert models.page().items == ()
+        assert models.list_page().items == ()
         assert models.add("pump", {"order": 1}).model.version == 2
 
 
@@ -162,20 +162,20 @@ def test_a_dispatcher_is_alive_while_it_beats(database):
     clock = Clock()
     with database.write() as session:
         dispatchers = DispatcherRepository(session, clock)
-        dispatchers.announce("d1", {LEASE_SECONDS: 30.0})
+        dispatchers.add_dispatcher("d1", {LEASE_SECONDS_KEY: 30.0})
         clock.advance(20)
-        dispatchers.announce("d2", {LEASE_SECONDS: 30.0})
-        assert [one.owner for one in dispatchers.alive()] == ["d1", "d2"]
+        dispatchers.add_dispatcher("d2", {LEASE_SECONDS_KEY: 30.0})
+        assert [one.owner for one in dispatchers.list_alive()] == ["d1", "d2"]
         clock.advance(20)
-        assert [one.owner for one in dispatchers.alive()] == ["d2"]
-        dispatchers.beat("d1")
+        assert [one.owner for one in dispatchers.list_alive()] == ["d2"]
+        dispatchers.record_heartbeat("d1")
         clock.advance(15)
-        assert [one.owner for one in dispatchers.alive()] == ["d1"]
-        dispatchers.leave("d1")
-        dispatchers.announce("d2", {LEASE_SECONDS: 30.0, "cpus": 8})
-        (left,) = dispatchers.alive()
+        assert [one.owner for one in dispatchers.list_alive()] == ["d1"]
+        dispatchers.remove_dispatcher("d1")
+        dispatchers.add_dispatcher("d2", {LEASE_SECONDS_KEY: 30.0, "cpus": 8})
+        (left,) = dispatchers.list_alive()
     with database.read() as session:
-        assert DispatcherRepository(session, clock).alive()[0].details["cpus"] == 8
+        assert DispatcherRepository(session, clock).list_alive()[0].details["cpus"] == 8
     assert left.owner == "d2"
 
 

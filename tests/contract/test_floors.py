@@ -6,13 +6,13 @@ import time
 import numpy as np
 import pytest
 
+from service.core.states import OPEN_STATES, JobState
 from service.dispatch import cramer_rao as floors
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import Leases
-from service.storage.tables import OPEN, State
-from service.sweeps.cramer_rao import Floors
+from service.dispatch.leases import HeldLeases
+from service.sweeps.cramer_rao import StoredBounds
 from tests.dispatching import LIMIT_SECONDS, Place
-from workers.inline import InlineCrew
+from workers.inline_executor import InlineExecutor
 
 SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
 NOISY = {"algorithm": SMALL, "noise": {"sigma": 0.1}}
@@ -27,50 +27,52 @@ def place(tmp_path):
 
 def carried_out(place, *jobs, meanwhile=lambda: None):
     """Carry out jobs; `meanwhile` is called in another thread."""
-    dispatcher = Dispatcher(place.database, place.store, InlineCrew(), Leases(place.database, 30))
+    dispatcher = Dispatcher(
+        place.database, place.store, InlineExecutor(), HeldLeases(place.database, 30)
+    )
 
     def stop_at_the_end():
         try:
             meanwhile()
-            while any(place.job(job).state in OPEN for job in jobs):
+            while any(place.job(job).state in OPEN_STATES for job in jobs):
                 time.sleep(0.01)
         finally:
             dispatcher.stopping.set()
 
     watcher = threading.Thread(target=stop_at_the_end)
     watcher.start()
-    dispatcher.run()
+    dispatcher.run_until_stopped()
     watcher.join()
     return [place.job(job) for job in jobs]
 
 
 def notes(job):
-    return list(Floors(job.floors).notes())
+    return list(StoredBounds(job.floors).list_notes())
 
 
 def test_other_jobs_are_carried_out_while_floors_are_made(place, monkeypatch):
     may_go_on, begun = threading.Event(), threading.Event()
-    made = floors.floor
+    made = floors.cramer_rao_bound
 
     def held(problem, theta):
         begun.set()
         assert may_go_on.wait(LIMIT_SECONDS)
         return made(problem, theta)
 
-    monkeypatch.setattr(floors, "floor", held)
+    monkeypatch.setattr(floors, "cramer_rao_bound", held)
     noisy = place.submit(**NOISY)
     states = []
 
     def meanwhile():
         assert begun.wait(LIMIT_SECONDS)
         quiet = place.submit(algorithm=SMALL)
-        states.append(place.until(quiet, State.SUCCEEDED).state)
+        states.append(place.until(quiet, JobState.SUCCEEDED).state)
         states.append(place.job(noisy).state)
         may_go_on.set()
 
     (job,) = carried_out(place, noisy, meanwhile=meanwhile)
-    assert states == [State.SUCCEEDED, State.RUNNING]
-    assert job.state is State.SUCCEEDED
+    assert states == [JobState.SUCCEEDED, JobState.RUNNING]
+    assert job.state is JobState.SUCCEEDED
     assert job.floors["problems"][0]["stderr"]["T"] > 0
 
 
@@ -82,19 +84,19 @@ def test_a_job_is_cancelled_while_its_floors_are_made(place, monkeypatch):
         assert may_go_on.wait(LIMIT_SECONDS)
         raise ZeroDivisionError
 
-    monkeypatch.setattr(floors, "floor", held)
+    monkeypatch.setattr(floors, "cramer_rao_bound", held)
     noisy = place.submit(**NOISY)
 
     def meanwhile():
         assert begun.wait(LIMIT_SECONDS)
         place.cancel(noisy)
-        place.until(noisy, State.CANCELLED)
+        place.until(noisy, JobState.CANCELLED)
         may_go_on.set()
 
     (job,) = carried_out(place, noisy, meanwhile=meanwhile)
-    assert job.state is State.CANCELLED
+    assert job.state is JobState.CANCELLED
     assert job.floors is None
-    assert {run.state for run in place.runs(noisy)} == {State.SUCCEEDED}
+    assert {run.state for run in place.runs(noisy)} == {JobState.SUCCEEDED}
 
 
 @pytest.mark.parametrize(
@@ -104,9 +106,9 @@ def test_an_error_of_the_numerics_is_a_note_and_the_job_succeeds(place, monkeypa
     def broken(problem, theta):
         raise error
 
-    monkeypatch.setattr(floors, "floor", broken)
+    monkeypatch.setattr(floors, "cramer_rao_bound", broken)
     (job,) = carried_out(place, place.submit(**NOISY))
-    assert job.state is State.SUCCEEDED
+    assert job.state is JobState.SUCCEEDED
     assert any("there is no floor: internal error" in one for one in notes(job))
 
 
@@ -115,7 +117,7 @@ def test_of_more_problems_than_floors_are_made_of_a_note_tells(place, monkeypatc
     (few,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[0]]}))
     (many,) = carried_out(place, place.submit(**NOISY, sweep={"axes": [SKIPS[1]]}))
     assert [len(job.floors["problems"]) for job in (few, many)] == [2, 2]
-    assert [floors.LEFT_OUT in notes(job) for job in (few, many)] == [False, True]
+    assert [floors.LEFT_OUT_NOTE in notes(job) for job in (few, many)] == [False, True]
 
 
 SKIPS = [{"path": "/skip", "values": [1, 2]}, {"path": "/skip", "values": [1, 2, 3]}]

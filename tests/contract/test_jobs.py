@@ -5,12 +5,13 @@ from datetime import UTC
 
 import pytest
 
-from service.queue.leases import Progress, Queue
-from service.queue.run_writes import RunLedger, RunOutcome
+from service.core.states import JobState
+from service.queue.leases import JobProgress, LeaseQueue
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository, NewJob
-from service.storage.errors import Conflict, KeyReused, NotFound, UnstorableValue
-from service.storage.tables import Project, State
+from service.storage.errors import KeyReused, RowConflict, RowNotFound, UnstorableValue
+from service.storage.tables import Project
 from tests.stored import claim, claimed, job_of, submit
 
 NEW = NewJob(name="tube 40 m", spec={"model": "tube", "sweep": {"axes": []}}, n_runs=3)
@@ -18,7 +19,7 @@ NEW = NewJob(name="tube 40 m", spec={"model": "tube", "sweep": {"axes": []}}, n_
 
 def events(database, job_id, after=0, limit=500):
     with database.read() as session:
-        return EventRepository(session).after(job_id, after, limit)
+        return EventRepository(session).list_after(job_id, after, limit)
 
 
 def kinds(database, job_id):
@@ -30,7 +31,12 @@ def test_a_submitted_job_is_queued_and_kept_whole(database):
         submission = JobRepository(session).submit(NEW)
     assert submission.is_new
     job = job_of(database, submission.job.id)
-    assert (job.state, job.spec, job.n_runs, job.name) == (State.QUEUED, NEW.spec, 3, "tube 40 m")
+    assert (job.state, job.spec, job.n_runs, job.name) == (
+        JobState.QUEUED,
+        NEW.spec,
+        3,
+        "tube 40 m",
+    )
     assert job.created_at.tzinfo is UTC
 
 
@@ -77,17 +83,17 @@ def test_many_requests_under_one_key_at_once_make_one_job(database):
     assert len({one.job.id for one in found}) == 1
     assert sum(one.is_new for one in found) == 1
     with database.read() as session:
-        assert JobRepository(session).counts()[State.QUEUED] == 1
+        assert JobRepository(session).count_states()[JobState.QUEUED] == 1
 
 
 def test_pages_of_jobs_stay_put_while_new_ones_arrive(database):
     old = [submit(database) for _ in range(5)]
     with database.read() as session:
-        first = JobRepository(session).page(limit=2)
+        first = JobRepository(session).list_page(limit=2)
     submit(database)
     with database.read() as session:
-        second = JobRepository(session).page(limit=2, cursor=first.next)
-        third = JobRepository(session).page(limit=2, cursor=second.next)
+        second = JobRepository(session).list_page(limit=2, cursor=first.next)
+        third = JobRepository(session).list_page(limit=2, cursor=second.next)
     pages = [*first.items, *second.items, *third.items]
     assert [job.id for job in pages] == old[::-1]
     assert third.next is None
@@ -96,7 +102,7 @@ def test_pages_of_jobs_stay_put_while_new_ones_arrive(database):
 def test_a_page_that_ends_exactly_at_the_end_has_no_next(database):
     submit(database), submit(database)
     with database.read() as session:
-        page = JobRepository(session).page(limit=2)
+        page = JobRepository(session).list_page(limit=2)
     assert len(page.items) == 2
     assert page.next is None
 
@@ -106,27 +112,27 @@ def test_jobs_are_listed_and_counted_by_state(database):
     claim(database)
     with database.read() as session:
         jobs = JobRepository(session)
-        assert [job.id for job in jobs.page(states=[State.RUNNING]).items] == [first]
-        assert [job.id for job in jobs.page(states=[State.QUEUED, State.RUNNING]).items] == [
+        assert [job.id for job in jobs.list_page(states=[JobState.RUNNING]).items] == [first]
+        assert [job.id for job in jobs.list_page(states=[JobState.QUEUED, JobState.RUNNING]).items] == [
             second, first,
         ]  # fmt: skip
-        assert jobs.counts() == {
-            State.QUEUED: 1, State.RUNNING: 1, State.SUCCEEDED: 0, State.FAILED: 0,
-            State.CANCELLED: 0,
+        assert jobs.count_states() == {
+            JobState.QUEUED: 1, JobState.RUNNING: 1, JobState.SUCCEEDED: 0, JobState.FAILED: 0,
+            JobState.CANCELLED: 0,
         }  # fmt: skip
 
 
 def test_a_deleted_job_is_no_longer_there(database):
     job_id = submit(database)
-    with pytest.raises(Conflict, match="cancel it"), database.write() as session:
+    with pytest.raises(RowConflict, match="cancel it"), database.write() as session:
         JobRepository(session).delete(job_id)
     with database.write() as session:
         JobRepository(session).cancel(job_id)
         JobRepository(session).delete(job_id)
     with database.read() as session:
-        assert JobRepository(session).page().items == ()
-        assert sum(JobRepository(session).counts().values()) == 0
-        with pytest.raises(NotFound, match=job_id):
+        assert JobRepository(session).list_page().items == ()
+        assert sum(JobRepository(session).count_states().values()) == 0
+        with pytest.raises(RowNotFound, match=job_id):
             JobRepository(session).get(job_id)
 
 
@@ -136,9 +142,9 @@ def test_another_projects_jobs_are_neither_seen_nor_touched(database):
     job_id = submit(database)
     with database.write() as session:
         foreign = JobRepository(session, "proj_other")
-        assert foreign.page().items == ()
+        assert foreign.list_page().items == ()
         for act in (foreign.get, foreign.cancel, foreign.resume, foreign.delete):
-            with pytest.raises(NotFound):
+            with pytest.raises(RowNotFound):
                 act(job_id)
         assert foreign.submit(NEW, key="k", request_hash="h").is_new
     with database.write() as session:
@@ -154,11 +160,13 @@ def test_a_name_that_not_every_database_can_keep_is_refused(database, name):
 def test_a_job_tells_its_whole_story(database):
     got, (run_id,) = claimed(database)
     with database.write() as session:
-        queue = Queue(session)
-        queue.tell(got.lease, "log", {"line": "packing 1 run"})
-        queue.report(got.lease, Progress(50, best_rms=0.5))
-        RunLedger(session, got.lease).record([RunOutcome(run_id=run_id, state=State.SUCCEEDED)])
-        queue.finish(got.lease, State.SUCCEEDED)
+        queue = LeaseQueue(session)
+        queue.append_event(got.lease, "log", {"line": "packing 1 run"})
+        queue.write_progress(got.lease, JobProgress(50, best_rms=0.5))
+        RunWriter(session, got.lease).record_outcomes(
+            [RunOutcome(run_id=run_id, state=JobState.SUCCEEDED)]
+        )
+        queue.finish_job(got.lease, JobState.SUCCEEDED)
     assert kinds(database, got.job.id) == [
         ("state", "queued"), ("state", "running"), ("log", None), ("progress", None),
         ("state", "succeeded"), ("end", "succeeded"),
@@ -178,8 +186,8 @@ def test_a_reader_goes_on_after_the_last_event_it_saw(database):
     other, _ = claimed(database)
     for i in range(5):
         with database.write() as session:
-            Queue(session).tell(got.lease, "log", {"line": i})
-            Queue(session).tell(other.lease, "log", {"line": -i})
+            LeaseQueue(session).append_event(got.lease, "log", {"line": i})
+            LeaseQueue(session).append_event(other.lease, "log", {"line": -i})
     everything = events(database, got.job.id)
     ids = [event.id for event in everything]
     assert ids == sorted(set(ids))
@@ -195,10 +203,10 @@ def test_an_event_is_never_seen_before_one_with_a_smaller_number(database):
 
     def write(line):
         with database.write() as session:
-            EventRepository(session).append(got.job.id, "log", {"line": line})
+            EventRepository(session).append_event(got.job.id, "log", {"line": line})
 
     with database.write() as slow:
-        EventRepository(slow).append(got.job.id, "log", {"line": "first"})
+        EventRepository(slow).append_event(got.job.id, "log", {"line": "first"})
         quick = threading.Thread(target=write, args=("second",))
         quick.start()
         quick.join(0.3)
@@ -215,7 +223,7 @@ def test_a_reader_who_polls_while_two_writers_write_misses_no_event(database):
     def write(who):
         for i in range(15):
             with database.write() as session:
-                EventRepository(session).append(got.job.id, "log", {"line": f"{who}{i}"})
+                EventRepository(session).append_event(got.job.id, "log", {"line": f"{who}{i}"})
 
     def read():
         last, final = 0, False

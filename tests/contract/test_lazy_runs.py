@@ -4,22 +4,23 @@ from datetime import timedelta
 
 import pytest
 
+from service.core.states import JobState
 from service.dispatch import job_runs as preparing
 from service.dispatch.job_runs import JobRuns
 from service.jobs import submit as jobs
 from service.jobs.schemas import JobIn
-from service.queue.leases import Owners, Queue
-from service.queue.run_writes import RunLedger
+from service.queue.leases import LeaseOwners, LeaseQueue
+from service.queue.run_writes import RunWriter
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
-from service.repositories.summaries import GroupKey, groups
-from service.runs.runs import Choice, page
-from service.storage.errors import Conflict
-from service.storage.tables import Dataset, State
-from service.sweeps.groups import all_groups
-from service.sweeps.summary import summary
+from service.repositories.summaries import GroupKey, read_groups
+from service.runs.runs import RunQuery, list_runs
+from service.storage.errors import RowConflict
+from service.storage.tables import Dataset
+from service.sweeps.groups import group_all_runs
+from service.sweeps.summary import summarise_job
 from tests.dispatching import Place, carry_out
-from workers.inline import InlineCrew
+from workers.inline_executor import InlineExecutor
 
 SMALL = {"population": 8, "generations": 3, "islands": 1, "refine": False}
 AXES = [
@@ -32,19 +33,19 @@ AT_ONCE, N_RUNS = 5, 12
 
 @pytest.fixture
 def place(tmp_path, database, monkeypatch):
-    monkeypatch.setattr(jobs, "AT_ONCE", AT_ONCE)
-    monkeypatch.setattr(preparing, "CHUNK", 2)
+    monkeypatch.setattr(jobs, "CELLS_AT_SUBMISSION", AT_ONCE)
+    monkeypatch.setattr(preparing, "CHUNK_ROWS", 2)
     return Place(tmp_path / "data", database)
 
 
 def claim(place, owner="d1"):
     with place.database.write() as session:
-        return Queue(session).claim(owner)
+        return LeaseQueue(session).claim_job(owner)
 
 
 def lose(place, claim):
     with place.database.write() as session:
-        Queue(session).reap(Owners(gone=frozenset({claim.lease.owner})))
+        LeaseQueue(session).reap_expired(LeaseOwners(ended=frozenset({claim.lease.owner})))
 
 
 def source(place, claim):
@@ -59,7 +60,7 @@ def cells(place, job):
 def submit_whole(place, monkeypatch, **body):
     """A job whose runs are all made at submission."""
     with monkeypatch.context() as patched:
-        patched.setattr(jobs, "AT_ONCE", 1000)
+        patched.setattr(jobs, "CELLS_AT_SUBMISSION", 1000)
         return place.submit(**body)
 
 
@@ -72,34 +73,34 @@ def test_a_submission_makes_the_first_runs_and_the_dispatcher_the_others(place, 
     lazily = place.submit(**SWEEP)
     assert len(place.runs(lazily)) == AT_ONCE
     assert place.job(lazily).n_runs == len(place.runs(whole)) == N_RUNS
-    carry_out(place, lazily, InlineCrew())
-    assert place.job(lazily).state is State.SUCCEEDED
+    carry_out(place, lazily, InlineExecutor())
+    assert place.job(lazily).state is JobState.SUCCEEDED
     assert cells(place, lazily) == cells(place, whole)
 
 
 def test_results_are_those_of_a_job_whose_runs_were_all_made_at_submission(place, monkeypatch):
     whole, lazily = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
-    carry_out(place, whole, InlineCrew())
-    carry_out(place, lazily, InlineCrew())
+    carry_out(place, whole, InlineExecutor())
+    carry_out(place, lazily, InlineExecutor())
     found = [[numbers_found(run) for run in place.runs(job)] for job in (whole, lazily)]
     assert found[0] == found[1]
-    assert all(state is State.SUCCEEDED for state, *_ in found[1])
+    assert all(state is JobState.SUCCEEDED for state, *_ in found[1])
 
 
 def test_a_chain_of_warm_starts_goes_on_over_runs_that_are_made_later(place, monkeypatch):
     chained = {**SWEEP, "warm_start": "previous"}
     whole, lazily = submit_whole(place, monkeypatch, **chained), place.submit(**chained)
-    carry_out(place, whole, InlineCrew())
-    carry_out(place, lazily, InlineCrew())
+    carry_out(place, whole, InlineExecutor())
+    carry_out(place, lazily, InlineExecutor())
     assert [run.estimates for run in place.runs(lazily)] == [
         run.estimates for run in place.runs(whole)
     ]
 
 
 def test_what_was_computed_before_is_taken_over_also_by_runs_that_are_made_later(place):
-    carry_out(place, place.submit(**SWEEP), InlineCrew())
+    carry_out(place, place.submit(**SWEEP), InlineExecutor())
     second = place.submit(**SWEEP, reuse=True)
-    carry_out(place, second, InlineCrew())
+    carry_out(place, second, InlineExecutor())
     assert place.job(second).n_reused == N_RUNS
 
 
@@ -125,14 +126,14 @@ def test_another_dispatcher_goes_on_making_runs_where_the_first_one_stopped(plac
 def test_a_transaction_that_fails_makes_no_runs_and_the_next_one_makes_them(place, monkeypatch):
     job = place.submit(**SWEEP)
     runs = source(place, claim(place))
-    create = RunLedger.create
+    create = RunWriter.create_runs
 
     def broken(ledger, made):
         create(ledger, made)
         raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr(RunLedger, "create", broken)
+        patched.setattr(RunWriter, "create_runs", broken)
         with pytest.raises(MemoryError):
             list(runs.runs())
     assert len(place.runs(job)) == AT_ONCE
@@ -153,12 +154,12 @@ def test_a_job_cannot_succeed_before_all_its_runs_are_made(place):
     place.submit(**SWEEP)
     got = claim(place)
     with place.database.write() as session:
-        for run in RunLedger(session, got.lease).pending():
-            run.state = State.SUCCEEDED
+        for run in RunWriter(session, got.lease).list_pending():
+            run.state = JobState.SUCCEEDED
     left = N_RUNS - AT_ONCE
     said = f"{left} of its runs did not finish"
-    with pytest.raises(Conflict, match=said), place.database.write() as session:
-        Queue(session).finish(got.lease, State.SUCCEEDED)
+    with pytest.raises(RowConflict, match=said), place.database.write() as session:
+        LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED)
 
 
 def test_a_cancelled_job_is_resumed_with_the_runs_that_were_never_made(place, monkeypatch):
@@ -167,20 +168,20 @@ def test_a_cancelled_job_is_resumed_with_the_runs_that_were_never_made(place, mo
     place.cancel(job)
     assert len(place.runs(job)) == AT_ONCE
     with place.database.read() as session:
-        (group,) = all_groups(session, place.job(job), [], [], 10)
-    assert group.states[State.CANCELLED] == N_RUNS
+        (group,) = group_all_runs(session, place.job(job), [], [], 10)
+    assert group.states[JobState.CANCELLED] == N_RUNS
     with place.database.write() as session:
-        jobs.resume(session, job, place.settings)
-    carry_out(place, job, InlineCrew())
-    assert place.job(job).state is State.SUCCEEDED
+        jobs.resume_job(session, job, place.settings)
+    carry_out(place, job, InlineExecutor())
+    assert place.job(job).state is JobState.SUCCEEDED
     assert cells(place, job) == cells(place, whole)
 
 
 def test_a_clone_has_the_same_cells(place):
     job = place.submit(**SWEEP)
-    other = jobs.clone(place.database, job, place.settings).id
+    other = jobs.clone_job(place.database, job, place.settings).id
     assert place.job(other).n_runs == N_RUNS
-    carry_out(place, job, InlineCrew())
+    carry_out(place, job, InlineExecutor())
     assert cells(place, other) == cells(place, job)
 
 
@@ -191,11 +192,11 @@ def test_groups_count_runs_that_are_not_made_yet_as_queued(place, monkeypatch, b
     whole, job = submit_whole(place, monkeypatch, **SWEEP), place.submit(**SWEEP)
     keys = [GroupKey("label" if one == "x" else "axis", one) for one in by]
     with place.database.read() as session:
-        expected = groups(session, whole, keys, [], 100)
-        found = all_groups(session, place.job(job), keys, [], 100)
-        told = summary(session, job, by)
-    assert [(one.key, one.first, one.states) for one in found] == [
-        (one.key, one.first, one.states) for one in expected
+        expected = read_groups(session, whole, keys, [], 100)
+        found = group_all_runs(session, place.job(job), keys, [], 100)
+        told = summarise_job(session, job, by)
+    assert [(one.key, one.first_number, one.states) for one in found] == [
+        (one.key, one.first_number, one.states) for one in expected
     ]
     assert sum(one.runs for one in told.groups) == told.runs == N_RUNS
 
@@ -203,9 +204,9 @@ def test_groups_count_runs_that_are_not_made_yet_as_queued(place, monkeypatch, b
 def test_a_list_of_runs_has_those_that_are_made_and_progress_counts_all(place):
     job = place.submit(**SWEEP)
     with place.database.read() as session:
-        listed = page(session, job, None, 100, Choice())
-        progress = jobs.told(JobRepository(session).get(job)).progress
-        assert RunRepository(session).n_made(job) == len(listed.items) == AT_ONCE
+        listed = list_runs(session, job, None, 100, RunQuery())
+        progress = jobs.to_job_out(JobRepository(session).get(job)).progress
+        assert RunRepository(session).count_created(job) == len(listed.items) == AT_ONCE
     assert (progress.runs, progress.finished) == (N_RUNS, 0)
 
 
@@ -214,9 +215,9 @@ def test_what_a_name_means_is_settled_at_submission(place):
     job = place.submit(algorithm=SMALL, sweep={"axes": axes})
     with place.database.write() as session:
         session.get(Dataset, place.dataset).name = "another name"
-    carry_out(place, job, InlineCrew())
+    carry_out(place, job, InlineExecutor())
     assert [run.cell for run in place.runs(job)] == [{"/datasets": [place.dataset]}] * 8
-    assert place.job(job).state is State.SUCCEEDED
+    assert place.job(job).state is JobState.SUCCEEDED
 
 
 def test_names_inside_objects_and_lists_are_settled_too(place):
@@ -228,14 +229,14 @@ def test_names_inside_objects_and_lists_are_settled_too(place):
     spec = place.job(place.submit(sweep={"axes": axes})).spec
     stored = [axis["values"] for axis in spec["sweep"]["axes"]]
     assert stored[:2] == [[None, {"datasets": None, "fraction": 0.5}], [place.dataset]]
-    whole = JobIn(model="m", datasets=["d"], algorithm=SMALL).normal_form()
+    whole = JobIn(model="m", datasets=["d"], algorithm=SMALL).to_normal_form()
     assert stored[2] == [whole["algorithm"]]
 
 
 def test_a_lease_that_has_expired_makes_nothing(place):
     job = place.submit(**SWEEP)
     with place.database.write() as session:
-        got = Queue(session).claim("late", timedelta(seconds=0))
+        got = LeaseQueue(session).claim_job("late", timedelta(seconds=0))
     lose(place, got)
     assert list(source(place, got).runs()) == []
     assert len(place.runs(job)) == AT_ONCE

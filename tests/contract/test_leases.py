@@ -9,10 +9,11 @@ import pytest
 from sqlalchemy import update
 from sqlalchemy.exc import OperationalError
 
+from service.core.states import JobState
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import Leases
+from service.dispatch.leases import HeldLeases
 from service.storage.sessions import BUSY_SECONDS
-from service.storage.tables import Job, State
+from service.storage.tables import Job
 from tests.dispatching import Place
 from tests.stored import Clock, claim, job_of, state_of, submit
 from tests.unit.test_feeding import ScriptedCrew, fails
@@ -25,18 +26,18 @@ def clock() -> Clock:
     return Clock()
 
 
-def leases_of(database, clock: Clock) -> Leases:
-    return Leases(database, SECONDS, clock=clock, stopwatch=lambda: clock.now.timestamp())
+def leases_of(database, clock: Clock) -> HeldLeases:
+    return HeldLeases(database, SECONDS, clock=clock, stopwatch=lambda: clock.now.timestamp())
 
 
 def test_a_lease_renewed_in_time_is_kept(database, clock: Clock) -> None:
     job, leases = submit(database), leases_of(database, clock)
-    lease = leases.claim().lease
+    lease = leases.claim_job().lease
     for _ in range(5):
         clock.advance(20)
-        leases.renew()
+        leases.renew_leases()
         assert not leases.is_lost(lease)
-    assert state_of(database, job) is State.RUNNING
+    assert state_of(database, job) is JobState.RUNNING
 
 
 def test_a_lease_that_is_late_is_unknown_until_a_heartbeat_tells_that_it_is_still_ours(
@@ -44,11 +45,11 @@ def test_a_lease_that_is_late_is_unknown_until_a_heartbeat_tells_that_it_is_stil
 ) -> None:
     submit(database)
     leases = leases_of(database, clock)
-    lease = leases.claim().lease
+    lease = leases.claim_job().lease
     clock.advance(31)
-    assert (leases.is_sure(lease), leases.is_lost(lease)) == (False, False)
-    leases.renew()
-    assert (leases.is_sure(lease), leases.is_lost(lease)) == (True, False)
+    assert (leases.is_held(lease), leases.is_lost(lease)) == (False, False)
+    leases.renew_leases()
+    assert (leases.is_held(lease), leases.is_lost(lease)) == (True, False)
     assert job_of(database, lease.job_id).lost_leases == 0
 
 
@@ -57,10 +58,10 @@ def test_a_late_heartbeat_of_other_leases_does_not_make_a_new_one_late(
 ) -> None:
     submit(database), submit(database)
     leases = leases_of(database, clock)
-    old = leases.claim().lease
+    old = leases.claim_job().lease
     clock.advance(31)
-    young = leases.claim().lease
-    assert (leases.is_sure(old), leases.is_sure(young)) == (False, True)
+    young = leases.claim_job().lease
+    assert (leases.is_held(old), leases.is_held(young)) == (False, True)
 
 
 def test_a_forgotten_lease_expires_while_the_others_of_its_owner_live(
@@ -68,13 +69,13 @@ def test_a_forgotten_lease_expires_while_the_others_of_its_owner_live(
 ) -> None:
     submit(database), submit(database)
     leases = leases_of(database, clock)
-    dropped, kept = leases.claim().lease, leases.claim().lease
-    leases.forget(dropped)
+    dropped, kept = leases.claim_job().lease, leases.claim_job().lease
+    leases.forget_lease(dropped)
     for _ in range(2):
         clock.advance(20)
-        leases.renew()
-    assert state_of(database, dropped.job_id) is State.QUEUED
-    assert state_of(database, kept.job_id) is State.RUNNING
+        leases.renew_leases()
+    assert state_of(database, dropped.job_id) is JobState.QUEUED
+    assert state_of(database, kept.job_id) is JobState.RUNNING
 
 
 def test_a_lease_that_a_rival_took_is_lost_and_the_rivals_is_not_renewed(
@@ -82,16 +83,16 @@ def test_a_lease_that_a_rival_took_is_lost_and_the_rivals_is_not_renewed(
 ) -> None:
     submit(database)
     leases, rival = leases_of(database, clock), leases_of(database, clock)
-    lease = leases.claim().lease
+    lease = leases.claim_job().lease
     clock.advance(31)
-    rival.renew()
+    rival.renew_leases()
     assert claim(database, "d2", clock).lease.attempt == 2
-    leases.renew()
-    assert (leases.is_lost(lease), leases.is_sure(lease)) == (True, False)
+    leases.renew_leases()
+    assert (leases.is_lost(lease), leases.is_held(lease)) == (True, False)
     clock.advance(31)
-    leases.renew()
+    leases.renew_leases()
     assert (state_of(database, lease.job_id), job_of(database, lease.job_id).lost_leases) == (
-        State.QUEUED, 2,
+        JobState.QUEUED, 2,
     )  # fmt: skip
 
 
@@ -107,19 +108,19 @@ class Stand:
             self.place.database, self.place.store, self.crew, self.leases
         )  # fmt: skip
 
-    def turn_until(self, job: str, state: State, attempt: int) -> None:
+    def turn_until(self, job: str, state: JobState, attempt: int) -> None:
         for _ in range(200_000):
             row = self.place.job(job)
             if (row.state, row.attempt) == (state, attempt):
                 return
-            self.dispatcher.turn()
+            self.dispatcher.run_round()
         raise AssertionError(f"{job} is {row.state} in attempt {row.attempt}")
 
     def turn_until_sent(self, n_packs: int) -> None:
         for _ in range(200_000):
             if len(self.crew.sent) == n_packs:
                 return
-            self.dispatcher.turn()
+            self.dispatcher.run_round()
         raise AssertionError(f"{len(self.crew.sent)} packs were sent")
 
 
@@ -138,15 +139,15 @@ def test_a_job_whose_heartbeat_was_late_goes_on_and_meanwhile_nothing_is_written
     stand.clock.advance(31)  # the heartbeat waits for the database
     (recorder,) = stand.dispatcher._recorders.values()
     flushes = []
-    recorder.flush = lambda: flushes.append(stand.clock.now)  # type: ignore[method-assign]
+    recorder.write_due = lambda: flushes.append(stand.clock.now)  # type: ignore[method-assign]
     for _ in range(20):
-        stand.dispatcher.turn()
+        stand.dispatcher.run_round()
     assert (stand.crew.cancelled, flushes) == ([], [])
-    stand.leases.renew()
-    stand.dispatcher.turn()
+    stand.leases.renew_leases()
+    stand.dispatcher.run_round()
     assert (stand.crew.cancelled, len(flushes)) == ([], 1)
     row = stand.place.job(job)
-    assert (row.state, row.attempt, row.lost_leases) == (State.RUNNING, 1, 0)
+    assert (row.state, row.attempt, row.lost_leases) == (JobState.RUNNING, 1, 0)
 
 
 def test_a_job_that_was_lost_while_its_heartbeat_was_late_is_taken_up_again(
@@ -155,15 +156,15 @@ def test_a_job_that_was_lost_while_its_heartbeat_was_late_is_taken_up_again(
     job = stand.place.submit()
     stand.turn_until_sent(1)
     stand.clock.advance(31)
-    leases_of(stand.place.database, stand.clock).renew()  # another reaps it
-    stand.leases.renew()
+    leases_of(stand.place.database, stand.clock).renew_leases()  # another reaps it
+    stand.leases.renew_leases()
     for _ in range(200_000):
-        stand.dispatcher.turn()
+        stand.dispatcher.run_round()
         if stand.crew.cancelled:
             break
     assert stand.crew.cancelled
     assert stand.place.job(job).lost_leases == 1
-    stand.turn_until(job, State.RUNNING, attempt=2)
+    stand.turn_until(job, JobState.RUNNING, attempt=2)
 
 
 class Unanswered:
@@ -188,30 +189,30 @@ def test_a_claim_that_was_made_but_not_answered_is_found_by_the_next(
     job, other = submit(database), submit(database)
     leases = leases_of(Unanswered(database), clock)
     with pytest.raises(OperationalError):
-        leases.claim()
-    found = leases.claim()
+        leases.claim_job()
+    found = leases.claim_job()
     assert (found.job.id, found.lease.attempt) == (job, 1)
-    assert state_of(database, other) is State.QUEUED
-    leases.renew()
-    assert leases.is_sure(found.lease)
-    assert leases.claim().job.id == other
+    assert state_of(database, other) is JobState.QUEUED
+    leases.renew_leases()
+    assert leases.is_held(found.lease)
+    assert leases.claim_job().job.id == other
 
 
 def test_a_heartbeat_waits_for_the_database_no_longer_than_a_third_of_the_lease(
     database, clock: Clock
 ) -> None:
     job = submit(database)
-    leases = Leases(database, 3.0)  # by the true clock
-    lease = leases.claim().lease
+    leases = HeldLeases(database, 3.0)  # by the true clock
+    lease = leases.claim_job().lease
     with database.write() as other:
         other.execute(update(Job).where(Job.id == job).values(name="held"))
         begun = time.monotonic()
         with pytest.raises(OperationalError):
-            leases.renew()
+            leases.renew_leases()
         took = time.monotonic() - begun
     assert took < BUSY_SECONDS / 2
-    leases.renew()
-    assert leases.is_sure(lease)
+    leases.renew_leases()
+    assert leases.is_held(lease)
 
 
 @pytest.mark.slow
@@ -221,13 +222,13 @@ def test_a_job_claimed_back_while_its_old_packs_fly_ends_once_under_its_new_atte
     job = stand.place.submit()
     stand.turn_until_sent(1)
     stand.clock.advance(31)
-    leases_of(stand.place.database, stand.clock).renew()  # another reaps it
+    leases_of(stand.place.database, stand.clock).renew_leases()  # another reaps it
     stand.turn_until_sent(2)
     assert len(stand.crew.packs) == 2
     stand.crew.is_slow = False
-    stand.turn_until(job, State.FAILED, attempt=2)
+    stand.turn_until(job, JobState.FAILED, attempt=2)
     (run,) = stand.place.runs(job)
-    assert (run.state, run.attempt, run.error) == (State.FAILED, 2, "as told")
+    assert (run.state, run.attempt, run.error) == (JobState.FAILED, 2, "as told")
     for _ in range(3):
-        stand.dispatcher.turn()
+        stand.dispatcher.run_round()
     assert stand.crew.packs == {}

@@ -154,7 +154,7 @@ def test_a_large_object_goes_to_a_bucket_in_parts(bucket, monkeypatch):
     store = open_store(url, **options)
     data = os.urandom(6 << 20)
     for _ in range(2):
-        assert store.get(store.put_stream([data]).sha256) == data
+        assert store.get_bytes(store.put_stream([data]).sha256) == data
 
 
 def test_a_bucket_never_replaces_an_object(bucket, s3_endpoint):
@@ -166,7 +166,7 @@ def test_a_bucket_never_replaces_an_object(bucket, s3_endpoint):
     client.put_object(Bucket=url.split("/")[2], Key=key, Body=b"marked")
     client.close()
     store.put_stream([b"first"])
-    assert store.get(name) == b"marked"
+    assert store.get_bytes(name) == b"marked"
 
 
 def test_a_folder_never_replaces_an_object_and_has_the_agreed_layout(tmp_path):

@@ -6,16 +6,16 @@ from datetime import timedelta
 import pytest
 from sqlalchemy import text
 
-from service.queue.leases import Lease, Progress, Queue
-from service.queue.run_writes import Cell, RunLedger, RunOutcome
+from service.core.states import JobState
+from service.queue.leases import JobProgress, Lease, LeaseQueue
+from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
-from service.storage.errors import Conflict, LeaseLost
-from service.storage.tables import State
+from service.storage.errors import LeaseLost, RowConflict
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
 
 LEASE = timedelta(seconds=10)
-ENDS = [State.SUCCEEDED, State.FAILED, State.CANCELLED]
+ENDS = [JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED]
 
 
 @pytest.fixture
@@ -25,12 +25,12 @@ def clock():
 
 def reap(database, clock):
     with database.write() as session:
-        return Queue(session, clock).reap()
+        return LeaseQueue(session, clock).reap_expired()
 
 
-def finish(database, lease, state=State.SUCCEEDED, error=None):
+def finish(database, lease, state=JobState.SUCCEEDED, error=None):
     with database.write() as session:
-        Queue(session).finish(lease, state, error)
+        LeaseQueue(session).finish_job(lease, state, error)
 
 
 def lose(database, clock):
@@ -56,7 +56,7 @@ def test_a_claimed_job_runs_under_its_first_attempt(database, clock):
     got = claim(database, "d1", clock)
     assert got.lease == Lease(job_id, 1, "d1")
     job = job_of(database, job_id)
-    assert (job.state, job.attempt, job.lease_owner) == (State.RUNNING, 1, "d1")
+    assert (job.state, job.attempt, job.lease_owner) == (JobState.RUNNING, 1, "d1")
     assert job.started_at == clock.now
     assert job.lease_until == clock.now + LEASE
 
@@ -83,7 +83,7 @@ def test_no_two_claimers_ever_get_the_same_job(database):
 def test_a_claimer_does_not_wait_for_a_rival_that_has_not_committed(postgres_database):
     first, second = submit(postgres_database), submit(postgres_database)
     with postgres_database.write() as slow:
-        assert Queue(slow).claim("slow").job.id == first
+        assert LeaseQueue(slow).claim_job("slow").job.id == first
         assert claim(postgres_database, "quick").job.id == second
         assert claim(postgres_database, "quick") is None
 
@@ -93,7 +93,7 @@ def test_a_claim_that_is_rolled_back_leaves_the_job_queued(database):
 
     def claim_and_crash():
         with database.write() as session:
-            Queue(session).claim("d1")
+            LeaseQueue(session).claim_job("d1")
             raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
@@ -110,7 +110,7 @@ def test_one_heartbeat_renews_the_leases_given_and_no_others(database, clock):
     claim(database, "d2", clock)
     clock.advance(7)
     with database.write() as session:
-        held = Queue(session, clock).heartbeat(mine)
+        held = LeaseQueue(session, clock).renew_leases(mine)
     assert {one.lease for one in held} == mine
     clock.advance(4)
     assert set(reap(database, clock).requeued) == others
@@ -148,7 +148,7 @@ def test_a_heartbeat_tells_of_a_wish_to_cancel(database):
     with database.write() as session:
         JobRepository(session).cancel(got.job.id)
     with database.write() as session:
-        (held,) = Queue(session).heartbeat([got.lease])
+        (held,) = LeaseQueue(session).renew_leases([got.lease])
     assert held.cancel_requested
 
 
@@ -157,7 +157,7 @@ def test_a_heartbeat_does_not_get_back_a_lease_that_was_lost(database, clock):
     lost, _ = lose(database, clock)
     claim(database, "silent", clock)  # under a new attempt
     with database.write() as session:
-        assert Queue(session, clock).heartbeat([lost.lease]) == ()
+        assert LeaseQueue(session, clock).renew_leases([lost.lease]) == ()
 
 
 def test_a_heartbeat_of_no_lease_renews_nothing(database, clock):
@@ -165,7 +165,7 @@ def test_a_heartbeat_of_no_lease_renews_nothing(database, clock):
     claim(database, "d1", clock)
     clock.advance(7)
     with database.write() as session:
-        assert Queue(session, clock).heartbeat([]) == ()
+        assert LeaseQueue(session, clock).renew_leases([]) == ()
     clock.advance(4)
     assert reap(database, clock).requeued == (job_id,)
 
@@ -175,25 +175,28 @@ def test_the_reaper_leaves_a_living_lease_alone(database, clock):
     claim(database, "d1", clock)
     clock.advance(9)
     assert reap(database, clock).requeued == ()
-    assert state_of(database, job_id) is State.RUNNING
+    assert state_of(database, job_id) is JobState.RUNNING
 
 
 def test_an_expired_job_is_queued_again_with_its_unfinished_runs(database, clock):
     submit(database, n_runs=2)
     got = claim(database, "d1", clock)
     with database.write() as session:
-        ledger = RunLedger(session, got.lease)
-        ledger.create(Cell(number=i) for i in range(2))
-        first, second = (run.id for run in ledger.pending())
-        ledger.start([first, second])
-        ledger.record([RunOutcome(run_id=first, state=State.SUCCEEDED, best_rms=0.5)])
+        ledger = RunWriter(session, got.lease)
+        ledger.create_runs(NewRun(number=i) for i in range(2))
+        first, second = (run.id for run in ledger.list_pending())
+        ledger.start_runs([first, second])
+        ledger.record_outcomes([RunOutcome(run_id=first, state=JobState.SUCCEEDED, best_rms=0.5)])
     clock.advance(11)
     assert reap(database, clock).requeued == (got.job.id,)
-    assert [run.state for run in runs_of(database, got.job.id)] == [State.SUCCEEDED, State.QUEUED]
+    assert [run.state for run in runs_of(database, got.job.id)] == [
+        JobState.SUCCEEDED,
+        JobState.QUEUED,
+    ]
     again = claim(database, "d2", clock)
     assert again.lease.attempt == 2
     with database.write() as session:
-        assert [run.id for run in RunLedger(session, again.lease).pending()] == [second]
+        assert [run.id for run in RunWriter(session, again.lease).list_pending()] == [second]
 
 
 def test_a_job_began_with_its_first_claim_and_not_with_a_later_one(database, clock):
@@ -208,7 +211,7 @@ def test_a_job_that_loses_its_lease_too_often_fails_and_says_why(database, clock
     assert lose(database, clock)[1].requeued == (job_id,)
     assert lose(database, clock)[1].failed == (job_id,)
     job = job_of(database, job_id)
-    assert job.state is State.FAILED
+    assert job.state is JobState.FAILED
     assert "fell silent 2 times" in job.error
     assert "silent" in job.error
     assert job.finished_at == clock.now
@@ -222,7 +225,7 @@ def test_a_job_that_was_to_be_cancelled_is_never_retried(database, clock):
         JobRepository(session).cancel(job_id)
     clock.advance(11)
     assert reap(database, clock).cancelled == (job_id,)
-    assert state_of(database, job_id) is State.CANCELLED
+    assert state_of(database, job_id) is JobState.CANCELLED
 
 
 def test_two_reapers_bury_a_job_once(database, clock):
@@ -236,9 +239,9 @@ def test_two_reapers_bury_a_job_once(database, clock):
 def test_a_released_job_is_queued_and_nothing_is_counted_against_it(database):
     got, _ = claimed(database)
     with database.write() as session:
-        Queue(session).release(got.lease)
+        LeaseQueue(session).release_job(got.lease)
     job = job_of(database, got.job.id)
-    assert (job.state, job.lost_leases, job.lease_owner) == (State.QUEUED, 0, None)
+    assert (job.state, job.lost_leases, job.lease_owner) == (JobState.QUEUED, 0, None)
     assert claim(database).lease.attempt == 2
 
 
@@ -246,24 +249,30 @@ def test_a_job_released_after_a_wish_to_cancel_is_cancelled(database):
     got, _ = claimed(database)
     with database.write() as session:
         JobRepository(session).cancel(got.job.id)
-        Queue(session).release(got.lease)
-    assert state_of(database, got.job.id) is State.CANCELLED
+        LeaseQueue(session).release_job(got.lease)
+    assert state_of(database, got.job.id) is JobState.CANCELLED
 
 
 LATE_WRITES = {
-    "hold": lambda session, lease, _: Queue(session).hold(lease),
-    "report": lambda session, lease, _: Queue(session).report(lease, Progress(5)),
-    "tell": lambda session, lease, _: Queue(session).tell(lease, "log", {"line": "late"}),
-    "finish": lambda session, lease, _: Queue(session).finish(lease, State.FAILED, "late"),
-    "release": lambda session, lease, _: Queue(session).release(lease),
-    "start": lambda session, lease, run: RunLedger(session, lease).start([run]),
-    "pending": lambda session, lease, _: RunLedger(session, lease).pending(),
-    "create": lambda session, lease, _: RunLedger(session, lease).create([]),
-    "append": lambda session, lease, _: RunLedger(session, lease).append([]),
-    "save": lambda session, lease, run: RunLedger(session, lease).save([(run, 1, b"late")]),
-    "checkpoints": lambda session, lease, _: RunLedger(session, lease).checkpoints(),
-    "record": lambda session, lease, run: RunLedger(session, lease).record(
-        [RunOutcome(run_id=run, state=State.SUCCEEDED, best_rms=9.0)]
+    "hold": lambda session, lease, _: LeaseQueue(session).lock_job(lease),
+    "report": lambda session, lease, _: LeaseQueue(session).write_progress(lease, JobProgress(5)),
+    "tell": lambda session, lease, _: LeaseQueue(session).append_event(
+        lease, "log", {"line": "late"}
+    ),
+    "finish": lambda session, lease, _: LeaseQueue(session).finish_job(
+        lease, JobState.FAILED, "late"
+    ),
+    "release": lambda session, lease, _: LeaseQueue(session).release_job(lease),
+    "start": lambda session, lease, run: RunWriter(session, lease).start_runs([run]),
+    "pending": lambda session, lease, _: RunWriter(session, lease).list_pending(),
+    "create": lambda session, lease, _: RunWriter(session, lease).create_runs([]),
+    "append": lambda session, lease, _: RunWriter(session, lease).append_history([]),
+    "save": lambda session, lease, run: RunWriter(session, lease).save_checkpoints(
+        [(run, 1, b"late")]
+    ),
+    "checkpoints": lambda session, lease, _: RunWriter(session, lease).read_checkpoints(),
+    "record": lambda session, lease, run: RunWriter(session, lease).record_outcomes(
+        [RunOutcome(run_id=run, state=JobState.SUCCEEDED, best_rms=9.0)]
     ),
 }
 
@@ -272,11 +281,13 @@ LATE_WRITES = {
 def test_a_late_writer_is_refused_and_changes_nothing(database, clock, write):
     got, (run_id,) = claimed(database)
     with database.write() as session:
-        Queue(session, clock).heartbeat([got.lease])  # in the past of the true clock: it expires
+        LeaseQueue(session, clock).renew_leases(
+            [got.lease]
+        )  # in the past of the true clock: it expires
     clock.advance(11)
     assert reap(database, clock).requeued == (got.job.id,)
     with database.read() as session:
-        before = EventRepository(session).after(got.job.id)[-1].id
+        before = EventRepository(session).list_after(got.job.id)[-1].id
     for rival in (None, "d2"):  # while it is queued again, and while another has it
         if rival:
             claim(database, rival, clock)
@@ -284,17 +295,17 @@ def test_a_late_writer_is_refused_and_changes_nothing(database, clock, write):
         with pytest.raises(LeaseLost, match="attempt 1"), database.write() as session:
             write(session, got.lease, run_id)
         (run,) = runs_of(database, got.job.id)
-        assert (run.state, run.best_rms, run.attempt) == (State.QUEUED, None, 0)
+        assert (run.state, run.best_rms, run.attempt) == (JobState.QUEUED, None, 0)
         with database.read() as session:
-            assert EventRepository(session).after(got.job.id)[-1].id == before
+            assert EventRepository(session).list_after(got.job.id)[-1].id == before
 
 
 @pytest.mark.parametrize("end", ENDS)
 def test_a_terminal_state_is_never_overwritten(database, clock, end):
     got, (run_id,) = claimed(database)
     with database.write() as session:
-        RunLedger(session, got.lease).record([RunOutcome(run_id=run_id, state=end)])
-        Queue(session).finish(got.lease, end, "as told")
+        RunWriter(session, got.lease).record_outcomes([RunOutcome(run_id=run_id, state=end)])
+        LeaseQueue(session).finish_job(got.lease, end, "as told")
     for other in ENDS:
         with pytest.raises(LeaseLost):
             finish(database, got.lease, other)
@@ -308,12 +319,12 @@ def test_a_terminal_state_is_never_overwritten(database, clock, end):
 
 def test_a_job_cannot_succeed_while_a_run_is_unfinished(database):
     got, _ = claimed(database, n_runs=2)
-    with pytest.raises(Conflict, match="2 of its runs"):
+    with pytest.raises(RowConflict, match="2 of its runs"):
         finish(database, got.lease)
-    assert state_of(database, got.job.id) is State.RUNNING
+    assert state_of(database, got.job.id) is JobState.RUNNING
 
 
-@pytest.mark.parametrize("end", [State.FAILED, State.CANCELLED])
+@pytest.mark.parametrize("end", [JobState.FAILED, JobState.CANCELLED])
 def test_unfinished_runs_end_with_their_job(database, end):
     got, _ = claimed(database, n_runs=3)
     finish(database, got.lease, end, "no memory")
@@ -324,11 +335,11 @@ def test_progress_is_kept_and_told_and_the_best_never_rises(database):
     got, _ = claimed(database)
     for rms in (0.5, None, 0.2, 0.9):
         with database.write() as session:
-            Queue(session).report(got.lease, Progress(100, 7, rms, 3.5))
+            LeaseQueue(session).write_progress(got.lease, JobProgress(100, 7, rms, 3.5))
     job = job_of(database, got.job.id)
     assert (job.evaluations, job.generation, job.best_rms, job.seconds_left) == (100, 7, 0.2, 3.5)
     with database.read() as session:
-        events = EventRepository(session).after(got.job.id)
+        events = EventRepository(session).list_after(got.job.id)
     told = [event.data["best_rms"] for event in events if event.kind == "progress"]
     assert told == [0.5, 0.5, 0.2, 0.2]
 
@@ -336,9 +347,11 @@ def test_progress_is_kept_and_told_and_the_best_never_rises(database):
 def test_the_best_of_an_ended_job_is_that_of_its_results(database):
     got, runs = claimed(database)
     with database.write() as session:
-        Queue(session).report(got.lease, Progress(100, 7, 0.2, 3.5))  # fitness, as of soft-l1
-        RunLedger(session, got.lease).record(
-            [RunOutcome(run_id=runs[0], state=State.SUCCEEDED, best_rms=0.9)]
+        LeaseQueue(session).write_progress(
+            got.lease, JobProgress(100, 7, 0.2, 3.5)
+        )  # fitness, as of soft-l1
+        RunWriter(session, got.lease).record_outcomes(
+            [RunOutcome(run_id=runs[0], state=JobState.SUCCEEDED, best_rms=0.9)]
         )
     finish(database, got.lease)
     assert job_of(database, got.job.id).best_rms == 0.9

@@ -12,14 +12,14 @@ from datetime import timedelta
 import pytest
 
 from service.core.processes import describe_process, is_awake, is_gone
-from service.dispatch.leases import Leases
-from service.queue.clocks import clock_of
-from service.queue.dispatchers import LEASE_SECONDS, DispatcherRepository
-from service.queue.leases import BESIDE_OTHERS, HUNG, Queue
-from service.queue.orphaned_jobs import Reaper, reap
-from service.queue.run_writes import Cell, RunLedger, RunOutcome
+from service.core.states import JobState
+from service.dispatch.leases import HeldLeases
+from service.queue.clocks import choose_database_clock
+from service.queue.dispatchers import LEASE_SECONDS_KEY, DispatcherRepository
+from service.queue.leases import HUNG_AFTER, SPARED_LOSS_FACTOR, LeaseQueue
+from service.queue.orphaned_jobs import Reaper, reap_jobs
+from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.storage.columns import utc_now
-from service.storage.tables import State
 from sysid.core.machine import read_machine_id
 from tests.dispatching import until
 from tests.stored import Clock, claim, claimed, job_of, runs_of, state_of, submit
@@ -34,8 +34,8 @@ def clock() -> Clock:
 
 def announce(database, owner: str, details) -> None:
     with database.write() as session:
-        told = {LEASE_SECONDS: LEASE.total_seconds(), **details}
-        DispatcherRepository(session).announce(owner, told)
+        told = {LEASE_SECONDS_KEY: LEASE.total_seconds(), **details}
+        DispatcherRepository(session).add_dispatcher(owner, told)
 
 
 def of_a_process_that_has_ended():
@@ -54,10 +54,10 @@ def test_jobs_of_a_dispatcher_whose_process_has_ended_are_given_back_at_once(dat
     job = submit(database)
     claim(database, "dead")
     announce(database, "dead", of_a_process_that_has_ended())
-    assert reap(database).requeued == (job,)
-    assert state_of(database, job) is State.QUEUED
+    assert reap_jobs(database).requeued == (job,)
+    assert state_of(database, job) is JobState.QUEUED
     with database.read() as session:
-        assert DispatcherRepository(session).alive() == []
+        assert DispatcherRepository(session).list_alive() == []
 
 
 def test_jobs_of_a_dispatcher_that_lives_or_that_cannot_be_seen_are_left_alone(database) -> None:
@@ -67,8 +67,8 @@ def test_jobs_of_a_dispatcher_that_lives_or_that_cannot_be_seen_are_left_alone(d
     jobs = {submit(database) for _ in range(3)}
     for owner in ("here", "elsewhere", "unknown"):
         claim(database, owner)
-    assert reap(database).requeued == ()
-    assert {state_of(database, job) for job in jobs} == {State.RUNNING}
+    assert reap_jobs(database).requeued == ()
+    assert {state_of(database, job) for job in jobs} == {JobState.RUNNING}
 
 
 @needs_proc
@@ -84,9 +84,9 @@ def test_a_lease_written_before_the_clock_was_stepped_back_is_not_waited_for(
     job = submit(database)
     claim(database, "silent", clock)
     clock.advance(-3600)
-    assert reap(database, clock).requeued == ()  # its owner has one lease to renew it
+    assert reap_jobs(database, clock).requeued == ()  # its owner has one lease to renew it
     clock.advance(11)
-    assert reap(database, clock).requeued == (job,)
+    assert reap_jobs(database, clock).requeued == (job,)
 
 
 def test_a_dispatcher_that_lives_keeps_its_jobs_though_the_clock_is_stepped_back(
@@ -96,12 +96,14 @@ def test_a_dispatcher_that_lives_keeps_its_jobs_though_the_clock_is_stepped_back
     submit(database)
     held = claim(database, "alive", clock).lease
     clock.advance(-3600)
-    reap(database, clock)
+    reap_jobs(database, clock)
     for _ in range(5):
         clock.advance(3)
         with database.write() as session:
-            assert [one.lease for one in Queue(session, clock).heartbeat([held], LEASE)] == [held]
-        assert reap(database, clock).requeued == ()
+            assert [
+                one.lease for one in LeaseQueue(session, clock).renew_leases([held], LEASE)
+            ] == [held]
+        assert reap_jobs(database, clock).requeued == ()
 
 
 def test_leases_lost_while_runs_come_to_their_end_are_not_added_up(database, clock: Clock) -> None:
@@ -109,34 +111,34 @@ def test_leases_lost_while_runs_come_to_their_end_are_not_added_up(database, clo
     for number in range(3):
         got = claim(database, "falls", clock)
         with database.write() as session:
-            ledger = RunLedger(session, got.lease)
-            ledger.create(Cell(number=i) for i in range(3))
-            run = ledger.pending()[0].id
-            ledger.record([RunOutcome(run_id=run, state=State.SUCCEEDED, best_rms=1.0)])
+            ledger = RunWriter(session, got.lease)
+            ledger.create_runs(NewRun(number=i) for i in range(3))
+            run = ledger.list_pending()[0].id
+            ledger.record_outcomes([RunOutcome(run_id=run, state=JobState.SUCCEEDED, best_rms=1.0)])
         clock.advance(11)
-        assert reap(database, clock).requeued == (job,), number
+        assert reap_jobs(database, clock).requeued == (job,), number
     assert job_of(database, job).lost_leases == 1
 
 
 def test_a_job_given_back_because_the_workers_are_gone_counts_as_lost(database) -> None:
     got, _ = claimed(database, max_attempts=2)
     with database.write() as session:
-        Queue(session).release(got.lease, lost=True)
+        LeaseQueue(session).release_job(got.lease, lost=True)
     assert job_of(database, got.job.id).lost_leases == 1
     again = claim(database)
     with database.write() as session:
-        Queue(session).release(again.lease, lost=True)
+        LeaseQueue(session).release_job(again.lease, lost=True)
     job = job_of(database, got.job.id)
-    assert job.state is State.FAILED
+    assert job.state is JobState.FAILED
     assert "lost its workers" in (job.error or "")
 
 
 def test_deaths_over_a_run_outlive_the_dispatcher_that_counted_them(database) -> None:
     got, (run,) = claimed(database)
     with database.write() as session:
-        RunLedger(session, got.lease).blame({run: 1})
+        RunWriter(session, got.lease).write_kills({run: 1})
     with database.write() as session:
-        Queue(session).release(got.lease)
+        LeaseQueue(session).release_job(got.lease)
     assert [one.kills for one in runs_of(database, got.job.id)] == [1]
 
 
@@ -149,7 +151,7 @@ def test_the_web_process_reaps_too(database) -> None:
     reaper = Reaper(database, stopping)
     reaper.start()
     try:
-        until(lambda: state_of(database, job) is State.QUEUED, "it was queued again")
+        until(lambda: state_of(database, job) is JobState.QUEUED, "it was queued again")
     finally:
         stopping.set()
         reaper.join()
@@ -161,7 +163,7 @@ def expired(database, owner: str, details, seconds: float = 0.1) -> str:
     announce(database, owner, details)
     with database.write() as session:
         ago = timedelta(seconds=-seconds)
-        assert Queue(session).claim(owner, ago).job.id == job
+        assert LeaseQueue(session).claim_job(owner, ago).job.id == job
     return job
 
 
@@ -169,10 +171,10 @@ def expired(database, owner: str, details, seconds: float = 0.1) -> str:
 def test_a_dispatcher_that_lives_here_is_not_reaped_while_it_waits_for_the_database(
     database,
 ) -> None:
-    job = expired(database, "here", describe_process(), HUNG.total_seconds() - 10)
+    job = expired(database, "here", describe_process(), HUNG_AFTER.total_seconds() - 10)
     lost = expired(database, "elsewhere", {**describe_process(), "machine": "another"})
-    assert reap(database).requeued == (lost,)
-    assert state_of(database, job) is State.RUNNING
+    assert reap_jobs(database).requeued == (lost,)
+    assert state_of(database, job) is JobState.RUNNING
     assert job_of(database, job).lost_leases == 0
 
 
@@ -180,9 +182,9 @@ def test_a_dispatcher_that_lives_here_is_not_reaped_while_it_waits_for_the_datab
 def test_a_dispatcher_that_lives_but_hangs_is_reaped_at_last_and_not_called_gone(
     database, caplog: pytest.LogCaptureFixture
 ) -> None:
-    job = expired(database, "here", describe_process(), HUNG.total_seconds() + 1)
+    job = expired(database, "here", describe_process(), HUNG_AFTER.total_seconds() + 1)
     with caplog.at_level(logging.WARNING):
-        assert reap(database).requeued == (job,)
+        assert reap_jobs(database).requeued == (job,)
     (told,) = caplog.messages
     assert "here lives, but has not renewed its leases" in told
     assert "gone" not in told
@@ -206,7 +208,7 @@ def test_a_dispatcher_that_is_stopped_is_reaped_when_its_lease_ends(database) ->
         assert not is_awake(details)
         assert not is_gone(details)
         job = expired(database, "stopped", details)
-        assert reap(database).requeued == (job,)
+        assert reap_jobs(database).requeued == (job,)
     finally:
         process.kill()
         process.communicate()
@@ -217,42 +219,42 @@ def test_leases_lost_while_a_run_came_further_are_not_added_up(database, clock: 
     for number in range(4):
         got = claim(database, "falls", clock)
         with database.write() as session:
-            ledger = RunLedger(session, got.lease)
-            ledger.create([Cell(number=0)])
-            ledger.save([(ledger.pending()[0].id, 100 * (number + 1), b"state")])
+            ledger = RunWriter(session, got.lease)
+            ledger.create_runs([NewRun(number=0)])
+            ledger.save_checkpoints([(ledger.list_pending()[0].id, 100 * (number + 1), b"state")])
         clock.advance(11)
-        assert reap(database, clock).requeued == (job,), number
+        assert reap_jobs(database, clock).requeued == (job,), number
         assert job_of(database, job).lost_leases == 1
     claim(database, "falls", clock)  # and now it does not come further
     clock.advance(11)
-    assert reap(database, clock).failed == (job,)
+    assert reap_jobs(database, clock).failed == (job,)
 
 
 def test_how_long_a_lease_is_tells_its_dispatcher_and_not_the_one_who_reaps(
     database, clock: Clock
 ) -> None:
     job = submit(database)
-    announce(database, "slow", {LEASE_SECONDS: 60.0})
+    announce(database, "slow", {LEASE_SECONDS_KEY: 60.0})
     with database.write() as session:
-        Queue(session, clock).claim("slow", timedelta(seconds=60))
-    assert reap(database, clock).requeued == ()
+        LeaseQueue(session, clock).claim_job("slow", timedelta(seconds=60))
+    assert reap_jobs(database, clock).requeued == ()
     assert job_of(database, job).lease_until == clock.now + timedelta(seconds=60)
     clock.advance(-3600)
-    reap(database, clock)
+    reap_jobs(database, clock)
     assert job_of(database, job).lease_until == clock.now + timedelta(seconds=60)
     clock.advance(59)
-    assert reap(database, clock).requeued == ()
+    assert reap_jobs(database, clock).requeued == ()
     clock.advance(2)
-    assert reap(database, clock).requeued == (job,)
+    assert reap_jobs(database, clock).requeued == (job,)
 
 
 def test_a_dispatcher_with_long_leases_counts_as_alive_as_long(database, clock: Clock) -> None:
     with database.write() as session:
         repository = DispatcherRepository(session, clock)
-        repository.announce("slow", {LEASE_SECONDS: 60.0})
-        repository.announce("quick", {LEASE_SECONDS: 10.0})
+        repository.add_dispatcher("slow", {LEASE_SECONDS_KEY: 60.0})
+        repository.add_dispatcher("quick", {LEASE_SECONDS_KEY: 10.0})
         clock.advance(30)
-        assert [one.owner for one in repository.alive()] == ["slow"]
+        assert [one.owner for one in repository.list_alive()] == ["slow"]
 
 
 @pytest.mark.postgres
@@ -263,19 +265,19 @@ def test_leases_follow_the_clock_of_the_server_not_those_of_its_clients(
     monkeypatch.setattr("service.storage.columns.utc_now", lambda: wrong)
     job = submit(postgres_database)
     with postgres_database.write() as session:
-        assert clock_of(session)() > wrong + timedelta(seconds=500)
-        Queue(session).claim("behind")
+        assert choose_database_clock(session)() > wrong + timedelta(seconds=500)
+        LeaseQueue(session).claim_job("behind")
     monkeypatch.undo()
-    assert reap(postgres_database).requeued == ()
-    assert state_of(postgres_database, job) is State.RUNNING
+    assert reap_jobs(postgres_database).requeued == ()
+    assert state_of(postgres_database, job) is JobState.RUNNING
 
 
 def save_one(database, got) -> None:
     """Write a checkpoint of a run of the job."""
     with database.write() as session:
-        ledger = RunLedger(session, got.lease)
-        ledger.create([Cell(number=0)])
-        ledger.save([(ledger.pending()[0].id, 100, b"state")])
+        ledger = RunWriter(session, got.lease)
+        ledger.create_runs([NewRun(number=0)])
+        ledger.save_checkpoints([(ledger.list_pending()[0].id, 100, b"state")])
 
 
 @pytest.mark.parametrize("is_told", [False, True], ids=["reaped", "given back"])
@@ -283,21 +285,21 @@ def test_a_job_that_waits_beside_others_that_come_further_is_not_soon_given_up(
     database, clock: Clock, is_told: bool
 ) -> None:
     busy, waits = submit(database, max_attempts=2), submit(database, max_attempts=2)
-    leases = Leases(database, 10, clock=clock, stopwatch=lambda: clock.now.timestamp())
-    for loss in range(1, 2 * BESIDE_OTHERS):
-        got = [leases.claim(), leases.claim()]
+    leases = HeldLeases(database, 10, clock=clock, stopwatch=lambda: clock.now.timestamp())
+    for loss in range(1, 2 * SPARED_LOSS_FACTOR):
+        got = [leases.claim_job(), leases.claim_job()]
         save_one(database, next(one for one in got if one.job.id == busy))
         if is_told:
             leases.release_all(lost=True)
         else:
             clock.advance(11)
-            reap(database, clock)
+            reap_jobs(database, clock)
             for one in got:
-                leases.forget(one.lease)
-        assert state_of(database, waits) is State.QUEUED
+                leases.forget_lease(one.lease)
+        assert state_of(database, waits) is JobState.QUEUED
         assert job_of(database, waits).lost_leases == loss
         assert job_of(database, busy).lost_leases == 1
-    leases.claim(), leases.claim()
+    leases.claim_job(), leases.claim_job()
     leases.release_all(lost=True)  # and now nothing came further
-    assert state_of(database, waits) is State.FAILED
-    assert state_of(database, busy) is State.FAILED
+    assert state_of(database, waits) is JobState.FAILED
+    assert state_of(database, busy) is JobState.FAILED

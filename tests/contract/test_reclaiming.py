@@ -2,27 +2,28 @@
 
 import pytest
 
-from service.dispatch.checkpoints import packed, unpacked
+from service.core.states import JobState
+from service.dispatch.checkpoints import pack_state, unpack_state
 from service.dispatch.job_runs import JobRuns
-from service.dispatch.recorder import Recorder
-from service.queue.leases import Queue
-from service.queue.run_writes import RunLedger, RunOutcome
+from service.dispatch.recorder import RunRecorder
+from service.queue.leases import LeaseQueue
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.events import EventRepository
 from service.repositories.history import HistoryPoint
 from service.repositories.runs import RunRepository
-from service.storage.tables import Checkpoint, State
-from sysid.identification.run import begin
+from service.storage.tables import Checkpoint
+from sysid.identification.run import begin_run
 from tests.dispatching import Place
 from tests.runs import RECORDS, spec
-from workers.ports import Failure, QueuedRun
-from workers.tasks import build
+from workers.protocol import QueuedRun, RunFailure
+from workers.tasks import build_pack_problems
 
 SWEEP = {"axes": [{"path": "/seed", "values": [1, 2, 3, 4]}]}
 
 
 @pytest.fixture(scope="module")
 def state():
-    return begin(build(spec().problem, RECORDS)[0], spec().algorithm, 1)
+    return begin_run(build_pack_problems(spec().problem, RECORDS)[0], spec().algorithm, 1)
 
 
 @pytest.fixture
@@ -34,17 +35,17 @@ def place(tmp_path):
 
 def claim(place):
     with place.database.write() as session:
-        return Queue(session).claim("d1")
+        return LeaseQueue(session).claim_job("d1")
 
 
 def claim_again(place, lease):
     with place.database.write() as session:
-        Queue(session).release(lease)
+        LeaseQueue(session).release_job(lease)
     return claim(place)
 
 
 def recorder(place, claim):
-    return Recorder(place.database, claim, lambda run, found: None, lambda run: None)
+    return RunRecorder(place.database, claim, lambda run, found: None, lambda run: None)
 
 
 def point(run, number):
@@ -55,25 +56,25 @@ def test_progress_and_reasons_go_on_from_the_attempt_before(place, state) -> Non
     job = place.submit(sweep=SWEEP)
     first, runs = claim(place), [run.id for run in place.runs(job)]
     with place.database.write() as session:
-        ledger = RunLedger(session, first.lease)
-        ledger.record([
-            RunOutcome(run_id=runs[0], state=State.SUCCEEDED, evaluations=700, generations=40),
-            RunOutcome(run_id=runs[1], state=State.FAILED, error="as told", evaluations=30),
+        ledger = RunWriter(session, first.lease)
+        ledger.record_outcomes([
+            RunOutcome(run_id=runs[0], state=JobState.SUCCEEDED, evaluations=700, generations=40),
+            RunOutcome(run_id=runs[1], state=JobState.FAILED, error="as told", evaluations=30),
         ])  # fmt: skip
-        ledger.save([(runs[2], 200, packed(state))])
+        ledger.save_checkpoints([(runs[2], 200, pack_state(state))])
     again = recorder(place, claim_again(place, first.lease))
-    again.failure(runs[3], Failure("otherwise"))
+    again.failure(runs[3], RunFailure("otherwise"))
     again.keep()
     assert (place.job(job).evaluations, place.job(job).generation) == (930, 40)
     again.progress(runs[2], state, 1.0)
     again.keep()
     assert place.job(job).evaluations == 730 + state.evaluations
-    again.failure(runs[2], Failure("as told"))
+    again.failure(runs[2], RunFailure("as told"))
     again.finish()
     assert place.job(job).error == "3 of 4 runs failed: as told; otherwise"
     assert place.job(job).evaluations == 730 + state.evaluations
     with place.database.read() as session:
-        told = [one.data for one in EventRepository(session).after(job) if one.kind == "log"]
+        told = [one.data for one in EventRepository(session).list_after(job) if one.kind == "log"]
     assert told == [{"message": f"{runs[3]} failed: otherwise"}]
 
 
@@ -83,17 +84,19 @@ def test_a_run_whose_checkpoint_is_refused_loses_its_history_and_only_that_run(
     job = place.submit(sweep=SWEEP)
     first, runs = claim(place), [run.id for run in place.runs(job)]
     with place.database.write() as session:
-        ledger = RunLedger(session, first.lease)
-        ledger.append([point(run, number) for run in runs for number in range(2)])
-        ledger.record([RunOutcome(run_id=runs[0], state=State.SUCCEEDED)])
-        ledger.save([(runs[1], 9, packed(state)), (runs[2], 9, b"lagid 0.0 run state 1\n...")])
+        ledger = RunWriter(session, first.lease)
+        ledger.append_history([point(run, number) for run in runs for number in range(2)])
+        ledger.record_outcomes([RunOutcome(run_id=runs[0], state=JobState.SUCCEEDED)])
+        ledger.save_checkpoints(
+            [(runs[1], 9, pack_state(state)), (runs[2], 9, b"lagid 0.0 run state 1\n...")]
+        )
     source = JobRuns(place.database, claim_again(place, first.lease), place.store)
-    queued = [one for one in source.runs() if isinstance(one, QueuedRun)]
+    queued = [one for one in source.iterate_runs() if isinstance(one, QueuedRun)]
     assert [(one.run, one.state is None) for one in queued] == [
         (runs[1], False), (runs[2], True), (runs[3], True),
     ]  # fmt: skip
     with place.database.read() as session:
-        lengths = [len(RunRepository(session).history(run)) for run in runs]
-        kept = [(one.run_id, unpacked(one.state) is None) for one in session.query(Checkpoint)]
+        lengths = [len(RunRepository(session).read_history(run)) for run in runs]
+        kept = [(one.run_id, unpack_state(one.state) is None) for one in session.query(Checkpoint)]
     assert lengths == [2, 2, 0, 0]
     assert kept == [(runs[1], False)]

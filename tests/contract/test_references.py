@@ -4,12 +4,13 @@ import threading
 
 import pytest
 
-from service.queue.leases import Queue
-from service.queue.run_writes import Cell, RunLedger, RunOutcome
+from service.core.states import JobState
+from service.queue.leases import LeaseQueue
+from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.repositories.references import ReferenceRepository
-from service.repositories.trends import count_succeeded, trend_rows
-from service.storage.errors import NotFound
-from service.storage.tables import Run, State
+from service.repositories.trends import count_succeeded, read_trend_rows
+from service.storage.errors import RowNotFound
+from service.storage.tables import Run
 from tests.stored import claimed, runs_of, submit
 
 RESULT = {
@@ -22,7 +23,7 @@ RESULT = {
 
 def accepted(database, name, run, **more):
     with database.write() as session:
-        return ReferenceRepository(session).accept(name, run, **more).number
+        return ReferenceRepository(session).accept_run(name, run, **more).number
 
 
 def test_the_latest_acceptance_is_in_use_and_the_others_stay(database):
@@ -33,15 +34,15 @@ def test_the_latest_acceptance_is_in_use_and_the_others_stay(database):
     accepted(database, "other", runs[2], note="narrow")
     with database.read() as session:
         repository = ReferenceRepository(session)
-        history = repository.history("tube")
+        history = repository.list_history("tube")
         assert [one.run_id for one in history] == [runs[0], runs[1], runs[0]]
         assert [one.accepted_by for one in history] == [None, "me", "me"]
-        page = repository.page()
+        page = repository.list_page()
         assert [(one.accepted.name, one.accepted.run_id) for one in page.items] == [
             ("other", runs[2]), ("tube", runs[0]),
         ]  # fmt: skip
-        with pytest.raises(NotFound, match="reference nobody"):
-            repository.history("nobody")
+        with pytest.raises(RowNotFound, match="reference nobody"):
+            repository.list_history("nobody")
 
 
 def test_the_same_run_again_is_kept_where_it_is_said_by_another_or_why(database):
@@ -53,8 +54,12 @@ def test_the_same_run_again_is_kept_where_it_is_said_by_another_or_why(database)
     assert accepted(database, "tube", run, accepted_by="me", note="second") == 3
     with database.read() as session:
         repository = ReferenceRepository(session)
-        assert repository.latest("tube").number == 3
-        assert [one.note for one in repository.history("tube")] == ["second", "second", "first"]
+        assert repository.get_latest("tube").number == 3
+        assert [one.note for one in repository.list_history("tube")] == [
+            "second",
+            "second",
+            "first",
+        ]
 
 
 def test_references_are_listed_page_by_page_without_the_results_of_their_runs(database):
@@ -66,7 +71,7 @@ def test_references_are_listed_page_by_page_without_the_results_of_their_runs(da
     with database.read() as session:
         repository = ReferenceRepository(session)
         for _ in range(3):
-            page = repository.page(cursor=cursor, limit=2)
+            page = repository.list_page(cursor=cursor, limit=2)
             found += page.items
             cursor = page.next
         assert not any(isinstance(one, Run) for one in session.identity_map.values())
@@ -85,7 +90,7 @@ def test_acceptances_at_once_have_numbers_of_their_own(database):
     for one in threads:
         one.join()
     with database.read() as session:
-        history = ReferenceRepository(session).history("tube")
+        history = ReferenceRepository(session).list_history("tube")
     assert [one.number for one in history] == [6, 5, 4, 3, 2, 1]
     assert {one.run_id for one in history} == set(runs)
 
@@ -93,24 +98,24 @@ def test_acceptances_at_once_have_numbers_of_their_own(database):
 def test_a_trend_reads_the_runs_that_succeeded_in_order_with_parts_of_their_results(database):
     submit(database, n_runs=3)
     with database.write() as session:
-        lease = Queue(session).claim("d1").lease
-        RunLedger(session, lease).create(
-            Cell(number=i, cell={"/seed": i}, labels={"length_m": 5.0 * i}) for i in range(3)
+        lease = LeaseQueue(session).claim_job("d1").lease
+        RunWriter(session, lease).create_runs(
+            NewRun(number=i, cell={"/seed": i}, labels={"length_m": 5.0 * i}) for i in range(3)
         )
     runs = [run.id for run in runs_of(database, lease.job_id)]
     ends = [
-        {"state": State.SUCCEEDED, "result": RESULT, "best_rms": 0.5, "evaluations": 7},
-        {"state": State.FAILED, "error": "diverged"},
-        {"state": State.SUCCEEDED, "result": {**RESULT, "warnings": []}},
+        {"state": JobState.SUCCEEDED, "result": RESULT, "best_rms": 0.5, "evaluations": 7},
+        {"state": JobState.FAILED, "error": "diverged"},
+        {"state": JobState.SUCCEEDED, "result": {**RESULT, "warnings": []}},
     ]
     with database.write() as session:
-        RunLedger(session, lease).record(
+        RunWriter(session, lease).record_outcomes(
             [RunOutcome(run_id=run, **end) for run, end in zip(runs, ends, strict=True)]
         )
     with database.read() as session:
-        first, last = trend_rows(session, lease.job_id, 10)
+        first, last = read_trend_rows(session, lease.job_id, 10)
         assert count_succeeded(session, lease.job_id) == 2
-        assert [one.id for one in trend_rows(session, lease.job_id, 1)] == runs[:1]
+        assert [one.id for one in read_trend_rows(session, lease.job_id, 1)] == runs[:1]
     assert (first.id, first.labels, first.evaluations) == (runs[0], {"length_m": 0.0}, 7)
     assert {name: getattr(first, name) for name in RESULT} == RESULT
     assert (last.id, last.warnings) == (runs[2], [])

@@ -4,28 +4,28 @@ from datetime import timedelta
 
 import pytest
 
+from service.core.states import JobState
 from service.repositories.events import EventRepository
 from service.repositories.jobs import JobRepository
-from service.storage.garbage import collect
-from service.storage.tables import State
+from service.storage.garbage import delete_orphans
 from sysid.identification.fit_problems import FitRecords
 from tests.dispatching import Place, carry_out
-from workers.inline import InlineCrew
-from workers.tasks import advance
+from workers.inline_executor import InlineExecutor
+from workers.tasks import process_pack
 
 SMALL = {"population": 8, "generations": 5, "islands": 1}
 
 
-class CountingCrew(InlineCrew):
+class CountingCrew(InlineExecutor):
     """A crew that remembers which runs it was given."""
 
     def __init__(self):
         super().__init__()
         self.computed = []
 
-    def submit(self, pack, keys, shared):
+    def submit_pack(self, pack, keys, shared):
         self.computed += [item.run for item in pack]
-        return super().submit(pack, keys, shared)
+        return super().submit_pack(pack, keys, shared)
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_more_replicates_of_a_sweep_compute_only_the_new_ones(place):
             old.best_rms, old.evaluations, old.signals_sha256,
         )  # fmt: skip
     with place.database.read() as session:
-        told = [one.data.get("message") for one in EventRepository(session).latest(job, 20)]
+        told = [one.data.get("message") for one in EventRepository(session).list_latest(job, 20)]
     assert "3 of 5 runs had been computed before: reused" in told
     assert place.job(job).evaluations == sum(run.evaluations for run in after)
     assert place.job(job).n_done == 5
@@ -88,7 +88,7 @@ def test_runs_of_a_deleted_job_are_not_taken_over_as_their_signals_are_garbage(p
     with place.database.write() as session:
         JobRepository(session).delete(first)
     with place.database.read() as session:
-        collect(session, place.store, older_than=timedelta(0))
+        delete_orphans(session, place.store, older_than=timedelta(0))
     _, after, computed = carried_out(place, **sweep(2))
     assert computed == [run.id for run in after]
     assert [run.best_rms for run in after] == [run.best_rms for run in before]
@@ -123,25 +123,26 @@ def test_a_run_that_the_clock_may_end_is_computed_again(place):
 
 def test_a_run_that_failed_is_tried_again(place, monkeypatch):
     def broken(pack, keys, *shared):
-        done = advance(pack, keys, *shared)
+        done = process_pack(pack, keys, *shared)
         raise MemoryError(f"{len(done)} lost")
 
     with monkeypatch.context() as patched:
         patched.setattr(
-            "service.dispatch.job_runs.prepared", lambda *_: FitRecords((), None, None, None)
+            "service.dispatch.job_runs.prepare_run_records",
+            lambda *_: FitRecords((), None, None, None),
         )
-        patched.setattr("sysid.identification.run.conclude", broken)
-        patched.setattr("workers.tasks.conclude", broken)
+        patched.setattr("sysid.identification.run.conclude_run", broken)
+        patched.setattr("workers.tasks.conclude_run", broken)
         _, (run,), _ = carried_out(place, **sweep(1))
-    assert run.state is State.FAILED
+    assert run.state is JobState.FAILED
     _, (again,), computed = carried_out(place, **sweep(1))
     assert computed == [again.id]
-    assert again.state is State.SUCCEEDED
+    assert again.state is JobState.SUCCEEDED
 
 
 def test_a_run_without_its_signals_is_computed_again(place, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr("service.dispatch.job_runs.save_fit", lambda *_: None)
+        patched.setattr("service.dispatch.job_runs.add_fitted_signals", lambda *_: None)
         _, (first,), _ = carried_out(place, **sweep(1))
     assert first.signals_sha256 is None
     _, (again,), computed = carried_out(place, **sweep(1))

@@ -2,13 +2,13 @@
 
 import pytest
 
-from service.queue.leases import Queue
-from service.queue.run_writes import Cell, RunLedger, RunOutcome, add_runs
+from service.core.states import JobState
+from service.queue.leases import LeaseQueue
+from service.queue.run_writes import NewRun, RunOutcome, RunWriter, insert_runs
 from service.repositories.history import HistoryPoint, MigrantPoint
 from service.repositories.jobs import JobRepository
 from service.repositories.runs import RunRepository
-from service.storage.errors import InvalidCursor, NotFound, UnstorableValue
-from service.storage.tables import State
+from service.storage.errors import InvalidCursor, RowNotFound, UnstorableValue
 from tests.stored import claimed, job_of, runs_of, submit
 
 RESULT = {
@@ -20,12 +20,12 @@ RESULT = {
 
 def record(database, lease, *outcomes, **evidence):
     with database.write() as session:
-        return RunLedger(session, lease).record(outcomes, **evidence)
+        return RunWriter(session, lease).record_outcomes(outcomes, **evidence)
 
 
 def good(run_id, rms=0.01):
     return RunOutcome(
-        run_id=run_id, state=State.SUCCEEDED, result=RESULT, valid=True, best_rms=rms,
+        run_id=run_id, state=JobState.SUCCEEDED, result=RESULT, valid=True, best_rms=rms,
         fit_estimation=98.0, evaluations=200, generations=4, seconds=0.5, signals_sha256="b" * 64,
     )  # fmt: skip
 
@@ -34,24 +34,24 @@ def sweep(database, cells):
     """A claimed job with these cells; its identifier."""
     submit(database, n_runs=len(cells))
     with database.write() as session:
-        got = Queue(session).claim("d1")
-        RunLedger(session, got.lease).create(
-            Cell(number=i, cell=cell, labels={"length_m": i % 2}) for i, cell in enumerate(cells)
+        got = LeaseQueue(session).claim_job("d1")
+        RunWriter(session, got.lease).create_runs(
+            NewRun(number=i, cell=cell, labels={"length_m": i % 2}) for i, cell in enumerate(cells)
         )
     return got
 
 
 def numbers(database, job_id, **filters):
     with database.read() as session:
-        return [run.number for run in RunRepository(session).page(job_id, **filters).items]
+        return [run.number for run in RunRepository(session).list_page(job_id, **filters).items]
 
 
 def test_runs_are_made_in_bulk_and_a_second_time_changes_nothing(database):
     got, before = claimed(database, n_runs=1500)
     with database.write() as session:
-        ledger = RunLedger(session, got.lease)
-        ledger.create(Cell(number=i) for i in range(1500))
-        assert [run.id for run in ledger.pending(limit=2000)] == before
+        ledger = RunWriter(session, got.lease)
+        ledger.create_runs(NewRun(number=i) for i in range(1500))
+        assert [run.id for run in ledger.list_pending(limit=2000)] == before
     assert before == sorted(before)
     assert len(set(before)) == 1500
 
@@ -60,31 +60,31 @@ def test_runs_can_be_made_with_their_job(database):
     job_id = submit(database)
     with database.write() as session:
         job = JobRepository(session).get(job_id)
-        add_runs(session, job, [Cell(number=0, cell={"/seed": 3}, seed=3, method="simple")])
+        insert_runs(session, job, [NewRun(number=0, cell={"/seed": 3}, seed=3, method="simple")])
     (run,) = runs_of(database, job_id)
     assert (run.job_id, run.project_id, run.seed, run.method) == (
         job_id, "proj_default", 3, "simple",
     )  # fmt: skip
-    assert run.state is State.QUEUED
+    assert run.state is JobState.QUEUED
 
 
 def test_pending_runs_come_in_order_and_in_parts(database):
     got, ids = claimed(database, n_runs=5)
     with database.write() as session:
-        ledger = RunLedger(session, got.lease)
-        first = ledger.pending(limit=2)
-        rest = ledger.pending(limit=9, after=first[-1].number)
+        ledger = RunWriter(session, got.lease)
+        first = ledger.list_pending(limit=2)
+        rest = ledger.list_pending(limit=9, after=first[-1].number)
     assert [run.id for run in first + rest] == ids
 
 
 def test_started_runs_carry_the_attempt_that_started_them(database):
     got, ids = claimed(database, n_runs=2)
     with database.write() as session:
-        RunLedger(session, got.lease).start(ids[:1])
+        RunWriter(session, got.lease).start_runs(ids[:1])
     first, second = runs_of(database, got.job.id)
-    assert (first.state, first.attempt) == (State.RUNNING, 1)
+    assert (first.state, first.attempt) == (JobState.RUNNING, 1)
     assert first.started_at is not None
-    assert (second.state, second.attempt) == (State.QUEUED, 0)
+    assert (second.state, second.attempt) == (JobState.QUEUED, 0)
 
 
 def test_a_result_is_stored_whole_with_the_columns_that_lists_use(database):
@@ -92,13 +92,13 @@ def test_a_result_is_stored_whole_with_the_columns_that_lists_use(database):
     assert record(database, got.lease, good(run_id)) == (run_id,)
     with database.read() as session:
         run = RunRepository(session).get(run_id)
-        (row,) = RunRepository(session).table(got.job.id)
+        (row,) = RunRepository(session).read_table(got.job.id)
     assert run.result == RESULT
     assert run.estimates == {
         "L": {"value": 0.12, "stderr": 0.01},
         "m": {"value": 1.0, "stderr": None},
     }
-    assert (run.state, run.best_rms, run.attempt) == (State.SUCCEEDED, 0.01, 1)
+    assert (run.state, run.best_rms, run.attempt) == (JobState.SUCCEEDED, 0.01, 1)
     assert run.finished_at is not None
     assert (row.id, row.estimates, row.cell, row.valid) == (run_id, run.estimates, run.cell, True)
 
@@ -116,13 +116,13 @@ def test_a_result_is_written_exactly_once(database):
 def test_a_job_counts_its_finished_and_failed_runs_and_keeps_the_least_rms(database):
     got, ids = claimed(database, n_runs=4)
     record(database, got.lease, good(ids[0], 0.3), good(ids[1], 0.2))
-    record(database, got.lease, RunOutcome(run_id=ids[2], state=State.FAILED, error="diverged"))
+    record(database, got.lease, RunOutcome(run_id=ids[2], state=JobState.FAILED, error="diverged"))
     job = job_of(database, got.job.id)
     assert (job.n_done, job.n_failed, job.best_rms) == (3, 1, 0.2)
     with database.read() as session:
-        counts = RunRepository(session).counts(got.job.id)
+        counts = RunRepository(session).count_states(got.job.id)
     assert counts == {
-        State.QUEUED: 1, State.RUNNING: 0, State.SUCCEEDED: 2, State.FAILED: 1, State.CANCELLED: 0,
+        JobState.QUEUED: 1, JobState.RUNNING: 0, JobState.SUCCEEDED: 2, JobState.FAILED: 1, JobState.CANCELLED: 0,
     }  # fmt: skip
 
 
@@ -137,7 +137,7 @@ def test_results_and_history_stand_or_fall_together(database):
     bad = HistoryPoint("run_none", 0, 0, 0, 0, 1.0, "start", [])
     with pytest.raises(Exception, match=r"(?i)foreign key"):
         record(database, got.lease, good(ids[0]), history=[bad])
-    assert {run.state for run in runs_of(database, got.job.id)} == {State.QUEUED}
+    assert {run.state for run in runs_of(database, got.job.id)} == {JobState.QUEUED}
     assert job_of(database, got.job.id).n_done == 0
 
 
@@ -150,11 +150,11 @@ def test_history_written_again_after_a_resume_changes_nothing(database):
     ]
     migrants = [MigrantPoint(run_id, 0, 1, 0, 1, 0.5)]
     with database.write() as session:
-        RunLedger(session, got.lease).append(points[:4], migrants)
+        RunWriter(session, got.lease).append_history(points[:4], migrants)
     record(database, got.lease, good(run_id), history=points, migrants=migrants)
     with database.read() as session:
-        history = RunRepository(session).history(run_id)
-        log = RunRepository(session).migrations(run_id)
+        history = RunRepository(session).read_history(run_id)
+        log = RunRepository(session).read_migrations(run_id)
     assert [(one.island, one.number) for one in history] == [
         (i, n) for i in (0, 1) for n in range(3)
     ]
@@ -166,22 +166,22 @@ def test_history_written_again_after_a_resume_changes_nothing(database):
 def test_only_the_last_checkpoint_is_kept_and_a_finished_run_has_none(database):
     got, (a, b) = claimed(database, n_runs=2)
     with database.write() as session:
-        RunLedger(session, got.lease).save([(a, 10, b"\x00old"), (b, 10, b"b")])
-        RunLedger(session, got.lease).save([(a, 20, b"\x00new")])
-        assert RunLedger(session, got.lease).checkpoints() == {a: b"\x00new", b: b"b"}
+        RunWriter(session, got.lease).save_checkpoints([(a, 10, b"\x00old"), (b, 10, b"b")])
+        RunWriter(session, got.lease).save_checkpoints([(a, 20, b"\x00new")])
+        assert RunWriter(session, got.lease).read_checkpoints() == {a: b"\x00new", b: b"b"}
     record(database, got.lease, good(b))
     with database.write() as session:
-        assert RunLedger(session, got.lease).checkpoints() == {a: b"\x00new"}
+        assert RunWriter(session, got.lease).read_checkpoints() == {a: b"\x00new"}
 
 
 def test_the_next_holder_goes_on_from_the_checkpoint(database):
     got, (run_id,) = claimed(database)
     with database.write() as session:
-        RunLedger(session, got.lease).save([(run_id, 10, b"half way")])
-        Queue(session).release(got.lease)
+        RunWriter(session, got.lease).save_checkpoints([(run_id, 10, b"half way")])
+        LeaseQueue(session).release_job(got.lease)
     with database.write() as session:
-        again = Queue(session).claim("d2")
-        assert RunLedger(session, again.lease).checkpoints() == {run_id: b"half way"}
+        again = LeaseQueue(session).claim_job("d2")
+        assert RunWriter(session, again.lease).read_checkpoints() == {run_id: b"half way"}
 
 
 def test_pages_of_runs_follow_each_other_without_gap_or_repeat(database):
@@ -189,7 +189,7 @@ def test_pages_of_runs_follow_each_other_without_gap_or_repeat(database):
     seen, cursor = [], None
     while True:
         with database.read() as session:
-            page = RunRepository(session).page(got.job.id, limit=3, cursor=cursor)
+            page = RunRepository(session).list_page(got.job.id, limit=3, cursor=cursor)
         seen += [run.number for run in page.items]
         if (cursor := page.next) is None:
             break
@@ -206,7 +206,7 @@ def test_pages_sorted_by_a_column_have_every_run_once_and_those_without_a_value_
     seen, cursor = [], None
     while True:
         with database.read() as session:
-            page = RunRepository(session).page(
+            page = RunRepository(session).list_page(
                 got.job.id, limit=2, cursor=cursor, order="best_rms", descending=descending
             )
         seen += [run.number for run in page.items]
@@ -243,24 +243,26 @@ def test_filters_hold_together(database):
     assert numbers(database, got.job.id, cell={"/seed": 1, "/x": 'b"\\'}) == [3]
     assert numbers(database, got.job.id, labels={"length_m": 0}) == [0, 2]
     assert numbers(database, got.job.id, cell={"/none": 1}) == []
-    assert numbers(database, got.job.id, states=[State.SUCCEEDED]) == []
+    assert numbers(database, got.job.id, states=[JobState.SUCCEEDED]) == []
 
 
 def test_another_projects_runs_are_not_seen(database):
     got, (run_id,) = claimed(database)
     with database.read() as session:
         foreign = RunRepository(session, "proj_other")
-        assert foreign.page(got.job.id).items == ()
-        assert foreign.table(got.job.id) == []
-        for read in (foreign.get, foreign.history, foreign.migrations):
-            with pytest.raises(NotFound, match="no run"):
+        assert foreign.list_page(got.job.id).items == ()
+        assert foreign.read_table(got.job.id) == []
+        for read in (foreign.get, foreign.read_history, foreign.read_migrations):
+            with pytest.raises(RowNotFound, match="no run"):
                 read(run_id)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "a\x00b", "\ud800"])
 def test_a_document_that_not_every_database_can_keep_is_refused(database, value):
     got, (run_id,) = claimed(database)
-    bad = RunOutcome(run_id=run_id, state=State.SUCCEEDED, result={"parameters": [], "note": [value]})
+    bad = RunOutcome(
+        run_id=run_id, state=JobState.SUCCEEDED, result={"parameters": [], "note": [value]}
+    )
     with pytest.raises(UnstorableValue):
         record(database, got.lease, bad)
 
@@ -270,7 +272,7 @@ def test_text_that_only_looks_like_an_escape_is_kept(database):
     text = "\\u0000 and \\\\u0000 and \N{GREEK SMALL LETTER SIGMA}\N{PILE OF POO}"
     record(
         database, got.lease,
-        RunOutcome(run_id=run_id, state=State.FAILED, result={"parameters": [], "note": text}, error=text),
+        RunOutcome(run_id=run_id, state=JobState.FAILED, result={"parameters": [], "note": text}, error=text),
     )  # fmt: skip
     (run,) = runs_of(database, got.job.id)
     assert run.result == {"parameters": [], "note": text}

@@ -4,59 +4,59 @@ import csv
 import io
 from collections.abc import Sequence
 
-from service.queue.leases import Queue
-from service.queue.run_writes import Cell, RunLedger, RunOutcome, add_runs
+from service.core.states import JobState
+from service.queue.leases import LeaseQueue
+from service.queue.run_writes import NewRun, RunOutcome, RunWriter, insert_runs
 from service.repositories.jobs import JobRepository, NewJob
 from service.repositories.runs import RunRepository
 from service.runs import table as runs_table
 from service.storage.sessions import Database
-from service.storage.tables import State
 from tests.stored import claim
 
 EVIL = '=HYPERLINK("http://x","y")'
 
 
 def submit(database: Database, n_runs: int) -> str:
-    with database.write() as session:
+    with database.write_session() as session:
         new = NewJob(name="many", spec={"model": "silverbox", "sweep": {"axes": []}}, n_runs=n_runs)
         return JobRepository(session).submit(new).job.id
 
 
 def ended(
-    database: Database, cells: list[Cell], outcomes: dict[int, dict[str, float] | str]
+    database: Database, cells: list[NewRun], outcomes: dict[int, dict[str, float] | str]
 ) -> str:
     """A job whose runs of these numbers have estimates, or failed for a reason."""
     job = submit(database, n_runs=len(cells))
     got = claim(database)
     assert got is not None
-    with database.write() as session:
-        add_runs(session, got.job, cells)
-        runs = RunRepository(session).page(job, limit=10_000).items
-        RunLedger(session, got.lease).record([
+    with database.write_session() as session:
+        insert_runs(session, got.job, cells)
+        runs = RunRepository(session).list_page(job, limit=10_000).items
+        RunWriter(session, got.lease).record_outcomes([
             _outcome(run.id, outcomes[run.number]) for run in runs if run.number in outcomes
         ])  # fmt: skip
-        Queue(session).finish(got.lease, State.FAILED, "stopped")
+        LeaseQueue(session).finish_job(got.lease, JobState.FAILED, "stopped")
     return job
 
 
 def _outcome(run: str, told: dict[str, float] | str) -> RunOutcome:
     if isinstance(told, str):
-        return RunOutcome(run_id=run, state=State.FAILED, error=told)
+        return RunOutcome(run_id=run, state=JobState.FAILED, error=told)
     parameters = [
         {"name": name, "unit": "1", "value": value, "stderr": None, "status": "fixed"}
         for name, value in told.items()
     ]
     return RunOutcome(
-        run_id=run, state=State.SUCCEEDED, result={"parameters": parameters}, best_rms=1.0
+        run_id=run, state=JobState.SUCCEEDED, result={"parameters": parameters}, best_rms=1.0
     )
 
 
 def rows(database: Database, job: str) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO("".join(runs_table.table(database, job)))))
+    return list(csv.DictReader(io.StringIO("".join(runs_table.stream_table(database, job)))))
 
 
 def test_parameters_that_only_late_runs_have_are_in_the_table(database: Database) -> None:
-    cells = [Cell(number=number) for number in range(1200)]
+    cells = [NewRun(number=number) for number in range(1200)]
     job = ended(database, cells, {0: {"K": 2.0}, 3: "no", 1199: {"K": 3.0, "late": 0.1}})
     found = rows(database, job)
     assert len(found) == 1200
@@ -65,17 +65,17 @@ def test_parameters_that_only_late_runs_have_are_in_the_table(database: Database
 
 
 def test_a_table_of_runs_without_estimates_has_no_columns_of_parameters(database: Database) -> None:
-    found = rows(database, ended(database, [Cell(number=0)], {}))
+    found = rows(database, ended(database, [NewRun(number=0)], {}))
     assert [one["state"] for one in found] == ["failed"]
     assert list(found[0])[-1] == "error"
 
 
 def test_no_text_of_a_user_is_a_formula_in_a_spreadsheet(database: Database) -> None:
-    cells = [Cell(number=0), Cell(number=1)]
+    cells = [NewRun(number=0), NewRun(number=1)]
     job = ended(database, cells, {0: EVIL, 1: "-2"})
     assert [one["error"] for one in rows(database, job)] == [f"'{EVIL}", "-2"]
     for text in ("+1+cmd|' /C calc'!A0", "-2*K", "@SUM(1)", "\t=1", "\r=1", "\n=1", "\uff1d1"):
-        [row] = rows(database, ended(database, [Cell(number=0)], {0: text}))
+        [row] = rows(database, ended(database, [NewRun(number=0)], {0: text}))
         assert row["error"] == f"'{text}".replace("\r", " ")
 
 
@@ -83,19 +83,19 @@ def estimated(database: Database, job: str, told: Sequence[tuple[str, str, str]]
     """One run after the other, each with one estimate: name, unit and status."""
     got = claim(database)
     assert got is not None
-    with database.write() as session:
-        add_runs(session, got.job, [Cell(number=number) for number in range(len(told))])
-        runs = RunRepository(session).page(job).items
-        RunLedger(session, got.lease).record([
+    with database.write_session() as session:
+        insert_runs(session, got.job, [NewRun(number=number) for number in range(len(told))])
+        runs = RunRepository(session).list_page(job).items
+        RunWriter(session, got.lease).record_outcomes([
             RunOutcome(
-                run_id=run.id, state=State.SUCCEEDED, best_rms=1.0 + run.number,
+                run_id=run.id, state=JobState.SUCCEEDED, best_rms=1.0 + run.number,
                 result={"parameters": [
                     {"name": name, "unit": unit, "value": 0.5, "stderr": 0.25, "status": status}
                 ]},
             )
             for run, (name, unit, status) in zip(runs, told, strict=True)
         ])  # fmt: skip
-        Queue(session).finish(got.lease, State.FAILED, "stopped")
+        LeaseQueue(session).finish_job(got.lease, JobState.FAILED, "stopped")
 
 
 def test_headings_have_units_and_estimates_their_status(database: Database) -> None:

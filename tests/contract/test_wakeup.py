@@ -5,8 +5,8 @@ import time
 
 from sqlalchemy import text
 
-from service.queue.leases import Queue
-from service.queue.notifications import new_waker
+from service.queue.leases import LeaseQueue
+from service.queue.notifications import open_notifier
 from service.repositories.jobs import JobRepository
 from tests.stored import claimed, submit
 
@@ -30,36 +30,36 @@ def elapsed(waker, seconds):
 
 
 def test_a_new_job_wakes_the_waiting(database):
-    with new_waker(database) as waker:
+    with open_notifier(database) as waker:
         settle(waker)
         thread = later(lambda: submit(database))
-        assert waker.wait(LONG)
+        assert waker.wait_for_change(LONG)
         thread.join()
 
 
 def test_a_job_that_came_just_before_the_wait_is_not_missed(database):
-    with new_waker(database) as waker:
+    with open_notifier(database) as waker:
         settle(waker)
         submit(database)
-        assert waker.wait(LONG)
+        assert waker.wait_for_change(LONG)
 
 
 def test_jobs_that_come_back_wake_too(database):
     got, _ = claimed(database)
-    with new_waker(database) as waker:
+    with open_notifier(database) as waker:
         settle(waker)
         with database.write() as session:
-            Queue(session).release(got.lease)
-        assert waker.wait(LONG)
+            LeaseQueue(session).release_job(got.lease)
+        assert waker.wait_for_change(LONG)
         settle(waker)
         with database.write() as session:
             JobRepository(session).cancel(got.job.id)
             JobRepository(session).resume(got.job.id)
-        assert waker.wait(LONG)
+        assert waker.wait_for_change(LONG)
 
 
 def test_without_news_the_wait_ends_by_the_clock(database):
-    with new_waker(database) as waker:
+    with open_notifier(database) as waker:
         settle(waker)
         woken, seconds = elapsed(waker, 0.2)
     assert not woken
@@ -68,23 +68,23 @@ def test_without_news_the_wait_ends_by_the_clock(database):
 
 def test_a_stop_ends_the_wait(database):
     stop = threading.Event()
-    with new_waker(database, stop) as waker:
+    with open_notifier(database, stop) as waker:
         settle(waker)
         thread = later(stop.set)
-        assert waker.wait(LONG)
+        assert waker.wait_for_change(LONG)
         thread.join()
 
 
 def test_a_broken_connection_is_replaced(postgres_database):
-    with new_waker(postgres_database) as waker:
+    with open_notifier(postgres_database) as waker:
         settle(waker)
         with postgres_database.write() as session:
             session.execute(
                 text("SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
                      "WHERE query LIKE 'LISTEN%' AND datname = current_database()")
             )  # fmt: skip
-        assert not waker.wait(0.1)  # it notices
+        assert not waker.wait_for_change(0.1)  # it notices
         settle(waker)  # it listens again
         thread = later(lambda: submit(postgres_database))
-        assert waker.wait(LONG)
+        assert waker.wait_for_change(LONG)
         thread.join()

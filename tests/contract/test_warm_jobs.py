@@ -6,31 +6,31 @@ import pytest
 from sqlalchemy import event
 
 from service.core.errors import InvalidRequest
+from service.core.states import JobState
 from service.dispatch.job_runs import JobRuns
-from service.jobs.references import accept
+from service.jobs.references import accept_reference
 from service.jobs.schemas import ReferenceIn
-from service.jobs.to_core import algorithm_of
-from service.queue.leases import Queue
-from service.queue.run_writes import RunLedger
-from service.storage.tables import State
+from service.jobs.to_core import to_algorithm
+from service.queue.leases import LeaseQueue
+from service.queue.run_writes import RunWriter
 from sysid.core.errors import InvalidSettings
 from tests.dispatching import Place, carry_out
-from workers.inline import InlineCrew
-from workers.ports import NotYet
+from workers.inline_executor import InlineExecutor
+from workers.protocol import RunNotReady
 
 QUICK = {"population": 16, "generations": 40, "islands": 2, "stop": {"settled": 2}}
 
 
-class KeepingCrew(InlineCrew):
+class KeepingCrew(InlineExecutor):
     """A crew that remembers what each run began with; `slots` decide how much is read ahead."""
 
     def __init__(self, slots):
         super().__init__(slots)
         self.warm = {}
 
-    def submit(self, pack, keys, shared):
+    def submit_pack(self, pack, keys, shared):
         self.warm.update({item.run: item.spec.warm for item in pack})
-        return super().submit(pack, keys, shared)
+        return super().submit_pack(pack, keys, shared)
 
 
 @pytest.fixture
@@ -89,9 +89,9 @@ def test_a_chain_computed_before_is_taken_over_whole(place):
 
 def test_behind_a_run_that_failed_the_last_that_succeeded_serves(place):
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("service.dispatch.job_runs.algorithm_of", broken_second_time())
+        patched.setattr("service.dispatch.job_runs.to_algorithm", broken_second_time())
         runs, warm = carried_out(place, **chained(NOISE))
-    assert [one.state for one in runs] == [State.SUCCEEDED, State.FAILED, State.SUCCEEDED]
+    assert [one.state for one in runs] == [JobState.SUCCEEDED, JobState.FAILED, JobState.SUCCEEDED]
     assert warm[2] == (values(runs[0]),)
 
 
@@ -101,7 +101,7 @@ def broken_second_time():
     def made(body):
         if next(calls) == 1:
             raise InvalidSettings("/algorithm", "as told")
-        return algorithm_of(body)
+        return to_algorithm(body)
 
     return made
 
@@ -117,10 +117,10 @@ def test_a_reference_means_the_run_accepted_when_the_job_was_submitted(place):
     (first,), _ = carried_out(place)
     (second,), _ = carried_out(place, seed=2)
     with place.database.write() as session:
-        accept(session, "tube", ReferenceIn(run=first.id, by="me"))
+        accept_reference(session, "tube", ReferenceIn(run=first.id, by="me"))
     job = place.submit(warm_start="reference:tube")
     with place.database.write() as session:
-        told = accept(session, "tube", ReferenceIn(run=second.id))
+        told = accept_reference(session, "tube", ReferenceIn(run=second.id))
     assert place.job(job).spec["warm_start"] == first.id
     assert (told.run, [one.run for one in told.history]) == (second.id, [first.id])
     assert told.history[0].by == "me"
@@ -136,7 +136,7 @@ def test_a_reference_means_the_run_accepted_when_the_job_was_submitted(place):
 def test_a_warm_start_that_is_not_there_is_told(place, warm, said):
     (first,), _ = carried_out(place)
     with place.database.write() as session:
-        accept(session, "tube", ReferenceIn(run=first.id))
+        accept_reference(session, "tube", ReferenceIn(run=first.id))
     with pytest.raises(InvalidRequest) as caught:
         place.submit(warm_start=warm)
     (fault,) = caught.value.errors
@@ -166,11 +166,11 @@ def before_the_first_wait(place, body):
     """Numbers of the runs that come before one waits for another."""
     place.submit(**{"algorithm": QUICK, **body})
     with place.database.write() as session:
-        claim = Queue(session).claim("d1")
+        claim = LeaseQueue(session).claim_job("d1")
     numbers = {run.id: run.number for run in place.runs(claim.job.id)}
     coming = takewhile(
-        lambda one: not isinstance(one, NotYet),
-        JobRuns(place.database, claim, place.store).runs(),
+        lambda one: not isinstance(one, RunNotReady),
+        JobRuns(place.database, claim, place.store).iterate_runs(),
     )
     return [numbers[one.run] for one in coming]
 
@@ -183,11 +183,11 @@ def test_every_chain_begins_at_once_whichever_axis_goes_fastest(place, axes, fir
 
 
 def test_a_chain_begins_also_where_its_first_run_was_not_made_yet(place, monkeypatch):
-    monkeypatch.setattr("service.jobs.submit.AT_ONCE", 2)
-    monkeypatch.setattr("service.dispatch.job_runs.CHUNK", 2)
+    monkeypatch.setattr("service.jobs.submit.CELLS_AT_SUBMISSION", 2)
+    monkeypatch.setattr("service.dispatch.job_runs.CHUNK_ROWS", 2)
     runs, warm = carried_out(place, **chained(SEEDS, LABELLED))
     assert [one == () for one in warm] == [True, False, False] * 4
-    assert {run.state for run in runs} == {State.SUCCEEDED}
+    assert {run.state for run in runs} == {JobState.SUCCEEDED}
 
 
 def test_the_results_of_chains_do_not_depend_on_the_order_of_the_axes(place):
@@ -213,17 +213,17 @@ def statements_behind(place, n_failed):
     """SQL statements that it takes to learn what the last of a chain begins with."""
     job = place.submit(**chained({"path": "/seed", "range": [0, n_failed + 2]}, algorithm=QUICK))
     with place.database.write() as session:
-        claim = Queue(session).claim("d1")
-        rows = RunLedger(session, claim.lease).pending()
-        rows[0].state, rows[0].estimates = State.SUCCEEDED, {"T": {"value": 2.0, "stderr": None}}
+        claim = LeaseQueue(session).claim_job("d1")
+        rows = RunWriter(session, claim.lease).list_pending()
+        rows[0].state, rows[0].estimates = JobState.SUCCEEDED, {"T": {"value": 2.0, "stderr": None}}
         for row in rows[1:-1]:
-            row.state = State.FAILED
+            row.state = JobState.FAILED
     seen = []
     with place.database.read() as session:
         engine = session.get_bind()
     event.listen(engine, "before_cursor_execute", lambda *told: seen.append(told[2]))
-    (last,) = JobRuns(place.database, claim, place.store).runs()
-    assert last.spec.warm == ({"T": 2.0},)
+    (last,) = JobRuns(place.database, claim, place.store).iterate_runs()
+    assert last.spec.warm_starts == ({"T": 2.0},)
     place.cancel(job)
     return len(seen)
 
@@ -239,7 +239,7 @@ def test_a_chain_of_runs_that_fail_asks_the_database_for_none_of_them(place, mon
     def broken(body):
         raise InvalidSettings("/algorithm", "as told")
 
-    monkeypatch.setattr("service.dispatch.warm_starts.WarmStarts._stored", refused)
-    monkeypatch.setattr("service.dispatch.job_runs.algorithm_of", broken)
+    monkeypatch.setattr("service.dispatch.warm_starts.WarmStarts._read_last_success", refused)
+    monkeypatch.setattr("service.dispatch.job_runs.to_algorithm", broken)
     runs, _ = carried_out(place, **chained({"path": "/seed", "range": [0, 50]}))
-    assert {one.state for one in runs} == {State.FAILED}
+    assert {one.state for one in runs} == {JobState.FAILED}

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 
 from service.core.settings import Settings
+from service.core.states import JobState
 from service.datasets.datasets import add_recording
-from service.formats.mcap import FitRole, FittedOutput, write_fit
+from service.formats.mcap import FitRole, FittedOutput, write_fitted_outputs
 from service.jobs import submit as jobs
 from service.jobs.schemas import JobIn
-from service.queue.leases import Claim, Progress, Queue
-from service.queue.run_writes import RunLedger, RunOutcome
+from service.queue.leases import Claim, JobProgress, LeaseQueue
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.history import HistoryPoint, MigrantPoint
 from service.repositories.runs import RunRepository
 from service.storage.objects import ObjectStore
 from service.storage.sessions import Database
-from service.storage.tables import State
 from sysid.data.records import Channel, Recording
 
 MODEL = {
@@ -72,18 +72,18 @@ def fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
     sweep = _claimed(database, settings, _body(dataset, "three methods, four seeds", sweep=True))
     _end_sweep(database, sweep)
     failed = _claimed(database, settings, _body(dataset, "a model that diverges"))
-    with database.write() as session:
+    with database.write_session() as session:
         reason = "the model diverges everywhere: no individual of 50 gave a finite output"
-        ledger = RunLedger(session, failed.lease)
-        ledger.record([RunOutcome(run_id=_first(session, failed), state=State.FAILED,
+        ledger = RunWriter(session, failed.lease)
+        ledger.record_outcomes([RunOutcome(run_id=_first(session, failed), state=JobState.FAILED,
                                   error=reason)])  # fmt: skip
-        Queue(session).finish(failed.lease, State.FAILED, reason)
+        LeaseQueue(session).finish_job(failed.lease, JobState.FAILED, reason)
     running = _claimed(database, settings, _body(dataset, "tube 80 m <b>live</b>"))
-    with database.write() as session:
+    with database.write_session() as session:
         running_run = _first(session, running)
-        RunLedger(session, running.lease).start([running_run])
+        RunWriter(session, running.lease).start_runs([running_run])
     progress(database, running, running_run, 60)
-    queued = jobs.submit_to(database, _body(dataset, "tube 5 m, waits"), settings).id
+    queued = jobs.submit_job(database, _body(dataset, "tube 5 m, waits"), settings).id
     return Filled(
         dataset, finished.job.id, run, running.job.id, running_run, failed.job.id, queued,
         sweep.job.id, running,
@@ -92,11 +92,11 @@ def fill(database: Database, store: ObjectStore, settings: Settings) -> Filled:
 
 def progress(database: Database, claim: Claim, run: str, generation: int) -> None:
     """Bring the running job to a generation."""
-    with database.write() as session:
+    with database.write_session() as session:
         points = [p for p in _history(run) if p.generation <= generation]
-        RunLedger(session, claim.lease).append(points)
-        now = Progress(50 * generation, generation, min(p.rms for p in points), 12.5)
-        Queue(session).report(claim.lease, now)
+        RunWriter(session, claim.lease).append_history(points)
+        now = JobProgress(50 * generation, generation, min(p.rms for p in points), 12.5)
+        LeaseQueue(session).write_progress(claim.lease, now)
 
 
 def end_running(database: Database, store: ObjectStore, claim: Claim) -> None:
@@ -137,15 +137,15 @@ def _simulated(u: np.ndarray) -> np.ndarray:
 
 
 def _claimed(database: Database, settings: Settings, body: JobIn) -> Claim:
-    jobs.submit_to(database, body, settings)
-    with database.write() as session:
-        claim = Queue(session).claim("test", timedelta(hours=1))
+    jobs.submit_job(database, body, settings)
+    with database.write_session() as session:
+        claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
     assert claim is not None
     return claim
 
 
 def _first(session: Any, claim: Claim) -> str:
-    return RunRepository(session).page(claim.job.id, limit=1).items[0].id
+    return RunRepository(session).list_page(claim.job.id, limit=1).items[0].id
 
 
 def _history(run: str, islands: int = 4, floor: float = SIGMA) -> list[HistoryPoint]:
@@ -220,36 +220,38 @@ def _end(database: Database, store: ObjectStore, claim: Claim, recording: Record
         FittedOutput(role, 1, "p", "kPa", y.times[part], y.values[part], _simulated(u.values)[part])
         for role, part in parts
     ]
-    with database.write() as session:
+    with database.write_session() as session:
         run = _first(session, claim)
         target = io.BytesIO()
-        write_fit(run, fits, target)
+        write_fitted_outputs(run, fits, target)
         migrants = [MigrantPoint(run, n, 1 + n // 4, n % 4, (n + 1) % 4, 5.0) for n in range(60)]
         outcome = RunOutcome(
-            run_id=run, state=State.SUCCEEDED, result=_result(), valid=True, best_rms=SIGMA,
+            run_id=run, state=JobState.SUCCEEDED, result=_result(), valid=True, best_rms=SIGMA,
             fit_estimation=99.71, fit_validation=99.68, evaluations=20_000, generations=400,
             seconds=0.184, signals_sha256=store.put_stream([target.getvalue()]).sha256,
         )  # fmt: skip
-        ledger = RunLedger(session, claim.lease)
-        ledger.record([outcome], _history(run), migrants)
-        queue = Queue(session)
-        queue.tell(claim.lease, "log", {"message": "compiled lagged-tube in 26 ms"})
-        queue.report(claim.lease, Progress(20_000, 400, SIGMA))
-        queue.finish(claim.lease, State.SUCCEEDED)
+        ledger = RunWriter(session, claim.lease)
+        ledger.record_outcomes([outcome], _history(run), migrants)
+        queue = LeaseQueue(session)
+        queue.append_event(claim.lease, "log", {"message": "compiled lagged-tube in 26 ms"})
+        queue.write_progress(claim.lease, JobProgress(20_000, 400, SIGMA))
+        queue.finish_job(claim.lease, JobState.SUCCEEDED)
     return run
 
 
 def _end_sweep(database: Database, claim: Claim) -> None:
-    with database.write() as session:
-        runs = RunRepository(session).page(claim.job.id, limit=100).items
+    with database.write_session() as session:
+        runs = RunRepository(session).list_page(claim.job.id, limit=100).items
         outcomes = [
             RunOutcome(
-                run_id=run.id, state=State.SUCCEEDED, result=_result(SIGMA * (1 + (7 * n) % 12)),
+                run_id=run.id, state=JobState.SUCCEEDED, result=_result(SIGMA * (1 + (7 * n) % 12)),
                 valid=True, best_rms=SIGMA * (1 + (7 * n) % 12), fit_estimation=99.0 - n,
                 fit_validation=98.0 - n, evaluations=20_000, generations=400, seconds=0.2,
             )
             for n, run in enumerate(runs)
         ]  # fmt: skip
-        RunLedger(session, claim.lease).record(outcomes, [p for r in runs for p in _history(r.id)])
-        Queue(session).report(claim.lease, Progress(240_000, 400, SIGMA))
-        Queue(session).finish(claim.lease, State.SUCCEEDED)
+        RunWriter(session, claim.lease).record_outcomes(
+            outcomes, [p for r in runs for p in _history(r.id)]
+        )
+        LeaseQueue(session).write_progress(claim.lease, JobProgress(240_000, 400, SIGMA))
+        LeaseQueue(session).finish_job(claim.lease, JobState.SUCCEEDED)

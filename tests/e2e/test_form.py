@@ -63,7 +63,7 @@ def test_own_equations_are_submitted_with_bounds_and_channels(own_site: Site, pa
     page.get_by_role("button", name="Identify").click()
     page.wait_for_url(re.compile(r"/jobs/job_"))
     expect(page.locator("h1")).to_have_text("by hand")
-    with own_site.parts.database.read() as session:
+    with own_site.parts.database.read_session() as session:
         spec = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec
     assert spec["model"]["name"] == "my-tube"
     assert spec["datasets"] == [own_site.filled.dataset]
@@ -114,7 +114,7 @@ def test_a_clone_starts_from_the_request_of_the_job(own_site: Site, page: Page) 
     assert document["name"] == "lagged-tube"
     page.get_by_role("button", name="Identify").click()
     page.wait_for_url(re.compile(r"/jobs/job_"))
-    with own_site.parts.database.read() as session:
+    with own_site.parts.database.read_session() as session:
         jobs = JobRepository(session)
         specs = [
             jobs.get(name).spec for name in (own_site.filled.finished, page.url.rsplit("/", 1)[1])
@@ -141,6 +141,6 @@ def test_a_clone_keeps_starts_scales_and_ties(own_site: Site, page: Page) -> Non
     page.get_by_label("lower of y(0)", exact=True).fill("-3")
     page.get_by_role("button", name="Identify").click()
     page.wait_for_url(re.compile(r"/jobs/job_"))
-    with own_site.parts.database.read() as session:
+    with own_site.parts.database.read_session() as session:
         spec = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec
     assert spec["parameters"] == {**asked, "y(0)": {"lower": -3.0, "upper": 900.0}}

@@ -144,7 +144,7 @@ def test_a_cloned_request_cannot_be_sent_before_all_of_it_is_there(
     check.stop()
     button.click()
     page.wait_for_url(re.compile(r"/jobs/job_"))
-    with own_site.parts.database.read() as session:
+    with own_site.parts.database.read_session() as session:
         spec = JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec
     assert spec["parameters"] == body["parameters"]
 
@@ -186,7 +186,7 @@ def test_a_page_that_comes_late_does_not_bring_back_what_was(own_site: Site, pag
     while not asked:
         page.wait_for_timeout(10)
     earlier = asked[0].fetch()
-    with own_site.parts.database.write() as session:
+    with own_site.parts.database.write_session() as session:
         JobRepository(session).resume(job)
     page.evaluate(refresh)
     chip = page.locator("#job .chip")

@@ -6,9 +6,9 @@ import re
 import pytest
 from playwright.sync_api import Page, expect
 
-from service.queue.leases import Queue
+from service.core.states import JobState
+from service.queue.leases import LeaseQueue
 from service.repositories.jobs import JobRepository
-from service.storage.tables import State
 from tests.e2e.conftest import Site
 from tests.e2e.filled import TRUE, end_running, progress
 
@@ -158,15 +158,15 @@ def test_a_job_is_cancelled_and_resumed_from_its_page(own_site: Site, page: Page
     expect(page.locator("#job .chip")).to_have_text("cancelled")
     page.get_by_role("button", name="Resume").click()
     expect(page.locator("#job .chip")).to_have_text("queued")
-    with own_site.parts.database.write() as session:
-        assert JobRepository(session).counts()[State.QUEUED] == 1
+    with own_site.parts.database.write_session() as session:
+        assert JobRepository(session).count_states()[JobState.QUEUED] == 1
 
 
 def test_the_page_of_a_resumed_job_goes_on_after_its_earlier_end(
     own_site: Site, page: Page
 ) -> None:
     job, database = own_site.filled.queued, own_site.parts.database
-    with database.write() as session:
+    with database.write_session() as session:
         JobRepository(session).cancel(job)
         JobRepository(session).resume(job)
     page.add_init_script(
@@ -183,8 +183,8 @@ def test_the_page_of_a_resumed_job_goes_on_after_its_earlier_end(
     page.goto(f"{own_site.url}/jobs/{job}")
     page.wait_for_function("() => open_after_end.length > 0")
     assert page.evaluate("open_after_end[0]")
-    with database.write() as session:
-        claim = Queue(session).claim("test")
+    with database.write_session() as session:
+        claim = LeaseQueue(session).claim_job("test")
         assert claim is not None
         assert claim.job.id == job
     expect(page.locator("#job .chip")).to_have_text("running")

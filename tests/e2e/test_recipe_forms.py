@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 def spec_of(site: Site, page: Page) -> dict[str, object]:
     page.wait_for_url(re.compile(r"/jobs/job_"))
-    with site.parts.database.read() as session:
+    with site.parts.database.read_session() as session:
         return dict(JobRepository(session).get(page.url.rsplit("/", 1)[1]).spec)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from service.client.embedded import embedded_service
+from service.client.embedded import run_embedded_service
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.timeout(600)]
 
@@ -18,7 +18,7 @@ LAST = "plot => Math.max(0, ...(plot.data ?? []).flatMap(trace => trace.x))"
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with embedded_service(tmp_path_factory.mktemp("whole"), cpus=2) as url:
+    with run_embedded_service(tmp_path_factory.mktemp("whole"), cpus=2) as url:
         yield url
 
 

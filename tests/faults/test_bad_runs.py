@@ -13,7 +13,8 @@ from benchmarks import paper_example
 from benchmarks.breaking.audit import is_over
 from benchmarks.breaking.stand import Stand, standing_service, until
 from service.client.calls import ProblemError
-from service.storage.tables import Job, Run, State
+from service.core.states import JobState
+from service.storage.tables import Job, Run
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(400)]
 
@@ -37,11 +38,11 @@ class Service:
         return self.job(job)
 
     def job(self, job: str) -> Job:
-        with self.stand.database.read() as session:
+        with self.stand.database.read_session() as session:
             return session.get_one(Job, job)
 
     def runs(self, job: str) -> list[Run]:
-        with self.stand.database.read() as session:
+        with self.stand.database.read_session() as session:
             query = select(Run).where(Run.job_id == job).order_by(Run.number)
             return list(session.scalars(query))
 
@@ -75,7 +76,7 @@ def test_a_queued_job_is_cancelled_at_once_and_stays_so(waiting: Service) -> Non
     job = waiting.submit(algorithm=ENDLESS)
     assert waiting.stand.client.cancel(job)["state"] == "cancelled"
     assert waiting.stand.client.cancel(job)["state"] == "cancelled"
-    assert [run.state for run in waiting.runs(job)] == [State.CANCELLED]
+    assert [run.state for run in waiting.runs(job)] == [JobState.CANCELLED]
 
 
 def test_a_run_that_kills_its_worker_fails_with_that_reason_and_the_others_go_on(
@@ -85,11 +86,11 @@ def test_a_run_that_kills_its_worker_fails_with_that_reason_and_the_others_go_on
     job = service.end(service.submit(sweep={"axes": [seeds]}))
     runs = {run.seed: run for run in service.runs.runs(job.id)}
     killer = runs.pop(DEADLY)
-    assert (killer.state, killer.kills) == (State.FAILED, 2)
+    assert (killer.state, killer.kills) == (JobState.FAILED, 2)
     assert (killer.error or "").startswith("its worker process died 2 times")
-    assert {run.state for run in runs.values()} == {State.SUCCEEDED}
+    assert {run.state for run in runs.values()} == {JobState.SUCCEEDED}
     assert {run.kills for run in runs.values()} <= {0, 1}
-    assert (job.state, job.n_done, job.n_failed) == (State.SUCCEEDED, 30, 1)
+    assert (job.state, job.n_done, job.n_failed) == (JobState.SUCCEEDED, 30, 1)
 
 
 def test_a_run_that_wants_too_much_memory_fails_and_the_others_go_on(service: Service) -> None:
@@ -97,10 +98,10 @@ def test_a_run_that_wants_too_much_memory_fails_and_the_others_go_on(service: Se
     job = service.end(service.submit(sweep={"axes": [seeds]}))
     runs = {run.seed: run for run in service.runs.runs(job.id)}
     greedy = runs.pop(GREEDY)
-    assert greedy.state is State.FAILED
+    assert greedy.state is JobState.FAILED
     assert (greedy.error or "").startswith("it needs more memory than a worker may use")
-    assert {run.state for run in runs.values()} == {State.SUCCEEDED}
-    assert (job.state, job.n_failed) == (State.SUCCEEDED, 1)
+    assert {run.state for run in runs.values()} == {JobState.SUCCEEDED}
+    assert (job.state, job.n_failed) == (JobState.SUCCEEDED, 1)
 
 
 def test_a_model_that_diverges_in_half_of_its_cells_ends_with_the_other_half(
@@ -110,17 +111,17 @@ def test_a_model_that_diverges_in_half_of_its_cells_ends_with_the_other_half(
     axes = [{"path": "/parameters/b", "values": cells}, {"path": "/seed", "values": [1, 2, 3]}]
     job = service.end(service.submit(sweep={"axes": axes}))
     states = [run.state for run in service.runs.runs(job.id)]
-    assert states == [State.SUCCEEDED] * 3 + [State.FAILED] * 3
+    assert states == [JobState.SUCCEEDED] * 3 + [JobState.FAILED] * 3
     assert "diverged" in (service.runs.runs(job.id)[-1].error or "")
-    assert (job.state, job.n_failed) == (State.SUCCEEDED, 3)
+    assert (job.state, job.n_failed) == (JobState.SUCCEEDED, 3)
 
 
 def test_a_running_job_is_cancelled_with_what_it_has(service: Service) -> None:
     job = service.submit(algorithm=ENDLESS)
     until(lambda: service.job(job).evaluations > 0, "progress", LIMIT_SECONDS)
     service.stand.client.cancel(job)
-    assert service.end(job).state is State.CANCELLED
-    assert [run.state for run in service.runs.runs(job)] == [State.CANCELLED]
+    assert service.end(job).state is JobState.CANCELLED
+    assert [run.state for run in service.runs.runs(job)] == [JobState.CANCELLED]
 
 
 def test_a_job_cancelled_while_its_dispatcher_is_dead_is_not_taken_up_again(
@@ -132,11 +133,11 @@ def test_a_job_cancelled_while_its_dispatcher_is_dead_is_not_taken_up_again(
         os.kill(pid, signal.SIGKILL)
     service.stand.client.cancel(job)
     ended = service.end(job)
-    assert (ended.state, ended.attempt) == (State.CANCELLED, 1)
+    assert (ended.state, ended.attempt) == (JobState.CANCELLED, 1)
 
 
 def test_an_ended_job_cannot_be_cancelled(service: Service) -> None:
     job = service.submit()
-    assert service.end(job).state is State.SUCCEEDED
+    assert service.end(job).state is JobState.SUCCEEDED
     with pytest.raises(ProblemError, match="only a queued or running job"):
         service.stand.client.cancel(job)

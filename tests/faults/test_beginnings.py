@@ -12,7 +12,8 @@ from benchmarks import paper_example
 from benchmarks.breaking.audit import is_over
 from benchmarks.breaking.disks import filled, small_disk
 from benchmarks.breaking.stand import Stand, standing_service, until
-from service.storage.tables import Checkpoint, Job, Run, State
+from service.core.states import JobState
+from service.storage.tables import Checkpoint, Job, Run
 from tests.rest import CSV, PROBLEM
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.timeout(400)]
@@ -22,8 +23,8 @@ SHORT = {"generations": 20}
 LONG = {"generations": 60_000, "islands": 4, "stop": {"settled": None}}
 
 
-def state_of(stand: Stand, job: str) -> State:
-    with stand.database.read() as session:
+def state_of(stand: Stand, job: str) -> JobState:
+    with stand.database.read_session() as session:
         return session.get_one(Job, job).state
 
 
@@ -44,12 +45,12 @@ def test_jobs_wait_for_ray_and_survive_a_restart(tmp_path: Path) -> None:
         answer = httpx.get(f"{one.url}/readyz", timeout=60.0)
         assert answer.status_code == 503
         assert "no dispatcher is alive" in answer.json()["detail"]
-        assert state_of(one, job) is State.QUEUED
+        assert state_of(one, job) is JobState.QUEUED
         one.stop()
         assert one.leftovers() == []
     with standing_service(Stand(folder)) as stand:
         until(lambda: is_over(stand, job), "the job ended", LIMIT_SECONDS)
-        assert state_of(stand, job) is State.SUCCEEDED
+        assert state_of(stand, job) is JobState.SUCCEEDED
         assert {run["state"] for run in stand.client.runs(job)} == {"succeeded"}
 
 
@@ -80,10 +81,10 @@ def test_a_full_disk_stops_nothing_for_good(disk: Path, tmp_path: Path) -> None:
             os.sync()
             until(lambda: refused(stand, body), "a job was refused", LIMIT_SECONDS)
         until(lambda: is_over(stand, job), "the job ended", LIMIT_SECONDS)
-        assert state_of(stand, job) is State.SUCCEEDED
+        assert state_of(stand, job) is JobState.SUCCEEDED
         assert log.exists()
         assert stand.family.dispatchers() == [dispatcher]
-        with stand.database.read() as session:
+        with stand.database.read_session() as session:
             hashes = list(session.scalars(select(Run.signals_sha256)))
         objects = {path.stem for path in (disk / "data/objects/sha256").rglob("*.mcap")}
         assert set(hashes) - {None} <= objects
@@ -91,7 +92,7 @@ def test_a_full_disk_stops_nothing_for_good(disk: Path, tmp_path: Path) -> None:
 
 
 def checkpoints(stand: Stand) -> int:
-    with stand.database.read() as session:
+    with stand.database.read_session() as session:
         return session.query(Checkpoint).count()
 
 

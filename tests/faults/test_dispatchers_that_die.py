@@ -7,11 +7,11 @@ from datetime import timedelta
 
 import pytest
 
-from service.queue.leases import Queue
-from service.queue.run_writes import Cell, RunLedger, RunOutcome
+from service.core.states import JobState
+from service.queue.leases import LeaseQueue
+from service.queue.run_writes import NewRun, RunOutcome, RunWriter
 from service.storage.errors import LeaseLost
 from service.storage.sessions import Database
-from service.storage.tables import State
 from tests.stored import job_of, runs_of, submit
 
 pytestmark = pytest.mark.slow  # processes of their own
@@ -22,29 +22,29 @@ N_JOBS, N_RUNS = 24, 2
 
 def _work_on(database, claim, trouble):
     with database.write() as session:
-        ledger = RunLedger(session, claim.lease)
-        ledger.create(Cell(number=i) for i in range(N_RUNS))
-        pending = ledger.pending()
-        ledger.start([run.id for run in pending])
+        ledger = RunWriter(session, claim.lease)
+        ledger.create_runs(NewRun(number=i) for i in range(N_RUNS))
+        pending = ledger.list_pending()
+        ledger.start_runs([run.id for run in pending])
     for run in pending:
         if trouble == "dies":
             os._exit(9)
         if trouble == "stalls":
             _fall_silent(database, claim.lease)
         outcome = RunOutcome(
-            run_id=run.id, state=State.SUCCEEDED, best_rms=float(run.number + 1),
+            run_id=run.id, state=JobState.SUCCEEDED, best_rms=float(run.number + 1),
             result={"by": claim.lease.owner, "attempt": claim.lease.attempt},
         )  # fmt: skip
         with database.write() as session:
-            RunLedger(session, claim.lease).record([outcome])
+            RunWriter(session, claim.lease).record_outcomes([outcome])
     with database.write() as session:
-        Queue(session).finish(claim.lease, State.SUCCEEDED)
+        LeaseQueue(session).finish_job(claim.lease, JobState.SUCCEEDED)
 
 
 def _fall_silent(database, lease):
     """Do nothing until the lease is lost."""
     job = job_of(database, lease.job_id)
-    while (job.state, job.attempt) == (State.RUNNING, lease.attempt):
+    while (job.state, job.attempt) == (JobState.RUNNING, lease.attempt):
         time.sleep(0.05)
         job = job_of(database, lease.job_id)
 
@@ -54,10 +54,10 @@ def _dispatch(url, owner, trouble, before, claimed, refused):
     database = Database(url)
     before.wait(180)
     while True:
-        with database.write() as session:
-            queue = Queue(session)
-            queue.reap()
-            claim = queue.claim(owner, LEASE)
+        with database.write_session() as session:
+            queue = LeaseQueue(session)
+            queue.reap_expired()
+            claim = queue.claim_job(owner, LEASE)
         if claim is None:
             time.sleep(0.02)
             continue
@@ -100,7 +100,7 @@ def test_each_run_has_one_result_though_dispatchers_die_and_stall(database):
             process.join()
     for job_id in jobs:
         job, runs = job_of(database, job_id), runs_of(database, job_id)
-        assert (job.state, job.n_done, job.n_failed) == (State.SUCCEEDED, N_RUNS, 0)
+        assert (job.state, job.n_done, job.n_failed) == (JobState.SUCCEEDED, N_RUNS, 0)
         assert [run.number for run in runs] == list(range(N_RUNS))
         assert all(run.result["attempt"] == run.attempt for run in runs)
     assert job_of(database, late).attempt > 1

@@ -18,9 +18,9 @@ from mcap.records import Chunk, DataEnd, Footer, Header, McapRecord, Message, Me
 from mcap.writer import CompressionType
 
 from service.formats.errors import InvalidUpload
-from service.formats.limits import DEFAULT_LIMITS, Limits
-from service.formats.mcap import read_mcap
-from service.formats.mcap_writer import MAGIC
+from service.formats.limits import DEFAULT_LIMITS, UploadLimits
+from service.formats.mcap import read_mcap_with_notes
+from service.formats.mcap_writer import MCAP_MAGIC
 from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
 
@@ -37,9 +37,9 @@ FILES = [OURS, *FOREIGN.values()]
 ONE_MIB = 1024**2
 
 
-def refused(content: bytes, limits: Limits = DEFAULT_LIMITS) -> InvalidUpload:
+def refused(content: bytes, limits: UploadLimits = DEFAULT_LIMITS) -> InvalidUpload:
     with pytest.raises(InvalidUpload) as caught:
-        read_mcap(content, limits)
+        read_mcap_with_notes(content, limits)
     assert "\n" not in str(caught.value)
     return caught.value
 
@@ -47,10 +47,10 @@ def refused(content: bytes, limits: Limits = DEFAULT_LIMITS) -> InvalidUpload:
 def file_of(*records: McapRecord | bytes) -> bytes:
     """Return a file of any records, right or wrong, with a right beginning and end."""
     stream = BytesIO()
-    stream.write(MAGIC)
+    stream.write(MCAP_MAGIC)
     for record in (Header("", "test"), *records, DataEnd(0), Footer(0, 0, 0)):
         stream.write(record if isinstance(record, bytes) else as_bytes(record))
-    return stream.getvalue() + MAGIC
+    return stream.getvalue() + MCAP_MAGIC
 
 
 def as_bytes(record: McapRecord) -> bytes:
@@ -69,7 +69,7 @@ MESSAGE = Message(1, 5, b'{"x": 2}', 5, 0)
 
 
 def test_the_parts_used_here_make_a_file_that_is_read() -> None:
-    recording, _ = read_mcap(file_of(CHANNEL, MESSAGE), DEFAULT_LIMITS)
+    recording, _ = read_mcap_with_notes(file_of(CHANNEL, MESSAGE), DEFAULT_LIMITS)
     assert recording.channel("x").values[0] == 2
 
 
@@ -86,13 +86,13 @@ def test_a_file_cut_off_anywhere_is_refused_at_a_byte_of_it(content: bytes) -> N
 @given(data=st.data())
 @settings(max_examples=150)
 def test_flipped_bits_are_found_or_change_nothing(content: bytes, data: st.DataObject) -> None:
-    whole, _ = read_mcap(content, DEFAULT_LIMITS)
+    whole, _ = read_mcap_with_notes(content, DEFAULT_LIMITS)
     damaged = bytearray(content)
     for _ in range(data.draw(st.integers(1, 3))):
         place = data.draw(st.integers(0, len(content) - 1))
         damaged[place] ^= 1 << data.draw(st.integers(0, 7))
     try:
-        read, _ = read_mcap(bytes(damaged), DEFAULT_LIMITS)
+        read, _ = read_mcap_with_notes(bytes(damaged), DEFAULT_LIMITS)
     except InvalidUpload:
         return
     for before, after in zip(whole.channels, read.channels, strict=True):
@@ -102,7 +102,7 @@ def test_flipped_bits_are_found_or_change_nothing(content: bytes, data: st.DataO
 def is_read_whole_or_refused(content: bytes) -> bool:
     """Whether a file gives channels with a value for every time, or a reason; nothing else may."""
     try:
-        recording, _ = read_mcap(content, DEFAULT_LIMITS)
+        recording, _ = read_mcap_with_notes(content, DEFAULT_LIMITS)
     except InvalidUpload as error:
         return bool(str(error))
     return bool(recording.channels) and all(
@@ -195,15 +195,15 @@ def test_a_record_that_cannot_be_right_is_refused(
 @pytest.mark.parametrize(
     ("limits", "words"),
     [
-        (Limits(file_bytes=10), "at most 10"),
-        (Limits(record_bytes=30), "at most 30"),
-        (Limits(messages=19), "messages to more than 19"),
-        (Limits(channels=1), "more than 1 fields"),
-        (Limits(total_bytes=100), "to more than 100"),
-        (Limits(schema_bytes=1), "at most 1"),
+        (UploadLimits(file_bytes=10), "at most 10"),
+        (UploadLimits(record_bytes=30), "at most 30"),
+        (UploadLimits(messages=19), "messages to more than 19"),
+        (UploadLimits(channels=1), "more than 1 fields"),
+        (UploadLimits(total_bytes=100), "to more than 100"),
+        (UploadLimits(schema_bytes=1), "at most 1"),
     ],
 )
-def test_every_limit_is_kept(limits: Limits, words: str) -> None:
+def test_every_limit_is_kept(limits: UploadLimits, words: str) -> None:
     assert words in refused(FOREIGN[CompressionType.ZSTD], limits).detail
 
 
@@ -255,6 +255,6 @@ def test_a_manifest_that_cannot_be_right_is_refused(change: dict[str, str]) -> N
     }
     later = replace(MESSAGE, log_time=10)
     good = file_of(Metadata("lagid.dataset", manifest), CHANNEL, MESSAGE, later)
-    assert read_mcap(good, DEFAULT_LIMITS)[0].names == ("u",)
+    assert read_mcap_with_notes(good, DEFAULT_LIMITS)[0].names == ("u",)
     bad = file_of(Metadata("lagid.dataset", {**manifest, **change}), CHANNEL, MESSAGE, later)
     refused(bad)

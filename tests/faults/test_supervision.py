@@ -12,7 +12,7 @@ import pytest
 
 from service.core.settings import Settings
 from service.dispatch import supervisor as supervision
-from service.dispatch.supervisor import Supervisor, environment_of, find_session_processes
+from service.dispatch.supervisor import Supervisor, find_session_processes, to_environment
 
 LIMIT_SECONDS = 40.0
 
@@ -87,7 +87,7 @@ def test_a_killed_child_is_started_anew_and_its_orphans_are_killed(tmp_path: Pat
 def test_a_child_that_stays_stopped_is_killed_and_started_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(supervision, "LOOK_SECONDS", 0.05)
+    monkeypatch.setattr(supervision, "POLL_SECONDS", 0.05)
     monkeypatch.setattr(supervision, "STOPPED_SECONDS", 0.2)
     file = tmp_path / "pids"
     supervisor = Supervisor([sys.executable, "-c", CHILD, str(file)], {})
@@ -112,7 +112,7 @@ def test_the_settings_of_the_child_are_those_of_the_parent(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = Settings(data_dir=tmp_path / "data", cpus=3, lease_seconds=7.0)
-    for name, value in environment_of(settings).items():
+    for name, value in to_environment(settings).items():
         monkeypatch.setenv(name, value)
     assert Settings() == settings
 
@@ -124,7 +124,7 @@ def test_a_child_that_was_at_work_is_started_again_without_waiting_longer_each_t
     monkeypatch.setattr(supervision, "LONGEST_PAUSE_SECONDS", 600.0)
     monkeypatch.setattr(supervision, "LIVED_SECONDS", 0.0)
     file = tmp_path / "pids"
-    code = f"import os, sys; open(sys.argv[1], 'a').write('1\\n'); os._exit({supervision.AGAIN})"
+    code = f"import os, sys; open(sys.argv[1], 'a').write('1\\n'); os._exit({supervision.RESTART_EXIT_CODE})"
     supervisor = Supervisor([sys.executable, "-S", "-c", code, str(file)], {})
     supervisor.start()
     until(lambda: len(pids(file)) >= 12, "the twelfth start")

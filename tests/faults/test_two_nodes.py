@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from service.dispatch.supervisor import environment_of
-from service.storage.tables import Run, State
+from service.core.states import JobState
+from service.dispatch.supervisor import to_environment
+from service.storage.tables import Run
 from tests.dispatching import Place, until
 from tests.two_nodes import two_nodes
 
@@ -20,8 +21,8 @@ ALGORITHM = {"generations": 1500, "islands": 2, "stop": {"settled": None}}
 
 JOIN = """
 import sys
-from workers.cluster import ClusterSettings
-from workers.cluster import RayCrew
+from workers.ray_executor import ClusterSettings
+from workers.ray_executor import RayCrew
 from workers.errors import ClusterUnavailable
 try:
     RayCrew(ClusterSettings(sys.argv[1]))
@@ -33,12 +34,14 @@ except ClusterUnavailable as error:
 def plain(place: Place, job: str) -> list[dict[str, Any]]:
     """What the job's runs give in this process, without Ray."""
     from service.dispatch.dispatcher import Dispatcher
-    from service.dispatch.leases import Leases
-    from workers.inline import InlineCrew
+    from service.dispatch.leases import HeldLeases
+    from workers.inline_executor import InlineExecutor
 
-    dispatcher = Dispatcher(place.database, place.store, InlineCrew(), Leases(place.database, 30))
+    dispatcher = Dispatcher(
+        place.database, place.store, InlineExecutor(), HeldLeases(place.database, 30)
+    )
     while not place.job(job).state.is_terminal:
-        dispatcher.turn()
+        dispatcher.run_round()
     return results(place.runs(job))
 
 
@@ -70,13 +73,13 @@ def test_two_nodes_give_the_bits_of_the_plain_loop_also_when_one_of_them_dies(
         )
         quiet = place.submit(algorithm=ALGORITHM, sweep=SWEEP)
         with place.dispatcher():
-            place.until(quiet, State.SUCCEEDED, State.FAILED)
+            place.until(quiet, JobState.SUCCEEDED, JobState.FAILED)
             assert "with 2 cores" in log_of(place)
             assert any((tmp_path / "cache").glob("*.o"))  # the second node compiled, for itself
             shaken = place.submit(algorithm=ALGORITHM, sweep=SWEEP)
             until(lambda: place.job(shaken).n_done > 3, "some runs")
             cluster.order("kill")
-            ended = place.until(shaken, State.SUCCEEDED, State.FAILED)
+            ended = place.until(shaken, JobState.SUCCEEDED, JobState.FAILED)
             until(lambda: "has 1 cores now" in log_of(place), "one core")
             cluster.order("add")
             until(lambda: "has 2 cores now" in log_of(place), "two cores again")
@@ -86,7 +89,7 @@ def test_two_nodes_give_the_bits_of_the_plain_loop_also_when_one_of_them_dies(
         none = told_on_joining(cluster.address)
         assert none.startswith(f"there is no token for the Ray cluster at {cluster.address}: set")
     assert (ended.state, ended.attempt, ended.n_done, ended.n_failed) == (
-        State.SUCCEEDED, 1, 24, 0,
+        JobState.SUCCEEDED, 1, 24, 0,
     )  # fmt: skip
     assert results(place.runs(shaken)) == results(place.runs(quiet))
     alone = place.submit(algorithm=ALGORITHM, sweep=SWEEP)
@@ -118,7 +121,7 @@ def test_an_address_that_is_wrong_ends_the_dispatcher_with_one_line(
     settings = place.settings.model_copy(update={"ray_address": address})
     done = subprocess.run(
         [sys.executable, "-m", *command],
-        env={**os.environ, **environment_of(settings)}, capture_output=True, text=True, timeout=60,
+        env={**os.environ, **to_environment(settings)}, capture_output=True, text=True, timeout=60,
     )  # fmt: skip
     assert done.returncode == 1
     (line,) = [line for line in done.stderr.splitlines() if "ERROR" in line]

@@ -9,7 +9,7 @@ import pytest
 
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS, MIB
-from service.formats.sandbox import Kind, read_untrusted
+from service.formats.sandbox import FileKind, read_untrusted
 from sysid.data.records import Channel, Recording
 from tests.mcap_files import foreign, json_messages, recorded
 
@@ -22,7 +22,7 @@ def saved(folder: Path, content: bytes) -> Path:
     return path
 
 
-def refused(path: Path, kind: Kind, **options: object) -> InvalidUpload:
+def refused(path: Path, kind: FileKind, **options: object) -> InvalidUpload:
     with pytest.raises(InvalidUpload) as caught:
         read_untrusted(path, kind, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)

@@ -13,8 +13,8 @@ import uvicorn
 from service.api.app import create_app
 from service.api.dependencies import Parts
 from service.client.client import Client
+from service.core.states import JobState
 from service.repositories.jobs import JobRepository
-from service.storage.tables import State
 from tests.identified import carried_out
 from tests.rest import settings_of
 
@@ -32,8 +32,8 @@ class _Worker(threading.Thread):
 
     def run(self) -> None:
         while not self.ended.wait(0.02):
-            with self._parts.database.read() as session:
-                queued = JobRepository(session).page(limit=10, states=[State.QUEUED]).items
+            with self._parts.database.read_session() as session:
+                queued = JobRepository(session).list_page(limit=10, states=[JobState.QUEUED]).items
                 waiting = [job.id for job in queued]
             for job in reversed(waiting):
                 carried_out(self._parts, job)

@@ -15,7 +15,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.client.embedded import free_port
+from service.client.embedded import find_free_port
 from tests.rest import recording
 
 pytestmark = pytest.mark.slow  # processes of their own
@@ -55,7 +55,7 @@ def refused(done: "subprocess.CompletedProcess[str]", code: int = 1) -> str:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A web process without a dispatcher."""
     folder = tmp_path_factory.mktemp("served")
-    port = free_port()
+    port = find_free_port()
     child = subprocess.Popen(
         [sys.executable, "-m", "service.cli.main", "serve", "--no-dispatcher",
          "--port", str(port), "--data-dir", str(folder)],
@@ -321,7 +321,7 @@ def test_a_job_file_that_cannot_be_used_is_one_line(
 
 
 def test_an_open_event_stream_does_not_hold_up_the_end(tmp_path: Path) -> None:
-    port = free_port()
+    port = find_free_port()
     url = f"http://127.0.0.1:{port}"
     child = subprocess.Popen(
         [sys.executable, "-m", "service.cli.main", "serve", "--no-dispatcher",
@@ -350,7 +350,7 @@ def test_tables_are_made_and_checked_by_command(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_doctor_finds_a_sound_installation(tmp_path: Path) -> None:
-    done = lagid("doctor", "--data-dir", tmp_path, LAGID_PORT=str(free_port()))
+    done = lagid("doctor", "--data-dir", tmp_path, LAGID_PORT=str(find_free_port()))
     assert done.returncode == 0, done.stderr
     assert "compiled" in done.stdout
 

@@ -17,7 +17,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Hold
 from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
-from sysid.models.parse import parse_model, with_terms
+from sysid.models.parse import keep_terms, parse_model
 from tests.exporting import compiled, in_c, in_python, simulated, with_entry
 
 N = 240
@@ -103,7 +103,7 @@ def written(text: str, **solver: Any) -> Model:
 def selected() -> Model:
     """A polynomial whose terms were selected."""
     labels = [term.label for term in parse_model(LINEAR_NARX).terms]
-    return with_terms(parse_model(LINEAR_NARX), [labels[0], labels[1], labels[-1]])
+    return keep_terms(parse_model(LINEAR_NARX), [labels[0], labels[1], labels[-1]])
 
 
 COEFFICIENTS = dict(

@@ -4,13 +4,13 @@ from datetime import timedelta
 
 import pytest
 
-from service.queue.leases import Queue
-from service.queue.run_writes import RunLedger, RunOutcome
+from service.core.states import JobState
+from service.queue.leases import LeaseQueue
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.datasets import DatasetRepository
 from service.repositories.jobs import JobRepository
-from service.storage.garbage import collect, lost, orphans
+from service.storage.garbage import delete_orphans, find_lost_hashes, find_orphans
 from service.storage.objects import open_store
-from service.storage.tables import State
 from tests.stored import claimed, new_dataset
 
 AT_ONCE = timedelta(seconds=-5)
@@ -23,7 +23,7 @@ def store(tmp_path):
 
 def garbage(database, store, older_than=AT_ONCE):
     with database.read() as session:
-        return {one.sha256 for one in orphans(session, store, older_than)}
+        return {one.sha256 for one in find_orphans(session, store, older_than)}
 
 
 def test_only_objects_that_no_living_row_names_are_garbage(database, store):
@@ -33,10 +33,10 @@ def test_only_objects_that_no_living_row_names_are_garbage(database, store):
         datasets = DatasetRepository(session)
         dataset_id = datasets.add(new_dataset(sha256=raw)).dataset.id
         datasets.add(new_dataset(sha256=raw, source_key="again"))
-        RunLedger(session, got.lease).record(
-            [RunOutcome(run_id=run_id, state=State.SUCCEEDED, signals_sha256=fit)]
+        RunWriter(session, got.lease).record_outcomes(
+            [RunOutcome(run_id=run_id, state=JobState.SUCCEEDED, signals_sha256=fit)]
         )
-        Queue(session).finish(got.lease, State.SUCCEEDED)
+        LeaseQueue(session).finish_job(got.lease, JobState.SUCCEEDED)
     assert garbage(database, store) == {stray}
     with database.write() as session:
         DatasetRepository(session).delete(dataset_id)
@@ -54,8 +54,8 @@ def test_collecting_deletes_the_garbage_only(database, store):
     with database.write() as session:
         DatasetRepository(session).add(new_dataset(sha256=kept))
     with database.read() as session:
-        assert collect(session, store, AT_ONCE) == len(b"stray")
-        assert lost(session, store) == set()
+        assert delete_orphans(session, store, AT_ONCE) == len(b"stray")
+        assert find_lost_hashes(session, store) == set()
     assert store.exists(kept)
     assert not store.exists(stray)
 
@@ -64,4 +64,4 @@ def test_an_object_that_a_row_names_but_is_not_there_is_lost(database, store):
     with database.write() as session:
         DatasetRepository(session).add(new_dataset(sha256="e" * 64))
     with database.read() as session:
-        assert lost(session, store) == {"e" * 64}
+        assert find_lost_hashes(session, store) == {"e" * 64}

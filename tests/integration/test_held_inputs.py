@@ -8,8 +8,8 @@ import pytest
 
 from sysid import Channel, Record, identify, load_model, simulate
 from sysid.core.types import FloatArray
-from sysid.data.interpolation import fine_input
-from sysid.models.catalogue.load import document
+from sysid.data.interpolation import interpolate_input
+from sysid.models.catalogue.load import copy_catalogue_document
 
 T, K = 4.0, 2.0  # s, 1; sampled once a second
 
@@ -42,7 +42,9 @@ def record(u: FloatArray, y: FloatArray) -> Record:
 @pytest.mark.parametrize("substeps", [2, 8])
 def test_the_response_is_that_of_the_plant(lag: float, substeps: int) -> None:
     u = steps(3)
-    model = load_model({**document("tube"), "solver": {"method": "rk4", "substeps": substeps}})
+    model = load_model(
+        {**copy_catalogue_document("tube"), "solver": {"method": "rk4", "substeps": substeps}}
+    )
     found = simulate(
         model, [Channel("u", np.arange(300.0), u, hold="zero")],
         {"K": K, "T": T, "L": lag, "y(0)": K * u[0]}, times=np.arange(300.0),
@@ -83,10 +85,10 @@ def test_intervals_of_a_lag_cover_it() -> None:
 def test_the_mean_of_a_held_input_is_exact_and_a_constant_stays_what_it_is() -> None:
     times = np.array([0.0, 1.0, 2.0, 3.0])
     channel = Channel("u", times, np.array([0.3, 0.3, 1.3, 0.3]), hold="zero")
-    fine = fine_input(channel, 0.0, 1.0, 3, 2.0, "around")
+    fine = interpolate_input(channel, 0.0, 1.0, 3, 2.0, "around")
     at = {0.0: 0.3, 1.0: 0.3, 1.5: 0.3, 1.75: 0.55, 2.0: 0.8, 2.5: 1.3, 3.0: 0.8, 3.5: 0.3}
     for time, value in at.items():
-        place = fine.zero + round(time * fine.points)
+        place = fine.start_index + round(time * fine.points_per_step)
         assert fine.values[place] == pytest.approx(value, abs=1e-12)
     flat = Channel("u", times, np.full(4, 0.1), hold="zero")
-    assert np.all(fine_input(flat, 0.0, 1.0, 3, 2.0, "around").values == 0.1)
+    assert np.all(interpolate_input(flat, 0.0, 1.0, 3, 2.0, "around").values == 0.1)

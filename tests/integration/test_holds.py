@@ -26,7 +26,7 @@ def step_test() -> Recording:
 
 
 def fitted(recording: Recording) -> Identification:
-    record = recording.record({"u": "u"}, {"y": "y"})
+    record = recording.to_record({"u": "u"}, {"y": "y"})
     return identify(load_model("fopdt"), record, GeneticAlgorithm(generations=100))
 
 
@@ -35,7 +35,7 @@ def lag(found: Identification) -> float:
 
 
 def test_a_held_input_gives_the_true_lag_of_a_step_test() -> None:
-    assert lag(fitted(step_test().held({"u": "zero"}))) == pytest.approx(LAG, abs=0.02)
+    assert lag(fitted(step_test().replace_holds({"u": "zero"}))) == pytest.approx(LAG, abs=0.02)
 
 
 def test_a_step_that_is_read_as_a_ramp_is_asked_about() -> None:
@@ -45,10 +45,10 @@ def test_a_step_that_is_read_as_a_ramp_is_asked_about() -> None:
 
 
 def test_a_held_input_is_not_asked_about() -> None:
-    found = fitted(step_test().held({"u": "zero"}))
+    found = fitted(step_test().replace_holds({"u": "zero"}))
     assert not any("hold" in one for one in found.warnings)
 
 
 def test_the_hold_of_a_channel_that_is_not_there_is_refused() -> None:
     with pytest.raises(InvalidRecord, match="no channel 'v'"):
-        step_test().held({"v": "zero"})
+        step_test().replace_holds({"v": "zero"})

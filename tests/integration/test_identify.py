@@ -11,7 +11,7 @@ from sysid.identification.identify import identify
 from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import load_model
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from tests.searching import COULOMB, DUFFING, clean, example, noisy, record
 
 DUFFING_MODEL = load_model("duffing-eq16")
@@ -37,8 +37,8 @@ def test_the_least_squares_optimum_is_reached_within_20000_evaluations(
 ) -> None:
     truth = DUFFING if model == "duffing-eq16" else COULOMB
     problem = example(model, seed=seed)
-    start = np.array([truth[p.name] for p in problem.space])
-    optimum = refine(problem, [start])[0]
+    start = np.array([truth[p.name] for p in problem.free_parameters])
+    optimum = refine_candidates(problem, [start])[0]
     assert optimum is not None
     settings = GeneticAlgorithm(stop=Stop(evaluations=20_000), generations=100_000)
     found = identify(load_model(model), record(noisy(model, seed=seed)), settings, seed=seed)

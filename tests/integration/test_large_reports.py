@@ -13,13 +13,13 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.api.app import create_app
+from service.core.states import JobState
 from service.jobs import submit as jobs
 from service.jobs.schemas import JobIn
-from service.queue.leases import Claim, Queue
-from service.queue.run_writes import RunLedger, RunOutcome
+from service.queue.leases import Claim, LeaseQueue
+from service.queue.run_writes import RunOutcome, RunWriter
 from service.repositories.runs import RunRepository
 from service.storage.sessions import Database
-from service.storage.tables import State
 from tests.rest import recording, settings_of
 
 N_SIGMA, N_SEEDS = 40, 105  # times the two methods: 8,400 asked for, the first 2,000 of them made
@@ -50,24 +50,26 @@ def large(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Large]:
                 {"path": "/seed", "range": [0, N_SEEDS]},
             ]},
         })  # fmt: skip
-        job = jobs.submit_to(parts.database, body, settings).id
+        job = jobs.submit_job(parts.database, body, settings).id
         with parts.database.write() as session:
-            claim = Queue(session).claim("test", timedelta(hours=1))
+            claim = LeaseQueue(session).claim_job("test", timedelta(hours=1))
         assert claim is not None
         _end(parts.database, claim)
         yield Large(client, job)
 
 
 def _end(database: Database, claim: Claim) -> None:
-    with database.write() as session:
-        found = RunRepository(session).page(claim.job.id, limit=3000).items
-        RunLedger(session, claim.lease).record([_outcome(run.id, run.number) for run in found])
-        Queue(session).finish(claim.lease, State.FAILED, "stopped before its end")
+    with database.write_session() as session:
+        found = RunRepository(session).list_page(claim.job.id, limit=3000).items
+        RunWriter(session, claim.lease).record_outcomes(
+            [_outcome(run.id, run.number) for run in found]
+        )
+        LeaseQueue(session).finish_job(claim.lease, JobState.FAILED, "stopped before its end")
 
 
 def _outcome(run: str, number: int) -> RunOutcome:
     if number in (11, 12):
-        return RunOutcome(run_id=run, state=State.FAILED, error=WHY)
+        return RunOutcome(run_id=run, state=JobState.FAILED, error=WHY)
     rms = 99.0 if number == 7 else 1.0 + number / 1000
     values: list[dict[str, Any]] = [
         {"name": name, "unit": "1", "value": 2.0 + number, "stderr": 0.1, "lower": 0.01,
@@ -75,7 +77,7 @@ def _outcome(run: str, number: int) -> RunOutcome:
         for name in ("K", "T")
     ]  # fmt: skip
     return RunOutcome(
-        run_id=run, state=State.SUCCEEDED, valid=True, best_rms=rms, rms_noise_free=rms,
+        run_id=run, state=JobState.SUCCEEDED, valid=True, best_rms=rms, rms_noise_free=rms,
         fit_estimation=100 - rms, evaluations=100, generations=4, seconds=0.01,
         result={"valid": True, "rms": rms, "parameters": values},
     )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.formats.csv_recordings import read_csv
-from sysid.data.derivations import derive
+from sysid.data.derivations import derive_recording
 from sysid.data.records import Recording
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -30,7 +30,7 @@ def tube(remainder: int) -> Recording:
     pooled = {
         "input": "p_in_bar", "outputs": ["p_out_bar"], "bin": 0.003, "start": 0, "stop": 1,
     }  # fmt: skip
-    return derive(recording, [{"select": chosen}, {"pool": pooled}])
+    return derive_recording(recording, [{"select": chosen}, {"pool": pooled}])
 
 
 @pytest.mark.parametrize("remainder", [0, 1])
@@ -55,7 +55,9 @@ def test_pooled_repeats_are_what_a_plain_loop_finds(remainder: int) -> None:
 
 def test_the_silverbox_is_regular_and_trimmed_by_rows() -> None:
     recording, _ = read_csv(DATA / "silverbox" / "silverbox_snls80mv.csv")
-    part = derive(recording, [{"trim": {"rows": [100, 40575]}}, {"hold": {"u": "band-limited"}}])
+    part = derive_recording(
+        recording, [{"trim": {"rows": [100, 40575]}}, {"hold": {"u": "band-limited"}}]
+    )
     assert part.samples == 40475
     assert part.sampling.is_regular
     assert 1 / part.sampling.period == pytest.approx(610.35, rel=1e-5)

@@ -22,18 +22,18 @@ def tables(database):
 
 
 def test_the_migrations_build_exactly_the_tables_of_the_program(empty_database):
-    migrate.upgrade(empty_database)
+    migrate.upgrade_database(empty_database)
     assert tables(empty_database) == set(Base.metadata.tables)
-    assert migrate.differences(empty_database) == []
+    assert migrate.list_differences(empty_database) == []
 
 
 def test_going_down_removes_every_table_and_up_again_brings_them_back(empty_database):
-    migrate.upgrade(empty_database)
-    migrate.downgrade(empty_database)
+    migrate.upgrade_database(empty_database)
+    migrate.downgrade_database(empty_database)
     assert tables(empty_database) == set()
-    assert migrate.current(empty_database) is None
-    migrate.upgrade(empty_database)
-    assert migrate.differences(empty_database) == []
+    assert migrate.read_current_revision(empty_database) is None
+    migrate.upgrade_database(empty_database)
+    assert migrate.list_differences(empty_database) == []
 
 
 def test_a_new_database_has_the_default_project(database):
@@ -43,29 +43,29 @@ def test_a_new_database_has_the_default_project(database):
 
 def test_a_database_that_is_not_at_the_head_is_told(empty_database):
     with pytest.raises(DatabaseNotAtHead, match=r"none.*lagid db upgrade"):
-        migrate.check(empty_database)
-    migrate.upgrade(empty_database)
-    migrate.check(empty_database)
-    assert migrate.current(empty_database) == migrate.head()
+        migrate.check_revision(empty_database)
+    migrate.upgrade_database(empty_database)
+    migrate.check_revision(empty_database)
+    assert migrate.read_current_revision(empty_database) == migrate.find_head_revision()
 
 
 def test_upgrading_again_changes_nothing(database):
-    before = migrate.current(database)
-    migrate.upgrade(database)
-    assert migrate.current(database) == before
+    before = migrate.read_current_revision(database)
+    migrate.upgrade_database(database)
+    assert migrate.read_current_revision(database) == before
 
 
 def test_a_missing_table_is_a_difference(database):
     with database.engine.begin() as connection:
         connection.execute(text("DROP TABLE dispatchers"))
-    assert any("dispatchers" in one for one in migrate.differences(database))
+    assert any("dispatchers" in one for one in migrate.list_differences(database))
 
 
 def test_a_migration_that_fails_leaves_the_database_as_it_was(empty_database):
     with empty_database.engine.begin() as connection:
         connection.execute(text("CREATE TABLE dispatchers (x INTEGER)"))  # the last one made
     with pytest.raises(Exception, match="already exists"):
-        migrate.upgrade(empty_database)
+        migrate.upgrade_database(empty_database)
     assert tables(empty_database) == {"dispatchers"}
 
 
@@ -76,7 +76,7 @@ def test_threads_that_upgrade_at_once_do_not_race(empty_database):
     def work():
         start.wait()
         try:
-            migrate.upgrade(empty_database)
+            migrate.upgrade_database(empty_database)
         except Exception as error:  # noqa: BLE001 - shown by the assertion
             errors.append(error)
 
@@ -86,14 +86,14 @@ def test_threads_that_upgrade_at_once_do_not_race(empty_database):
     for thread in threads:
         thread.join()
     assert errors == []
-    migrate.check(empty_database)
+    migrate.check_revision(empty_database)
 
 
 def _start_service(url, start, results):
     start.wait(180)
     database = Database(url)
-    migrate.upgrade(database)
-    migrate.check(database)
+    migrate.upgrade_database(database)
+    migrate.check_revision(database)
     database.dispose()
     results.put("up")
 
@@ -111,7 +111,7 @@ def test_processes_that_start_at_once_on_a_new_database_do_not_race(empty_databa
     assert [results.get(timeout=180) for _ in processes] == ["up"] * 3
     for process in processes:
         process.join()
-    assert migrate.differences(empty_database) == []
+    assert migrate.list_differences(empty_database) == []
 
 
 SECOND = """
@@ -155,23 +155,23 @@ def test_a_second_revision_carries_the_rows_over_and_back(database, revisions):
     before = columns(database)
     (revisions / "second.py").write_text(SECOND.format(last=""))
     with pytest.raises(DatabaseNotAtHead, match="0002"):
-        migrate.check(database)
-    migrate.upgrade(database)
+        migrate.check_revision(database)
+    migrate.upgrade_database(database)
     assert copies(database) == ["default"]
-    migrate.downgrade(database, "0001")
+    migrate.downgrade_database(database, "0001")
     assert columns(database) == before
     with database.read() as session:
         assert [one.name for one in session.query(Project)] == ["default"]
-    assert migrate.differences(database) == []
+    assert migrate.list_differences(database) == []
 
 
 def test_a_second_revision_that_fails_leaves_the_database_as_it_was(database, revisions):
     before = columns(database)
     (revisions / "second.py").write_text(SECOND.format(last='raise OSError("in the middle")'))
     with pytest.raises(OSError, match="in the middle"):
-        migrate.upgrade(database)
+        migrate.upgrade_database(database)
     assert columns(database) == before
-    assert migrate.current(database) == "0001"
+    assert migrate.read_current_revision(database) == "0001"
 
 
 def test_an_upgrade_waits_for_a_writer_that_has_begun_and_carries_over_what_it_wrote(
@@ -181,7 +181,7 @@ def test_an_upgrade_waits_for_a_writer_that_has_begun_and_carries_over_what_it_w
     with ThreadPoolExecutor(1) as pool:
         with database.engine.begin() as writer:
             writer.execute(text("UPDATE projects SET name = 'early'"))
-            upgraded = pool.submit(migrate.upgrade, database)
+            upgraded = pool.submit(migrate.upgrade_database, database)
             wait_for_a_lock(database, upgraded)
             writer.execute(text("UPDATE projects SET name = 'late'"))
         upgraded.result()
@@ -204,7 +204,7 @@ def test_an_upgrade_waits_longer_for_its_turn_than_other_writers(database, revis
     with ThreadPoolExecutor(1) as pool:
         with database.engine.begin() as writer:
             writer.execute(text("UPDATE projects SET name = 'late'"))
-            upgraded = pool.submit(migrate.upgrade, database)
+            upgraded = pool.submit(migrate.upgrade_database, database)
             time.sleep(0.3)
         upgraded.result()
     assert copies(database) == ["late"]

@@ -11,11 +11,11 @@ from sysid.data.records import Channel, Record
 from sysid.export.export import export_model
 from sysid.identification.identify import identify
 from sysid.identification.result import Identification
-from sysid.identification.run import begin
+from sysid.identification.run import begin_run
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.selection.starts import equation_error_starts
+from sysid.selection.starts import find_equation_error_starts
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 from tests.polynomials import LAGGED, TRUTH, document, frols, lagged, record_of
@@ -80,33 +80,33 @@ def test_with_measurement_noise_they_are_recovered_within_their_errors() -> None
 
 def test_the_starts_hold_the_solution_of_data_without_noise() -> None:
     posed = problem(narx_record(3.0, 7.0))
-    starts = equation_error_starts(posed, GeneticAlgorithm())
+    starts = find_equation_error_starts(posed, GeneticAlgorithm())
     assert starts.values[0] == pytest.approx(
-        {one.name: 0.0 for one in posed.space} | NARX | {"dh": 3.0, "dk": 7.0}, abs=1e-9
+        {one.name: 0.0 for one in posed.free_parameters} | NARX | {"dh": 3.0, "dk": 7.0}, abs=1e-9
     )
 
 
 def fitness(posed: Problem, start: Any) -> float:
-    theta = np.array([[start[one.name] for one in posed.space]])
-    return float(posed.fitness(theta)[0])
+    theta = np.array([[start[one.name] for one in posed.free_parameters]])
+    return float(posed.evaluate_fitness(theta)[0])
 
 
 def test_starts_come_best_first_inside_the_bounds_and_finite() -> None:
     changes = {"a[u(k-1)]": {"lower": -0.1, "upper": 0.1}, "dk": {"upper": 5}}
     posed = problem(narx_record(3.0, 7.0, noise=0.1), parameters=changes)
-    starts = equation_error_starts(posed, GeneticAlgorithm()).values
+    starts = find_equation_error_starts(posed, GeneticAlgorithm()).values
     reached = [fitness(posed, start) for start in starts]
     assert reached == sorted(reached)
     assert np.isfinite(reached[-1])
     for start in starts:
-        assert all(one.lower <= start[one.name] <= one.upper for one in posed.space)
+        assert all(one.lower <= start[one.name] <= one.upper for one in posed.free_parameters)
 
 
 def test_simulated_past_values_take_away_the_bias_of_noisy_ones() -> None:
     """One step ahead, noise pulls the coefficients of the past output towards zero."""
     record = record_of(TRUTH, samples=3000, noise=0.2)
     posed = Problem.build(parse_model(document(list(TRUTH))), [record])
-    best = equation_error_starts(posed, GeneticAlgorithm()).values[0]
+    best = find_equation_error_starts(posed, GeneticAlgorithm()).values[0]
     assert best["a[y(k-1)]"] == pytest.approx(TRUTH["y(k-1)"], abs=0.05)
     assert best["a[y(k-2)]"] == pytest.approx(TRUTH["y(k-2)"], abs=0.05)
 
@@ -115,7 +115,7 @@ def test_a_fixed_coefficient_is_kept_and_the_others_are_solved_for() -> None:
     changes = {"a[y(k-1)]": {"fixed": TRUTH["y(k-1)"]}}
     record = record_of(TRUTH)
     posed = Problem.build(parse_model(document(list(TRUTH))), [record], parameters=changes)
-    best = equation_error_starts(posed, GeneticAlgorithm()).values[0]
+    best = find_equation_error_starts(posed, GeneticAlgorithm()).values[0]
     rest = {f"a[{term}]": value for term, value in TRUTH.items() if term != "y(k-1)"}
     assert best == pytest.approx(rest, abs=1e-9)
 
@@ -125,20 +125,20 @@ def test_a_fixed_coefficient_is_kept_and_the_others_are_solved_for() -> None:
 def test_the_methods_of_the_paper_begin_without_starts(method: Any) -> None:
     posed = problem(narx_record(3.0, 7.0))
     algorithm = GeneticAlgorithm(method=method)
-    assert equation_error_starts(posed, algorithm).values == ()
+    assert find_equation_error_starts(posed, algorithm).values == ()
     islands = (IslandChange(method=method), IslandChange(method="improved"))
     mixed = GeneticAlgorithm(islands=islands)
     other = GeneticAlgorithm(islands=(IslandChange(method=method), IslandChange(method=method)))
-    one, two = begin(posed, mixed, 1).islands
-    alone = begin(posed, other, 1).islands
-    assert np.array_equal(one.words, alone[0].words)
-    assert not np.array_equal(two.words, alone[1].words)
+    one, two = begin_run(posed, mixed, 1).islands
+    alone = begin_run(posed, other, 1).islands
+    assert np.array_equal(one.chromosomes, alone[0].chromosomes)
+    assert not np.array_equal(two.chromosomes, alone[1].chromosomes)
 
 
 def test_a_model_that_is_no_polynomial_has_no_starts() -> None:
     recursion = replace(load_model("narx"), form="difference")
     posed = Problem.build(recursion, [narx_record(3.0, 7.0)])
-    assert equation_error_starts(posed, GeneticAlgorithm()).values == ()
+    assert find_equation_error_starts(posed, GeneticAlgorithm()).values == ()
 
 
 @pytest.mark.slow
@@ -146,9 +146,9 @@ def test_a_model_that_is_no_polynomial_has_no_starts() -> None:
 def test_simulations_of_the_starts_count(evaluations: int) -> None:
     algorithm = GeneticAlgorithm(stop=Stop(evaluations=evaluations))
     posed = problem(narx_record(3.0, 7.0, noise=0.05))
-    starts = equation_error_starts(posed, algorithm)
+    starts = find_equation_error_starts(posed, algorithm)
     assert 0 < starts.evaluations <= evaluations // 4
-    assert begin(posed, algorithm, 1).evaluations == starts.evaluations
+    assert begin_run(posed, algorithm, 1).evaluations == starts.evaluations
     found = identify(posed.model, posed.records, algorithm)
     assert found.evaluations <= evaluations
 

@@ -75,7 +75,7 @@ def test_the_pages_of_jobs_follow_each_other(client: TestClient, filled: Filled)
 
 
 def test_plotly_is_served_compressed_and_kept_forever(client: TestClient) -> None:
-    name = f"/static/{assets.plotly_name()}"
+    name = f"/static/{assets.plotly_file_name()}"
     answer = client.get(name, headers={"Accept-Encoding": "gzip"})
     assert answer.headers["content-encoding"] == "gzip"
     assert "immutable" in answer.headers["cache-control"]

@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 from service.client.client import Client
-from service.client.embedded import embedded_service
+from service.client.embedded import run_embedded_service
 
 pytestmark = [pytest.mark.slow, pytest.mark.ray, pytest.mark.timeout(600)]
 
 
 @pytest.fixture(scope="module")
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with embedded_service(tmp_path_factory.mktemp("paper"), cpus=2) as address:
+    with run_embedded_service(tmp_path_factory.mktemp("paper"), cpus=2) as address:
         yield address
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sysid.core.settings import GeneticAlgorithm, Stop
-from sysid.identification.conclude import conclude
-from sysid.identification.run import advance, begin
+from sysid.identification.conclude import conclude_run
+from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from tests.searching import COULOMB, noisy, record
 
@@ -17,12 +17,12 @@ from tests.searching import COULOMB, noisy, record
 def test_a_lag_box_of_five_seconds_with_dry_friction_ends_at_the_optimum(seed: int) -> None:
     measured = [record(noisy("coulomb-eq16", seed=seed))]
     problem = Problem.build(load_model("coulomb-eq16"), measured, parameters={"L": {"upper": 5.0}})
-    truth = np.array([COULOMB[p.name] for p in problem.space])
-    optimum = refine(problem, [truth])[0]
+    truth = np.array([COULOMB[p.name] for p in problem.free_parameters])
+    optimum = refine_candidates(problem, [truth])[0]
     assert optimum is not None
     algorithm = GeneticAlgorithm(stop=Stop(evaluations=20_000))
-    found = conclude(
-        problem, algorithm, advance(problem, algorithm, begin(problem, algorithm, seed))
+    found = conclude_run(
+        problem, algorithm, advance_run(problem, algorithm, begin_run(problem, algorithm, seed))
     )
     assert found.rms <= optimum.rms * 1.0001
     assert found.evaluations <= 20_000

@@ -7,18 +7,18 @@ from typing import Any
 
 import pytest
 
+from service.core.states import JobState
 from service.dispatch.dispatcher import Dispatcher
-from service.dispatch.leases import Leases
+from service.dispatch.leases import HeldLeases
 from service.queue.admission import Admission
 from service.queue.leases import Claim
 from service.storage.objects import open_store
 from service.storage.sessions import Database
-from service.storage.tables import State
 from tests.dispatching import LIMIT_SECONDS, Place
 from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
-from workers.feeding import Feeder
-from workers.inline import InlineCrew
-from workers.ports import Evolve, QueuedRun
+from workers.inline_executor import InlineExecutor
+from workers.protocol import EvolveIsland, QueuedRun
+from workers.scheduler import Scheduler
 
 QUICK = {"generations": 60, "population": 16, "stop": {"settled": None}}
 
@@ -33,27 +33,27 @@ def test_a_single_identification_gets_in_while_nine_sweeps_of_thousands_of_runs_
     tmp_path: Path, ray_crew
 ) -> None:
     place = Place(tmp_path / "data")
-    dispatcher = Dispatcher(place.database, place.store, ray_crew, Leases(place.database, 60.0))
+    dispatcher = Dispatcher(place.database, place.store, ray_crew, HeldLeases(place.database, 60.0))
     sweeps = [place.submit(sweep=sweep(2000), algorithm=QUICK) for _ in range(9)]
 
-    def turn_until(job: str, *states: State) -> None:
+    def turn_until(job: str, *states: JobState) -> None:
         limit = time.monotonic() + LIMIT_SECONDS
         while place.job(job).state not in states:
             assert time.monotonic() < limit
-            dispatcher.turn()
+            dispatcher.run_round()
 
     for job in sweeps:
-        turn_until(job, State.RUNNING)
+        turn_until(job, JobState.RUNNING)
     single = place.submit(seed=5)
-    turn_until(single, State.SUCCEEDED)
-    assert all(place.job(job).state is State.RUNNING for job in sweeps)
+    turn_until(single, JobState.SUCCEEDED)
+    assert all(place.job(job).state is JobState.RUNNING for job in sweeps)
     for job in sweeps:
         place.cancel(job)
     for job in sweeps:
-        turn_until(job, State.CANCELLED)
+        turn_until(job, JobState.CANCELLED)
 
 
-class Counted(Leases):
+class Counted(HeldLeases):
     """Leases that count what they claim; after the first, the rival's first is waited for."""
 
     claimed = 0
@@ -62,8 +62,8 @@ class Counted(Leases):
         super().__init__(database, seconds)
         self._both = both
 
-    def claim(self, admission: Admission | None = None) -> Claim | None:
-        found = super().claim(admission)
+    def claim_job(self, admission: Admission | None = None) -> Claim | None:
+        found = super().claim_job(admission)
         self.claimed += found is not None
         if found is not None and self.claimed == 1:
             self._both.wait(LIMIT_SECONDS)
@@ -80,15 +80,15 @@ def test_two_dispatchers_split_the_jobs_of_one_database_and_each_run_is_done_onc
     both = threading.Barrier(2)  # a quick one could have them all before the other begins
     leases = [Counted(one, 60.0, both) for one in own]
     dispatchers = [
-        Dispatcher(one, open_store(place.settings.store), InlineCrew(), mine)
+        Dispatcher(one, open_store(place.settings.resolved_store_url), InlineExecutor(), mine)
         for one, mine in zip(own, leases, strict=True)
     ]
-    threads = [threading.Thread(target=one.run) for one in dispatchers]
+    threads = [threading.Thread(target=one.run_until_stopped) for one in dispatchers]
     for thread in threads:
         thread.start()
     try:
         for job in jobs:
-            place.until(job, State.SUCCEEDED, State.FAILED)
+            place.until(job, JobState.SUCCEEDED, JobState.FAILED)
     finally:
         for dispatcher, thread in zip(dispatchers, threads, strict=True):
             dispatcher.stopping.set()
@@ -99,7 +99,7 @@ def test_two_dispatchers_split_the_jobs_of_one_database_and_each_run_is_done_onc
     assert min(one.claimed for one in leases) > 0
     for job in jobs:
         ended = place.job(job)
-        assert (ended.state, ended.attempt, ended.n_done) == (State.SUCCEEDED, 1, 4)
+        assert (ended.state, ended.attempt, ended.n_done) == (JobState.SUCCEEDED, 1, 4)
         assert [run.number for run in place.runs(job)] == [0, 1, 2, 3]
 
 
@@ -111,7 +111,7 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
     monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
     monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 0.001)
     one = spec(3, "long", generations=120, islands=8, population=64)
-    plain = carry_out(InlineCrew(), {"r": one})
+    plain = carry_out(InlineExecutor(), {"r": one})
     flying: set[Any] = set()
     most = 0
     submit, fetch = ray_crew.submit, ray_crew.fetch
@@ -119,7 +119,7 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
     def counted(pack, keys, shared) -> Any:
         nonlocal most
         handle = submit(pack, keys, shared)
-        if isinstance(pack[0], Evolve):
+        if isinstance(pack[0], EvolveIsland):
             flying.add(handle)
             most = max(most, len(flying))
         return handle
@@ -138,19 +138,21 @@ def test_the_islands_of_one_long_run_keep_both_workers_busy_with_the_same_bits(
 @pytest.mark.ray
 @pytest.mark.slow
 def test_a_short_job_passes_a_sweep_on_real_workers(ray_crew) -> None:
-    feeder: Feeder[str] = Feeder(ray_crew)
+    feeder: Scheduler[str] = Scheduler(ray_crew)
     long, short = Notebook(), Notebook()
     runs = (QueuedRun(f"s{n}", spec(n)) for n in range(3000))
-    feeder.add("sweep", ListedRuns(runs), long)
+    feeder.add_job("sweep", ListedRuns(runs), long)
     limit = time.monotonic() + LIMIT_SECONDS
     while not long.results and time.monotonic() < limit:
-        feeder.step(0.05)
-    feeder.add("single", ListedRuns([QueuedRun("one", spec(9, "long", generations=300))]), short)
-    while "single" not in feeder.step(0.05):
+        feeder.run_step(0.05)
+    feeder.add_job(
+        "single", ListedRuns([QueuedRun("one", spec(9, "long", generations=300))]), short
+    )
+    while "single" not in feeder.run_step(0.05):
         assert time.monotonic() < limit
     assert len(short.results["one"]) == 1
     assert len(long.results) < 3000
     long.is_stopped = True
     while feeder._jobs:
-        feeder.step(0.05)
+        feeder.run_step(0.05)
         assert time.monotonic() < limit

@@ -14,13 +14,13 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.api.app import create_app
-from service.core.concurrency import AT_ONCE, WAITING, simulating
+from service.core.concurrency import MAX_RUNNING, MAX_WAITING, simulation_limit
 from service.jobs.stored_run import StoredRun
-from service.pages.simulate import _defaults, _Known
+from service.pages.simulate import _default_values, _FormContext
 from service.storage.tables import Dataset, Job, Run
 from sysid.models.catalogue.load import load_model
 from sysid.search import refine as refinement
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from tests.identified import identified
 from tests.rest import refused, settings_of
@@ -96,10 +96,10 @@ def test_the_start_of_each_record_is_searched_on_it_alone(
     searched = []
 
     def noted(problem: Problem, *arguments: Any) -> Any:
-        searched.append([one.name for one in problem.space])
-        return refine(problem, *arguments)
+        searched.append([one.name for one in problem.free_parameters])
+        return refine_candidates(problem, *arguments)
 
-    monkeypatch.setattr(refinement, "refine", noted)
+    monkeypatch.setattr(refinement, "refine_candidates", noted)
     found = validated(place, dataset=answer.json()["id"]).json()
     assert searched == 5 * [["x(0)"]]
     assert list(found["starts"]) == ["x(0)", *(f"x(0)[{n}]" for n in range(2, 6))]
@@ -156,10 +156,10 @@ def test_of_an_irregular_recording_the_form_suggests_its_own_duration_and_densit
     oven = Dataset(n_samples=586, duration=3600.0, sample_time=None, channels=[])
     job = Job(spec={"model": "fopdt", "channels": {}, "hold": {}})
     stored = StoredRun.from_rows(job, Run(cell={}))
-    found = _defaults(stored, oven)
+    found = _default_values(stored, oven)
     assert (found["duration"], found["sample_time"]) == ("3600", "6.2")
     single = Dataset(n_samples=1, duration=0.0, sample_time=None, channels=[])
-    assert _defaults(stored, single)["sample_time"] == "0.01"
+    assert _default_values(stored, single)["sample_time"] == "0.01"
 
 
 def test_the_form_suggests_a_step_within_what_was_measured(place: Place) -> None:
@@ -202,7 +202,7 @@ def test_the_gain_has_the_unit_that_makes_an_input_of_an_output(
     above: str, below: str, unit: str
 ) -> None:
     known = SimpleNamespace(model=load_model("fopdt"), units={"u": above, "y": below})
-    assert _Known.gain_unit.fget(known) == unit  # type: ignore[attr-defined]
+    assert _FormContext.gain_unit.fget(known) == unit  # type: ignore[attr-defined]
 
 
 def test_a_loop_of_small_gain_settles_and_the_page_says_by_how_much(place: Place) -> None:
@@ -375,11 +375,11 @@ def test_while_too_many_simulate_the_others_are_asked_to_come_again_and_nothing_
     query = {"kind": "loop", "gain": "1", "duration": "5", "sample_time": "0.1"}
     made = {**NOISELESS, "parameters": TRUE}
     with ExitStack() as others:
-        for _ in range(AT_ONCE):
-            others.enter_context(simulating.one())
-        for _ in range(WAITING):
-            assert simulating._here.acquire(blocking=False)  # all that may wait are there
-            others.callback(simulating._here.release)
+        for _ in range(MAX_RUNNING):
+            others.enter_context(simulation_limit.acquire())
+        for _ in range(MAX_WAITING):
+            assert simulation_limit._here.acquire(blocking=False)  # all that may wait are there
+            others.callback(simulation_limit._here.release)
         for answer in (
             place.client.post(f"/v1/runs/{place.run}:simulate", json=step),
             place.client.post("/v1/datasets:simulate", json=made),

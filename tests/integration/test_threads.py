@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sysid.core.threads import _libraries, one_thread
+from sysid.core.threads import _load_libraries, use_one_thread
 
 CONCLUDED = """
 import hashlib
@@ -48,18 +48,18 @@ def test_a_long_record_gives_the_same_bits_with_one_and_two_threads() -> None:
 
 
 def test_the_number_of_threads_comes_back_when_the_last_caller_is_done() -> None:
-    before = [library.threads() for library in _libraries()]
-    for library in _libraries():
-        library.limit(2)
+    before = [library.get_threads() for library in _load_libraries()]
+    for library in _load_libraries():
+        library.set_threads(2)
     try:
-        with one_thread():
-            with one_thread():
+        with use_one_thread():
+            with use_one_thread():
                 pass
-            assert all(library.threads() == 1 for library in _libraries())
-        assert all(library.threads() == 2 for library in _libraries())
+            assert all(library.get_threads() == 1 for library in _load_libraries())
+        assert all(library.get_threads() == 2 for library in _load_libraries())
     finally:
-        for library, threads in zip(_libraries(), before, strict=True):
-            library.limit(threads)
+        for library, threads in zip(_load_libraries(), before, strict=True):
+            library.set_threads(threads)
 
 
 STARTED = """

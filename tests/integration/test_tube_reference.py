@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sysid.plants.tube import Tube, excitation, tube_record
+from sysid.plants.tube import Tube, build_excitation, simulate_tube_record
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("LAGID_DATA", ROOT.parent / "shared" / "data")) / "tube_reference"
@@ -26,9 +26,9 @@ def test_both_ends_follow_the_record_within_0_2_percent_of_its_span(
     times, command, first, second = np.loadtxt(
         path, delimiter=",", skiprows=1, usecols=(0, 1, 2, 3), unpack=True
     )
-    ours = excitation(pattern, float(length), times)
+    ours = build_excitation(pattern, float(length), times)
     assert np.count_nonzero(np.abs(ours - command) > 1.0) <= 3  # at jumps, by one sample
-    found = tube_record(Tube(length_m=float(length)), pattern, times.size, 0.01)
+    found = simulate_tube_record(Tube(length_m=float(length)), pattern, times.size, 0.01)
     span = float(np.ptp(second))
     for name, expected in (("P1", first), ("P2", second)):
         error = found.channel(name).values - expected

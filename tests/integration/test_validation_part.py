@@ -8,7 +8,7 @@ import pytest
 
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import GeneticAlgorithm
-from sysid.data.noise import Noise, with_noise
+from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Channel, Record
 from sysid.data.splitting import split_record
 from sysid.identification.identify import identify
@@ -17,8 +17,8 @@ from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from tests.searching import DUFFING, force
-from workers.ports import ProblemSpec
-from workers.tasks import build, prepared
+from workers.protocol import ProblemSpec
+from workers.tasks import build_pack_problems, prepare_run_records
 
 BRIEF = GeneticAlgorithm(population=16, generations=2)
 TRUE = {name: {"fixed": value} for name, value in DUFFING.items() if name != "c"}
@@ -40,10 +40,8 @@ DECAY = {
 def free_run(model: str, values: Mapping[str, float], n: int = 600) -> Record:
     blank = Record((force(n),), (Channel("y", 0.02 * np.arange(n), np.zeros(n), "m"),))
     problem = Problem.build(load_model(model), [blank])
-    theta = np.array([[values[p.name] for p in problem.space]])
-    return replace(
-        blank, outputs=(replace(blank.outputs[0], values=problem.predictions(theta)[0]),)
-    )
+    theta = np.array([[values[p.name] for p in problem.free_parameters]])
+    return replace(blank, outputs=(replace(blank.outputs[0], values=problem.predict(theta)[0]),))
 
 
 def decay(sd: float = 0.0) -> Record:
@@ -60,7 +58,7 @@ def standard_deviation(found: Identification, record: Record) -> list[float]:
 
 @pytest.mark.parametrize("model", ["duffing-eq16", "duffing-delay"])
 def test_the_true_model_fits_both_parts_alike(model: str) -> None:
-    record = with_noise(free_run(model, DUFFING), Noise(0.01, 1), 0)
+    record = add_output_noise(free_run(model, DUFFING), Noise(0.01, 1), 0)
     found = identify(load_model(model), record, BRIEF, parameters=NEAR, validation_fraction=0.3)
     assert found.fit_percent > 97
     assert found.fit_percent_validation == pytest.approx(found.fit_percent, abs=1.0)
@@ -113,15 +111,15 @@ def test_a_worker_builds_the_part_kept_on_the_whole_record_without_noise() -> No
         model=dict(load_model("duffing-eq16").document), records="r", validation=None,
         validation_fraction=FRACTION, noise=Noise(0.05, 1),
     )  # fmt: skip
-    posed, judged = build(spec, {"r": (record,)})
-    estimation, kept, *_ = prepared(spec, {"r": (record,)})
+    posed, judged = build_pack_problems(spec, {"r": (record,)})
+    estimation, kept, *_ = prepare_run_records(spec, {"r": (record,)})
     assert judged is not None
     assert kept is not None
     assert posed.records[0].outputs[0].values.tobytes() == estimation[0].outputs[0].values.tobytes()
     assert judged.records == (record,)
     assert judged.n_scored == kept[0].outputs[0].values.size == 180
-    theta = np.array([[DUFFING[p.name] for p in judged.space]])
-    assert judged.metrics(theta[0]).rms < 1e-12
+    theta = np.array([[DUFFING[p.name] for p in judged.free_parameters]])
+    assert judged.evaluate_metrics(theta[0]).rms < 1e-12
 
 
 def test_records_and_a_fraction_together_are_refused() -> None:

@@ -10,14 +10,14 @@ import pytest
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
-from sysid.data.derivations import derive
+from sysid.data.derivations import derive_recording
 from sysid.data.records import Channel, Record, Recording
 from sysid.identification.identify import identify
 from sysid.identification.result import Identification
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import located
+from sysid.simulation.scaling import from_unit
 from sysid.simulation.simulate import simulate
 
 TRUTH = {"K": 2.0, "T": 0.6, "L": 0.37}
@@ -114,8 +114,8 @@ def test_a_logarithmic_scale_divides_an_interval_by_ratios() -> None:
     model = lag_model(T={"lower": 0.01, "upper": 100, "scale": "log"})
     log = Problem.build(model, [record()])
     middle = np.full((1, 3), 0.5)
-    assert located(linear.evaluator, middle)[0, 1] == pytest.approx((0.05 + 5) / 2)
-    assert located(log.evaluator, middle)[0, 1] == pytest.approx(1.0)
+    assert from_unit(linear.evaluator, middle)[0, 1] == pytest.approx((0.05 + 5) / 2)
+    assert from_unit(log.evaluator, middle)[0, 1] == pytest.approx(1.0)
     assert values(identify(model, record(), QUICK)) == pytest.approx(TRUTH, abs=1e-4)
 
 
@@ -149,7 +149,7 @@ def test_a_derived_recording_gives_the_same_system(
 ) -> None:
     given = source()
     whole = Recording((given, answer(given)))
-    part = derive(whole, steps).record({"u": "u"}, {"y": "y"})
+    part = derive_recording(whole, steps).to_record({"u": "u"}, {"y": "y"})
     # What the input was before the part goes with it: every sample is scored.
     model = lag_model({"lower": -9, "upper": 9})
     found = identify(model, part, QUICK)
@@ -160,8 +160,10 @@ def test_a_drift_that_is_taken_away_does_no_harm() -> None:
     given = source()
     y = answer(given)
     drifting = Recording((given, replace(y, values=y.values + DRIFT)))
-    flat = derive(drifting, [{"detrend": {"kind": "linear"}}]).record({"u": "u"}, {"y": "y"})
-    raw = drifting.record({"u": "u"}, {"y": "y"})
+    flat = derive_recording(drifting, [{"detrend": {"kind": "linear"}}]).to_record(
+        {"u": "u"}, {"y": "y"}
+    )
+    raw = drifting.to_record({"u": "u"}, {"y": "y"})
     model = lag_model({"lower": -9, "upper": 9})
     with_drift, without = (identify(model, one, QUICK) for one in (raw, flat))
     assert without.rms < 0.2 * with_drift.rms

@@ -10,7 +10,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
 from sysid.identification.result import Identification
-from sysid.identification.warnings import _correlated
+from sysid.identification.warnings import _warn_correlations
 from sysid.models.catalogue.load import load_model
 from sysid.simulation.problem import Problem
 from tests.searching import DUFFING as TRUTH
@@ -74,14 +74,14 @@ def test_a_lag_that_may_as_well_be_zero_is_not_separable_from_what_it_is_on_a_ri
     known = {"K": {"fixed": 1.0}, "y0": {"fixed": 0.0}, "x(0)": {"fixed": 0.0}}
     sought = known | {"T": {"lower": 0.01, "upper": 2.0}, "L": {"lower": 0.0, "upper": 0.4}}
     problem = Problem.build(FOPDT, [driven("u", TIMES / 6, 0.0 * TIMES)], parameters=sought)
-    y = problem.predictions(np.array([[0.2, 0.05]]))[0] + noise(0.02)
+    y = problem.predict(np.array([[0.2, 0.05]]))[0] + noise(0.02)
     found = identify(FOPDT, driven("u", TIMES / 6, y), parameters=sought)
     assert told(found, "T and L not separable")
     # Coloured residuals may turn the ellipsoid; what one sensitivity makes up for in another stays.
     assert found.uncertainty is not None
     turned = replace(found.uncertainty, correlation=np.array([[1.0, 0.5], [0.5, 1.0]]))
-    [ridge] = _correlated(turned, found.estimates, {"L"})
-    r = found.uncertainty.alike[0, 1]
+    [ridge] = _warn_correlations(turned, found.estimates, {"L"})
+    r = found.uncertainty.sensitivity_correlation[0, 1]
     assert f"not separable (r = 0.500, {r:.3f} if the residuals were white)" in ridge
-    apart = replace(turned, alike=turned.correlation)
-    assert _correlated(apart, found.estimates, {"L"}) == []
+    apart = replace(turned, sensitivity_correlation=turned.correlation)
+    assert _warn_correlations(apart, found.estimates, {"L"}) == []

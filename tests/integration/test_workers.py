@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 
 from tests.runs import ListedRuns, Notebook, bits, carry_out, spec
-from workers.feeding import Feeder
-from workers.inline import InlineCrew
-from workers.ports import QueuedRun
+from workers.inline_executor import InlineExecutor
+from workers.protocol import QueuedRun
+from workers.scheduler import Scheduler
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
 
 def test_many_small_runs_on_ray_give_the_bits_of_the_plain_loop(ray_crew) -> None:
     specs = {f"r{seed}": spec(seed, generations=20) for seed in range(1, 9)}
-    plain, spread = carry_out(InlineCrew(), specs), carry_out(ray_crew, specs)
+    plain, spread = carry_out(InlineExecutor(), specs), carry_out(ray_crew, specs)
     assert plain.failures == spread.failures == {}
     for run in specs:
         assert [bits(one) for one in spread.results[run]] == [bits(plain.results[run][0])]
@@ -34,7 +34,7 @@ def test_one_large_run_spread_by_islands_gives_the_bits_of_the_plain_loop(
     assert len(spread.states["r"]) >= 4
     monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 1000.0)
     monkeypatch.setattr("workers.packing.PACK_SECONDS", 1000.0)
-    plain = carry_out(InlineCrew(), specs)
+    plain = carry_out(InlineExecutor(), specs)
     assert len(plain.states.get("r", [])) == 0  # one call, from the start to the end
     assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])
 
@@ -43,31 +43,33 @@ def test_a_run_goes_on_from_a_checkpoint_with_the_same_bits(ray_crew) -> None:
     one = spec(3, "long", generations=4000)
     whole = carry_out(ray_crew, {"r": one})
     middle = whole.states["r"][0]
-    feeder, notebook = Feeder(ray_crew), Notebook()
-    feeder.add("job", ListedRuns([QueuedRun("r", one, middle)]), notebook)
-    while not feeder.step(0.05):
+    feeder, notebook = Scheduler(ray_crew), Notebook()
+    feeder.add_job("job", ListedRuns([QueuedRun("r", one, middle)]), notebook)
+    while not feeder.run_step(0.05):
         pass
     assert bits(notebook.results["r"][0]) == bits(whole.results["r"][0])
 
 
 def test_a_cancelled_job_frees_the_workers_soon_and_they_go_on_working(ray_crew) -> None:
-    feeder, notebook = Feeder(ray_crew, grace_seconds=5.0), Notebook()
-    feeder.add("job", ListedRuns([QueuedRun("r", spec(1, "long", generations=10**6))]), notebook)
+    feeder, notebook = Scheduler(ray_crew, grace_seconds=5.0), Notebook()
+    feeder.add_job(
+        "job", ListedRuns([QueuedRun("r", spec(1, "long", generations=10**6))]), notebook
+    )
     while not notebook.states:
-        feeder.step(0.05)
+        feeder.run_step(0.05)
     notebook.is_stopped = True
     begun = time.monotonic()
-    while not feeder.step(0.05):
+    while not feeder.run_step(0.05):
         assert time.monotonic() - begun < 60.0
     assert carry_out(ray_crew, {"r": spec()}).failures == {}
 
 
 def test_a_run_survives_the_death_of_its_worker(ray_crew) -> None:
     one = spec(4, "long", generations=4000)  # of many packs, each of which is fed from here
-    feeder, notebook = Feeder(ray_crew), Notebook()
-    feeder.add("job", ListedRuns([QueuedRun("r", one)]), notebook)
+    feeder, notebook = Scheduler(ray_crew), Notebook()
+    feeder.add_job("job", ListedRuns([QueuedRun("r", one)]), notebook)
     killed: list[int] = []
-    while not feeder.step(0.01):
+    while not feeder.run_step(0.01):
         if not killed and (killed := workers_of(os.getpid())[:1]):
             os.kill(killed[0], signal.SIGKILL)
     assert killed

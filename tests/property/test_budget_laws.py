@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sysid.core.errors import InvalidSettings
-from sysid.core.settings import METHODS, GeneticAlgorithm, SearchMethod, Stop
+from sysid.core.settings import SEARCH_METHODS, GeneticAlgorithm, SearchMethod, Stop
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
@@ -37,7 +37,7 @@ def record() -> Record:
 @pytest.mark.parametrize("model", [LAG, polynomial()], ids=["lag", "polynomial"])
 @settings(max_examples=25)
 @given(
-    budget=st.integers(24, 900), method=st.sampled_from(METHODS), refine=st.booleans(),
+    budget=st.integers(24, 900), method=st.sampled_from(SEARCH_METHODS), refine=st.booleans(),
     population=st.sampled_from([24, 50, 130]), islands=st.sampled_from([None, 1, 6]),
 )  # fmt: skip
 def test_a_budget_is_never_exceeded_or_refused_where_one_population_does(

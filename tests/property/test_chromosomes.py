@@ -6,17 +6,17 @@ from hypothesis import strategies as st
 
 from sysid.search import operators as random
 from sysid.search.operators import (
-    coded,
-    cross,
-    decoded,
-    flip,
-    rank,
-    reflected,
-    scheduled,
-    stepped,
-    two_of,
+    cross_over,
+    decode,
+    draw_pair,
+    encode,
+    flip_bit,
+    get_mutation_rate,
+    mutate_by_step,
+    reflect_at_bounds,
+    sort_population,
 )
-from sysid.simulation.scaling import located, placed
+from sysid.simulation.scaling import from_unit, to_unit
 from tests.searching import example
 
 BITS = st.integers(1, 32)
@@ -26,24 +26,26 @@ WORD = st.integers(0, 2**32 - 1)
 @given(BITS, st.lists(WORD, min_size=1, max_size=8))
 def test_coding_is_the_inverse_of_decoding(bits: int, values: list[int]) -> None:
     words = np.array([[v % 2**bits for v in values]], dtype=np.uint32)
-    assert np.array_equal(coded(decoded(words, bits), bits), words)
+    assert np.array_equal(encode(decode(words, bits), bits), words)
 
 
 @given(st.booleans(), st.lists(st.floats(0, 1), min_size=4, max_size=4))
 def test_placing_is_the_inverse_of_locating(log: bool, values: list[float]) -> None:
     evaluator = example(n=80).evaluator
     if log:
-        evaluator = evaluator._replace(log=np.ones(4, dtype=np.int64), lower=evaluator.upper / 1e4)
+        evaluator = evaluator._replace(
+            is_log=np.ones(4, dtype=np.int64), lower=evaluator.upper / 1e4
+        )
     places = np.array([values])
-    theta = located(evaluator, places)
+    theta = from_unit(evaluator, places)
     assert np.all((theta >= evaluator.lower) & (theta <= evaluator.upper))
-    assert np.allclose(placed(evaluator, theta), places, atol=1e-12)
+    assert np.allclose(to_unit(evaluator, theta), places, atol=1e-12)
 
 
 def test_the_code_reaches_both_bounds() -> None:
     evaluator = example(n=80).evaluator
     ends = np.array([[0, 0, 0, 0], [2**24 - 1] * 4], dtype=np.uint32)
-    theta = located(evaluator, decoded(ends, 24))
+    theta = from_unit(evaluator, decode(ends, 24))
     assert np.array_equal(theta, np.vstack([evaluator.lower, evaluator.upper]))
 
 
@@ -61,7 +63,7 @@ def test_a_child_has_the_first_parents_bits_up_to_the_cut(
     )
     cut = data.draw(st.integers(0, 2 * bits))
     child = np.empty(2, dtype=np.uint32)
-    cross(child, first, second, cut, bits)
+    cross_over(child, first, second, cut, bits)
     assert string(child, bits) == string(first, bits)[:cut] + string(second, bits)[cut:]
 
 
@@ -72,7 +74,7 @@ def test_a_mutation_changes_exactly_the_chosen_bit(
     before = np.array([a % 2**bits, b % 2**bits], dtype=np.uint32)
     position = data.draw(st.integers(0, 2 * bits - 1))
     after = before.copy()
-    flip(after, position, bits)
+    flip_bit(after, position, bits)
     changed = [i for i in range(2 * bits) if string(before, bits)[i] != string(after, bits)[i]]
     assert changed == [position]
 
@@ -82,7 +84,7 @@ def test_ranking_is_stable_and_ascends(values: list[float]) -> None:
     words = np.arange(len(values), dtype=np.uint32)[:, None]
     fitness = np.array(values)
     order = np.argsort(fitness, kind="stable")
-    rank(words, fitness)
+    sort_population(words, fitness)
     assert np.array_equal(words[:, 0], order)
     assert np.array_equal(fitness, np.sort(values))
 
@@ -91,13 +93,13 @@ def test_ranking_is_stable_and_ascends(values: list[float]) -> None:
 def test_a_scale_free_step_stays_in_the_box_and_moves(
     place: float, size: int, sign: int, bits: int
 ) -> None:
-    assert 0 <= stepped(place, size, sign, bits) <= 1
-    assert 0 <= reflected(2 * place - 0.5) <= 1
+    assert 0 <= mutate_by_step(place, size, sign, bits) <= 1
+    assert 0 <= reflect_at_bounds(2 * place - 0.5) <= 1
 
 
 @given(WORD, WORD, st.integers(2, 1000))
 def test_two_parents_differ(a: int, b: int, n: int) -> None:
-    first, second = two_of(a, b, n)
+    first, second = draw_pair(a, b, n)
     assert first != second
     assert 0 <= first < n
     assert 0 <= second < n
@@ -105,13 +107,13 @@ def test_two_parents_differ(a: int, b: int, n: int) -> None:
 
 def test_the_mutation_rate_follows_its_schedule() -> None:
     starts, rates = np.array([0, 50]), np.array([0.2, 0.8])
-    assert [scheduled(starts, rates, g) for g in (0, 49, 50, 399)] == [0.2, 0.2, 0.8, 0.8]
+    assert [get_mutation_rate(starts, rates, g) for g in (0, 49, 50, 399)] == [0.2, 0.2, 0.8, 0.8]
 
 
 def test_philox_gives_its_published_values() -> None:
     def words(counter: tuple[int, ...], key: tuple[int, int]) -> tuple[int, ...]:
         draw, generation, island, use = counter
-        return tuple(random.draws(key[0] | key[1] << 32, use, island, generation, draw))
+        return tuple(random.draw_words(key[0] | key[1] << 32, use, island, generation, draw))
 
     zero = (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)
     pi = (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1)
@@ -122,7 +124,7 @@ def test_philox_gives_its_published_values() -> None:
 
 def test_no_two_places_of_a_run_share_draws() -> None:
     seen = [
-        tuple(random.draws(seed, use, island, generation, draw))
+        tuple(random.draw_words(seed, use, island, generation, draw))
         for seed in (0, 1, 2**40)
         for use in range(1, 7)
         for island in range(4)
@@ -133,7 +135,11 @@ def test_no_two_places_of_a_run_share_draws() -> None:
 
 
 def test_draws_are_uniform() -> None:
-    values = np.array([random.unit(random.draws(7, 1, 0, 0, i)[0]) for i in range(20_000)])
+    values = np.array(
+        [random.to_uniform(random.draw_words(7, 1, 0, 0, i)[0]) for i in range(20_000)]
+    )
     counts = np.histogram(values, bins=20, range=(0, 1))[0]
     assert np.sum((counts - 1000) ** 2 / 1000) < 60  # chi-squared, 19 degrees: P < 1e-5
-    assert {random.below(random.draws(7, 2, 0, 0, i)[1], 7) for i in range(500)} == set(range(7))
+    assert {random.to_integer(random.draw_words(7, 2, 0, 0, i)[1], 7) for i in range(500)} == set(
+        range(7)
+    )

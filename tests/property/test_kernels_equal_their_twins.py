@@ -28,10 +28,10 @@ RECURSION = {
 def assert_equal(problem: Problem, one_step: bool = False) -> None:
     theta = individuals(problem, 4)
     expected = np.array([reference.predictions(problem, one, one_step) for one in theta])
-    np.testing.assert_allclose(problem.predictions(theta), expected, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(problem.predict(theta), expected, rtol=1e-9, atol=1e-11)
     if not one_step:
         costs = [reference.fitness(problem, one) for one in theta]
-        np.testing.assert_allclose(problem.fitness(theta), costs, rtol=1e-9)
+        np.testing.assert_allclose(problem.evaluate_fitness(theta), costs, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_a_recursion_finer_than_its_samples_equals_its_twin(hold: Any) -> None:
     model = difference(RECURSION, "x", solver={"substeps": 3}, initial=start)
     problem = Problem.build(model, [record(14, hold=hold)])
     assert_equal(problem)
-    found = problem.predictions(individuals(problem, 3))[:, : model.memory // 3]
+    found = problem.predict(individuals(problem, 3))[:, : model.memory // 3]
     given = np.tile(record(14).outputs[0].values[:4], (3, 1))
     np.testing.assert_allclose(found, given, rtol=1e-14)
 
@@ -89,7 +89,7 @@ def test_a_measured_start_gives_the_first_samples_of_a_recursion() -> None:
     model = difference(RECURSION, "x", initial={"x": "measured", "w": 0})
     problem = Problem.build(model, [record(24)])
     assert_equal(problem)
-    found = problem.predictions(individuals(problem, 3))[:, : model.memory]
+    found = problem.predict(individuals(problem, 3))[:, : model.memory]
     np.testing.assert_array_equal(found, np.tile(record(24).outputs[0].values[:12], (3, 1)))
 
 
@@ -100,7 +100,7 @@ def test_several_experiments_and_outputs_equal_their_twin() -> None:
     )  # fmt: skip
     records = [record(20, outputs=("y", "z")), record(25, 0.04, seed=5, outputs=("z", "y"))]
     problem = Problem.build(model, records, skip=3)
-    assert [p.name for p in problem.space] == ["c", "L", "b", "x(0)", "x(0)[2]"]
+    assert [p.name for p in problem.free_parameters] == ["c", "L", "b", "x(0)", "x(0)[2]"]
     assert_equal(problem)
 
 

@@ -6,13 +6,13 @@ from fractions import Fraction
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from sysid.language.checker import check
+from sysid.language.checker import check_expression
 from sysid.language.functions import FUNCTIONS
-from sysid.language.intervals import bounds
-from sysid.language.monomials import collect, rebuild
-from sysid.language.printer import text
+from sysid.language.intervals import bound_expression
+from sysid.language.monomials import collect_terms, to_expression
+from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
-from sysid.language.tree import Binary, Call, Expression, Number, Past, Symbol, Unary
+from sysid.language.tree import Binary, Expression, FunctionCall, Number, PastValue, Symbol, Unary
 from tests.meaning import meaning
 
 SCOPE = Scope(
@@ -29,7 +29,7 @@ symbols = st.sampled_from(
 )
 pasts = st.sampled_from(
     ["x", "q", "x(k-1)", "y(k-2)", "x(k-1 - L/h)", "q(k - L/h)", "y(k - d)", "x(k-1.5)"]
-).map(lambda written: check(written, SCOPE).tree)
+).map(lambda written: check_expression(written, SCOPE).tree)
 
 
 def _grown(inner: st.SearchStrategy[Expression]) -> st.SearchStrategy[Expression]:
@@ -45,9 +45,11 @@ def _grown(inner: st.SearchStrategy[Expression]) -> st.SearchStrategy[Expression
     return st.one_of(
         st.builds(Binary, st.sampled_from(["+", "-", "*", "/", "**"]), inner, inner),
         inner.map(lambda one: Unary("-", one)),
-        st.builds(lambda f, a: Call(f, (a,)), st.sampled_from(single), inner),
-        st.builds(lambda f, a, b: Call(f, (a, b)), st.sampled_from(["min", "max"]), inner, inner),
-        st.builds(lambda c, a, b: Call("where", (c, a, b)), condition, inner, inner),
+        st.builds(lambda f, a: FunctionCall(f, (a,)), st.sampled_from(single), inner),
+        st.builds(
+            lambda f, a, b: FunctionCall(f, (a, b)), st.sampled_from(["min", "max"]), inner, inner
+        ),
+        st.builds(lambda c, a, b: FunctionCall("where", (c, a, b)), condition, inner, inner),
     )
 
 
@@ -60,12 +62,12 @@ values = st.fixed_dictionaries(
 
 @given(trees)
 def test_a_printed_tree_parses_to_itself(tree: Expression) -> None:
-    assert check(text(tree), SCOPE).tree == tree
+    assert check_expression(format_expression(tree), SCOPE).tree == tree
 
 
 @given(still, values)
 def test_a_value_lies_inside_its_interval(tree: Expression, at: dict[str, float]) -> None:
-    low, high = bounds(tree, SCOPE.parameters, PERIOD)
+    low, high = bound_expression(tree, SCOPE.parameters, PERIOD)
     try:
         value = meaning(tree, at, _no_signal)
     except (ArithmeticError, ValueError):
@@ -79,8 +81,8 @@ def test_a_value_lies_inside_its_interval(tree: Expression, at: dict[str, float]
 def test_an_interval_for_any_period_holds_that_of_one_period(
     tree: Expression, at: dict[str, float], period: float
 ) -> None:
-    low, high = bounds(tree, SCOPE.parameters)
-    inner_low, inner_high = bounds(tree, SCOPE.parameters, period)
+    low, high = bound_expression(tree, SCOPE.parameters)
+    inner_low, inner_high = bound_expression(tree, SCOPE.parameters, period)
     assert low <= inner_low
     assert inner_high <= high
 
@@ -98,7 +100,7 @@ def test_collecting_terms_keeps_the_value(tree: Expression) -> None:
     at = {"a": Fraction(3, 7), "b": Fraction(-5, 3), "c": Fraction(11, 2)}
     try:
         expected = float(meaning(tree, at, _no_signal))  # type: ignore[arg-type]
-        found = float(meaning(rebuild(collect(tree)), at, _no_signal))  # type: ignore[arg-type]
+        found = float(meaning(to_expression(collect_terms(tree)), at, _no_signal))  # type: ignore[arg-type]
     except ZeroDivisionError:
         return
     assert math.isclose(expected, found, rel_tol=1e-6, abs_tol=1e-6)
@@ -114,7 +116,7 @@ def test_collecting_terms_keeps_the_value(tree: Expression) -> None:
 @example("x(k-" * 60 + "1" + ")" * 60)
 @example("x**9" * 900)
 def test_no_text_raises_or_gives_both_a_tree_and_faults(written: str) -> None:
-    found = check(written, SCOPE)
+    found = check_expression(written, SCOPE)
     assert (found.tree is None) == bool(found.faults)
     assert all(1 <= fault.column <= len(written) + 1 for fault in found.faults)
 
@@ -129,17 +131,17 @@ words = st.lists(
 
 @given(words)
 def test_no_arrangement_of_the_language_s_own_words_raises(written: str) -> None:
-    found = check(written, SCOPE)
+    found = check_expression(written, SCOPE)
     if found.tree is not None:
-        assert check(text(found.tree), SCOPE).tree is not None
+        assert check_expression(format_expression(found.tree), SCOPE).tree is not None
 
 
 @given(st.integers(0, 5), st.permutations(["+ k", "- {n}", "- L/h", "+ 1", "- 1", "+ d - d"]))
 def test_the_order_of_an_index_does_not_matter(n: int, parts: list[str]) -> None:
     index = " ".join(["0", *parts]).format(n=n)
     samples = Binary("/", Symbol("L", "parameter"), Symbol("h", "period"))
-    assert check(f"q({index})", SCOPE).tree == Past("q", "input", n, samples)
+    assert check_expression(f"q({index})", SCOPE).tree == PastValue("q", "input", n, samples)
 
 
-def _no_signal(past: Past, lag: float) -> float:
+def _no_signal(past: PastValue, lag: float) -> float:
     raise AssertionError("no signal here")

@@ -7,11 +7,16 @@ from hypothesis import strategies as st
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identifiability.combinations import blocks, untold, weighed, written
+from sysid.identifiability.combinations import (
+    classify_directions,
+    express_combinations,
+    find_blocks,
+    find_unidentified,
+)
 from sysid.models.catalogue.load import load_model
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.analysis import analyse_estimate
 
 NAMES = "abcdef"
 
@@ -31,8 +36,8 @@ def test_a_group_has_two_members_and_does_not_change_along_any_direction(
     value = rng.choice([-1.0, 1.0], d) * 10.0 ** rng.uniform(-3, 4, d)
     unit = np.abs(value) * 10.0 ** rng.uniform(-0.5, 1.5, d)
     member = np.any(null**2 > 1e-5, axis=0)
-    for block in blocks(null, member):
-        for group in written(block, NAMES, value, unit, np.diag(unit**2)):
+    for block in find_blocks(null, member):
+        for group in express_combinations(block, NAMES, value, unit, np.diag(unit**2)):
             assert len(group.members) >= 2
             assert group.members == tuple(sorted(set(group.members)))
             assert all(name in group.expression for name in group.members)
@@ -57,8 +62,8 @@ def test_a_standard_error_of_half_the_range_is_never_said_to_be_told(d: int, see
     null = np.arange(d) >= d - rng.integers(0, 2)
     root = rows[~null] / singular[~null, None]
     covariance = root.T @ np.diag(10.0 ** rng.uniform(-2, 2, len(root))) @ root
-    found = weighed(singular, rows, null, np.zeros(d, dtype=np.bool_), covariance, 0.1)
-    told_nothing = {d for block in untold(found) for d in block.members.tolist()}
+    found = classify_directions(singular, rows, null, np.zeros(d, dtype=np.bool_), covariance, 0.1)
+    told_nothing = {d for block in find_unidentified(found) for d in block.members.tolist()}
     assert set(np.flatnonzero(np.diag(covariance) >= 0.25)) <= told_nothing
 
 
@@ -69,10 +74,10 @@ def test_of_a_nearly_constant_output_no_group_has_one_member(seed: int) -> None:
     u = Channel("u", times, 1.0 + 1e-6 * times / 20, hold="zero")
     posed = Problem.build(load_model("sopdt"), [Record((u,), (Channel("y", times, y),))])
     span = posed.evaluator.upper - posed.evaluator.lower
-    place = np.random.default_rng(seed).uniform(size=len(posed.space))
-    end = refine(posed, [posed.evaluator.lower + span * place])[0]
+    place = np.random.default_rng(seed).uniform(size=len(posed.free_parameters))
+    end = refine_candidates(posed, [posed.evaluator.lower + span * place])[0]
     assert end is not None
-    found = analyse(posed, end.theta)
+    found = analyse_estimate(posed, end.theta)
     assert found.uncertainty is not None
     groups = found.uncertainty.groups
     assert all(len(one.members) >= 2 for one in groups)

@@ -26,18 +26,18 @@ def test_permuting_individuals_permutes_fitness_bit_for_bit(model: Model) -> Non
     problem = Problem.build(model, [record(40)])
     theta = individuals(problem, 37)
     order = np.random.default_rng(3).permutation(37)
-    np.testing.assert_array_equal(problem.fitness(theta)[order], problem.fitness(theta[order]))
     np.testing.assert_array_equal(
-        problem.predictions(theta)[order], problem.predictions(theta[order])
+        problem.evaluate_fitness(theta)[order], problem.evaluate_fitness(theta[order])
     )
+    np.testing.assert_array_equal(problem.predict(theta)[order], problem.predict(theta[order]))
 
 
 @pytest.mark.parametrize("model", MODELS)
 def test_an_individual_has_the_same_bits_alone_and_among_others(model: Model) -> None:
     problem = Problem.build(model, [record(40)])
     theta = individuals(problem, 35)
-    alone = [problem.fitness(one[np.newaxis])[0] for one in theta]
-    np.testing.assert_array_equal(problem.fitness(theta), alone)
+    alone = [problem.evaluate_fitness(one[np.newaxis])[0] for one in theta]
+    np.testing.assert_array_equal(problem.evaluate_fitness(theta), alone)
 
 
 @pytest.mark.parametrize(
@@ -47,9 +47,9 @@ def test_the_free_run_of_the_true_model_gives_zero_error(model: Model, irregular
     blank = record(40, irregular=irregular)
     theta = individuals(Problem.build(model, [blank]), 5)
     for one in theta[2:]:
-        truth = Problem.build(model, [blank]).predictions(one[np.newaxis])[0]
+        truth = Problem.build(model, [blank]).predict(one[np.newaxis])[0]
         problem = Problem.build(model, [with_output(blank, truth)])
-        assert problem.fitness(one[np.newaxis])[0] == 0.0
+        assert problem.evaluate_fitness(one[np.newaxis])[0] == 0.0
 
 
 @pytest.mark.parametrize("hold", ["first", "zero", "band-limited"])
@@ -62,7 +62,7 @@ def test_a_lag_delays_the_output_of_a_linear_system_by_itself(hold: str, samples
     excited = Record((Channel("u", u.times, quiet, hold=u.hold),), excited.outputs)
     problem = Problem.build(lag_element(), [excited])
     lag = samples * 0.05
-    prompt, late = problem.predictions(np.array([[1.0, 0.0, 0.4], [1.0, lag, 0.4]]))
+    prompt, late = problem.predict(np.array([[1.0, 0.0, 0.4], [1.0, lag, 0.4]]))
     tolerance = {"first": 1e-9, "zero": 5e-2, "band-limited": 1e-3}[hold]
     np.testing.assert_allclose(late[samples:], prompt[:-samples], atol=tolerance)
 
@@ -72,7 +72,7 @@ def test_fitness_is_continuous_in_the_lag_down_to_none() -> None:
     problem = Problem.build(model, [record(40)])
     lags = np.array([0.0, 1e-9, 0.025 - 1e-9, 0.025, 0.025 + 1e-9, 0.05 - 1e-9, 0.05, 0.05 + 1e-9])
     theta = np.column_stack([np.full(8, 0.3), lags, np.full(8, 4.0)])
-    fitness = problem.fitness(theta)
+    fitness = problem.evaluate_fitness(theta)
     for i in (0, 2, 3, 5, 6):
         assert fitness[i] == pytest.approx(fitness[i + 1], abs=1e-7)
 
@@ -132,6 +132,6 @@ def test_a_diverging_individual_has_infinite_fitness_and_harms_nobody() -> None:
     model = difference({"x": "b*x(k-1)**2 + c*u(k)"}, "min(x, 5)")
     problem = Problem.build(model, [record(60)])
     theta = np.array([[0.5, 0.0, 9.0], [0.5, 0.0, 0.1]])
-    fitness = problem.fitness(theta)
+    fitness = problem.evaluate_fitness(theta)
     assert fitness[0] == np.inf
-    assert fitness[1] == problem.fitness(theta[1:])[0] < np.inf
+    assert fitness[1] == problem.evaluate_fitness(theta[1:])[0] < np.inf

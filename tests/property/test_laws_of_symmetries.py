@@ -9,9 +9,9 @@ import pytest
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel
-from sysid.identifiability.scaling import scalings
+from sysid.identifiability.scaling import find_scalings
 from sysid.models.catalogue.load import load_model
-from sysid.models.model import EstimatedInitial, Model, initial_name, initial_parameters
+from sysid.models.model import EstimatedInitial, Model, build_initial_parameters, name_initial_state
 from sysid.models.parameters import Parameter
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
@@ -41,9 +41,9 @@ def checked(
     model: Model, values: dict[str, float], inputs: tuple[Channel, ...], times: FloatArray
 ) -> int:
     """Check every scaling of a model at some values; gives how many there are."""
-    parameters: list[Parameter] = [*model.parameters, *initial_parameters(model, 1)]
+    parameters: list[Parameter] = [*model.parameters, *build_initial_parameters(model, 1)]
     free = [one.name for one in parameters if one.is_free]
-    found = scalings(model, parameters)
+    found = find_scalings(model, parameters)
     before = simulate(model, inputs, values, times=times).channels
     for powers in found:
         factors = dict(zip(free, FACTOR**powers, strict=True))
@@ -60,9 +60,9 @@ def values_of(model: Model, name: str) -> dict[str, float]:
     """Every value that a simulation needs, of a case of the catalogue."""
     case = CASES[name]
     ties = {p.name: case.truth[p.tied] for p in load_model(name).parameters if p.tied}
-    starts = {initial_name(s.name, 0): 0.0 for s in model.states}
+    starts = {name_initial_state(s.name, 0): 0.0 for s in model.states}
     needed = {
-        initial_name(s.name, 0)
+        name_initial_state(s.name, 0)
         for s, start in zip(model.states, model.initial, strict=True)
         if isinstance(start, EstimatedInitial)
     }

@@ -5,8 +5,8 @@ from math import prod
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.jobs.axes import positions_of
-from service.sweeps.groups import below
+from service.jobs.axes import locate_cell
+from service.sweeps.groups import count_cells_below
 
 
 @given(st.lists(st.integers(1, 4), max_size=4), st.data())
@@ -18,6 +18,6 @@ def test_cells_before_a_number_are_counted_as_if_they_were_made(
         place: data.draw(st.integers(0, length - 1))
         for place, length in enumerate(lengths) if data.draw(st.booleans())
     }  # fmt: skip
-    cells = [positions_of(number, lengths) for number in range(end)]
+    cells = [locate_cell(number, lengths) for number in range(end)]
     expected = sum(all(cell[place] == at for place, at in fixed.items()) for cell in cells)
-    assert below(end, lengths, fixed) == expected
+    assert count_cells_below(end, lengths, fixed) == expected

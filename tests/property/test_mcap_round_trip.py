@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from service.formats import mcap_writer as mcap_file
 from service.formats.mcap import read_recording
-from service.formats.topics import clock_for
+from service.formats.topics import choose_clock
 from sysid.data.records import HOLDS, Channel, History, Recording
 from tests.mcap_files import recorded
 
@@ -76,6 +76,6 @@ def test_the_plain_reader_counts_the_same_samples(recording: Recording) -> None:
 @settings(max_examples=50)
 def test_computed_and_printed_times_need_no_field_of_their_own(samples: int, step: float) -> None:
     computed = np.arange(samples) * step
-    assert clock_for(computed)[0].rule != "field"
+    assert choose_clock(computed)[0].rule != "field"
     printed = np.array([float(f"{time:.9f}") for time in computed])
-    assert clock_for(printed)[0].rule == "nanoseconds"
+    assert choose_clock(printed)[0].rule == "nanoseconds"

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sysid.core.errors import InvalidModel
-from sysid.models.catalogue.load import catalogue, document
-from sysid.models.documents import read_yaml
+from sysid.models.catalogue.load import catalogue, copy_catalogue_document
+from sysid.models.documents import parse_yaml
 from sysid.models.parse import parse_model
 
 junk = st.recursive(
@@ -27,7 +27,7 @@ junk = st.recursive(
 def test_a_damaged_document_gives_faults_or_a_model_that_round_trips(
     name: str, data: st.DataObject
 ) -> None:
-    damaged: dict[str, Any] = document(name)
+    damaged: dict[str, Any] = copy_catalogue_document(name)
     for _ in range(data.draw(st.integers(1, 3))):
         _damage(damaged, data)
     said, model = "", None
@@ -54,7 +54,7 @@ def _damage(place: dict[str, Any], data: st.DataObject) -> None:
 def test_no_text_makes_the_yaml_reader_raise_anything_but_its_own_error(text: str) -> None:
     said = ""
     try:
-        read_yaml(text)
+        parse_yaml(text)
     except InvalidModel as error:
         said = str(error)
     assert "\n" not in said

@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.islands.archipelago import plans
+from sysid.islands.archipelago import make_plans
 from sysid.models.catalogue.load import load_model
-from sysid.search.slopes import partial_fitness
-from sysid.simulation.evaluator import partial_predictions
-from sysid.simulation.problem import Problem, record_progress
-from sysid.simulation.scaling import located
+from sysid.search.slopes import evaluate_partial_fitness
+from sysid.simulation.evaluator import predict_partially
+from sysid.simulation.problem import Problem, compute_record_progress
+from sysid.simulation.scaling import from_unit
 from tests.searching import example, record
 
 
@@ -37,8 +37,8 @@ POSED = problems()
 
 
 def candidates(problem: Problem, seed: int) -> FloatArray:
-    places = np.random.default_rng(seed).random((5, len(problem.space)))
-    return np.asarray(located(problem.evaluator, places))
+    places = np.random.default_rng(seed).random((5, len(problem.free_parameters)))
+    return np.asarray(from_unit(problem.evaluator, places))
 
 
 @settings(max_examples=30)
@@ -48,9 +48,9 @@ def test_a_part_of_the_simulation_is_the_beginning_of_the_whole(
 ) -> None:
     problem = POSED[name]
     theta = candidates(problem, seed)
-    part = partial_predictions(problem.evaluator, theta, horizon)[:, :5].T
-    reached = record_progress(problem) <= horizon
-    whole = problem.predictions(theta)[:, reached]
+    part = predict_partially(problem.evaluator, theta, horizon)[:, :5].T
+    reached = compute_record_progress(problem) <= horizon
+    whole = problem.predict(theta)[:, reached]
     assert np.array_equal(part[:, reached], whole, equal_nan=True)
 
 
@@ -58,14 +58,14 @@ def test_a_part_of_the_simulation_is_the_beginning_of_the_whole(
 def test_fitness_by_the_whole_part_is_fitness(name: str) -> None:
     problem = POSED[name]
     theta = candidates(problem, 3)
-    plan = plans(problem, GeneticAlgorithm(), 1)[0]
-    predicted = partial_predictions(problem.evaluator, theta, 1.0)
-    found = partial_fitness(problem.evaluator, plan, predicted, 1.0)[:5]
-    assert found == pytest.approx(problem.fitness(theta), rel=1e-12)
+    plan = make_plans(problem, GeneticAlgorithm(), 1)[0]
+    predicted = predict_partially(problem.evaluator, theta, 1.0)
+    found = evaluate_partial_fitness(problem.evaluator, plan, predicted, 1.0)[:5]
+    assert found == pytest.approx(problem.evaluate_fitness(theta), rel=1e-12)
 
 
 def test_progress_rises_to_one_in_each_experiment() -> None:
     for problem in POSED.values():
-        for part in problem.split(record_progress(problem)):
+        for part in problem.split_by_output(compute_record_progress(problem)):
             assert np.all(np.diff(part["y"]) >= 0)
             assert part["y"][-1] == 1.0

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sysid.core.settings import (  # fmt: skip
-    METHODS,
+    SEARCH_METHODS,
     GeneticAlgorithm,
     IslandChange,
     Migration,
@@ -18,24 +18,24 @@ from sysid.core.settings import (  # fmt: skip
 )
 from sysid.identification import run
 from sysid.identification.run import (  # fmt: skip
-    advance,
     advance_island,
-    begin,
-    border,
-    exchange,
+    advance_run,
+    begin_run,
+    exchange_migrants,
+    find_next_border,
     is_finished,
 )
-from sysid.islands.archipelago import found, plans
-from sysid.islands.evolve import rests
+from sysid.islands.archipelago import create_islands, make_plans
+from sysid.islands.evolve import is_island_resting
 from sysid.islands.state import RunState
-from sysid.islands.stopping import searches
+from sysid.islands.stopping import count_restarts
 from sysid.search.island import Island, evolve
-from sysid.search.operators import decoded
+from sysid.search.operators import decode
 from sysid.simulation.problem import Problem
-from sysid.simulation.scaling import located
+from sysid.simulation.scaling import from_unit
 from tests.searching import bits, example
 
-METHOD = st.sampled_from(METHODS)
+METHOD = st.sampled_from(SEARCH_METHODS)
 
 
 def small(method: SearchMethod = "improved", **changes: object) -> GeneticAlgorithm:
@@ -52,7 +52,7 @@ def problem() -> Problem:
 
 def alone(method: SearchMethod, seed: int, **changes: object) -> tuple[Island, object]:
     algorithm = small(method, **changes)
-    return found(problem(), algorithm, seed)[1], plans(problem(), algorithm, seed)[1]
+    return create_islands(problem(), algorithm, seed)[1], make_plans(problem(), algorithm, seed)[1]
 
 
 @settings(max_examples=25)
@@ -84,7 +84,7 @@ def test_the_fittest_survives_a_step(method: SearchMethod, seed: int, age: int) 
     island, plan = alone(method, seed)
     before = evolve(problem().evaluator, plan, island, age)
     after = evolve(problem().evaluator, plan, before, 1)
-    there = np.any(np.all(after.words == before.words[0], axis=1))
+    there = np.any(np.all(after.chromosomes == before.chromosomes[0], axis=1))
     assert there or after.fitness[0] < before.fitness[0]
     assert after.fitness[0] <= before.fitness[0]
 
@@ -96,24 +96,24 @@ def test_fitness_is_that_of_the_chromosome_and_ascends(
 ) -> None:
     island, plan = alone(method, seed)
     after = evolve(problem().evaluator, plan, island, age)
-    theta = located(problem().evaluator, decoded(after.words, plan.bits))  # type: ignore[attr-defined]
-    assert np.array_equal(after.fitness, problem().fitness(theta))
+    theta = from_unit(problem().evaluator, decode(after.chromosomes, plan.bits))  # type: ignore[attr-defined]
+    assert np.array_equal(after.fitness, problem().evaluate_fitness(theta))
     assert np.all(np.diff(after.fitness) >= 0)
     assert after.history[-1].rms == after.fitness[0]
     assert after.history[-1].parameters == tuple(theta[0])
 
 
 @pytest.mark.parametrize(("seconds", "most"), [(0.0, 1), (1e-9, 7)])
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SEARCH_METHODS)
 def test_a_run_cut_after_every_call_gives_the_same_bits(
     method: SearchMethod, seconds: float, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     algorithm = small(method)
-    whole = advance(problem(), algorithm, begin(problem(), algorithm, 3))
-    monkeypatch.setattr(run, "UNMEASURED_STEPS", most * 8 * problem().n_steps)
-    cut, calls = begin(problem(), algorithm, 3), 0
+    whole = advance_run(problem(), algorithm, begin_run(problem(), algorithm, 3))
+    monkeypatch.setattr(run, "FIRST_CALL_STEPS", most * 8 * problem().n_steps)
+    cut, calls = begin_run(problem(), algorithm, 3), 0
     while not is_finished(algorithm, cut):
-        cut = pickle.loads(pickle.dumps(advance(problem(), algorithm, cut, seconds)))
+        cut = pickle.loads(pickle.dumps(advance_run(problem(), algorithm, cut, seconds)))
         calls += 1
     assert bits(cut) == bits(whole)
     assert calls >= sum(island.generation for island in cut.islands) / most
@@ -140,74 +140,76 @@ DIFFERENT = (
 def test_islands_evolved_apart_and_exchanged_are_the_plain_loop(
     algorithm: GeneticAlgorithm,
 ) -> None:
-    whole = advance(problem(), algorithm, begin(problem(), algorithm, 9))
-    state = begin(problem(), algorithm, 9)
+    whole = advance_run(problem(), algorithm, begin_run(problem(), algorithm, 9))
+    state = begin_run(problem(), algorithm, 9)
     while not is_finished(algorithm, state):
-        target = border(algorithm, state)
+        target = find_next_border(algorithm, state)
         moved = [
             advance_island(problem(), algorithm, island, target - island.generation)
             for island in reversed(state.islands)
         ]
-        state = exchange(algorithm, state, moved[::-1])
+        state = exchange_migrants(algorithm, state, moved[::-1])
     assert bits(state) == bits(whole)
 
 
 def test_the_same_seed_repeats_and_another_does_not() -> None:
     def searched(seed: int) -> RunState:
-        return advance(problem(), small(), begin(problem(), small(), seed))
+        return advance_run(problem(), small(), begin_run(problem(), small(), seed))
 
     assert bits(searched(1)) == bits(searched(1))
-    assert searched(1).islands[0].words.tobytes() != searched(2).islands[0].words.tobytes()
+    assert (
+        searched(1).islands[0].chromosomes.tobytes() != searched(2).islands[0].chromosomes.tobytes()
+    )
 
 
 def test_islands_of_one_seed_begin_apart() -> None:
-    islands = begin(problem(), small("simple"), 1).islands
-    words = np.concatenate([island.words for island in islands])
+    islands = begin_run(problem(), small("simple"), 1).islands
+    words = np.concatenate([island.chromosomes for island in islands])
     assert np.unique(words, axis=0).shape == words.shape
 
 
 def test_first_individuals_of_the_improved_method_are_stratified() -> None:
-    islands = begin(problem(), small(), 1).islands
-    places = np.sort(np.concatenate([i.words for i in islands]) / (2**24 - 1), axis=0)
+    islands = begin_run(problem(), small(), 1).islands
+    places = np.sort(np.concatenate([i.chromosomes for i in islands]) / (2**24 - 1), axis=0)
     strata = np.arange(24)[:, None]
     assert np.all((places * 24 >= strata - 1e-5) & (places * 24 <= strata + 1 + 1e-5))
 
 
 def test_a_warm_start_begins_at_the_given_values() -> None:
     warm = {"c": 0.31, "L": 0.42, "b": 3.0, "a": 2.0, "unknown": 1.0}
-    state = begin(problem(), small(), 1, warm)
+    state = begin_run(problem(), small(), 1, warm)
     one = advance_island(problem(), small(), state.islands[2], 0)
-    theta = np.array([[warm[p.name] for p in problem().space]])
-    assert one.champion_rms <= problem().fitness(theta)[0] * (1 + 1e-5)
+    theta = np.array([[warm[p.name] for p in problem().free_parameters]])
+    assert one.champion_rms <= problem().evaluate_fitness(theta)[0] * (1 + 1e-5)
 
 
 def test_evaluations_end_a_run_and_all_are_counted() -> None:
     algorithm = small(generations=10**6, stop=Stop(evaluations=2000))
-    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
+    state = advance_run(problem(), algorithm, begin_run(problem(), algorithm, 1))
     assert 1700 <= state.evaluations <= 2000
     assert state.evaluations == sum(island.evaluations for island in state.islands)
 
 
 def test_a_simple_generation_simulates_its_children_only() -> None:
     algorithm = GeneticAlgorithm(method="simple", generations=10)
-    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
+    state = advance_run(problem(), algorithm, begin_run(problem(), algorithm, 1))
     assert state.evaluations == 50 + 10 * 25
 
 
 def test_the_target_rms_ends_a_run() -> None:
     algorithm = small(generations=10**6, stop=Stop(rms=0.05))
-    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
+    state = advance_run(problem(), algorithm, begin_run(problem(), algorithm, 1))
     assert state.rms <= 0.05
-    plan = plans(problem(), algorithm, 1)
+    plan = make_plans(problem(), algorithm, 1)
     assert any(
-        rests(p, i.fitness, i.counters, i.champion_rms)
+        is_island_resting(p, i.fitness, i.counters, i.champion_rms)
         for p, i in zip(plan, state.islands, strict=True)
     )
 
 
 def test_seconds_end_a_run() -> None:
     algorithm = small(generations=10**9, stop=Stop(seconds=0.05, settled=None))
-    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
+    state = advance_run(problem(), algorithm, begin_run(problem(), algorithm, 1))
     assert is_finished(algorithm, state)
     assert state.seconds >= 0.05
 
@@ -215,8 +217,8 @@ def test_seconds_end_a_run() -> None:
 def test_should_stop_is_heard_between_calls() -> None:
     algorithm = small(generations=10**9, stop=Stop(settled=None))
     answers = iter([False, False, False, True])
-    state = begin(problem(), algorithm, 1)
-    state = advance(problem(), algorithm, state, None, lambda: next(answers))
+    state = begin_run(problem(), algorithm, 1)
+    state = advance_run(problem(), algorithm, state, None, lambda: next(answers))
     assert not is_finished(algorithm, state)
     assert state.evaluations > 0
 
@@ -224,23 +226,28 @@ def test_should_stop_is_heard_between_calls() -> None:
 def test_islands_may_differ_in_method_and_bits() -> None:
     changes = (IslandChange(), IslandChange(method="simple", bits=12), IslandChange(bits=20))
     algorithm = small(islands=changes)
-    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
-    assert int(state.islands[1].words.max()) < 2**12
+    state = advance_run(problem(), algorithm, begin_run(problem(), algorithm, 1))
+    assert int(state.islands[1].chromosomes.max()) < 2**12
     assert state.migrations
-    cut = begin(problem(), algorithm, 1)
+    cut = begin_run(problem(), algorithm, 1)
     while not is_finished(algorithm, cut):
-        cut = advance(problem(), algorithm, cut, 0.0)
+        cut = advance_run(problem(), algorithm, cut, 0.0)
     assert bits(cut) == bits(state)
 
 
 def test_a_run_settles_where_searches_from_anywhere_agree() -> None:
     once = GeneticAlgorithm(stop=Stop(settled=3))
-    settled = advance(example(), once, begin(example(), once, 1))
-    assert searches(*settled.tally).confirmed >= 3
-    assert 3 * searches(*settled.tally).confirmed >= 2 * searches(*settled.tally).independent
+    settled = advance_run(example(), once, begin_run(example(), once, 1))
+    assert count_restarts(*settled.champions_and_counters).confirmed >= 3
+    assert (
+        3 * count_restarts(*settled.champions_and_counters).confirmed
+        >= 2 * count_restarts(*settled.champions_and_counters).independent
+    )
     assert settled.generation < once.generations
-    twice = GeneticAlgorithm(stop=Stop(settled=2 * searches(*settled.tally).confirmed))
-    longer = advance(example(), twice, begin(example(), twice, 1))
+    twice = GeneticAlgorithm(
+        stop=Stop(settled=2 * count_restarts(*settled.champions_and_counters).confirmed)
+    )
+    longer = advance_run(example(), twice, begin_run(example(), twice, 1))
     assert longer.generation > settled.generation
     assert longer.rms == pytest.approx(settled.rms, rel=1e-4)
 
@@ -248,7 +255,7 @@ def test_a_run_settles_where_searches_from_anywhere_agree() -> None:
 @pytest.mark.parametrize("method", ["simple", "improved-paper"])
 def test_the_papers_methods_and_those_told_so_never_settle(method: SearchMethod) -> None:
     algorithm = small(method, generations=60, stop=Stop(settled=1))
-    state = advance(problem(), algorithm, begin(problem(), algorithm, 1))
-    assert (state.generation, searches(*state.tally).independent) == (60, 0)
+    state = advance_run(problem(), algorithm, begin_run(problem(), algorithm, 1))
+    assert (state.generation, count_restarts(*state.champions_and_counters).independent) == (60, 0)
     never = small(generations=60, stop=Stop(settled=None))
-    assert advance(problem(), never, begin(problem(), never, 1)).generation == 60
+    assert advance_run(problem(), never, begin_run(problem(), never, 1)).generation == 60

@@ -8,18 +8,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from sysid.trends.laws import Law, fit_line, fit_power
+from sysid.trends.laws import TrendLaw, fit_line, fit_power
 from sysid.trends.trend import (  # fmt: skip
     Drift,
-    Estimate,
-    Place,
-    drift,
-    drift_limit,
-    drifts_from_law,
+    TrendEstimate,
+    TrendPoint,
+    compute_drift,
+    compute_drift_limit,
+    compute_half_width,
+    compute_law_drifts,
     fit_trend,
-    half_width,
-    pooled,
-    predictions,
+    pool_estimates,
+    predict_estimates,
 )
 
 X = np.array([5.0, 10.0, 20.0, 40.0, 80.0])
@@ -27,17 +27,22 @@ NUMBER = st.floats(-10, 10).filter(lambda v: v == 0 or abs(v) > 1e-3)
 SCALE = st.floats(1e-6, 1e6)
 
 
-def prediction(law: Law, x: np.ndarray, stderr: np.ndarray, at: float) -> Place:
-    return predictions(law, x, stderr, np.array([at]))[0]
+def prediction(law: TrendLaw, x: np.ndarray, stderr: np.ndarray, at: float) -> TrendPoint:
+    return predict_estimates(law, x, stderr, np.array([at]))[0]
 
 
 def drift_from_law(
-    new: Estimate, law: Law, x: np.ndarray, stderr: np.ndarray, at: float, comparisons: int = 1
+    new: TrendEstimate,
+    law: TrendLaw,
+    x: np.ndarray,
+    stderr: np.ndarray,
+    at: float,
+    comparisons: int = 1,
 ) -> Drift:
-    return drifts_from_law([new], law, x, stderr, np.array([at]), comparisons)[0]
+    return compute_law_drifts([new], law, x, stderr, np.array([at]), comparisons)[0]
 
 
-def coefficients(law: Law) -> dict[str, tuple[float, float]]:
+def coefficients(law: TrendLaw) -> dict[str, tuple[float, float]]:
     return {name: (value, error) for name, value, error in law.coefficients}
 
 
@@ -52,9 +57,9 @@ def noisy(seed: int, n: int = 9) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 @given(NUMBER, NUMBER)
 def test_an_exact_line_is_recovered_and_chosen(a: float, b: float) -> None:
     found = fit_trend(X, a + b * X, np.full(5, 0.1), [30.0])
-    assert found.chosen is not None
-    assert found.chosen.kind == "line"
-    told = coefficients(found.chosen)
+    assert found.best_law is not None
+    assert found.best_law.kind == "line"
+    told = coefficients(found.best_law)
     assert told["a"][0] == pytest.approx(a, abs=1e-12 * (abs(a) + 80 * abs(b)))
     assert told["b"][0] == pytest.approx(b, abs=1e-12 * (abs(a) + abs(b)))
     assert found.predictions[0].value == pytest.approx(a + 30 * b, abs=1e-11)
@@ -66,9 +71,9 @@ def test_an_exact_line_is_recovered_and_chosen(a: float, b: float) -> None:
 def test_an_exact_power_law_is_recovered_and_chosen(a: float, b: float) -> None:
     y = a * X**b
     found = fit_trend(X, y, 0.01 * np.abs(y))
-    assert found.chosen is not None
-    assert found.chosen.kind == "power"
-    told = coefficients(found.chosen)
+    assert found.best_law is not None
+    assert found.best_law.kind == "power"
+    told = coefficients(found.best_law)
     assert (told["a"][0], told["b"][0]) == (pytest.approx(a, rel=1e-7), pytest.approx(b, rel=1e-7))
 
 
@@ -80,10 +85,10 @@ def test_units_of_x_and_y_change_only_the_units_of_the_result(
     x, y, stderr = noisy(seed)
     found = fit_trend(x, y, stderr, [30.0])
     other = fit_trend(metre * x, second * y, second * stderr, [30.0 * metre])
-    assert found.chosen is not None
-    assert other.chosen is not None
-    assert other.chosen.kind == found.chosen.kind
-    assert other.chosen.birge == pytest.approx(found.chosen.birge, rel=1e-5)
+    assert found.best_law is not None
+    assert other.best_law is not None
+    assert other.best_law.kind == found.best_law.kind
+    assert other.best_law.birge_ratio == pytest.approx(found.best_law.birge_ratio, rel=1e-5)
     one, two = found.predictions[0], other.predictions[0]
     assert two.value == pytest.approx(second * one.value, rel=1e-5)
     assert two.upper - two.lower == pytest.approx(second * (one.upper - one.lower), rel=1e-5)
@@ -97,8 +102,8 @@ def test_the_line_and_its_covariance_are_those_of_the_textbook() -> None:
     (b, a), covariance = np.polyfit(x, y, 1, w=1 / stderr, cov="unscaled")
     told = coefficients(law)
     assert (told["a"][0], told["b"][0]) == (pytest.approx(a), pytest.approx(b))
-    assert told["b"][1] == pytest.approx(law.widening * covariance[0, 0] ** 0.5)
-    assert told["a"][1] == pytest.approx(law.widening * covariance[1, 1] ** 0.5)
+    assert told["b"][1] == pytest.approx(law.error_factor * covariance[0, 0] ** 0.5)
+    assert told["a"][1] == pytest.approx(law.error_factor * covariance[1, 1] ** 0.5)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -116,11 +121,11 @@ def test_a_point_of_infinite_error_has_no_weight_and_a_doubled_point_counts_twic
     x, y, stderr = noisy(2)
     wild = fit_line(np.append(x, 30.0), np.append(y, 1e3), np.append(stderr, 1e9))
     plain = fit_line(x, y, stderr)
-    assert wild.values(X) == pytest.approx(plain.values(X), rel=1e-9)
+    assert wild.evaluate_law(X) == pytest.approx(plain.evaluate_law(X), rel=1e-9)
     twice = fit_line(np.append(x, x[3]), np.append(y, y[3]), np.append(stderr, stderr[3]))
     once = stderr.copy()
     once[3] /= np.sqrt(2)
-    assert twice.values(X) == pytest.approx(fit_line(x, y, once).values(X), rel=1e-12)
+    assert twice.evaluate_law(X) == pytest.approx(fit_line(x, y, once).evaluate_law(X), rel=1e-12)
 
 
 @pytest.mark.parametrize("understated", [1.0, 5.0])
@@ -137,8 +142,10 @@ def test_intervals_cover_what_they_say_even_where_errors_are_understated(
         told = prediction(law, X, stderr / understated, 30.0)
         new = 0.3 * 30.0 + 1.0 + 0.02 * 30.0 * draw.normal()
         covered[0] += told.lower <= new <= told.upper
-        error = half_width(law) * law.widening * law.stated(np.array([30.0]))[0]
-        covered[1] += abs(law.values(np.array([30.0]))[0] - 10.0) <= error
+        error = (
+            compute_half_width(law) * law.error_factor * law.evaluate_stderr(np.array([30.0]))[0]
+        )
+        covered[1] += abs(law.evaluate_law(np.array([30.0]))[0] - 10.0) <= error
         covered[2] += told.upper > told.lower
     # 95 % to a binomial error of 0.8 %; wider where the stated errors alone already suffice.
     assert covered[2] == n
@@ -152,15 +159,15 @@ def test_the_deleted_residual_is_that_of_a_fit_without_the_point() -> None:
     for i, one in enumerate(fit_trend_by_line(x, y, stderr)):
         others = fit_line(np.delete(x, i), np.delete(y, i), np.delete(stderr, i))
         at = x[i : i + 1]
-        difference = y[i] - others.values(at)[0]
-        error = others.birge * np.hypot(others.stated(at)[0], stderr[i])
+        difference = y[i] - others.evaluate_law(at)[0]
+        error = others.birge_ratio * np.hypot(others.evaluate_stderr(at)[0], stderr[i])
         assert one.studentised == pytest.approx(difference / error, rel=1e-9)
 
 
 def fit_trend_by_line(x, y, stderr):  # type: ignore[no-untyped-def]
-    from sysid.trends.trend import _influences
+    from sysid.trends.trend import _compute_influences
 
-    return _influences(fit_line(x, y, stderr), x, y, stderr)
+    return _compute_influences(fit_line(x, y, stderr), x, y, stderr)
 
 
 def test_one_wild_point_is_flagged_and_rarely_one_of_a_clean_batch() -> None:
@@ -187,15 +194,15 @@ def test_a_point_that_its_stated_error_explains_is_no_outlier() -> None:
 @pytest.mark.parametrize("n", [3, 4])
 def test_with_few_points_nothing_is_divided_by_nothing(n: int) -> None:
     found = fit_trend(X[:n], [1.0, 2.1, 2.9, 4.2][:n], np.full(n, 0.1), [100.0, 0.0])
-    assert found.chosen is not None
-    assert found.chosen.aicc == inf
+    assert found.best_law is not None
+    assert found.best_law.aicc == inf
     assert all((one.studentised is None) == (n == 3) for one in found.influences)
     assert [one.is_outside for one in found.predictions] == [True, True]
 
 
 def test_less_than_three_places_give_a_reason() -> None:
     found = fit_trend([5, 5, 10], [1, 2, 3], [0.1, 0.1, 0.1])
-    assert (found.laws, found.chosen) == ((), None)
+    assert (found.laws, found.best_law) == ((), None)
     assert "found 2 different values of x" in found.reason
     assert "needs 3" in found.reason
 
@@ -207,22 +214,25 @@ def test_a_power_law_needs_positive_x() -> None:
 
 def test_means_of_several_runs_carry_the_scatter_between_them() -> None:
     draw = np.random.default_rng(3)
-    groups = [[Estimate(x + 0.5 * draw.normal(), 0.1) for _ in range(4)] for x in range(50)]
-    means, ratio = pooled(groups)
+    groups = [[TrendEstimate(x + 0.5 * draw.normal(), 0.1) for _ in range(4)] for x in range(50)]
+    means, ratio = pool_estimates(groups)
     assert ratio == pytest.approx(5.0, rel=0.2)
     assert means[0].stderr == pytest.approx(ratio * 0.1 / 2)
     assert means[0].value == pytest.approx(np.mean([one.value for one in groups[0]]))
-    assert pooled([[Estimate(1.0, 0.1)]]) == ((Estimate(1.0, pytest.approx(0.1)),), 1.0)
+    assert pool_estimates([[TrendEstimate(1.0, 0.1)]]) == (
+        (TrendEstimate(1.0, pytest.approx(0.1)),),
+        1.0,
+    )
 
 
 def test_drift_is_flagged_beyond_three_standard_errors() -> None:
-    old = Estimate(1.0, 0.03)
-    assert drift(Estimate(1.0 + 0.149, 0.04), old).has_drifted is False
-    found = drift(Estimate(1.0 + 0.151, 0.04), old)
+    old = TrendEstimate(1.0, 0.03)
+    assert compute_drift(TrendEstimate(1.0 + 0.149, 0.04), old).has_drifted is False
+    found = compute_drift(TrendEstimate(1.0 + 0.151, 0.04), old)
     assert found.has_drifted is True
     assert found.z == pytest.approx(3.02)
-    assert drift(Estimate(1.0 + 0.151, 0.04), old, comparisons=10).has_drifted is False
-    assert drift(old, old).z == 0.0
+    assert compute_drift(TrendEstimate(1.0 + 0.151, 0.04), old, comparisons=10).has_drifted is False
+    assert compute_drift(old, old).z == 0.0
 
 
 def test_a_batch_without_change_rarely_drifts_from_its_own_law() -> None:
@@ -231,10 +241,10 @@ def test_a_batch_without_change_rarely_drifts_from_its_own_law() -> None:
     for _ in range(400):
         y = 0.3 * X + 1.0 + stderr * draw.normal(size=5)
         law = fit_line(X, y, stderr)
-        new = Estimate(0.3 * 30.0 + 1.0 + 0.6 * draw.normal(), 0.6)
+        new = TrendEstimate(0.3 * 30.0 + 1.0 + 0.6 * draw.normal(), 0.6)
         flags += drift_from_law(new, law, X, stderr, 30.0).has_drifted
     assert flags <= 6
-    moved = Estimate(0.3 * 30.0 + 30.0, 0.6)
+    moved = TrendEstimate(0.3 * 30.0 + 30.0, 0.6)
     assert drift_from_law(moved, law, X, stderr, 30.0).has_drifted
 
 
@@ -242,7 +252,7 @@ def test_few_points_that_scatter_as_they_say_are_told_from_a_change_by_three_err
     exact = fit_line(X, 0.3 * X + 1.0, np.full(5, 0.1))
     error = prediction(exact, X, np.full(5, 0.1), 30.0).stderr
     for size, has_drifted in ((2.9, False), (3.1, True)):
-        new = Estimate(10.0 + size * error, 0.1)
+        new = TrendEstimate(10.0 + size * error, 0.1)
         assert drift_from_law(new, exact, X, np.full(5, 0.1), 30.0).has_drifted is has_drifted
 
 
@@ -254,13 +264,13 @@ def test_of_five_points_a_gross_change_is_seen_whether_their_errors_are_right_or
             y = 0.3 * X + 1.0 + understated * stderr * draw.normal(size=5)
             law = fit_line(X, y, stderr)
             new = [
-                Estimate(0.3 * x + 1.0 + understated * s * draw.normal(), s)
+                TrendEstimate(0.3 * x + 1.0 + understated * s * draw.normal(), s)
                 for x, s in zip(X, stderr, strict=True)
             ]
-            found = drifts_from_law(new, law, X, stderr, X, comparisons=15)
+            found = compute_law_drifts(new, law, X, stderr, X, comparisons=15)
             false += any(one.has_drifted for one in found)
             error = understated * stderr[3]
-            moved = Estimate(new[3].value + 15 * error, new[3].stderr)
+            moved = TrendEstimate(new[3].value + 15 * error, new[3].stderr)
             seen += drift_from_law(moved, law, X, stderr, 40.0, comparisons=15).has_drifted
         assert seen >= 0.95 * 300
         assert false <= (0.01 if understated == 1 else 0.15) * 300
@@ -269,14 +279,14 @@ def test_of_five_points_a_gross_change_is_seen_whether_their_errors_are_right_or
 def test_the_limit_is_three_and_moderately_more_for_many_comparisons_and_few_points() -> None:
     right, wrong = (fit_line(X, 0.3 * X + np.array([0, 1, -1, 1, 0]), np.full(5, s))
                     for s in (1.0, 0.2))  # fmt: skip
-    assert drift_limit() == pytest.approx(3.0)
-    assert drift_limit(right) == pytest.approx(3.0)
-    assert drift_limit(None, 15) == pytest.approx(-stats.norm.ppf(stats.norm.sf(3) / 15))
+    assert compute_drift_limit() == pytest.approx(3.0)
+    assert compute_drift_limit(right) == pytest.approx(3.0)
+    assert compute_drift_limit(None, 15) == pytest.approx(-stats.norm.ppf(stats.norm.sf(3) / 15))
     ratio = stats.t.ppf(0.975, 3) / stats.norm.ppf(0.975)
-    assert drift_limit(wrong, 15) == pytest.approx(ratio * drift_limit(right, 15))
-    assert drift_limit(wrong, 15) < 6.2
-    told = drift_from_law(Estimate(1.0, 0.1), wrong, X, np.full(5, 0.2), 20.0, 15)
-    assert told.limit == drift_limit(wrong, 15)
+    assert compute_drift_limit(wrong, 15) == pytest.approx(ratio * compute_drift_limit(right, 15))
+    assert compute_drift_limit(wrong, 15) < 6.2
+    told = drift_from_law(TrendEstimate(1.0, 0.1), wrong, X, np.full(5, 0.2), 20.0, 15)
+    assert told.limit == compute_drift_limit(wrong, 15)
 
 
 def test_aic_prefers_the_law_that_made_the_data() -> None:
@@ -284,8 +294,8 @@ def test_aic_prefers_the_law_that_made_the_data() -> None:
     right = {"line": 0, "power": 0}
     for _ in range(100):
         noise = draw.normal(size=5)
-        line = fit_trend(X, 5.0 + 0.3 * X + 0.05 * noise, np.full(5, 0.05)).chosen
-        curve = fit_trend(X, 0.01 * X**1.4 * (1 + 0.02 * noise), 0.0002 * X**1.4).chosen
+        line = fit_trend(X, 5.0 + 0.3 * X + 0.05 * noise, np.full(5, 0.05)).best_law
+        curve = fit_trend(X, 0.01 * X**1.4 * (1 + 0.02 * noise), 0.0002 * X**1.4).best_law
         right["line"] += line is not None and line.kind == "line"
         right["power"] += curve is not None and curve.kind == "power"
     assert right["line"] >= 95
@@ -306,11 +316,11 @@ def test_many_places_at_once_are_told_as_one_after_the_other(kind: str) -> None:
     law = fit_line(x, y, stderr) if kind == "line" else fit_power(x, y, stderr)
     assert law is not None
     at = np.array([-1.0, 0.0, 1e-3, 7.0, *x, 90.0])
-    told = predictions(law, x, stderr, at)
+    told = predict_estimates(law, x, stderr, at)
     alone = [prediction(law, x, stderr, float(one)) for one in at]
     np.testing.assert_allclose(np.array(told, float), np.array(alone, float), rtol=1e-12)
-    new = [Estimate(float(3.0 * one), 0.1) for one in at]
-    found = drifts_from_law(new, law, x, stderr, at, 4)
+    new = [TrendEstimate(float(3.0 * one), 0.1) for one in at]
+    found = compute_law_drifts(new, law, x, stderr, at, 4)
     one_by_one = [
         drift_from_law(one, law, x, stderr, float(place), 4)
         for one, place in zip(new, at, strict=True)
@@ -324,7 +334,7 @@ def test_the_error_of_a_new_estimate_lies_between_those_of_its_neighbours() -> N
     x = np.array([1.0, 1.0, 3.0])
     law = fit_line(np.arange(5.0), np.arange(5.0), np.full(5, 1e-9))
     assert law is not None
-    told = predictions(law, x, np.array([1.0, 4.0, 8.0]), np.array([0.5, 1.0, 2.0, 3.0, 9.0]))
+    told = predict_estimates(law, x, np.array([1.0, 4.0, 8.0]), np.array([0.5, 1.0, 2.0, 3.0, 9.0]))
     assert [one.stderr for one in told] == pytest.approx([2.0, 2.0, 4.0, 8.0, 8.0], rel=1e-6)
 
 
@@ -338,7 +348,7 @@ def test_looking_up_the_errors_of_a_batch_is_done_once_not_for_every_estimate(
     monkeypatch.setattr(
         np, "unique", lambda *given, **more: looked.append(1) or unique(*given, **more)
     )
-    drifts_from_law([Estimate(1.0, 0.1)] * 200, law, x, stderr, x)
+    compute_law_drifts([TrendEstimate(1.0, 0.1)] * 200, law, x, stderr, x)
     assert len(looked) == 1
 
 
@@ -355,7 +365,7 @@ def test_points_of_any_size_give_finite_laws_or_a_reason(
     assert bool(found.laws) != bool(found.reason)
     for law in found.laws:
         assert np.all(np.isfinite([one[1:] for one in law.coefficients]))
-        assert np.all(np.isfinite([law.aic, law.birge]))
+        assert np.all(np.isfinite([law.aic, law.birge_ratio]))
     for one in found.influences:
         assert one.p_value is None or 0 <= one.p_value <= 1
 
@@ -364,12 +374,15 @@ def test_places_that_doubles_cannot_tell_apart_give_no_law_but_a_reason() -> Non
     found = fit_trend([1e-300, 1.0, 2.0, 1e300], [1.0, 2.0, 3.0, 4.0], np.full(4, 0.1))
     assert all(law.kind == "power" for law in found.laws)
     lost = fit_trend([-1e300, 1.0, 2.0, 1e300], [1.0, 2.0, 3.0, 4.0], np.full(4, 0.1))
-    assert (lost.laws, lost.chosen) == ((), None)
+    assert (lost.laws, lost.best_law) == ((), None)
     assert "-1e+300 to 1e+300" in lost.reason
 
 
 def test_the_mean_of_runs_with_tiny_errors_is_as_that_of_others() -> None:
-    tiny, plain = (pooled([[Estimate(s, s), Estimate(3 * s, 2 * s)]])[0] for s in (1e-200, 1.0))
+    tiny, plain = (
+        pool_estimates([[TrendEstimate(s, s), TrendEstimate(3 * s, 2 * s)]])[0]
+        for s in (1e-200, 1.0)
+    )
     assert tiny[0].value == pytest.approx(1e-200 * plain[0].value)
     assert tiny[0].stderr == pytest.approx(1e-200 * plain[0].stderr)
 
@@ -389,9 +402,9 @@ def test_a_steep_decay_is_a_power_law_although_the_square_of_its_factor_overflow
     x = [1000.0, 1100.0, 1200.0, 1300.0]
     y = [1000.0 * (one / 1000.0) ** -97.0 for one in x]
     found = fit_trend(x, y, [1e-3 * one for one in y])
-    assert found.chosen is not None
-    assert found.chosen.kind == "power"
-    (_, a, error), (_, b, _) = found.chosen.coefficients
+    assert found.best_law is not None
+    assert found.best_law.kind == "power"
+    (_, a, error), (_, b, _) = found.best_law.coefficients
     assert b == pytest.approx(-97.0)
     assert np.isfinite([a, error]).all()
     assert error > 0

@@ -6,4 +6,4 @@ import pytest
 @pytest.fixture
 def time_to_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each step of a feeder reads all runs it wants, also when this process waits meanwhile."""
-    monkeypatch.setattr("workers.feeding.READ_SECONDS", float("inf"))
+    monkeypatch.setattr("workers.scheduler.READ_SECONDS", float("inf"))

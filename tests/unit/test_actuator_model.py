@@ -8,7 +8,7 @@ import pytest
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
-from sysid.models.catalogue.load import document, load_model
+from sysid.models.catalogue.load import copy_catalogue_document, load_model
 from sysid.models.parse import parse_model
 from sysid.plants.actuator import Actuator, simulate_actuator
 from sysid.simulation.simulate import simulate
@@ -33,7 +33,7 @@ def pressure(amplitude: float, seed: int = 1) -> Channel:
 
 
 def angle(given: Channel, substeps: int = 8, **values: float) -> FloatArray:
-    model = parse_model({**document("actuator"), "solver": {"substeps": substeps}})
+    model = parse_model({**copy_catalogue_document("actuator"), "solver": {"substeps": substeps}})
     known = PUBLISHED | {"theta(0)": 0.0} | values
     return simulate(model, [given], known, times=TIMES).channel("theta").values
 

@@ -9,9 +9,9 @@ import pytest
 from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold
-from sysid.models.catalogue.load import document
+from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.models.parse import parse_model
-from sysid.plants.actuator import MOST_SAMPLES, Actuator, simulate_actuator
+from sysid.plants.actuator import MAX_SAMPLES, Actuator, simulate_actuator
 from sysid.simulation.simulate import simulate
 
 TIMES = 0.01 * np.arange(400)
@@ -24,7 +24,7 @@ def supply(amplitude: float, hold: Hold = "first") -> Channel:
 
 
 def modelled(given: Channel, substeps: int) -> FloatArray:
-    model = parse_model({**document("actuator"), "solver": {"substeps": substeps}})
+    model = parse_model({**copy_catalogue_document("actuator"), "solver": {"substeps": substeps}})
     names = ("J", "F_c", "F_max", "k_a", "k_c", "A_m", "B", "theta_s")
     values = {name: getattr(ARM, name) for name in names}
     found = simulate(model, [given], {**values, "theta(0)": 0.0}, times=TIMES)
@@ -76,7 +76,7 @@ def test_what_cannot_be_simulated_is_told() -> None:
         Actuator(F_max=0.01)
     with pytest.raises(InvalidSettings, match="/parameters/J"):
         Actuator(J=0.0)
-    many = np.arange(float(MOST_SAMPLES + 1))
+    many = np.arange(float(MAX_SAMPLES + 1))
     for times, values in ((TIMES[:1], TIMES[:1]), (many, many), (0 * TIMES, TIMES)):
         with pytest.raises(InvalidRecord):
             simulate_actuator(ARM, Channel("P_a", times, values, "Pa"))
@@ -90,7 +90,7 @@ def test_the_work_of_a_record_grows_with_its_time_and_is_bounded(last: float) ->
 
 
 def test_an_arm_that_stops_too_often_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sysid.plants.actuator.MOST_WORK", 8_000)
+    monkeypatch.setattr("sysid.plants.actuator.MAX_WORK", 8_000)
     simulate_actuator(ARM, Channel("P_a", TIMES, np.zeros(400), "Pa"))  # at rest: no event
     with pytest.raises(InvalidSettings, match="so often"):
         simulate_actuator(ARM, Channel("P_a", TIMES, 12e3 * np.sin(40 * TIMES), "Pa"))

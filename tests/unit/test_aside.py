@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from service.dispatch.background import Aside
+from service.dispatch.background import BackgroundJobs
 from service.storage.columns import Document
 
 LIMIT_SECONDS = 30.0
@@ -20,25 +20,25 @@ def until(holds: Callable[[], bool]) -> None:
 
 
 @pytest.fixture
-def aside() -> Iterator[Aside[str]]:
-    made: Aside[str] = Aside()
+def aside() -> Iterator[BackgroundJobs[str]]:
+    made: BackgroundJobs[str] = BackgroundJobs()
     yield made
     made.stop()
 
 
-def test_the_last_step_gives_the_document(aside: Aside[str]) -> None:
+def test_the_last_step_gives_the_document(aside: BackgroundJobs[str]) -> None:
     def steps() -> Iterator[Document | None]:
         yield None
         yield {"a": 1}
 
-    aside.begin("a", steps)
+    aside.start_job("a", steps)
     assert "a" in aside
-    until(lambda: aside.ended() == ("a",))
-    assert aside.take("a") == {"a": 1}
-    assert aside.keys == ()
+    until(lambda: aside.list_done() == ("a",))
+    assert aside.take_result("a") == {"a": 1}
+    assert aside.pending_keys == ()
 
 
-def test_a_short_document_does_not_wait_for_a_long_one(aside: Aside[str]) -> None:
+def test_a_short_document_does_not_wait_for_a_long_one(aside: BackgroundJobs[str]) -> None:
     may_go_on = threading.Event()
     told: list[str] = []
 
@@ -53,15 +53,15 @@ def test_a_short_document_does_not_wait_for_a_long_one(aside: Aside[str]) -> Non
         told.append("short")
         yield {}
 
-    aside.begin("long", long)
-    aside.begin("short", short)
+    aside.start_job("long", long)
+    aside.start_job("short", short)
     may_go_on.set()
-    until(lambda: set(aside.ended()) == {"long", "short"})
+    until(lambda: set(aside.list_done()) == {"long", "short"})
     assert told == ["long", "short", *["long"] * 4]
 
 
 def test_an_error_is_raised_where_the_document_is_taken_and_ends_nothing_else(
-    aside: Aside[str],
+    aside: BackgroundJobs[str],
 ) -> None:
     def broken() -> Iterator[Document | None]:
         yield None
@@ -70,15 +70,15 @@ def test_an_error_is_raised_where_the_document_is_taken_and_ends_nothing_else(
     def sound() -> Iterator[Document | None]:
         yield {"b": 2}
 
-    aside.begin("a", broken)
-    aside.begin("b", sound)
-    until(lambda: set(aside.ended()) == {"a", "b"})
+    aside.start_job("a", broken)
+    aside.start_job("b", sound)
+    until(lambda: set(aside.list_done()) == {"a", "b"})
     with pytest.raises(ZeroDivisionError):
-        aside.take("a")
-    assert aside.take("b") == {"b": 2}
+        aside.take_result("a")
+    assert aside.take_result("b") == {"b": 2}
 
 
-def test_what_is_dropped_or_stopped_is_made_no_further(aside: Aside[str]) -> None:
+def test_what_is_dropped_or_stopped_is_made_no_further(aside: BackgroundJobs[str]) -> None:
     steps_taken: list[int] = []
 
     def endless() -> Iterator[Document | None]:
@@ -86,12 +86,12 @@ def test_what_is_dropped_or_stopped_is_made_no_further(aside: Aside[str]) -> Non
             steps_taken.append(1)
             yield None
 
-    aside.begin("a", endless)
+    aside.start_job("a", endless)
     until(lambda: len(steps_taken) > 3)
-    aside.drop("a")
-    aside.drop("a")
-    assert aside.keys == ()
-    aside.begin("b", endless)
+    aside.cancel_job("a")
+    aside.cancel_job("a")
+    assert aside.pending_keys == ()
+    aside.start_job("b", endless)
     aside.stop()
     count = len(steps_taken)
     time.sleep(0.02)

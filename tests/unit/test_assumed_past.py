@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 
 from sysid.core.settings import GeneticAlgorithm
-from sysid.data.derivations import derive
+from sysid.data.derivations import derive_recording
 from sysid.data.records import Channel, Recording
 from sysid.identification.identify import identify
-from sysid.identification.unrecorded_input import past_notes, reads_assumed
+from sysid.identification.unrecorded_input import find_assumed_samples, warn_unrecorded_input
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import FixedInitial, Model
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
-from sysid.uncertainty.analysis import Analysis, analyse
+from sysid.uncertainty.analysis import Analysis, analyse_estimate
 
 H, CUT = 0.1, 120
 TRUE = {"K": 2.0, "T": 0.6, "L": 0.73, "y0": 0.5}
@@ -42,20 +42,20 @@ def recorded(seed: int, *, was_at_rest: bool, samples: int = 300) -> Recording:
 
 
 def posed(recording: Recording, *, history: bool, model: Model = FOPDT, skip: int = 0) -> Problem:
-    part = derive(recording, [{"trim": {"rows": [CUT, CUT + 300], "history": history}}])
-    record = part.record({"u": "u"}, {"y": "y"})
+    part = derive_recording(recording, [{"trim": {"rows": [CUT, CUT + 300], "history": history}}])
+    record = part.to_record({"u": "u"}, {"y": "y"})
     return Problem.build(model, [record], parameters=BOUNDS, skip=skip)
 
 
 def analysed(problem: Problem) -> Analysis:
-    start = np.array([TRUE.get(one.name, 0.0) for one in problem.space])
-    [found] = refine(problem, [start])
+    start = np.array([TRUE.get(one.name, 0.0) for one in problem.free_parameters])
+    [found] = refine_candidates(problem, [start])
     assert found is not None
-    return analyse(problem, found.theta)
+    return analyse_estimate(problem, found.theta)
 
 
 def notes(problem: Problem) -> list[str]:
-    return past_notes(problem, analysed(problem))
+    return warn_unrecorded_input(problem, analysed(problem))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -91,12 +91,16 @@ def test_of_a_record_that_begins_at_rest_nothing_is_told() -> None:
 def test_samples_that_read_an_assumed_input_end_with_the_estimated_lag() -> None:
     recording = recorded(0, was_at_rest=True)
     problem = posed(recording, history=False)
-    [part] = reads_assumed(problem, analysed(problem))
+    [part] = find_assumed_samples(problem, analysed(problem))
     assert np.flatnonzero(part).tolist() == list(range(8))  # 0.7 s lies before L = 0.73 s
-    short = derive(recording, [{"trim": {"rows": [CUT - 4, CUT + 300], "history": False}}])
-    record = derive(short, [{"trim": {"rows": [4, 304]}}]).record({"u": "u"}, {"y": "y"})
+    short = derive_recording(
+        recording, [{"trim": {"rows": [CUT - 4, CUT + 300], "history": False}}]
+    )
+    record = derive_recording(short, [{"trim": {"rows": [4, 304]}}]).to_record(
+        {"u": "u"}, {"y": "y"}
+    )
     known = Problem.build(FOPDT, [record], parameters=BOUNDS)
-    [part] = reads_assumed(known, analysed(known))
+    [part] = find_assumed_samples(known, analysed(known))
     assert np.count_nonzero(part) == 4
 
 
@@ -109,9 +113,9 @@ def test_of_a_model_with_given_starts_nothing_is_told() -> None:
 
 
 def test_a_result_warns() -> None:
-    part = derive(
+    part = derive_recording(
         recorded(0, was_at_rest=False), [{"trim": {"rows": [CUT, 420], "history": False}}]
     )
-    record = part.record({"u": "u"}, {"y": "y"})
+    record = part.to_record({"u": "u"}, {"y": "y"})
     found = identify(FOPDT, record, GeneticAlgorithm(generations=80), parameters=BOUNDS)
     assert any("its first value is taken to have stood there" in one for one in found.warnings)

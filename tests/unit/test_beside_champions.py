@@ -4,8 +4,8 @@ from functools import cache
 from itertools import pairwise
 
 from sysid.core.settings import GeneticAlgorithm, Stop
-from sysid.islands.archipelago import found, plans
-from sysid.search.basin_hopping import COUNTED, SINGLE, UNCOUNTED
+from sysid.islands.archipelago import create_islands, make_plans
+from sysid.search.basin_hopping import COUNTED_HOP, SINGLE_PARAMETER_HOP, UNCOUNTED_HOP
 from sysid.search.island import Island, evolve
 from tests.searching import bits, example
 
@@ -17,8 +17,8 @@ GENERATIONS = 400
 def generations(model: str) -> tuple[Island, ...]:
     """An island after every one of its generations, each evolved by itself."""
     problem = example(model)
-    (plan,) = plans(problem, ALONE, 3)
-    states = [found(problem, ALONE, 3)[0]]
+    (plan,) = make_plans(problem, ALONE, 3)
+    states = [create_islands(problem, ALONE, 3)[0]]
     for _ in range(GENERATIONS):
         states.append(evolve(problem.evaluator, plan, states[-1], 1))
     return tuple(states)
@@ -36,8 +36,8 @@ def begun(model: str, field: str) -> list[int]:
 
 def test_jumps_once_met_stay_known_when_a_better_champion_comes() -> None:
     problem = example("coulomb-eq16")
-    (plan,) = plans(problem, ALONE, 3)
-    start = found(problem, ALONE, 3)[0]
+    (plan,) = make_plans(problem, ALONE, 3)
+    start = create_islands(problem, ALONE, 3)[0]
     start.search.fitness_discontinuities = start.search.champion_discontinuities = 1
     later = evolve(problem.evaluator, plan, start, 8)
     assert later.champion_rms < 0.9 * evolve(problem.evaluator, plan, start, 1).champion_rms
@@ -51,30 +51,38 @@ def test_there_most_developments_are_hops_and_some_still_begin_anywhere() -> Non
     hops = begun("coulomb-eq16", "hop_kind")
     assert len(hops) > 30
     assert sum(hop > 0 for hop in hops) >= 0.4 * len(hops)
-    assert {COUNTED, COUNTED + SINGLE, UNCOUNTED + SINGLE} <= set(hops)
+    assert {
+        COUNTED_HOP,
+        COUNTED_HOP + SINGLE_PARAMETER_HOP,
+        UNCOUNTED_HOP + SINGLE_PARAMETER_HOP,
+    } <= set(hops)
     assert sum(begun("coulomb-eq16", "from_random_start")) >= 2
     smooth = begun("duffing-eq16", "hop_kind")
-    assert set(smooth) == {0, COUNTED}
+    assert set(smooth) == {0, COUNTED_HOP}
     assert sum(hop > 0 for hop in smooth) < 0.6 * len(smooth)
 
 
 def test_growing_from_beside_the_champion_is_no_evidence_for_it() -> None:
     """It need not lead back where a better one lies near, so it tells nothing of the champion."""
     states = generations("coulomb-eq16")
-    ends = {COUNTED: 0, COUNTED + SINGLE: 0, UNCOUNTED + SINGLE: 0}
+    ends = {
+        COUNTED_HOP: 0,
+        COUNTED_HOP + SINGLE_PARAMETER_HOP: 0,
+        UNCOUNTED_HOP + SINGLE_PARAMETER_HOP: 0,
+    }
     for before, after in pairwise(states):
         hop = int(before.search.hop_kind)
         ended = before.search.in_sequence_search == 1 and after.search.in_sequence_search == 0
         if ended and hop and after.champion_rms == before.champion_rms:
             ends[hop] += 1
-            assert after.search.hop_count - before.search.hop_count == (hop & COUNTED > 0)
+            assert after.search.hop_count - before.search.hop_count == (hop & COUNTED_HOP > 0)
             assert after.search.step_count == 0
     assert min(ends.values()) > 0
 
 
 def test_it_can_be_cut_anywhere_there_too() -> None:
     problem = example("coulomb-eq16")
-    (plan,) = plans(problem, ALONE, 3)
-    at_once = evolve(problem.evaluator, plan, found(problem, ALONE, 3)[0], GENERATIONS)
+    (plan,) = make_plans(problem, ALONE, 3)
+    at_once = evolve(problem.evaluator, plan, create_islands(problem, ALONE, 3)[0], GENERATIONS)
     assert at_once.search.fitness_discontinuities > 0
     assert bits(at_once) == bits(generations("coulomb-eq16")[-1])

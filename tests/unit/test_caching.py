@@ -47,13 +47,13 @@ def doubled(x: float) -> float:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache folder, and a process that has told nothing yet."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(keeping, "_told", [])
+    monkeypatch.setattr(keeping, "_logged_reasons", [])
     return tmp_path / "cache"
 
 
 def hits() -> int:
     """How often a new copy of the function was found on disk; its result is right anyway."""
-    copy: Any = caching.compiled(doubled)
+    copy: Any = caching.jit_compile(doubled)
     assert copy(2.0) == 4.0
     return sum(copy.stats.cache_hits.values())
 
@@ -110,11 +110,11 @@ def names_in(node: ast.AST) -> set[str]:
 
 def test_the_fingerprint_covers_all_that_compiled_functions_take_values_from() -> None:
     package = ROOT / "sysid"
-    covered = {path for pattern in caching._SOURCES for path in package.glob(pattern)}
+    covered = {path for pattern in caching._SOURCE_PATTERNS for path in package.glob(pattern)}
     frozen = frozen_by_compiled(package.rglob("*.py"))
     assert {package / "kernels" / "layout.py", package / "search" / "state.py"} <= frozen
     assert frozen <= covered
-    assert len(caching.fingerprint()) == 64
+    assert len(caching.get_sources_digest()) == 64
 
 
 @pytest.mark.slow
@@ -162,7 +162,7 @@ def test_what_was_loaded_is_taken_into_what_is_compiled_with_it(folder: Path) ->
         return 3.0 * x + inner(x)
 
     for loaded in (0, 1):
-        inner: Any = caching.compiled(doubled)
+        inner: Any = caching.jit_compile(doubled)
         assert inner(2.0) == 4.0
         assert sum(inner.stats.cache_hits.values()) == loaded
         outer: Any = numba.njit(tripled)
@@ -193,7 +193,7 @@ def test_what_is_whole_but_no_compiled_function_is_replaced(folder: Path) -> Non
     hits()
     (path,) = folder.iterdir()
     for content in (b"", b"no pickle", b"\x80\x04]\x94."):
-        keeping.store(path.stem, content, "loop")
+        keeping.store_code(path.stem, content, "loop")
         assert [hits(), hits()] == [0, 1]
 
 
@@ -271,18 +271,18 @@ def test_a_function_of_numba_that_has_no_cache_works(
         def __call__(self, x: float) -> float:
             return self.call(x)
 
-    monkeypatch.setattr(keeping, "_told", [])
+    monkeypatch.setattr(keeping, "_logged_reasons", [])
     monkeypatch.setattr(numba, "njit", lambda **_: Plain)
-    assert caching.compiled(doubled)(2.0) == 4.0
+    assert caching.jit_compile(doubled)(2.0) == 4.0
     assert len(caplog.records) == 1
 
 
 def test_the_newest_files_are_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keeping, "_MOST_FILES", 2)
+    monkeypatch.setattr(keeping, "_MAX_FILES", 2)
     folder.mkdir(mode=0o700)
     (folder / "a letter.o").write_text("somebody else's")
     for number in range(4):
-        keeping.store(f"{number:064x}", b"code", "loop")
+        keeping.store_code(f"{number:064x}", b"code", "loop")
         os.utime(folder / f"{number:064x}.loop", ns=(number, number))
     kept = sorted(one.name for one in folder.iterdir())
     assert kept == [f"{2:064x}.loop", f"{3:064x}.loop", "a letter.o"]
@@ -291,22 +291,22 @@ def test_the_newest_files_are_kept(folder: Path, monkeypatch: pytest.MonkeyPatch
 def test_what_is_used_stays_longer_than_what_is_newer(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(keeping, "_MOST_FILES", 2)
+    monkeypatch.setattr(keeping, "_MAX_FILES", 2)
     for number in range(2):
-        keeping.store(f"{number:064x}", b"code", "loop")
+        keeping.store_code(f"{number:064x}", b"code", "loop")
         os.utime(folder / f"{number:064x}.loop", ns=(number, number))
-    assert keeping.stored(f"{0:064x}", "loop") == b"code"
-    keeping.store(f"{2:064x}", b"code", "loop")
+    assert keeping.load_code(f"{0:064x}", "loop") == b"code"
+    keeping.store_code(f"{2:064x}", b"code", "loop")
     assert sorted(one.name for one in folder.iterdir()) == [f"{0:064x}.loop", f"{2:064x}.loop"]
 
 
 def test_files_that_another_process_removes_meanwhile_are_no_fault(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(keeping, "_MOST_FILES", 1)
-    monkeypatch.setattr(keeping, "_told", [])
+    monkeypatch.setattr(keeping, "_MAX_FILES", 1)
+    monkeypatch.setattr(keeping, "_logged_reasons", [])
     for number in range(2):
-        keeping.store(f"{number:064x}", b"code", "loop")
+        keeping.store_code(f"{number:064x}", b"code", "loop")
     listed = os.scandir
 
     def outrun(at: Path) -> list[os.DirEntry[str]]:
@@ -316,7 +316,7 @@ def test_files_that_another_process_removes_meanwhile_are_no_fault(
         return found
 
     monkeypatch.setattr(keeping.os, "scandir", outrun)
-    keeping.store(f"{2:064x}", b"code", "loop")
+    keeping.store_code(f"{2:064x}", b"code", "loop")
     assert not caplog.records
 
 

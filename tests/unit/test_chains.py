@@ -4,17 +4,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.jobs.axes import Cell, Step, expand, grouped, values_of
-from service.jobs.schemas import Axis
-from service.jobs.warm_start_order import Chain
+from service.jobs.axes import AxisPosition, SweepCell, expand_values, group_axes, iterate_cells
+from service.jobs.schemas import SweepAxis
+from service.jobs.warm_start_order import ChainLayout
 
-DATA = Axis(path="/datasets", values=["a", "b", "c"])
-SEEDS = Axis(path="/seed", range=[0, 4])
-LABELLED = Axis(path="/noise/sigma", values=[0, 1], labels=[{"x": 1}, {"x": 2}])
+DATA = SweepAxis(path="/datasets", values=["a", "b", "c"])
+SEEDS = SweepAxis(path="/seed", range=[0, 4])
+LABELLED = SweepAxis(path="/noise/sigma", values=[0, 1], labels=[{"x": 1}, {"x": 2}])
 
 
 def test_without_axes_there_is_no_chain() -> None:
-    assert Chain.along([]) is None
+    assert ChainLayout.from_axes([]) is None
 
 
 @pytest.mark.parametrize(
@@ -24,14 +24,19 @@ def test_without_axes_there_is_no_chain() -> None:
         ([DATA, SEEDS, LABELLED], "/noise/sigma"), ([SEEDS], "/seed"),
     ],
 )  # fmt: skip
-def test_the_run_before_differs_in_that_axis_only_by_one_step(axes: list[Axis], along: str) -> None:
-    chain = Chain.along(axes)
+def test_the_run_before_differs_in_that_axis_only_by_one_step(
+    axes: list[SweepAxis], along: str
+) -> None:
+    chain = ChainLayout.from_axes(axes)
     assert chain is not None
-    groups = [[Step("", cell) for cell in _cells(axes[numbers[0]])] for numbers in grouped(axes)]
-    cells = [dict(cell.values) for cell in expand(groups)]
-    order = values_of(next(axis for axis in axes if axis.path == along))
+    groups = [
+        [AxisPosition("", cell) for cell in _cells(axes[numbers[0]])]
+        for numbers in group_axes(axes)
+    ]
+    cells = [dict(cell.values) for cell in iterate_cells(groups)]
+    order = expand_values(next(axis for axis in axes if axis.path == along))
     for number, cell in enumerate(cells):
-        before = chain.before(number)
+        before = chain.find_previous(number)
         place = order.index(cell[along])
         if place == 0:
             assert before is None
@@ -40,14 +45,14 @@ def test_the_run_before_differs_in_that_axis_only_by_one_step(axes: list[Axis], 
             assert cells[before] == {**cell, along: order[place - 1]}
 
 
-def _cells(axis: Axis) -> list[Cell]:
-    return [Cell({axis.path: value}) for value in values_of(axis)]
+def _cells(axis: SweepAxis) -> list[SweepCell]:
+    return [SweepCell({axis.path: value}) for value in expand_values(axis)]
 
 
 @given(st.integers(1, 50), st.integers(1, 50), st.integers(0, 10_000))
 def test_every_chain_ends_at_its_first_run(stride: int, length: int, number: int) -> None:
-    chain, steps = Chain(stride, length), 0
+    chain, steps = ChainLayout(stride, length), 0
     at: int | None = number
     while at is not None:
-        at, steps = chain.before(at), steps + 1
+        at, steps = chain.find_previous(at), steps + 1
     assert steps == number // stride % length + 1

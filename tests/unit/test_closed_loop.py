@@ -8,12 +8,12 @@ import pytest
 
 from sysid.control.closed_loop import close_loop
 from sysid.control.controllers import PidControl, Transport
-from sysid.control.step_response import StepMetrics, step_metrics
+from sysid.control.step_response import StepMetrics, measure_step_response
 from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel
-from sysid.kernels.build import kernel_key
-from sysid.kernels.layout import Variant
+from sysid.kernels.build import compute_kernel_key
+from sysid.kernels.layout import KernelVariant
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
@@ -38,7 +38,7 @@ def arm(gain: float, transport: Transport | None = TUBE) -> tuple[FloatArray, St
     control = PidControl("P_a", "theta", gain, 0.25e6, transport)
     loop = close_loop(load_model("actuator"), control)
     angle = simulate(loop.model, [stepped(pi / 2)], ACTUATOR, times=TIMES).channel("theta").values
-    return angle, step_metrics(TIMES, angle, at=0.0, before=0.0, after=pi / 2)
+    return angle, measure_step_response(TIMES, angle, at=0.0, before=0.0, after=pi / 2)
 
 
 def lag(output: str = "y", **fields: Any) -> Model:
@@ -117,7 +117,7 @@ def test_a_recursion_that_answers_at_once_has_a_controller_one_step_late() -> No
     late = direct | {"equations": {"x": "0.5*x(k-1) + 0.4*u(k-1)"}}
     control = PidControl("u", "y", 1.1)
     loops = [close_loop(parse_model(one), control) for one in (direct, late)]
-    assert [loop.steps_late for loop in loops] == [1, 0]
+    assert [loop.controller_delay_steps for loop in loops] == [1, 0]
     first, second = (simulate(loop.model, [stepped(1.0, "m")], {}, times=TIMES) for loop in loops)
     x, expected = 0.0, []
     for _ in TIMES:
@@ -138,7 +138,7 @@ DIRECT = {"name": "d", "form": "difference", "inputs": {"u": "V"}, "states": {"x
 def test_a_delay_of_a_step_or_more_is_no_circle(delay: float, steps_late: int, back: float) -> None:
     control = PidControl("u", "y", 0.9, None, Transport(1.0, 0.0, delay))
     loop = close_loop(parse_model(DIRECT), control, 0.01)
-    assert loop.steps_late == steps_late
+    assert loop.controller_delay_steps == steps_late
     found = simulate(loop.model, [stepped(1.0, "m")], {}, times=TIMES).channel("y").values
     x = np.zeros(TIMES.size)
     grid = np.arange(TIMES.size)
@@ -165,18 +165,18 @@ def test_during_a_dead_time_of_whole_steps_the_plant_goes_on() -> None:
 def test_other_numbers_of_controller_and_transport_need_no_other_kernel(
     plant: Model, time_constant: float
 ) -> None:
-    variant = Variant(one_step=False, soft=False, on_grid=True, weighted=False)
+    variant = KernelVariant(one_step=False, soft=False, on_grid=True, weighted=False)
     keys = set()
     for size in (1.0, 1.7, -2.0):
         transport = Transport(size, abs(size) * time_constant, 0.05 * abs(size))
         control = PidControl("u", "y", 3.0 * size, 2.0 * abs(size), transport)
-        keys.add(kernel_key(close_loop(plant, control, 0.01).model, variant))
+        keys.add(compute_kernel_key(close_loop(plant, control, 0.01).model, variant))
     assert len(keys) == 1
 
 
 def test_a_delay_whose_step_is_not_known_is_taken_for_less_than_one() -> None:
     control = PidControl("u", "y", 0.9, None, Transport(1.0, 0.0, 0.03))
-    assert close_loop(parse_model(DIRECT), control).steps_late == 1
+    assert close_loop(parse_model(DIRECT), control).controller_delay_steps == 1
 
 
 def test_a_polynomial_can_be_controlled() -> None:
@@ -187,7 +187,7 @@ def test_a_polynomial_can_be_controlled() -> None:
     })  # fmt: skip
     loop = close_loop(narx, PidControl("u", "y", 2.0))
     names = [parameter.name for parameter in narx.parameters]
-    values = loop.values(dict(zip(names, (0.8, 0.1), strict=True)))
+    values = loop.rename_values(dict(zip(names, (0.8, 0.1), strict=True)))
     found = simulate(loop.model, [stepped(1.0, "1")], values, times=TIMES).channel("y").values
     assert found[-1] == pytest.approx(0.2 / (1 - 0.8 + 0.2), rel=1e-9)
 
@@ -234,7 +234,7 @@ def test_metrics_of_a_second_order_step_are_those_of_its_formula() -> None:
     free = rate * np.sqrt(1 - damping**2)
     shape = np.cos(free * times) + damping * rate / free * np.sin(free * times)
     values = 1 + 2 * (1 - np.exp(-damping * rate * times) * shape)
-    found = step_metrics(times + 5, values, at=5.0, before=1.0, after=3.0)
+    found = measure_step_response(times + 5, values, at=5.0, before=1.0, after=3.0)
     overshoot = 100 * np.exp(-pi * damping / np.sqrt(1 - damping**2))
     assert found.overshoot_percent == pytest.approx(overshoot, rel=1e-3)
     assert found.steady_error == pytest.approx(0.0, abs=1e-4)
@@ -248,13 +248,13 @@ def test_metrics_of_a_second_order_step_are_those_of_its_formula() -> None:
 
 def test_with_a_steady_error_rise_and_overshoot_of_the_final_value_are_told_besides() -> None:
     values = 4 * (1 - np.exp(-TIMES) * np.cos(4 * TIMES))  # towards 4 of a reference of 10
-    found = step_metrics(TIMES, values, at=0.0, before=0.0, after=10.0)
-    other = step_metrics(TIMES, values, at=0.0, before=0.0, after=found.final_value)
+    found = measure_step_response(TIMES, values, at=0.0, before=0.0, after=10.0)
+    other = measure_step_response(TIMES, values, at=0.0, before=0.0, after=found.final_value)
     assert found.overshoot_percent == 0.0
     assert found.overshoot_of_final_percent == pytest.approx(other.overshoot_percent)
     assert found.overshoot_of_final_percent > 30
     assert found.rise_time == pytest.approx(other.rise_time)
-    down = step_metrics(TIMES, -values, at=0.0, before=0.0, after=-10.0)
+    down = measure_step_response(TIMES, -values, at=0.0, before=0.0, after=-10.0)
     assert down.overshoot_of_final_percent == pytest.approx(found.overshoot_of_final_percent)
 
 
@@ -265,8 +265,8 @@ def test_rise_and_overshoot_count_from_where_a_steady_error_kept_the_output(
     settles = [42 + 0.47 * (reference - 42) for reference in (before, after)]
     way = 1 - np.exp(-SINCE) * np.cos(2 * SINCE)
     values = settles[0] + (settles[1] - settles[0]) * way
-    found = step_metrics(LONG, values, at=1.0, before=before, after=after)
-    plain = step_metrics(LONG, way, at=1.0, before=0.0, after=1.0)
+    found = measure_step_response(LONG, values, at=1.0, before=before, after=after)
+    plain = measure_step_response(LONG, way, at=1.0, before=0.0, after=1.0)
     assert plain.rise_time > 0.3
     assert plain.overshoot_of_final_percent > 10
     assert found.rise_time == pytest.approx(plain.rise_time)
@@ -274,14 +274,14 @@ def test_rise_and_overshoot_count_from_where_a_steady_error_kept_the_output(
 
 
 def test_an_output_that_does_not_answer_has_no_rise() -> None:
-    found = step_metrics(LONG, 3 + 1e-12 * np.sin(LONG), at=1.0, before=0.0, after=1.0)
+    found = measure_step_response(LONG, 3 + 1e-12 * np.sin(LONG), at=1.0, before=0.0, after=1.0)
     assert np.isnan([found.rise_time, found.overshoot_of_final_percent]).all()
 
 
 def test_a_response_that_grows_or_is_not_finite_runs_away() -> None:
     swing: FloatArray = np.exp(0.5 * TIMES) * np.sin(8 * TIMES)
     for values in (1 + swing, np.where(TIMES < 3, swing, np.inf), -0.1 * TIMES):
-        found = step_metrics(TIMES, values, at=0.0, before=0.0, after=1.0)
+        found = measure_step_response(TIMES, values, at=0.0, before=0.0, after=1.0)
         assert found.runs_away
         assert np.isnan([found.overshoot_percent, found.settling_time, found.final_value]).all()
 
@@ -289,7 +289,7 @@ def test_a_response_that_grows_or_is_not_finite_runs_away() -> None:
 @pytest.mark.parametrize("rate", [-0.5, 0.0])
 def test_a_swing_that_stays_or_decays_does_not_run_away(rate: float) -> None:
     values = 1 + 1.2 * np.exp(rate * TIMES) * np.cos(8 * TIMES)
-    found = step_metrics(TIMES, values, at=0.0, before=0.0, after=1.0)
+    found = measure_step_response(TIMES, values, at=0.0, before=0.0, after=1.0)
     assert not found.runs_away
     assert found.overshoot_percent > 100
 
@@ -301,7 +301,7 @@ SINCE = np.maximum(LONG - 1.0, 0.0)
 @pytest.mark.parametrize("rate", [0.005, 0.01, 0.1])
 def test_a_swing_that_grows_slowly_runs_away(rate: float) -> None:
     values = 1 - np.exp(rate * SINCE) * np.cos(3 * SINCE)
-    assert step_metrics(LONG, values, at=1.0, before=0.0, after=1.0).runs_away
+    assert measure_step_response(LONG, values, at=1.0, before=0.0, after=1.0).runs_away
 
 
 @pytest.mark.parametrize(
@@ -320,7 +320,7 @@ def test_a_swing_that_grows_slowly_runs_away(rate: float) -> None:
 def test_a_response_that_is_far_off_late_or_slow_does_not_run_away(
     values: FloatArray, is_settled: bool
 ) -> None:
-    found = step_metrics(LONG, values, at=1.0, before=0.0, after=1.0)
+    found = measure_step_response(LONG, values, at=1.0, before=0.0, after=1.0)
     assert not found.runs_away
     assert found.is_settled is is_settled
     assert np.isfinite(found.settling_time) == is_settled
@@ -329,15 +329,15 @@ def test_a_response_that_is_far_off_late_or_slow_does_not_run_away(
 
 def test_metrics_need_a_step_that_was_recorded() -> None:
     with pytest.raises(InvalidRecord, match="no two samples after"):
-        step_metrics(TIMES, TIMES, at=6.0, before=0.0, after=1.0)
+        measure_step_response(TIMES, TIMES, at=6.0, before=0.0, after=1.0)
     with pytest.raises(InvalidRecord, match="does not change"):
-        step_metrics(TIMES, TIMES, at=1.0, before=1.0, after=1.0)
+        measure_step_response(TIMES, TIMES, at=1.0, before=1.0, after=1.0)
 
 
 @pytest.mark.parametrize("rate", [0.0, -0.002])
 def test_a_swing_that_lasts_is_told_with_its_size_and_period(rate: float) -> None:
     values = 1 + np.exp(rate * LONG) * 0.4 * np.cos(3 * LONG)
-    found = step_metrics(LONG, values, at=0.0, before=0.0, after=1.0)
+    found = measure_step_response(LONG, values, at=0.0, before=0.0, after=1.0)
     assert not found.runs_away
     assert np.isnan(found.settling_time)
     assert found.swing == pytest.approx(0.8, rel=0.05)
@@ -355,12 +355,14 @@ def test_a_swing_that_lasts_is_told_with_its_size_and_period(rate: float) -> Non
     ],
 )
 def test_what_settles_grows_or_is_under_way_does_not_keep_swinging(values: FloatArray) -> None:
-    found = step_metrics(LONG, values, at=1.0, before=0.0, after=1.0)
+    found = measure_step_response(LONG, values, at=1.0, before=0.0, after=1.0)
     assert np.isnan([found.swing, found.swing_period]).all()
 
 
 def test_integrals_of_the_error_are_those_of_an_exponential() -> None:
     times = np.arange(0, 40, 0.01)
-    found = step_metrics(times + 3, 2 * (1 - np.exp(-times / 2)), at=3.0, before=0.0, after=2.0)
+    found = measure_step_response(
+        times + 3, 2 * (1 - np.exp(-times / 2)), at=3.0, before=0.0, after=2.0
+    )
     assert found.iae == pytest.approx(2 * 2, rel=1e-4)
     assert found.itae == pytest.approx(2 * 2**2, rel=1e-4)

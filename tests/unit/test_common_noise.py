@@ -7,11 +7,11 @@ from scipy.signal import lfilter
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.parse import parse_model
-from sysid.residuals.correlated_outputs import coloured_jointly
-from sysid.search.refine import refine
+from sysid.residuals.correlated_outputs import estimate_joint_covariance
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
-from sysid.uncertainty.analysis import Analysis, analyse
+from sysid.uncertainty.analysis import Analysis, analyse_estimate
 
 TIMES = 0.05 * np.arange(300.0)
 TRUTH = {"a": 2.0, "b": 1.5, "T": 0.6, "L": 0.3}
@@ -40,9 +40,9 @@ def analysed(both: FloatArray, late: int = 0) -> Analysis:
         Channel("z", TIMES[late:], (CLEAN[1].values + both[1])[late:], "m"),
     ]
     problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
-    end = refine(problem, [np.array(list(TRUTH.values()))])[0]
+    end = refine_candidates(problem, [np.array(list(TRUTH.values()))])[0]
     assert end is not None
-    return analyse(problem, end.theta)
+    return analyse_estimate(problem, end.theta)
 
 
 @pytest.mark.parametrize(("correlation", "pole"), [(0.9, 0.0), (-0.9, 0.0), (0.9, 0.7)])
@@ -65,7 +65,9 @@ def test_of_independent_outputs_nothing_is_taken_for_common() -> None:
     data = [Channel(one.name, TIMES, one.values, "m") for one in CLEAN]
     problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
     drawn = ([noise(seed, one).ravel() for seed in range(30)] for one in (0.0, 0.9))
-    free, common = ([coloured_jointly(problem, e, columns) is None for e in one] for one in drawn)
+    free, common = (
+        [estimate_joint_covariance(problem, e, columns) is None for e in one] for one in drawn
+    )
     assert sum(free) >= 29
     assert not any(common)
 
@@ -112,7 +114,7 @@ def test_the_same_noise_in_two_outputs_counts_once() -> None:
     columns = np.random.default_rng(0).standard_normal((2 * TIMES.size, 4))
     data = [Channel(one.name, TIMES, one.values, "m") for one in CLEAN]
     problem = Problem.build(MODEL, [Record((U,), tuple(data))], weights={"y": 1.0, "z": 1.0})
-    found = coloured_jointly(problem, noise(0, 1.0).ravel(), columns)
+    found = estimate_joint_covariance(problem, noise(0, 1.0).ravel(), columns)
     assert found is not None
-    assert found.samples == pytest.approx(TIMES.size)
+    assert found.equivalent_samples == pytest.approx(TIMES.size)
     assert found.degrees == pytest.approx(TIMES.size - 4)

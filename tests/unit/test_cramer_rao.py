@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from sysid.core.errors import InvalidSettings
-from sysid.data.noise import Noise, with_noise
+from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Channel, Record
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.cramer_rao import floor
+from sysid.uncertainty.cramer_rao import cramer_rao_bound
 
 TIMES = np.arange(200) * 0.1
 INPUT = np.sin(1.3 * TIMES) + 0.2 * TIMES
@@ -28,33 +28,35 @@ def problem(document=LINE, skip=0, **options):
 
 @pytest.mark.parametrize("skip", [0, 50])
 def test_the_floor_of_a_linear_model_is_that_of_its_regressors(skip):
-    found = floor(problem(skip=skip), np.array([2.0, 1.0]))
+    found = cramer_rao_bound(problem(skip=skip), np.array([2.0, 1.0]))
     regressors = np.column_stack([INPUT, np.ones(INPUT.size)])[skip:]
     expected = np.sqrt(np.diag(np.linalg.inv(regressors.T @ regressors)))
     assert found.names == ("a", "b")
     np.testing.assert_allclose(found.stderr, expected, rtol=1e-6)
     assert found.samples == 200 - skip
-    assert found.response == pytest.approx(np.sqrt(2 / (200 - skip)))
+    assert found.response_rms == pytest.approx(np.sqrt(2 / (200 - skip)))
 
 
 def test_bounds_and_scale_of_the_search_do_not_change_the_floor():
     theta = np.array([2.0, 1.0])
-    linear = floor(problem(), theta)
+    linear = cramer_rao_bound(problem(), theta)
     changed = {"a": {"lower": 0.5, "upper": 200.0, "scale": "log"}, "b": {"lower": 1.0}}
     np.testing.assert_allclose(
-        floor(problem(parameters=changed), theta).stderr, linear.stderr, rtol=1e-4
+        cramer_rao_bound(problem(parameters=changed), theta).stderr, linear.stderr, rtol=1e-4
     )
 
 
 def test_a_product_of_which_the_data_tell_no_factor_has_none_but_the_others_keep_theirs():
     document = {**LINE, "outputs": {"y": "a*c*u(t) + b + x"},
                 "parameters": {**LINE["parameters"], "c": {"lower": 0.1, "upper": 10}}}  # fmt: skip
-    found = floor(problem(document), np.array([1.0, 1.0, 2.0]))
+    found = cramer_rao_bound(problem(document), np.array([1.0, 1.0, 2.0]))
     known = dict(zip(found.names, found.stderr.tolist(), strict=True))
     assert np.isinf(known["a"])
     assert np.isinf(known["c"])
-    assert known["b"] == pytest.approx(floor(problem(), np.array([2.0, 1.0])).stderr[1], rel=1e-5)
-    assert found.response == pytest.approx(np.sqrt(2 / 200))
+    assert known["b"] == pytest.approx(
+        cramer_rao_bound(problem(), np.array([2.0, 1.0])).stderr[1], rel=1e-5
+    )
+    assert found.response_rms == pytest.approx(np.sqrt(2 / 200))
 
 
 def test_no_least_squares_estimate_is_better_than_the_floor_and_its_spread_reaches_it():
@@ -62,7 +64,7 @@ def test_no_least_squares_estimate_is_better_than_the_floor_and_its_spread_reach
     regressors = np.column_stack([INPUT, np.ones(INPUT.size)])
     noisy = (regressors @ [2.0, 1.0])[:, None] + 0.3 * generator.standard_normal((200, 4000))
     spread = np.std(np.linalg.lstsq(regressors, noisy, rcond=None)[0], axis=1)
-    least = 0.3 * floor(problem(), np.array([2.0, 1.0])).stderr
+    least = 0.3 * cramer_rao_bound(problem(), np.array([2.0, 1.0])).stderr
     np.testing.assert_allclose(spread, least, rtol=0.05)
 
 
@@ -72,7 +74,7 @@ def test_weights_that_are_not_one_are_refused():
     record = Record(inputs=(Channel("u", TIMES, INPUT),), outputs=outputs)
     weighted = Problem.build(model, [record], weights={"y": 1.0, "z": 2.0})
     with pytest.raises(InvalidSettings, match="weight 1"):
-        floor(weighted, np.array([2.0, 1.0]))
+        cramer_rao_bound(weighted, np.array([2.0, 1.0]))
 
 
 LAGGED = {
@@ -96,9 +98,9 @@ def few(samples: int, document=LAGGED) -> Problem:
 
 @pytest.mark.parametrize("samples", [2, 3])
 def test_fewer_samples_than_parameters_tell_none_of_those_they_mix(samples):
-    found = floor(few(samples), np.array([0.5, 1.0, 0.3, 0.1, 0.2]))
+    found = cramer_rao_bound(few(samples), np.array([0.5, 1.0, 0.3, 0.1, 0.2]))
     assert found.samples == samples
-    assert found.response <= 1.0
+    assert found.response_rms <= 1.0
     assert np.isinf(found.stderr).all()
 
 
@@ -108,7 +110,9 @@ def test_what_few_samples_tell_by_itself_keeps_its_floor():
     times = np.array([0.0, 1.0])
     record = Record((), (Channel("y", times, np.ones(2)),))
     posed = Problem.build(parse_model(document), [record], weights={"y": 1.0})
-    found = dict(zip(["a", "b", "c"], floor(posed, np.array([1.0, 1.0, 2.0])).stderr, strict=True))
+    found = dict(
+        zip(["a", "b", "c"], cramer_rao_bound(posed, np.array([1.0, 1.0, 2.0])).stderr, strict=True)
+    )
     assert found["a"] == pytest.approx(np.sqrt(1 / 2), rel=1e-6)
     assert np.isinf([found["b"], found["c"]]).all()
 
@@ -120,13 +124,13 @@ def test_the_floor_of_two_outputs_is_that_of_the_noise_that_a_job_adds_to_them()
     u = Channel("u", TIMES, INPUT)
     exact = (Channel("y", TIMES, 2.0 * INPUT + 1.0), Channel("w", TIMES, 2.0 * INPUT - 1.0))
     weights = {"y": 1.0, "w": 1.0}
-    found = floor(
+    found = cramer_rao_bound(
         Problem.build(model, [Record((u,), exact)], weights=weights), np.array([2.0, 1.0])
     )
     noises, estimates = [], []
     regressors = np.vstack([np.column_stack([INPUT, sign * np.ones(200)]) for sign in (1.0, -1.0)])
     for seed in range(400):
-        outputs = with_noise(Record((u,), exact), Noise(0.1, seed=seed)).outputs
+        outputs = add_output_noise(Record((u,), exact), Noise(0.1, seed=seed)).outputs
         values = np.concatenate([one.values for one in outputs])
         noises.append(values - regressors @ [2.0, 1.0])
         estimates.append(np.linalg.lstsq(regressors, values, rcond=None)[0])

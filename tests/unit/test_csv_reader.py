@@ -108,7 +108,7 @@ def test_segments_are_laid_end_to_end_with_their_labels() -> None:
         {"length": 1.0, "phase": "vent"},
         {"length": 2.0, "phase": "vent"},
     ]
-    pieces = recording.pieces()
+    pieces = recording.split_segments()
     np.testing.assert_array_equal(pieces[1].channel("u").times, [0.1, 0.3])
 
 

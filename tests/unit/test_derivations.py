@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sysid.core.errors import InvalidSettings
-from sysid.data.derivations import derive
-from sysid.data.noise import Noise, with_noise
+from sysid.data.derivations import derive_recording
+from sysid.data.noise import Noise, add_output_noise
 from sysid.data.records import Channel, Hold, Recording, Segment
 from sysid.models.catalogue.load import load_model
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
 
@@ -48,13 +48,13 @@ def values(made: Recording, name: str) -> Any:
 
 
 def test_steps_are_taken_one_after_the_other() -> None:
-    made = derive(recording(), [{"trim": {"rows": [10, 20]}}, {"offset": {"y": 3}}])
+    made = derive_recording(recording(), [{"trim": {"rows": [10, 20]}}, {"offset": {"y": 3}}])
     np.testing.assert_allclose(values(made, "y"), 0.5 * made.channel("y").times)
 
 
 def test_trimming_by_rows_and_by_time_agree() -> None:
-    by_rows = derive(recording(), [{"trim": {"rows": [10, 21]}}])
-    by_time = derive(recording(), [{"trim": {"start": 0.95, "stop": 2.05}}])
+    by_rows = derive_recording(recording(), [{"trim": {"rows": [10, 21]}}])
+    by_time = derive_recording(recording(), [{"trim": {"start": 0.95, "stop": 2.05}}])
     for name in ("u", "y"):
         np.testing.assert_array_equal(values(by_rows, name), values(by_time, name))
         np.testing.assert_array_equal(
@@ -65,39 +65,39 @@ def test_trimming_by_rows_and_by_time_agree() -> None:
 def test_noise_has_its_deviation_is_drawn_by_the_seed_and_leaves_others_alone() -> None:
     start = recording(20_000)
     step = {"noise": {"sigma": 0.2, "seed": 7, "channels": ["y"]}}
-    first, again = derive(start, [step]), derive(start, [step])
+    first, again = derive_recording(start, [step]), derive_recording(start, [step])
     added = values(first, "y") - values(start, "y")
     np.testing.assert_array_equal(values(first, "y"), values(again, "y"))
     np.testing.assert_array_equal(values(first, "u"), values(start, "u"))
     assert np.std(added) == pytest.approx(0.2, rel=0.05)
     assert abs(np.mean(added)) < 0.01
-    other = derive(start, [{"noise": {"sigma": 0.2, "seed": 8, "channels": ["y"]}}])
+    other = derive_recording(start, [{"noise": {"sigma": 0.2, "seed": 8, "channels": ["y"]}}])
     assert not np.array_equal(values(first, "y"), values(other, "y"))
 
 
 def test_noise_is_the_same_as_that_of_a_job() -> None:
     start = recording()
-    derived = derive(start, [{"noise": {"sigma": 0.2, "seed": 7, "channels": ["y"]}}])
-    record = with_noise(start.record({"u": "u"}, {"y": "y"}), Noise(0.2, 7))
+    derived = derive_recording(start, [{"noise": {"sigma": 0.2, "seed": 7, "channels": ["y"]}}])
+    record = add_output_noise(start.to_record({"u": "u"}, {"y": "y"}), Noise(0.2, 7))
     np.testing.assert_array_equal(values(derived, "y"), record.outputs[0].values)
 
 
 def test_noise_of_two_channels_is_independent() -> None:
     start = recording(5000)
-    made = derive(start, [{"noise": {"sigma": 1, "seed": 1, "channels": ["u", "y"]}}])
+    made = derive_recording(start, [{"noise": {"sigma": 1, "seed": 1, "channels": ["u", "y"]}}])
     a, b = (values(made, name) - values(start, name) for name in ("u", "y"))
     assert abs(np.corrcoef(a, b)[0, 1]) < 0.1
 
 
 def test_detrending_takes_away_what_it_says() -> None:
-    line = derive(recording(), [{"detrend": {"kind": "linear", "channels": ["y"]}}])
+    line = derive_recording(recording(), [{"detrend": {"kind": "linear", "channels": ["y"]}}])
     np.testing.assert_allclose(values(line, "y"), 0, atol=1e-12)
-    mean = derive(recording(), [{"detrend": {}}])
+    mean = derive_recording(recording(), [{"detrend": {}}])
     assert np.mean(values(mean, "u")) == pytest.approx(0, abs=1e-14)
 
 
 def test_a_line_survives_resampling() -> None:
-    made = derive(recording(), [{"resample": {"sample_time": 0.03}}])
+    made = derive_recording(recording(), [{"resample": {"sample_time": 0.03}}])
     y = made.channel("y")
     assert y.sampling.is_regular
     assert y.sampling.period == pytest.approx(0.03)
@@ -106,13 +106,15 @@ def test_a_line_survives_resampling() -> None:
 
 
 def test_resampling_a_held_input_never_invents_a_value() -> None:
-    made = derive(recording(), [{"hold": {"u": "zero"}}, {"resample": {"sample_time": 0.03}}])
+    made = derive_recording(
+        recording(), [{"hold": {"u": "zero"}}, {"resample": {"sample_time": 0.03}}]
+    )
     assert set(values(made, "u")) <= set(values(recording(), "u"))
 
 
 def test_the_mean_of_each_period_is_taken() -> None:
     start = recording(101)
-    made = derive(start, [{"resample": {"sample_time": 0.5, "method": "mean"}}])
+    made = derive_recording(start, [{"resample": {"sample_time": 0.5, "method": "mean"}}])
     assert values(made, "u")[2] == pytest.approx(np.mean(values(start, "u")[8:13]))
 
 
@@ -121,7 +123,9 @@ def test_a_held_input_is_averaged_over_the_period_for_which_it_is_then_held() ->
     held = Channel(
         "u", np.array([0.0, 0.26, 0.75, 1.7]), np.array([1.0, 3.0, -1.0, 2.0]), "V", "zero"
     )
-    made = derive(Recording((held,)), [{"resample": {"sample_time": 0.5, "method": "mean"}}])
+    made = derive_recording(
+        Recording((held,)), [{"resample": {"sample_time": 0.5, "method": "mean"}}]
+    )
     expected = [
         (0.26 * 1 + 0.24 * 3) / 0.5,
         (0.25 * 3 - 0.25 * 1) / 0.5,
@@ -134,7 +138,9 @@ def test_a_held_input_is_averaged_over_the_period_for_which_it_is_then_held() ->
 def test_a_gap_of_a_held_input_stays_one() -> None:
     times = 0.1 * np.arange(20)
     held = Channel("u", times, np.where(np.arange(20) == 6, np.nan, 0.1 * 3), "V", "zero")
-    made = derive(Recording((held,)), [{"resample": {"sample_time": 0.5, "method": "mean"}}])
+    made = derive_recording(
+        Recording((held,)), [{"resample": {"sample_time": 0.5, "method": "mean"}}]
+    )
     np.testing.assert_array_equal(values(made, "u"), [0.1 * 3, np.nan, 0.1 * 3, 0.1 * 3])
 
 
@@ -148,18 +154,18 @@ def test_a_lag_survives_resampling_by_means(hold: Hold) -> None:
     model, truth = load_model("fopdt"), {"K": 2.0, "T": 1.0, "L": 0.53, "y0": 0.7, "x(0)": 0.0}
     measured = simulate(model, [Channel("u", times, levels, "V", hold)], truth, times=times)
     whole = Recording((Channel("u", times, levels, "V", hold), measured.channel("y")))
-    made = derive(whole, [{"resample": {"sample_time": 0.2, "method": "mean"}}])
-    problem = Problem.build(model, [made.record({"u": "u"}, {"y": "y"})])
-    start = np.array([truth[p.name] for p in problem.space])
-    (end,) = refine(problem, [start])
+    made = derive_recording(whole, [{"resample": {"sample_time": 0.2, "method": "mean"}}])
+    problem = Problem.build(model, [made.to_record({"u": "u"}, {"y": "y"})])
+    start = np.array([truth[p.name] for p in problem.free_parameters])
+    (end,) = refine_candidates(problem, [start])
     assert end is not None
-    found = dict(zip((p.name for p in problem.space), end.theta, strict=True))
+    found = dict(zip((p.name for p in problem.free_parameters), end.theta, strict=True))
     assert found["L"] == pytest.approx(0.53, abs=0.01)
 
 
 def test_the_two_parts_of_a_split_are_the_whole() -> None:
     parts = [
-        derive(recording(), [{"split": {"fraction": 0.3, "part": part}}])
+        derive_recording(recording(), [{"split": {"fraction": 0.3, "part": part}}])
         for part in ("estimation", "validation")
     ]
     assert [part.samples for part in parts] == [70, 30]
@@ -168,7 +174,7 @@ def test_the_two_parts_of_a_split_are_the_whole() -> None:
 
 
 def test_hold_and_names_are_set() -> None:
-    made = derive(recording(), [{"hold": {"u": "band-limited"}}, {"rename": {"u": "q"}}])
+    made = derive_recording(recording(), [{"hold": {"u": "band-limited"}}, {"rename": {"u": "q"}}])
     assert made.names == ("q", "y")
     assert made.channel("q").hold == "band-limited"
 
@@ -184,16 +190,16 @@ def test_hold_and_names_are_set() -> None:
     ],
 )
 def test_segments_are_selected_by_their_labels(condition: dict[str, Any], kept: list[int]) -> None:
-    made = derive(repeats(), [{"select": condition}])
+    made = derive_recording(repeats(), [{"select": condition}])
     assert [one.labels["n"] for one in made.segments] == kept
-    for piece, number in zip(made.pieces(), kept, strict=True):
-        whole = repeats().pieces()[number - 1]
+    for piece, number in zip(made.split_segments(), kept, strict=True):
+        whole = repeats().split_segments()[number - 1]
         np.testing.assert_array_equal(piece.channel("u").times, whole.channel("u").times)
         np.testing.assert_array_equal(values(piece, "u"), values(whole, "u"))
 
 
 def test_pooling_puts_every_output_sample_at_its_own_time() -> None:
-    made = derive(repeats(), [{"pool": {"input": "u", "outputs": ["y"], "bin": 0.1}}])
+    made = derive_recording(repeats(), [{"pool": {"input": "u", "outputs": ["y"], "bin": 0.1}}])
     assert made.segments == ()
     y = made.channel("y")
     np.testing.assert_array_equal(y.times, y.values)  # y = t in every repeat
@@ -201,7 +207,7 @@ def test_pooling_puts_every_output_sample_at_its_own_time() -> None:
 
 
 def test_a_pooled_input_is_the_median_of_each_bin() -> None:
-    made = derive(
+    made = derive_recording(
         repeats(), [{"pool": {"input": "u", "outputs": ["y"], "bin": 0.3, "start": 0, "stop": 0.7}}]
     )
     u = made.channel("u")
@@ -213,9 +219,9 @@ def test_a_pooled_input_is_the_median_of_each_bin() -> None:
 def test_a_pooled_input_is_that_of_all_repeats_where_outputs_are_those_of_some() -> None:
     pooling = {"input": "u", "outputs": ["y"], "bin": 0.3, "start": 0}
     some = {"n": {"modulus": 2, "remainder": 0}}
-    whole = derive(repeats(), [{"pool": pooling}])
-    made = derive(repeats(), [{"pool": pooling | {"outputs_from": some}}])
-    alone = derive(repeats(), [{"select": some}, {"pool": pooling}])
+    whole = derive_recording(repeats(), [{"pool": pooling}])
+    made = derive_recording(repeats(), [{"pool": pooling | {"outputs_from": some}}])
+    alone = derive_recording(repeats(), [{"select": some}, {"pool": pooling}])
     for name, same in (("u", whole), ("y", alone)):
         np.testing.assert_array_equal(made.channel(name).times, same.channel(name).times)
         np.testing.assert_array_equal(values(made, name), values(same, name))
@@ -230,7 +236,7 @@ def test_pooled_outputs_are_of_segments_that_exist() -> None:
         ({"n": 99}, "/steps/0/pool/outputs_from"), ({}, "/steps/0/pool/outputs_from"),
     ):  # fmt: skip
         with pytest.raises(InvalidSettings) as caught:
-            derive(repeats(), [{"pool": pooling | {"outputs_from": wrong}}])
+            derive_recording(repeats(), [{"pool": pooling | {"outputs_from": wrong}}])
         assert caught.value.pointer == pointer
 
 
@@ -276,7 +282,7 @@ def test_pooled_outputs_are_of_segments_that_exist() -> None:
 )  # fmt: skip
 def test_a_bad_step_is_told_with_its_pointer(steps: Any, pointer: str) -> None:
     with pytest.raises(InvalidSettings) as caught:
-        derive(recording(), steps)
+        derive_recording(recording(), steps)
     assert caught.value.pointer == pointer
     assert "\n" not in str(caught.value)
 
@@ -292,5 +298,5 @@ def test_a_bad_step_is_told_with_its_pointer(steps: Any, pointer: str) -> None:
 )
 def test_a_bad_condition_is_told_with_its_pointer(condition: dict[str, Any], pointer: str) -> None:
     with pytest.raises(InvalidSettings) as caught:
-        derive(repeats(), [{"select": condition}])
+        derive_recording(repeats(), [{"select": condition}])
     assert caught.value.pointer == pointer

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from workers.cluster import RayCrew
+from workers.ray_executor import RayExecutor
 
 
 def test_nothing_heavy_is_imported_before_ray_starts() -> None:
@@ -16,7 +16,7 @@ def test_nothing_heavy_is_imported_before_ray_starts() -> None:
 
 @pytest.mark.ray
 def test_a_local_ray_has_neither_dashboard_nor_autoscaler_nor_collector_of_logs(
-    ray_crew: RayCrew,
+    ray_crew: RayExecutor,
 ) -> None:
     from ray._private.worker import _global_node
 

@@ -6,8 +6,15 @@ from xml.etree import ElementTree
 
 import pytest
 
-from service.figures.plotly import layout
-from service.figures.svg import POINTS, axes_of, drawing, is_drawable, label_of, text_of
+from service.figures.plotly import base_layout
+from service.figures.svg import (
+    MAX_LINE_POINTS,
+    build_axes,
+    format_tick,
+    is_drawable,
+    to_markup,
+    to_svg,
+)
 
 BOX = (100.0, 500.0, 20.0, 220.0)
 SVG = "{http://www.w3.org/2000/svg}"
@@ -16,7 +23,7 @@ SVG = "{http://www.w3.org/2000/svg}"
 def figure(*traces: dict[str, Any], **more: Any) -> dict[str, Any]:
     shared = {"xaxis": {"title": {"text": "time [s]"}}, "yaxis": {"title": {"text": "y [m]"}}}
     return {"data": [{"type": "scatter", **one} for one in traces],
-            "layout": layout(300, **{**shared, **more})}  # fmt: skip
+            "layout": base_layout(300, **{**shared, **more})}  # fmt: skip
 
 
 def parsed(found: str) -> ElementTree.Element:
@@ -38,35 +45,35 @@ def path_of(found: str, colour: str = "#123456") -> str:
 
 
 def test_an_axis_puts_its_ends_at_its_edges_and_y_goes_up() -> None:
-    axes = axes_of(figure(line([0, 10], [0, 1]), xaxis={"range": [0, 10]},
+    axes = build_axes(figure(line([0, 10], [0, 1]), xaxis={"range": [0, 10]},
                           yaxis={"range": [-1, 1]}), BOX)  # fmt: skip
-    assert (axes["x"].at(0), axes["x"].at(10)) == (100, 500)
-    assert (axes["y"].at(-1), axes["y"].at(1)) == (220, 20)
+    assert (axes["x"].to_pixel(0), axes["x"].to_pixel(10)) == (100, 500)
+    assert (axes["y"].to_pixel(-1), axes["y"].to_pixel(1)) == (220, 20)
 
 
 def test_a_logarithmic_axis_gives_every_decade_the_same_room() -> None:
     log = {"type": "log"}
-    axis = axes_of(figure(line([0, 1, 2], [1, 10, 100]), yaxis=log), BOX)["y"]
-    low, middle, high = (axis.at(10.0**n) for n in range(3))
+    axis = build_axes(figure(line([0, 1, 2], [1, 10, 100]), yaxis=log), BOX)["y"]
+    low, middle, high = (axis.to_pixel(10.0**n) for n in range(3))
     assert low is not None
     assert middle is not None
     assert high is not None
     assert low - middle == pytest.approx(middle - high)
-    assert axis.at(0) is None
-    assert axis.at(-1) is None
+    assert axis.to_pixel(0) is None
+    assert axis.to_pixel(-1) is None
 
 
 def test_axes_that_match_have_one_range() -> None:
     made = figure(line([0, 1], [0, 1]), line([5, 9], [0, 1], xaxis="x2", yaxis="y2"),
                   xaxis2={"matches": "x"}, yaxis2={"anchor": "x2"})  # fmt: skip
-    axes = axes_of(made, BOX)
+    axes = build_axes(made, BOX)
     assert (axes["x"].low, axes["x"].high) == (axes["x2"].low, axes["x2"].high)
 
 
 def test_all_points_lie_inside_and_errors_too() -> None:
     bars = {"error_y": {"array": [0.5, 3.0], "color": "#abcdef"}}
     made = figure({**line([0, 1], [1, 2]), "mode": "markers", **bars})
-    axis = axes_of(made, BOX)["y"]
+    axis = build_axes(made, BOX)["y"]
     assert axis.low <= 2 - 3
     assert axis.high >= 2 + 3
 
@@ -77,14 +84,14 @@ def test_all_points_lie_inside_and_errors_too() -> None:
      (1e-6, "1·10⁻⁶"), (1e15, "1·10¹⁵"), (0.1 + 0.2, "0.3")],
 )  # fmt: skip
 def test_ticks_are_written_shortly(value: float, label: str) -> None:
-    assert label_of(value) == label
+    assert format_tick(value) == label
 
 
 @pytest.mark.parametrize("span", [1e-12, 0.3, 1.0, 7.3, 1e9])
 @pytest.mark.parametrize("start", [0.0, -0.4, 123.0])
 def test_an_axis_has_some_ticks_but_not_too_many(span: float, start: float) -> None:
     made = figure(line([0, 1], [start, start + span * max(1.0, abs(start))]))
-    ticks = list(axes_of(made, BOX)["y"].ticks())
+    ticks = list(build_axes(made, BOX)["y"].tick_positions())
     assert 2 <= len(ticks) <= 9
     assert len({text for _, text in ticks}) == len(ticks) or span == 1e-12
     assert all(20 - 1e-6 <= place <= 220 + 1e-6 for place, _ in ticks)
@@ -92,17 +99,17 @@ def test_an_axis_has_some_ticks_but_not_too_many(span: float, start: float) -> N
 
 def test_a_constant_line_and_an_empty_one_can_be_drawn() -> None:
     for x, y in (([0, 1], [3, 3]), ([], []), ([1], [None])):
-        parsed(str(drawing(figure(line(x, y)), "flat")))
+        parsed(str(to_svg(figure(line(x, y)), "flat")))
 
 
 def test_a_gap_parts_the_line() -> None:
-    found = str(drawing(figure(line([0, 1, 2, 3], [0, None, 1, 2])), "gap"))
+    found = str(to_svg(figure(line([0, 1, 2, 3], [0, None, 1, 2])), "gap"))
     assert path_of(found).count("M") == 2
 
 
 def test_a_held_line_goes_across_then_up() -> None:
     held = {"color": "#123456", "shape": "hv"}
-    found = str(drawing(figure(line([0, 1, 2], [0, 5, 5], line=held)), "held"))
+    found = str(to_svg(figure(line([0, 1, 2], [0, 5, 5], line=held)), "held"))
     assert re.fullmatch(r"M[\d. ]+(H[\d.]+V[\d.]+)+", path_of(found))
 
 
@@ -110,8 +117,8 @@ def test_a_long_line_is_thinned_and_its_spike_stays() -> None:
     values = [0.0] * 20_000
     values[7_777] = 10.0
     made = figure(line(list(range(20_000)), values), yaxis={"range": [0, 10]})
-    path = path_of(str(drawing(made, "spike")))
-    assert path.count("L") <= POINTS
+    path = path_of(str(to_svg(made, "spike")))
+    assert path.count("L") <= MAX_LINE_POINTS
     top = min(float(place) for place in re.findall(r"[ML][\d.]+ ([\d.]+)", path))
     assert top == pytest.approx(made["layout"]["margin"]["t"])
 
@@ -119,14 +126,14 @@ def test_a_long_line_is_thinned_and_its_spike_stays() -> None:
 def test_the_band_is_closed_between_its_edges() -> None:
     fill = {"fill": "tonexty", "fillcolor": "rgba(1,2,3,0.2)", "line": {"width": 0}}
     made = figure(line([0, 1], [0, 0], line={"width": 0}), line([0, 1], [1, 2], **fill))
-    [path] = re.findall(r'd="([^"]*)" fill="rgba\(1,2,3,0.2\)"', str(drawing(made, "band")))
+    [path] = re.findall(r'd="([^"]*)" fill="rgba\(1,2,3,0.2\)"', str(to_svg(made, "band")))
     assert path.endswith("Z")
     assert path.count("L") == 3
 
 
 def test_title_legend_axes_and_captions_are_written() -> None:
     caption = {"text": "<b>T</b> = 2·x<sup>1.4</sup>", "xref": "paper", "x": 0, "y": 1}
-    found = str(drawing(figure(line([0, 1], [0, 1]), annotations=[caption]), "What it shows"))
+    found = str(to_svg(figure(line([0, 1], [0, 1]), annotations=[caption]), "What it shows"))
     assert {"line", "time [s]", "y [m]", "T = 2·x1.4"} <= set(texts(found))
     assert parsed(found).get("aria-label") == "What it shows"
 
@@ -134,10 +141,10 @@ def test_title_legend_axes_and_captions_are_written() -> None:
 def test_what_is_written_by_a_user_is_no_markup() -> None:
     evil = '<script>alert("1")</script>'
     made = figure(line([0, 1], [0, 1], name=evil), xaxis={"title": {"text": evil}})
-    found = str(drawing(made, evil))
+    found = str(to_svg(made, evil))
     assert "<script" not in found
     assert evil in texts(found)
-    assert text_of("a<b>b</b>&") == 'a<tspan font-weight="600">b</tspan>&amp;'
+    assert to_markup("a<b>b</b>&") == 'a<tspan font-weight="600">b</tspan>&amp;'
 
 
 def test_a_matrix_is_not_drawn() -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sysid.language.checker import check
-from sysid.language.evaluation import values_at
+from sysid.language.checker import check_expression
+from sysid.language.evaluation import evaluate_signal
 from sysid.language.scope import Scope
 from sysid.models.parse import parse_model
 from sysid.simulation.simulate import simulate
@@ -24,7 +24,7 @@ TIMES = np.arange(400) / 16  # exact, so that comparisons with them are
     ],
 )  # fmt: skip
 def test_values_are_those_of_a_kernel(expression: str) -> None:
-    tree = check(expression, Scope("difference")).tree
+    tree = check_expression(expression, Scope("difference")).tree
     assert tree is not None
     model = parse_model({
         "name": "wave", "form": "difference", "states": {"unused": "1"},
@@ -32,10 +32,10 @@ def test_values_are_those_of_a_kernel(expression: str) -> None:
     })  # fmt: skip
     expected = simulate(model, [], {}, times=TIMES).channel("y").values
     small = 1e-12 * np.max(np.abs(expected[np.isfinite(expected)]))
-    np.testing.assert_allclose(values_at(tree, TIMES), expected, rtol=1e-12, atol=small)
+    np.testing.assert_allclose(evaluate_signal(tree, TIMES), expected, rtol=1e-12, atol=small)
 
 
 def test_what_it_has_no_value_for_is_nan() -> None:
-    tree = check("x(k-1) + 1", Scope("difference", states=("x",))).tree
+    tree = check_expression("x(k-1) + 1", Scope("difference", states=("x",))).tree
     assert tree is not None
-    assert np.all(np.isnan(values_at(tree, TIMES)))
+    assert np.all(np.isnan(evaluate_signal(tree, TIMES)))

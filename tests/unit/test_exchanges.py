@@ -9,14 +9,19 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identifiability import subsystems as sections
-from sysid.identifiability.exchange import Exchanges, exchange_notes, exchanges, ordered
+from sysid.identifiability.exchange import (
+    ExchangeGroups,
+    describe_exchanges,
+    find_exchanges,
+    order_exchangeable,
+)
 from sysid.identification.identify import identify
 from sysid.language.tree import Expression
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
-from sysid.uncertainty.profile_likelihood import profile
+from sysid.uncertainty.profile_likelihood import compute_profile
 
 TIMES = 0.1 * np.arange(300.0)
 U = Channel("u", TIMES, np.repeat(np.random.default_rng(3).normal(size=30), 10), hold="zero")
@@ -58,9 +63,9 @@ def problem(form: str, **bounds: dict[str, float]) -> Problem:
     ("in series", (((2,), (3,)),)), ("symmetric", (((2,), (3,)),)), ("unlike", ()),
 ])  # fmt: skip
 def test_an_exchange_is_found_whether_or_not_the_equations_show_it(
-    form: str, expected: Exchanges
+    form: str, expected: ExchangeGroups
 ) -> None:
-    found, spent = exchanges(problem(form), THETA)
+    found, spent = find_exchanges(problem(form), THETA)
     assert found == expected
     # The lag is no candidate, and the gain has another unit; what is found is looked at twice.
     assert spent == (5 if expected else 3)
@@ -72,11 +77,13 @@ def test_what_is_known_as_a_product_or_a_sum_only_is_no_exchange(form: str) -> N
         **(model("symmetric").document or {}), "states": {"x": "m"}, "equations": {"x": form},
         "outputs": {"z": "x"}, "initial": {"x": 0},
     })  # fmt: skip
-    assert exchanges(Problem.build(made, [recorded("symmetric")]), THETA)[0] == ()
+    assert find_exchanges(Problem.build(made, [recorded("symmetric")]), THETA)[0] == ()
 
 
 def test_it_is_found_at_a_double_pole_too() -> None:
-    assert exchanges(problem("in series"), np.array([2.0, 0.3, 1.0, 1.0]))[0] == (((2,), (3,)),)
+    assert find_exchanges(problem("in series"), np.array([2.0, 0.3, 1.0, 1.0]))[0] == (
+        ((2,), (3,)),
+    )
 
 
 PARALLEL = {"equations": {"x": "(K*u - x)/T1", "y": "(M*u - y)/T2"}, "outputs": {"z": "x + y"}}
@@ -89,14 +96,14 @@ BESIDE = {"equations": {"x": "(K*u - x)/T1", "y": "(x - y)/T2"}, "outputs": {"z"
     (BESIDE, [2.0, 0.0, 1.5, 0.5], ()),  # the way past the second one is closed
 ])  # fmt: skip
 def test_what_can_be_exchanged_at_this_estimate_only_is_none(
-    form: dict[str, Any], theta: list[float], expected: Exchanges
+    form: dict[str, Any], theta: list[float], expected: ExchangeGroups
 ) -> None:
     gain = {"lower": -5, "upper": 5, "unit": "m"}
     made = parse_model({
         **(model("in series").document or {}), **form,
         "parameters": {"K": gain, "M": gain, "T1": SPAN, "T2": SPAN},
     })  # fmt: skip
-    found = exchanges(Problem.build(made, [recorded("in series")]), np.array(theta))[0]
+    found = find_exchanges(Problem.build(made, [recorded("in series")]), np.array(theta))[0]
     assert found == expected
 
 
@@ -107,16 +114,16 @@ def test_it_is_found_in_wide_bounds_where_the_middle_of_the_range_diverges(
 ) -> None:
     wide: dict[str, Any] = {"lower": 1e-3, "upper": 1e3, "scale": scale}
     posed = problem("in series", T1=wide, T2=wide)
-    assert exchanges(posed, np.array([2.0, 0.3, 1.5, second]))[0] == (((2,), (3,)),)
+    assert find_exchanges(posed, np.array([2.0, 0.3, 1.5, second]))[0] == (((2,), (3,)),)
 
 
 def test_bounds_that_tell_which_is_which_leave_nothing_to_be_exchanged() -> None:
     posed = problem("in series", T1={"lower": 1.0}, T2={"upper": 0.9})
-    assert exchanges(posed, THETA) == ((), 0)
+    assert find_exchanges(posed, THETA) == ((), 0)
 
 
 def test_a_budget_is_kept() -> None:
-    assert exchanges(problem("in series"), THETA, 4) == ((), 0)
+    assert find_exchanges(problem("in series"), THETA, 4) == ((), 0)
 
 
 def test_three_in_a_row_are_one_group() -> None:
@@ -128,12 +135,14 @@ def test_three_in_a_row_are_one_group() -> None:
         "outputs": {"z": "w"}, "initial": {"x": 0, "y": 0, "w": 0},
     })  # fmt: skip
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
-    groups, _ = exchanges(posed, np.array([0.4, 1.0, 2.0]))
+    groups, _ = find_exchanges(posed, np.array([0.4, 1.0, 2.0]))
     assert groups == (((0,), (1,), (2,)),)
-    assert ordered(posed, np.array([[0.4, 2.0, 1.0]]), groups).tolist() == [[2.0, 1.0, 0.4]]
-    [note] = exchange_notes(posed, groups, {"T1", "T2", "T3"})
+    assert order_exchangeable(posed, np.array([[0.4, 2.0, 1.0]]), groups).tolist() == [
+        [2.0, 1.0, 0.4]
+    ]
+    [note] = describe_exchanges(posed, groups, {"T1", "T2", "T3"})
     assert note.startswith("T1 and T2 and T3 can be exchanged")
-    assert exchange_notes(posed, groups, {"T1", "T2"}) == ()
+    assert describe_exchanges(posed, groups, {"T1", "T2"}) == ()
 
 
 GAIN = {"lower": 0, "upper": 5, "unit": "m"}
@@ -156,8 +165,10 @@ def beside(
     return Problem.build(parse_model(document), [recorded("in series")] * records)
 
 
-def named(posed: Problem, found: Exchanges) -> list[list[str]]:
-    return [[" ".join(posed.space[d].name for d in unit) for unit in one] for one in found]
+def named(posed: Problem, found: ExchangeGroups) -> list[list[str]]:
+    return [
+        [" ".join(posed.free_parameters[d].name for d in unit) for unit in one] for one in found
+    ]
 
 
 def drawn(posed: Problem, seed: int = 1) -> FloatArray:
@@ -173,12 +184,12 @@ def drawn(posed: Problem, seed: int = 1) -> FloatArray:
 ])  # fmt: skip
 def test_sections_side_by_side_change_places_with_gains_and_starts(written: dict[str, str]) -> None:
     posed = beside(written=written)
-    found, spent = exchanges(posed, drawn(posed))
+    found, spent = find_exchanges(posed, drawn(posed))
     assert named(posed, found) == [["Kx Tx x(0)", "Ky Ty y(0)"]]
     assert spent == 2 * 3 + 5  # a pair of gains, one of time constants; the sections
-    [note] = exchange_notes(posed, found, {"Tx", "Ty"})
+    [note] = describe_exchanges(posed, found, {"Tx", "Ty"})
     assert note.startswith("(Kx, Tx, x(0)) and (Ky, Ty, y(0)) can be exchanged as a whole")
-    assert exchange_notes(posed, found, {"Tx", "Ky"}) == ()
+    assert describe_exchanges(posed, found, {"Tx", "Ky"}) == ()
 
 
 @pytest.mark.parametrize(("written", "changed"), [
@@ -196,7 +207,7 @@ def test_sections_that_are_not_alike_are_not_exchanged(
     if "Tx" in written.get("y", ""):
         changed = {**changed, "Ty": SPAN | {"fixed": 1.0}}
     posed = beside(written=written, **changed)
-    assert exchanges(posed, drawn(posed))[0] == ()
+    assert find_exchanges(posed, drawn(posed))[0] == ()
 
 
 def test_sums_of_names_that_fit_either_way_round_are_not_all_tried(
@@ -214,34 +225,32 @@ def test_sums_of_names_that_fit_either_way_round_are_not_all_tried(
     ]
     written = {"x": product("x", 1), "y": product("y", 2)}
     posed = beside(written=written, **dict.fromkeys(names, SPAN))
-    apart, looked_at = sections._apart, []
+    apart, looked_at = sections._split_expression, []
 
     def counted(tree: Expression) -> Any:
         looked_at.append(tree)
         return apart(tree)
 
-    monkeypatch.setattr(sections, "_apart", counted)
-    assert list(sections.alike(posed)) == []
+    monkeypatch.setattr(sections, "_split_expression", counted)
+    assert list(sections.find_equivalent_subsystems(posed)) == []
     assert len(looked_at) < 10_000
 
 
 def test_three_sections_side_by_side_are_one_group_and_are_given_in_order() -> None:
     posed = beside("xyw")
     theta = drawn(posed)
-    found, spent = exchanges(posed, theta)
+    found, spent = find_exchanges(posed, theta)
     assert named(posed, found) == [["Kx Tx x(0)", "Ky Ty y(0)", "Kw Tw w(0)"]]
     assert spent <= 2 * 9 + 2 * 5
-    after = ordered(posed, theta[None], found)[0]
+    after = order_exchangeable(posed, theta[None], found)[0]
     assert after[0] > after[1] > after[2]
-    np.testing.assert_allclose(
-        posed.predictions(after[None]), posed.predictions(theta[None]), rtol=1e-12
-    )
-    assert exchanges(posed, theta, spent - 5)[1] <= spent - 5
+    np.testing.assert_allclose(posed.predict(after[None]), posed.predict(theta[None]), rtol=1e-12)
+    assert find_exchanges(posed, theta, spent - 5)[1] <= spent - 5
 
 
 def test_each_experiment_has_starts_of_its_own() -> None:
     posed = beside(records=2)
-    found, _ = exchanges(posed, drawn(posed))
+    found, _ = find_exchanges(posed, drawn(posed))
     assert named(posed, found) == [["Kx Tx x(0) x(0)[2]", "Ky Ty y(0) y(0)[2]"]]
 
 
@@ -254,7 +263,7 @@ def test_sections_of_two_states_change_places_with_all_their_parameters() -> Non
         "outputs": {"z": "a + b"}, "initial": {"a": 0, "v": START, "b": 0, "w": START},
     })  # fmt: skip
     posed = Problem.build(made, [recorded("in series")])
-    found, _ = exchanges(posed, np.array([3.0, 0.5, 1.0, 0.2, 0.4, -0.3]))
+    found, _ = find_exchanges(posed, np.array([3.0, 0.5, 1.0, 0.2, 0.4, -0.3]))
     assert named(posed, found) == [["ka ca v(0)", "kb cb w(0)"]]
 
 
@@ -262,13 +271,13 @@ def test_sections_that_begin_unlike_are_told_apart() -> None:
     document = dict(beside().model.document or {})
     made = parse_model({**document, "initial": {"x": 0, "y": 1}})
     posed = Problem.build(made, [recorded("in series")])
-    assert exchanges(posed, drawn(posed))[0] == ()
+    assert find_exchanges(posed, drawn(posed))[0] == ()
 
 
 def test_whatever_the_seed_sections_are_given_in_one_order() -> None:
     posed = beside()
     theta = np.array([4.0, 1.0, 3.0, 0.4, 0.5, -0.5])
-    clean = posed.predictions(theta[None])[0]
+    clean = posed.predict(theta[None])[0]
     noise = np.random.default_rng(4).normal(0, 0.02, clean.size)
     data = Record((U,), (Channel("z", TIMES, clean + noise, "m"),))
     for seed in range(3):
@@ -285,13 +294,13 @@ def test_whatever_the_seed_sections_are_given_in_one_order() -> None:
 def test_a_profile_stays_with_one_order_of_sections(name: str) -> None:
     posed = beside()
     theta = np.array([4.0, 1.0, 3.0, 0.4, 0.5, -0.5])
-    clean = posed.predictions(theta[None])[0]
+    clean = posed.predict(theta[None])[0]
     noise = np.random.default_rng(4).normal(0, 0.02, clean.size)
     data = Record((U,), (Channel("z", TIMES, clean + noise, "m"),))
     again = Problem.build(posed.model, [data])
-    places = [one.name for one in again.space]
+    places = [one.name for one in again.free_parameters]
     swapped = theta[[1, 0, 3, 2, 5, 4]]
-    found = profile(again, swapped, name, points=21)
+    found = compute_profile(again, swapped, name, points=21)
     partner = places.index({"Kx": "Ky", "Ty": "Tx"}[name])
     own = found.others[:, partner - (partner > places.index(name))]
     larger, smaller = (found.values, own) if name == "Kx" else (own, found.values)
@@ -309,8 +318,8 @@ def test_what_no_bounds_let_be_put_in_order_is_not_said_to_be() -> None:
         "outputs": {"z": "w"}, "initial": {"x": 0, "y": 0, "w": 0},
     })  # fmt: skip
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
-    assert exchanges(posed, np.array([1.0, 1.1, 3.0]))[0] == ()  # T1 cannot be 3
-    assert exchanges(posed, np.array([1.15, 1.1, 1.0]))[0] == (((0,), (1,), (2,)),)
+    assert find_exchanges(posed, np.array([1.0, 1.1, 3.0]))[0] == ()  # T1 cannot be 3
+    assert find_exchanges(posed, np.array([1.15, 1.1, 1.0]))[0] == (((0,), (1,), (2,)),)
 
 
 def test_of_many_parameters_most_pairs_are_ruled_out_by_one_simulation_of_each() -> None:
@@ -328,9 +337,9 @@ def test_of_many_parameters_most_pairs_are_ruled_out_by_one_simulation_of_each()
     })  # fmt: skip
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
     values = {"T1": 1.5, "T2": 0.5} | dict(zip(gains, np.linspace(-0.5, 0.6, 12), strict=True))
-    theta = np.array([values[one.name] for one in posed.space])
-    found, spent = exchanges(posed, theta)
-    assert [[posed.space[d].name for (d,) in group] for group in found] == [["T1", "T2"]]
+    theta = np.array([values[one.name] for one in posed.free_parameters])
+    found, spent = find_exchanges(posed, theta)
+    assert [[posed.free_parameters[d].name for (d,) in group] for group in found] == [["T1", "T2"]]
     assert spent == 12 + 5  # of three for each of 67 pairs
 
 
@@ -343,10 +352,10 @@ def test_four_in_a_row_are_one_group_though_looked_at_together_first() -> None:
         "outputs": {"z": "d"}, "initial": dict.fromkeys("abcd", 0),
     })  # fmt: skip
     posed = Problem.build(made, [Record((U,), (Channel("z", TIMES, np.sin(TIMES), "V"),))])
-    found, spent = exchanges(posed, np.array([0.4, 1.0, 2.0, 0.7]))
+    found, spent = find_exchanges(posed, np.array([0.4, 1.0, 2.0, 0.7]))
     assert found == (((0,), (1,), (2,), (3,)),)
     assert spent == 4 + 3 * 5
-    assert exchanges(posed, np.array([0.4, 1.0, 2.0, 0.7]), 8)[1] <= 8
+    assert find_exchanges(posed, np.array([0.4, 1.0, 2.0, 0.7]), 8)[1] <= 8
 
 
 def test_whatever_the_seed_the_larger_comes_first_and_it_is_told() -> None:
@@ -368,7 +377,7 @@ def test_whatever_the_seed_the_larger_comes_first_and_it_is_told() -> None:
 @pytest.mark.parametrize("name", ["T1", "T2"])
 def test_a_profile_stays_with_one_copy(name: str) -> None:
     posed = problem("in series")
-    found = profile(posed, THETA, name, points=41)
+    found = compute_profile(posed, THETA, name, points=41)
     own = found.others[:, 2]  # the other time constant
     larger, smaller = (found.values, own) if name == "T1" else (own, found.values)
     assert np.all(larger >= smaller - 1e-5)

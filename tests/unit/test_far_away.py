@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from sysid.core.settings import GeneticAlgorithm, Migration, Stop
-from sysid.identification.run import advance, begin
-from sysid.islands.archipelago import found, plans
+from sysid.identification.run import advance_run, begin_run
+from sysid.islands.archipelago import create_islands, make_plans
 from sysid.islands.migration import migrate
-from sysid.search.adaptive_search import start_development
-from sysid.search.basin_hopping import is_behind, is_coloured
+from sysid.search.adaptive_search import start_local_search
+from sysid.search.basin_hopping import is_behind_champion, is_champion_coloured
 from sysid.search.island import Island
-from sysid.search.operators import coded
-from sysid.search.slopes import partial_fitness
-from sysid.search.state import Plan
-from sysid.simulation.evaluator import partial_predictions
+from sysid.search.operators import encode
+from sysid.search.slopes import evaluate_partial_fitness
+from sysid.search.state import IslandPlan
+from sysid.simulation.evaluator import predict_partially
 from tests.searching import COULOMB, example
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
@@ -23,15 +23,17 @@ PROBLEM = example("coulomb-eq16")
 FALSE = COULOMB | {"b": 3.0}
 
 
-def plan() -> Plan:
-    return plans(PROBLEM, ALONE, 3)[0]
+def plan() -> IslandPlan:
+    return make_plans(PROBLEM, ALONE, 3)[0]
 
 
 def island_at(values: dict[str, float]) -> Island:
     """A new island whose individuals all have these values."""
-    place = [(values[p.name] - p.lower) / (p.upper - p.lower) for p in PROBLEM.space]
-    words = np.asarray(coded(np.array([place] * 12), plan().bits))
-    return replace(found(PROBLEM, ALONE, 3)[0], words=words, fitness=np.full(12, 1.0))
+    place = [(values[p.name] - p.lower) / (p.upper - p.lower) for p in PROBLEM.free_parameters]
+    words = np.asarray(encode(np.array([place] * 12), plan().bits))
+    return replace(
+        create_islands(PROBLEM, ALONE, 3)[0], chromosomes=words, fitness=np.full(12, 1.0)
+    )
 
 
 @pytest.mark.parametrize(("values", "wanted"), [(COULOMB, False), (FALSE, True)])
@@ -40,21 +42,21 @@ def test_errors_are_coloured_where_the_response_is_wrong(
 ) -> None:
     island = island_at(values)
     before = island.evaluations
-    assert is_coloured(PROBLEM.evaluator, plan(), island.arrays) == wanted
+    assert is_champion_coloured(PROBLEM.evaluator, plan(), island.arrays) == wanted
     assert island.evaluations == before + 1
 
 
 def test_a_part_is_lost_where_the_champion_fits_it_better() -> None:
-    theta = np.array([[FALSE[p.name] for p in PROBLEM.space]])
-    predicted = partial_predictions(PROBLEM.evaluator, theta, 0.25)
-    loss = partial_fitness(PROBLEM.evaluator, plan(), predicted, 0.25)[0]
+    theta = np.array([[FALSE[p.name] for p in PROBLEM.free_parameters]])
+    predicted = predict_partially(PROBLEM.evaluator, theta, 0.25)
+    loss = evaluate_partial_fitness(PROBLEM.evaluator, plan(), predicted, 0.25)[0]
     island = island_at(FALSE)
     for share, wanted in ((1.001, True), (0.999, False)):
         reached = share * loss
-        assert is_behind(PROBLEM.evaluator, plan(), island.arrays, 0.25, reached) == wanted
-    island.search.evaluations = plan().evaluations
-    assert not is_behind(PROBLEM.evaluator, plan(), island.arrays, 0.25, 2.0 * loss)
-    assert island.evaluations == plan().evaluations
+        assert is_behind_champion(PROBLEM.evaluator, plan(), island.arrays, 0.25, reached) == wanted
+    island.search.evaluations = plan().most_evaluations
+    assert not is_behind_champion(PROBLEM.evaluator, plan(), island.arrays, 0.25, 2.0 * loss)
+    assert island.evaluations == plan().most_evaluations
 
 
 @pytest.mark.parametrize(("values", "kinds"), [(COULOMB, "hhhh"), (FALSE, "hfff")])
@@ -67,7 +69,7 @@ def test_a_champion_whose_errors_are_no_noise_lets_fresh_starts_have_the_turns_o
         search = island.search
         search.fitness_discontinuities = search.champion_converged = 1
         search.local_searches = turn - 1
-        start_development(PROBLEM.evaluator, plan(), island.arrays)
+        start_local_search(PROBLEM.evaluator, plan(), island.arrays)
         seen += "f" if search.from_random_start else "h" if search.hop_kind else "?"
         assert (search.horizon <= 0.25) == bool(search.from_random_start)
     assert seen == kinds
@@ -75,7 +77,7 @@ def test_a_champion_whose_errors_are_no_noise_lets_fresh_starts_have_the_turns_o
 
 def test_jumps_that_one_island_has_met_its_neighbour_knows_after_the_exchange() -> None:
     shared = GeneticAlgorithm(population=26, islands=4, generations=3)
-    islands = advance(PROBLEM, shared, begin(PROBLEM, shared, 4)).islands
+    islands = advance_run(PROBLEM, shared, begin_run(PROBLEM, shared, 4)).islands
     for island in islands:
         island.search.fitness_discontinuities = 0
     islands[1].search.fitness_discontinuities = 5

@@ -9,8 +9,8 @@ import pytest
 from sysid import Channel, Record, identify, load_model
 from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
-from sysid.residuals.feedback import feedback_notes, share_told
-from sysid.residuals.residual_tests import Series
+from sysid.residuals.feedback import compute_explained_share, describe_feedback
+from sysid.residuals.residual_tests import ResidualSeries
 
 N, STEP, LATE = 1500, 0.1, 20  # samples, s, samples of dead time
 TIMES = STEP * np.arange(N)
@@ -36,11 +36,11 @@ def held(u: FloatArray) -> Channel:
     return Channel("u", TIMES, u, hold="zero")
 
 
-def series(residual: FloatArray, hidden: int | None = None) -> Series:
+def series(residual: FloatArray, hidden: int | None = None) -> ResidualSeries:
     scored = np.ones(N, dtype=np.bool_)
     if hidden is not None:
         scored[hidden::37] = False
-    return Series(0, "y", TIMES, residual, scored, 1.0, ())
+    return ResidualSeries(0, "y", TIMES, residual, scored, 1.0, ())
 
 
 def delayed(u: FloatArray, gain: float = 2.0) -> FloatArray:
@@ -60,8 +60,8 @@ def test_a_loop_is_recognised_with_and_without_reference_and_with_a_poor_model(
     seed: int, quantum: float, height: float, gain: float
 ) -> None:
     u, y = loop(seed, height * ((TIMES // 15) % 2), quantum)
-    assert share_told(series(y - delayed(u, gain)), held(u)) > 0.8
-    assert share_told(series(y - delayed(u, gain), hidden=5), held(u)) > 0.8
+    assert compute_explained_share(series(y - delayed(u, gain)), held(u)) > 0.8
+    assert compute_explained_share(series(y - delayed(u, gain), hidden=5), held(u)) > 0.8
 
 
 def wave(of: Callable[[FloatArray, np.random.Generator], FloatArray], seed: int) -> FloatArray:
@@ -93,18 +93,18 @@ def test_an_open_loop_is_not_taken_for_one_however_poor_the_model(
         u = wave(INPUTS[name], seed)
         draws = np.random.default_rng(seed + 9)
         misfit = delayed(u) - delayed(u, gain=1.0) ** 2 + noise * np.std(u) * draws.normal(size=N)
-        assert share_told(series(misfit), Channel("u", TIMES, u, hold=hold)) < 0.3
+        assert compute_explained_share(series(misfit), Channel("u", TIMES, u, hold=hold)) < 0.3
 
 
 def test_too_short_constant_and_irregular_records_are_not_judged() -> None:
     u, y = loop(0, np.zeros(N))
     judged = series(y - delayed(u))
-    assert share_told(judged, held(np.ones(N))) == 0.0
-    assert share_told(judged._replace(residual=np.zeros(N)), held(u)) == 0.0
+    assert compute_explained_share(judged, held(np.ones(N))) == 0.0
+    assert compute_explained_share(judged._replace(residual=np.zeros(N)), held(u)) == 0.0
     short = judged.scored & (TIMES < 5.0)
-    assert share_told(judged._replace(scored=short), held(u)) == 0.0
+    assert compute_explained_share(judged._replace(scored=short), held(u)) == 0.0
     uneven = TIMES + 0.04 * np.random.default_rng(0).random(N)
-    assert share_told(judged._replace(times=uneven), held(u)) == 0.0
+    assert compute_explained_share(judged._replace(times=uneven), held(u)) == 0.0
 
 
 def test_a_regulated_record_without_reference_is_warned_of() -> None:
@@ -120,7 +120,7 @@ def test_a_regulated_record_without_reference_is_warned_of() -> None:
     assert note.startswith("input 'u' follows the residuals of y: they tell")
     assert "use loss: {noise_model: ar1}" in note
     assert "noise_model" not in told(loss=Loss(noise_model="ar1"))
-    assert feedback_notes([]) == []
+    assert describe_feedback([]) == []
 
 
 def test_what_a_model_misses_of_an_input_read_as_straight_is_told_as_another_cause() -> None:
@@ -129,7 +129,7 @@ def test_what_a_model_misses_of_an_input_read_as_straight_is_told_as_another_cau
     for k in range(1, N):  # an open loop: straight from sample to sample, and no dead time
         y[k] = keep * y[k - 1] + (1 - keep) * 0.5 * (u[k] + u[k - 1])
     straight, stepped = (
-        feedback_notes([series(y)._replace(inputs=(Channel("u", TIMES, u, hold=hold),))])
+        describe_feedback([series(y)._replace(inputs=(Channel("u", TIMES, u, hold=hold),))])
         for hold in ("first", "zero")
     )
     assert "misses some of how the output answers within a sample" in straight[0]

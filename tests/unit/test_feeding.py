@@ -6,30 +6,30 @@ from typing import Any
 import pytest
 
 from sysid.core.errors import InvalidSettings
-from sysid.identification.run import begin
+from sysid.identification.run import begin_run
 from tests.runs import RECORDS, ListedRuns, Notebook, bits, carry_out, spec
 from workers.errors import PackCancelled, PackFailed, PackLost, RecordsUnavailable, WorkerDied
-from workers.feeding import Feeder
-from workers.inline import InlineCrew
-from workers.jobwork import JobWork
+from workers.inline_executor import InlineExecutor
+from workers.job_queue import JobQueue
 from workers.packing import PACKS_PER_CPU
-from workers.ports import (  # fmt: skip
-    Advance,
-    Advanced,
-    Done,
-    Evolve,
-    Evolved,
-    Failure,
-    Item,
+from workers.protocol import (  # fmt: skip
+    AdvanceRun,
+    EvolveIsland,
+    InvalidRun,
+    IslandProgress,
+    ItemResult,
     QueuedRun,
     Records,
-    RefusedRun,
+    RunFailure,
+    RunProgress,
+    WorkItem,
 )
-from workers.tasks import build
+from workers.scheduler import Scheduler
+from workers.tasks import build_pack_problems
 
 pytestmark = pytest.mark.usefixtures("time_to_read")
 
-Answer = Callable[[Item], Done | PackLost]
+Answer = Callable[[WorkItem], ItemResult | PackLost]
 
 
 class ScriptedCrew:
@@ -37,7 +37,7 @@ class ScriptedCrew:
 
     def __init__(self, answer: Answer, slots: int = 2) -> None:
         self.slots, self.answer = slots, answer
-        self.packs: dict[int, tuple[Item, ...]] = {}
+        self.packs: dict[int, tuple[WorkItem, ...]] = {}
         self.sent: list[tuple[str, ...]] = []
         self.cancelled: list[tuple[int, bool]] = []
         self.is_slow = False
@@ -45,7 +45,7 @@ class ScriptedCrew:
     def share(self, records: Records) -> Any:
         return records
 
-    def submit(self, pack: Sequence[Item], keys: Sequence[str], shared: Sequence[Any]) -> int:
+    def submit(self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]) -> int:
         self.packs[len(self.sent)] = tuple(pack)
         self.sent.append(tuple(item.run for item in pack))
         return len(self.sent) - 1
@@ -53,12 +53,12 @@ class ScriptedCrew:
     def finished(self, timeout: float) -> tuple[int, ...]:
         return () if self.is_slow else tuple(reversed(self.packs))
 
-    def fetch(self, handle: int) -> tuple[Done, ...]:
+    def fetch(self, handle: int) -> tuple[ItemResult, ...]:
         answers = [self.answer(item) for item in self.packs.pop(handle)]
         for one in answers:
             if isinstance(one, PackLost):
                 raise one
-        return tuple(one for one in answers if isinstance(one, Done))
+        return tuple(one for one in answers if isinstance(one, ItemResult))
 
     def cancel(self, handle: int, *, force: bool) -> None:
         self.cancelled.append((handle, force))
@@ -70,31 +70,31 @@ class ScriptedCrew:
         pass
 
 
-def fails(item: Item) -> Done:
+def fails(item: WorkItem) -> ItemResult:
     """The quickest way to end a run."""
-    return Done(item.run, Failure("as told"), 0.01)
+    return ItemResult(item.run, RunFailure("as told"), 0.01)
 
 
-def jobs(feeder: Feeder, **sizes: int) -> dict[str, Notebook]:
+def jobs(feeder: Scheduler, **sizes: int) -> dict[str, Notebook]:
     notebooks = {}
     for job, size in sizes.items():
         notebooks[job] = Notebook()
         queued = (QueuedRun(f"{job}{number}", spec()) for number in range(size))
-        feeder.add(job, ListedRuns(queued), notebooks[job])
+        feeder.add_job(job, ListedRuns(queued), notebooks[job])
     return notebooks
 
 
-def finish(feeder: Feeder) -> list[str]:
+def finish(feeder: Scheduler) -> list[str]:
     ended: list[str] = []
     for _ in range(1000):
-        ended += feeder.step(0.0)
+        ended += feeder.run_step(0.0)
         if not feeder._jobs:
             return ended
     raise AssertionError("the jobs did not end")
 
 
 def test_every_run_ends_exactly_once_whatever_the_order_of_the_packs() -> None:
-    feeder = Feeder(ScriptedCrew(fails))
+    feeder = Scheduler(ScriptedCrew(fails))
     notebooks = jobs(feeder, a=150, b=1)
     assert sorted(finish(feeder)) == ["a", "b"]
     assert {run: len(told) for run, told in notebooks["a"].failures.items()} == {
@@ -106,9 +106,9 @@ def test_every_run_ends_exactly_once_whatever_the_order_of_the_packs() -> None:
 def test_the_packs_in_flight_are_shared_between_jobs() -> None:
     crew = ScriptedCrew(fails)
     crew.is_slow = True
-    feeder = Feeder(crew)
+    feeder = Scheduler(crew)
     jobs(feeder, a=100, b=100)
-    feeder.step(0.0)
+    feeder.run_step(0.0)
     assert len(crew.packs) == PACKS_PER_CPU * crew.slots
     names = [pack[0][0] for pack in crew.sent]
     assert names.count("a") == names.count("b")
@@ -116,7 +116,7 @@ def test_the_packs_in_flight_are_shared_between_jobs() -> None:
 
 def test_runs_of_known_cost_share_a_pack() -> None:
     crew = ScriptedCrew(fails)
-    feeder = Feeder(crew)
+    feeder = Scheduler(crew)
     jobs(feeder, a=100)
     finish(feeder)
     assert len(crew.sent) < 40
@@ -126,33 +126,33 @@ def test_runs_of_known_cost_share_a_pack() -> None:
 def test_a_run_whose_worker_dies_once_is_sent_again() -> None:
     died: list[str] = []
 
-    def answer(item: Item) -> Done | PackLost:
+    def answer(item: WorkItem) -> ItemResult | PackLost:
         if item.run == "a1" and not died:
             died.append(item.run)
             return WorkerDied("killed")
         return fails(item)
 
-    feeder = Feeder(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedCrew(answer))
     notebook = jobs(feeder, a=4)["a"]
     finish(feeder)
     assert [failure.reason for failure in notebook.failures["a1"]] == ["as told"]
 
 
 def test_a_run_that_kills_every_worker_fails_alone_and_says_so() -> None:
-    def answer(item: Item) -> Done | PackLost:
+    def answer(item: WorkItem) -> ItemResult | PackLost:
         return WorkerDied("out of memory") if item.run == "a1" else fails(item)
 
-    feeder = Feeder(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedCrew(answer))
     notebook = jobs(feeder, a=4)["a"]
     finish(feeder)
     (failure,) = notebook.failures.pop("a1")
     assert failure.reason == "its worker process died 2 times; the last time: out of memory"
-    assert all(told == [Failure("as told")] for told in notebook.failures.values())
+    assert all(told == [RunFailure("as told")] for told in notebook.failures.values())
 
 
 def test_a_run_packed_with_one_that_kills_its_worker_goes_alone_and_is_not_blamed() -> None:
     crew = ScriptedCrew(lambda item: WorkerDied("x") if item.run == "a40" else fails(item))
-    feeder = Feeder(crew)
+    feeder = Scheduler(crew)
     notebook = jobs(feeder, a=100)["a"]
     finish(feeder)
     shared = [set(pack) for pack in crew.sent if len(pack) > 1]
@@ -165,35 +165,35 @@ def test_a_run_packed_with_one_that_kills_its_worker_goes_alone_and_is_not_blame
 
 def test_a_death_counted_by_a_dispatcher_before_is_counted_on() -> None:
     crew = ScriptedCrew(lambda item: WorkerDied("killed"))
-    feeder, notebook = Feeder(crew), Notebook()
-    feeder.add("a", ListedRuns([QueuedRun("a0", spec(), kills=1)]), notebook)
+    feeder, notebook = Scheduler(crew), Notebook()
+    feeder.add_job("a", ListedRuns([QueuedRun("a0", spec(), kills=1)]), notebook)
     finish(feeder)
     assert len(crew.sent) == 1
     assert notebook.kills == {"a0": [2]}
 
 
 def test_a_run_that_went_on_between_two_deaths_is_not_given_up() -> None:
-    state = begin(build(spec().problem, RECORDS)[0], spec().algorithm, 1)
-    turns = iter([WorkerDied("x"), Advanced(state), WorkerDied("x"), Advanced(state)])
+    state = begin_run(build_pack_problems(spec().problem, RECORDS)[0], spec().algorithm, 1)
+    turns = iter([WorkerDied("x"), RunProgress(state), WorkerDied("x"), RunProgress(state)])
 
-    def answer(item: Item) -> Done | PackLost:
+    def answer(item: WorkItem) -> ItemResult | PackLost:
         one = next(turns, None)
         if one is None:
             return fails(item)
-        return one if isinstance(one, PackLost) else Done(item.run, one, 0.1)
+        return one if isinstance(one, PackLost) else ItemResult(item.run, one, 0.1)
 
-    feeder = Feeder(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedCrew(answer))
     notebook = jobs(feeder, a=1)["a"]
     finish(feeder)
     assert notebook.kills == {"a0": [1, 0, 1, 0]}
-    assert notebook.failures["a0"] == [Failure("as told")]
+    assert notebook.failures["a0"] == [RunFailure("as told")]
 
 
 def test_a_programming_error_fails_the_runs_of_its_pack_with_its_last_line() -> None:
-    def answer(item: Item) -> Done | PackLost:
+    def answer(item: WorkItem) -> ItemResult | PackLost:
         return PackFailed("Traceback\n  …\nKeyError: 'x'") if item.run == "a0" else fails(item)
 
-    feeder = Feeder(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedCrew(answer))
     notebook = jobs(feeder, a=2)["a"]
     finish(feeder)
     assert notebook.failures["a0"][0].reason == "internal error: KeyError: 'x'"
@@ -203,13 +203,13 @@ def test_a_programming_error_fails_the_runs_of_its_pack_with_its_last_line() -> 
 def test_work_whose_turn_did_not_come_is_sent_again() -> None:
     late: list[str] = []
 
-    def answer(item: Item) -> Done:
+    def answer(item: WorkItem) -> ItemResult:
         if item.run in late:
             return fails(item)
         late.append(item.run)
-        return Done(item.run, None, 0.0)
+        return ItemResult(item.run, None, 0.0)
 
-    feeder = Feeder(ScriptedCrew(answer))
+    feeder = Scheduler(ScriptedCrew(answer))
     notebook = jobs(feeder, a=3)["a"]
     finish(feeder)
     assert sorted(notebook.failures) == ["a0", "a1", "a2"]
@@ -218,12 +218,12 @@ def test_work_whose_turn_did_not_come_is_sent_again() -> None:
 def test_a_stopped_job_begins_nothing_more_and_is_told_nothing_more() -> None:
     crew = ScriptedCrew(fails)
     crew.is_slow = True
-    feeder = Feeder(crew, grace_seconds=60.0)
+    feeder = Scheduler(crew, grace_seconds=60.0)
     notebook = jobs(feeder, a=100)["a"]
-    feeder.step(0.0)
+    feeder.run_step(0.0)
     sent = len(crew.sent)
     notebook.is_stopped = True
-    feeder.step(0.0)
+    feeder.run_step(0.0)
     assert sorted(crew.cancelled) == [(handle, False) for handle in range(sent)]
     crew.is_slow, crew.answer = False, lambda item: PackCancelled("cancelled")
     assert finish(feeder) == ["a"]
@@ -234,12 +234,12 @@ def test_a_stopped_job_begins_nothing_more_and_is_told_nothing_more() -> None:
 def test_a_pack_that_outlives_the_grace_period_is_killed() -> None:
     crew = ScriptedCrew(fails)
     crew.is_slow = True
-    feeder = Feeder(crew, grace_seconds=0.0)
+    feeder = Scheduler(crew, grace_seconds=0.0)
     notebook = jobs(feeder, a=1)["a"]
-    feeder.step(0.0)
+    feeder.run_step(0.0)
     notebook.is_stopped = True
     for _ in range(3):
-        feeder.step(0.0)
+        feeder.run_step(0.0)
     assert crew.cancelled == [(0, False), (0, True)]
 
 
@@ -248,16 +248,16 @@ def test_a_run_without_records_fails_with_the_reason() -> None:
         def records(self, key: str) -> Records:
             raise RecordsUnavailable("there is no dataset ds_1")
 
-    feeder, notebook = Feeder(ScriptedCrew(fails)), Notebook()
-    feeder.add("a", Empty([QueuedRun("a0", spec())]), notebook)
+    feeder, notebook = Scheduler(ScriptedCrew(fails)), Notebook()
+    feeder.add_job("a", Empty([QueuedRun("a0", spec())]), notebook)
     assert finish(feeder) == ["a"]
     assert notebook.failures["a0"][0].reason == "there is no dataset ds_1"
 
 
 def test_a_refused_run_fails_with_its_reason_and_the_others_go_on() -> None:
-    feeder, notebook = Feeder(ScriptedCrew(fails)), Notebook()
-    refused = RefusedRun("a0", Failure(str(InvalidSettings("/seed", "negative"))))
-    feeder.add("a", ListedRuns([refused, QueuedRun("a1", spec())]), notebook)
+    feeder, notebook = Scheduler(ScriptedCrew(fails)), Notebook()
+    refused = InvalidRun("a0", RunFailure(str(InvalidSettings("/seed", "negative"))))
+    feeder.add_job("a", ListedRuns([refused, QueuedRun("a1", spec())]), notebook)
     finish(feeder)
     assert notebook.failures["a0"][0].reason == "/seed: negative"
     assert notebook.failures["a1"][0].reason == "as told"
@@ -265,52 +265,52 @@ def test_a_refused_run_fails_with_its_reason_and_the_others_go_on() -> None:
 
 @pytest.mark.parametrize("n_runs", [0, 1])
 def test_a_job_ends_when_nothing_of_it_is_left(n_runs: int) -> None:
-    feeder = Feeder(ScriptedCrew(fails))
+    feeder = Scheduler(ScriptedCrew(fails))
     jobs(feeder, a=n_runs)
     assert finish(feeder) == ["a"]
 
 
 def test_a_pack_of_no_job_is_let_go(caplog: pytest.LogCaptureFixture) -> None:
     crew = ScriptedCrew(fails)
-    feeder = Feeder(crew)
+    feeder = Scheduler(crew)
     notebook = jobs(feeder, a=1)["a"]
-    crew.submit([Advance("stray", spec(), None, 1.0)], (), ())
+    crew.submit([AdvanceRun("stray", spec(), None, 1.0)], (), ())
     assert finish(feeder) == ["a"]
     assert (crew.packs, list(notebook.failures)) == ({}, ["a0"])
     assert "a pack of no job came back" in caplog.messages
 
 
 def test_a_run_is_told_to_begin_once_also_when_it_goes_on_from_a_checkpoint() -> None:
-    problem, _ = build(spec().problem, RECORDS)
-    kept = begin(problem, spec().algorithm, 1)
-    answers = iter([Advanced(kept), Advanced(kept), Failure("as told")])
-    feeder = Feeder(ScriptedCrew(lambda item: Done(item.run, next(answers), 0.01)))
+    problem, _ = build_pack_problems(spec().problem, RECORDS)
+    kept = begin_run(problem, spec().algorithm, 1)
+    answers = iter([RunProgress(kept), RunProgress(kept), RunFailure("as told")])
+    feeder = Scheduler(ScriptedCrew(lambda item: ItemResult(item.run, next(answers), 0.01)))
     notebook = Notebook()
-    feeder.add("a", ListedRuns([QueuedRun("a0", spec(), kept)]), notebook)
+    feeder.add_job("a", ListedRuns([QueuedRun("a0", spec(), kept)]), notebook)
     finish(feeder)
     assert notebook.begun == ["a0"]
 
 
 def test_islands_whose_turn_did_not_come_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
     one = spec(3, "long", generations=60, islands=8, population=64)
-    plain = carry_out(InlineCrew(), {"r": one})
+    plain = carry_out(InlineExecutor(), {"r": one})
     monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
     monkeypatch.setattr("workers.packing.FIRST_SLICE_SECONDS", 0.001)
     monkeypatch.setattr("workers.tasks.PACK_LIMIT_SECONDS", 0.0)  # one island of a pack at a time
-    spread = carry_out(InlineCrew(slots=2), {"r": one})
+    spread = carry_out(InlineExecutor(slots=2), {"r": one})
     assert bits(spread.results["r"][0]) == bits(plain.results["r"][0])
 
 
-def spread(monkeypatch: pytest.MonkeyPatch) -> tuple[JobWork, ScriptedCrew, Notebook]:
+def spread(monkeypatch: pytest.MonkeyPatch) -> tuple[JobQueue, ScriptedCrew, Notebook]:
     """A run of four islands, of which the first two are one pack and the others another."""
     monkeypatch.setattr("workers.packing.WORTH_SPREADING_SECONDS", 0.0)
     one = spec(islands=4)
-    kept = begin(build(one.problem, RECORDS)[0], one.algorithm, 1)
+    kept = begin_run(build_pack_problems(one.problem, RECORDS)[0], one.algorithm, 1)
     crew, notebook = ScriptedCrew(fails), Notebook()
-    work = JobWork(ListedRuns([QueuedRun("a0", one, kept)]), notebook, crew)
+    work = JobQueue(ListedRuns([QueuedRun("a0", one, kept)]), notebook, crew)
     assert work.read_ahead(1, 0.0)
-    work.feed(2)
-    assert sorted(map(len, work.flying.values())) == [2, 2]
+    work.send_next_pack(2)
+    assert sorted(map(len, work.in_flight.values())) == [2, 2]
     return work, crew, notebook
 
 
@@ -318,42 +318,47 @@ def test_islands_of_a_run_that_goes_on_without_their_pack_are_not_sent_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     work, crew, _ = spread(monkeypatch)
-    first, second = work.flying
-    work.lose(second, "killed")
-    assert work.is_hungry
+    first, second = work.in_flight
+    work.requeue_lost_pack(second, "killed")
+    assert work.has_waiting_runs
     island = crew.packs[first][0]
-    assert isinstance(island, Evolve)
-    done = Done("a0", Evolved(island.island, island.target), 0.1), Done("a0", None, 0.0)
-    work.absorb(first, done)
-    assert (work.flying, work.is_hungry) == ({}, True)
+    assert isinstance(island, EvolveIsland)
+    done = (
+        ItemResult("a0", IslandProgress(island.island, island.target), 0.1),
+        ItemResult("a0", None, 0.0),
+    )
+    work.absorb_pack(first, done)
+    assert (work.in_flight, work.has_waiting_runs) == ({}, True)
 
 
 def test_a_run_that_goes_on_is_not_sent_a_second_time_when_an_older_pack_is_lost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     work, _, notebook = spread(monkeypatch)
-    first, second = work.flying
-    work.lose(first, "killed")
-    work.feed(0)
-    work.lose(second, "killed")
-    assert (len(work.flying), work.is_hungry) == (1, False)
+    first, second = work.in_flight
+    work.requeue_lost_pack(first, "killed")
+    work.send_next_pack(0)
+    work.requeue_lost_pack(second, "killed")
+    assert (len(work.in_flight), work.has_waiting_runs) == (1, False)
     assert notebook.kills == {"a0": [1]}
-    [whole] = work.flying
-    work.absorb(whole, (Done("a0", Failure("as told"), 0.1),))
-    assert notebook.failures == {"a0": [Failure("as told")]}
+    [whole] = work.in_flight
+    work.absorb_pack(whole, (ItemResult("a0", RunFailure("as told"), 0.1),))
+    assert notebook.failures == {"a0": [RunFailure("as told")]}
 
 
 def test_what_an_older_pack_says_of_a_run_that_goes_on_is_not_heard(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     work, _, notebook = spread(monkeypatch)
-    first, second = work.flying
-    work.lose(first, "killed")
-    work.absorb(second, (Done("a0", Failure("too late"), 0.1), Done("a0", None, 0.0)))
-    assert (notebook.failures, work.is_hungry) == ({}, True)
-    work.feed(2)
-    third, fourth = work.flying
-    work.fail(third, "internal error")
-    work.fail(fourth, "internal error")
+    first, second = work.in_flight
+    work.requeue_lost_pack(first, "killed")
+    work.absorb_pack(
+        second, (ItemResult("a0", RunFailure("too late"), 0.1), ItemResult("a0", None, 0.0))
+    )
+    assert (notebook.failures, work.has_waiting_runs) == ({}, True)
+    work.send_next_pack(2)
+    third, fourth = work.in_flight
+    work.fail_pack(third, "internal error")
+    work.fail_pack(fourth, "internal error")
     assert [one.reason for one in notebook.failures["a0"]] == ["internal error"]
-    assert (work.flying, work.is_hungry) == ({}, False)
+    assert (work.in_flight, work.has_waiting_runs) == ({}, False)

@@ -8,46 +8,56 @@ import pytest
 from service.figures import plotly as figures
 from service.figures import signals as figures_signals
 from service.figures.data import (
-    Experiment,
-    Improvement,
+    ExperimentTraces,
+    FreeParameter,
+    IslandImprovement,
     OutputTraces,
-    RunEvidence,
-    SoughtParameter,
-    Trace,
+    RunFigureData,
+    SignalTrace,
 )
-from service.figures.theme import DASHES, MAX_POINTS, SERIES, series_style, strided, thinned, window
-from service.pages.figure_data import fitness_of
+from service.figures.theme import (
+    MAX_POINTS,
+    SERIES_COLOURS,
+    SERIES_DASHES,
+    series_style,
+    stride_indices,
+    thin_indices,
+    window_slice,
+)
+from service.pages.figure_data import fitness_label
 
 
-def island(points: int, start: float = 100.0) -> list[Improvement]:
+def island(points: int, start: float = 100.0) -> list[IslandImprovement]:
     return [
-        Improvement(n, 50 * n, start * 0.99**n, "sequence" if n % 5 == 4 else "genetic", (n / 10,))
+        IslandImprovement(
+            n, 50 * n, start * 0.99**n, "sequence" if n % 5 == 4 else "genetic", (n / 10,)
+        )
         for n in range(points)
     ]
 
 
-def run(**more: object) -> RunEvidence:
+def run(**more: object) -> RunFigureData:
     known = {
         "generations": 400,
-        "parameters": [SoughtParameter("L", "s", 0.0, 0.5, value=0.1127, stderr=0.0002)],
+        "parameters": [FreeParameter("L", "s", 0.0, 0.5, value=0.1127, stderr=0.0002)],
         "history": [island(30), island(20, 80.0)],
         "epoch": 25,
         "migrations": [1, 2, 3],
         "islands": [(2.0, 1.1), (1.5, 1.0), (9.0, None)],
         "correlation": {"names": ["T", "L"], "matrix": [[1.0, -0.7], [-0.7, 1.0]]},
     }
-    return RunEvidence(id="run_1", unit="kPa", **{**known, **more})  # type: ignore[arg-type]
+    return RunFigureData(id="run_1", unit="kPa", **{**known, **more})  # type: ignore[arg-type]
 
 
-def signal(samples: int, name: str = "y") -> Trace:
+def signal(samples: int, name: str = "y") -> SignalTrace:
     times = np.arange(samples) * 0.01
-    return Trace(name, "V", times, np.sin(times))
+    return SignalTrace(name, "V", times, np.sin(times))
 
 
-def experiment(samples: int, since: float | None = None) -> Experiment:
+def experiment(samples: int, since: float | None = None) -> ExperimentTraces:
     measured = signal(samples)
     outputs = (OutputTraces(measured, measured.values + 0.5),)
-    return Experiment("record 1", outputs, (signal(samples, "u"),), since)
+    return ExperimentTraces("record 1", outputs, (signal(samples, "u"),), since)
 
 
 def drawn(figure: figures.Figure, name: str) -> dict[str, object]:
@@ -55,15 +65,21 @@ def drawn(figure: figures.Figure, name: str) -> dict[str, object]:
 
 
 @pytest.mark.parametrize(
-    "figure", [figures.history, figures.convergence, figures.correlation, figures.waterfall]
+    "figure",
+    [
+        figures.plot_history,
+        figures.plot_convergence,
+        figures.plot_correlation,
+        figures.plot_waterfall,
+    ],
 )
-@pytest.mark.parametrize("evidence", [run(), RunEvidence("run_0", "V")], ids=["full", "empty"])
+@pytest.mark.parametrize("evidence", [run(), RunFigureData("run_0", "V")], ids=["full", "empty"])
 def test_every_figure_is_json_without_nan(figure, evidence) -> None:  # type: ignore[no-untyped-def]
     assert json.loads(json.dumps(figure(evidence), allow_nan=False))["layout"]["height"] > 0
 
 
 def test_a_history_has_a_line_per_island_on_a_log_axis_with_its_unit() -> None:
-    figure = figures.history(run())
+    figure = figures.plot_history(run())
     lines = [trace for trace in figure["data"] if trace["mode"] == "lines"]
     assert [line["name"] for line in lines] == ["island 1", "island 2"]
     assert figure["layout"]["yaxis"]["type"] == "log"
@@ -71,7 +87,7 @@ def test_a_history_has_a_line_per_island_on_a_log_axis_with_its_unit() -> None:
 
 
 def test_the_axis_of_a_number_without_dimension_names_no_unit() -> None:
-    for draw in (figures.history, figures.waterfall):
+    for draw in (figures.plot_history, figures.plot_waterfall):
         assert draw(replace(run(), unit="1"))["layout"]["yaxis"]["title"]["text"] == "RMS"
 
 
@@ -79,41 +95,41 @@ def test_the_axis_of_a_number_without_dimension_names_no_unit() -> None:
 def test_digits_of_a_log_axis_do_not_lie_upon_each_other(
     smallest: float, digits: str | None
 ) -> None:
-    axis = figures.waterfall(run(islands=((1.0, None), (1.0, smallest))))["layout"]["yaxis"]
+    axis = figures.plot_waterfall(run(islands=((1.0, None), (1.0, smallest))))["layout"]["yaxis"]
     assert axis.get("dtick") == digits
 
 
 def test_a_history_line_goes_on_to_the_last_generation_at_its_last_value() -> None:
-    line = drawn(figures.history(run()), "island 2")
+    line = drawn(figures.plot_history(run()), "island 2")
     assert line["x"][-1] == 400
     assert line["y"][-1] == line["y"][-2]
 
 
 def test_a_history_over_evaluations_has_the_evaluations_as_abscissa() -> None:
-    figure = figures.history(run(), "evaluations")
+    figure = figures.plot_history(run(), "evaluations")
     assert drawn(figure, "island 1")["x"][:3] == [0, 50, 100]
     assert figure["layout"]["shapes"] == []
 
 
 def test_the_phases_of_a_history_are_marked_where_they_improved() -> None:
-    marks = drawn(figures.history(run()), "sequence")
+    marks = drawn(figures.plot_history(run()), "sequence")
     assert marks["x"] == [4, 9, 14, 19, 24, 29, 4, 9, 14, 19]
 
 
 def test_migrations_stand_at_the_end_of_their_epochs() -> None:
-    shapes = figures.history(run())["layout"]["shapes"]
+    shapes = figures.plot_history(run())["layout"]["shapes"]
     assert [shape["x0"] for shape in shapes] == [25, 50, 75]
 
 
 @pytest.mark.parametrize("points", [999, 1000, 1001, 50_000])
 def test_no_line_of_a_history_or_convergence_has_over_a_thousand_points(points: int) -> None:
     evidence = run(history=[island(points)], generations=10 * points)
-    for figure in (figures.history(evidence), figures.convergence(evidence)):
+    for figure in (figures.plot_history(evidence), figures.plot_convergence(evidence)):
         assert all(len(trace["x"]) <= MAX_POINTS for trace in figure["data"])
 
 
 def test_a_parameter_is_drawn_between_its_bounds_and_its_caption_has_its_error() -> None:
-    figure = figures.convergence(run())
+    figure = figures.plot_convergence(run())
     low, high = figure["layout"]["yaxis"]["range"]
     assert low < 0.0 < 0.5 < high
     assert [shape["y0"] for shape in figure["layout"]["shapes"]] == [0.0, 0.5]
@@ -121,8 +137,8 @@ def test_a_parameter_is_drawn_between_its_bounds_and_its_caption_has_its_error()
 
 
 def test_a_parameter_over_decades_has_a_log_axis() -> None:
-    sought = SoughtParameter("T", "s", 0.01, 100.0, "log")
-    axis = figures.convergence(run(parameters=[sought]))["layout"]["yaxis"]
+    sought = FreeParameter("T", "s", 0.01, 100.0, "log")
+    axis = figures.plot_convergence(run(parameters=[sought]))["layout"]["yaxis"]
     assert axis["type"] == "log"
     assert axis["range"][0] < -2 < 2 < axis["range"][1]
 
@@ -130,9 +146,9 @@ def test_a_parameter_over_decades_has_a_log_axis() -> None:
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 12])
 @pytest.mark.parametrize("columns", [1, 2, 3])
 def test_small_plots_lie_inside_the_figure_and_beside_each_other(count: int, columns: int) -> None:
-    sought = [SoughtParameter(f"p{n}", "1", 0.0, 1.0) for n in range(count)]
-    history = [[Improvement(0, 0, 1.0, "start", (0.5,) * count)]]
-    layout = figures.convergence(run(parameters=sought, history=history), columns)["layout"]
+    sought = [FreeParameter(f"p{n}", "1", 0.0, 1.0) for n in range(count)]
+    history = [[IslandImprovement(0, 0, 1.0, "start", (0.5,) * count)]]
+    layout = figures.plot_convergence(run(parameters=sought, history=history), columns)["layout"]
     boxes = []
     for n in range(count):
         axis = "" if n == 0 else str(n + 1)
@@ -146,53 +162,53 @@ def test_small_plots_lie_inside_the_figure_and_beside_each_other(count: int, col
 
 
 def test_the_waterfall_puts_the_best_island_first() -> None:
-    after = drawn(figures.waterfall(run()), "after refinement")
+    after = drawn(figures.plot_waterfall(run()), "after refinement")
     assert after["text"] == ["island 2", "island 1", "island 3"]
     assert after["y"] == [1.0, 1.1, None]
 
 
 def test_a_response_shows_measured_minus_identified_as_residual() -> None:
-    figure = figures_signals.response(experiment(50))
+    figure = figures_signals.plot_response(experiment(50))
     assert drawn(figure, "residual")["y"] == [-0.5] * 50
 
 
 def test_every_row_of_a_response_has_the_same_time_axis() -> None:
-    figure = figures_signals.response(experiment(50))
+    figure = figures_signals.plot_response(experiment(50))
     assert all("xaxis" not in trace for trace in figure["data"])
     assert {trace["yaxis"] for trace in figure["data"]} == {"y", "y2", "y3"}
 
 
 def test_validation_is_shaded_from_its_first_sample_to_the_last() -> None:
-    shape = figures_signals.response(experiment(100, since=0.7))["layout"]["shapes"][0]
+    shape = figures_signals.plot_response(experiment(100, since=0.7))["layout"]["shapes"][0]
     assert (shape["x0"], shape["x1"]) == (0.7, 0.99)
 
 
 def test_a_record_kept_for_validation_is_shaded_from_its_start() -> None:
-    shape = figures_signals.response(experiment(100, since=-math.inf))["layout"]["shapes"][0]
+    shape = figures_signals.plot_response(experiment(100, since=-math.inf))["layout"]["shapes"][0]
     assert shape["x0"] == 0.0
 
 
-def before_record(name: str, known: Trace) -> Experiment:
+def before_record(name: str, known: SignalTrace) -> ExperimentTraces:
     return replace(experiment(100), inputs=(replace(signal(100, name), history=known),))
 
 
 def test_what_an_input_was_before_the_record_is_dotted_as_far_as_a_tenth_of_it() -> None:
     times = np.arange(-50, 0) * 0.01
-    record = before_record("u", Trace("u", "V", times, np.cos(times)))
-    trace = drawn(figures_signals.response(record), "u, before the record")
+    record = before_record("u", SignalTrace("u", "V", times, np.cos(times)))
+    trace = drawn(figures_signals.plot_response(record), "u, before the record")
     assert trace["x"] == pytest.approx(times[-9:])
-    assert trace["yaxis"] == drawn(figures_signals.response(record), "u")["yaxis"]
+    assert trace["yaxis"] == drawn(figures_signals.plot_response(record), "u")["yaxis"]
     assert trace["line"]["dash"] == "dot"  # type: ignore[index]
-    whole = drawn(figures_signals.signals(record.inputs), "u, before the record")
+    whole = drawn(figures_signals.plot_signals(record.inputs), "u, before the record")
     assert whole["x"] == pytest.approx(times)
-    names = [one["name"] for one in figures_signals.response(experiment(100))["data"]]
+    names = [one["name"] for one in figures_signals.plot_response(experiment(100))["data"]]
     assert not any("before the record" in name for name in names)
 
 
 def test_a_long_response_is_thinned_and_a_stretch_of_it_is_not() -> None:
     record = experiment(20_000)
-    whole = figures_signals.response(record)
-    part = figures_signals.response(record, 50.0, 53.0)
+    whole = figures_signals.plot_response(record)
+    part = figures_signals.plot_response(record, 50.0, 53.0)
     assert all(len(trace["x"]) <= MAX_POINTS for trace in whole["data"])
     assert whole["layout"]["meta"]["thinned"]
     inside = [x for x in drawn(part, "measured")["x"] if 50.0 <= x <= 53.0]
@@ -201,45 +217,47 @@ def test_a_long_response_is_thinned_and_a_stretch_of_it_is_not() -> None:
 
 def test_pooled_samples_are_drawn_as_points() -> None:
     times = np.repeat(np.arange(500) * 0.01, 4)
-    output = OutputTraces(Trace("y", "1", times, times), times)
-    figure = figures_signals.response(Experiment("record 1", (output,), ()))
+    output = OutputTraces(SignalTrace("y", "1", times, times), times)
+    figure = figures_signals.plot_response(ExperimentTraces("record 1", (output,), ()))
     assert drawn(figure, "measured")["mode"] == "markers"
 
 
 def test_the_heights_that_a_page_reserves_are_those_of_the_figures() -> None:
-    assert figures_signals.response(experiment(9))["layout"][
+    assert figures_signals.plot_response(experiment(9))["layout"][
         "height"
     ] == figures_signals.response_height(1, 1)
-    assert figures_signals.signals([signal(9), signal(9)])["layout"][
+    assert figures_signals.plot_signals([signal(9), signal(9)])["layout"][
         "height"
     ] == figures_signals.signals_height(2)
-    assert figures.convergence(run(), 3)["layout"]["height"] == figures.convergence_height(1, 3)
-    assert figures.correlation(run())["layout"]["height"] == figures.correlation_height(2)
+    assert figures.plot_convergence(run(), 3)["layout"]["height"] == figures.convergence_height(
+        1, 3
+    )
+    assert figures.plot_correlation(run())["layout"]["height"] == figures.correlation_height(2)
 
 
 def test_the_numbers_of_a_figure_are_one_row_each_in_csv() -> None:
-    lines = figures.as_csv(figures_signals.signals([signal(3, "a,b")])).splitlines()
+    lines = figures.to_csv(figures_signals.plot_signals([signal(3, "a,b")])).splitlines()
     assert lines[0] == "series,x,y"
     assert lines[1:3] == ['"a,b",0.0,0.0', '"a,b",0.01,0.009999833']
-    assert figures.as_csv(figures.correlation(run())).splitlines()[2] == ",L,T,-0.7"
+    assert figures.to_csv(figures.plot_correlation(run())).splitlines()[2] == ",L,T,-0.7"
 
 
 def test_a_figure_in_the_dark_has_the_same_data() -> None:
-    light = figures.history(run())
-    dark = figures.in_theme(light, "dark")
+    light = figures.plot_history(run())
+    dark = figures.apply_theme(light, "dark")
     assert dark["data"] == light["data"]
     assert dark["layout"]["template"] != light["layout"]["template"]
 
 
 def test_no_two_of_the_first_islands_look_alike() -> None:
     styles = [(style["color"], style["dash"]) for style in map(series_style, range(24))]
-    assert len(set(styles)) == len(SERIES) * len(DASHES)
+    assert len(set(styles)) == len(SERIES_COLOURS) * len(SERIES_DASHES)
 
 
 def test_thinning_keeps_the_ends_and_a_spike_of_one_sample() -> None:
     values = np.zeros(100_000)
     values[77_777] = 5.0
-    kept = thinned(values)
+    kept = thin_indices(values)
     assert {0, 77_777, 99_999} <= set(kept.tolist())
     assert kept.size <= MAX_POINTS
     assert np.all(np.diff(kept) > 0)
@@ -248,25 +266,25 @@ def test_thinning_keeps_the_ends_and_a_spike_of_one_sample() -> None:
 def test_thinning_passes_over_missing_values() -> None:
     values = np.full(5000, np.nan)
     values[2500] = 1.0
-    assert 2500 in thinned(values)
+    assert 2500 in thin_indices(values)
 
 
 def test_strides_keep_first_and_last() -> None:
-    assert strided(3).tolist() == [0, 1, 2]
-    assert strided(7777)[[0, -1]].tolist() == [0, 7776]
-    assert strided(7777).size <= MAX_POINTS
+    assert stride_indices(3).tolist() == [0, 1, 2]
+    assert stride_indices(7777)[[0, -1]].tolist() == [0, 7776]
+    assert stride_indices(7777).size <= MAX_POINTS
 
 
 def test_a_window_has_one_sample_more_at_each_side() -> None:
     times = np.arange(10.0)
-    assert window(times, 3.0, 5.0) == slice(2, 7)
-    assert window(times, None, None) == slice(0, 10)
-    assert window(times, -5.0, 50.0) == slice(0, 10)
+    assert window_slice(times, 3.0, 5.0) == slice(2, 7)
+    assert window_slice(times, None, None) == slice(0, 10)
+    assert window_slice(times, -5.0, 50.0) == slice(0, 10)
 
 
-@pytest.mark.parametrize("draw", [figures.history, figures.waterfall])
+@pytest.mark.parametrize("draw", [figures.plot_history, figures.plot_waterfall])
 def test_a_robust_loss_is_not_called_the_rms(draw):
-    robust = fitness_of({"loss": {"kind": "soft-l1", "scale": 0.1}})
+    robust = fitness_label({"loss": {"kind": "soft-l1", "scale": 0.1}})
     shown = draw(run(fitness=robust))["layout"]["yaxis"]["title"]["text"]
     assert shown == "soft-l1 loss, as RMS [kPa]"
-    assert draw(run(fitness=fitness_of({})))["layout"]["yaxis"]["title"]["text"] == "RMS [kPa]"
+    assert draw(run(fitness=fitness_label({})))["layout"]["yaxis"]["title"]["text"] == "RMS [kPa]"

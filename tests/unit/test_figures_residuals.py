@@ -10,8 +10,8 @@ import pytest
 from service.core.text import format_p_value
 from service.figures import plotly as figures
 from service.figures.data import CorrelationTrace
-from service.figures.residuals import residuals, residuals_height
-from service.pages.diagnostics import findings_of
+from service.figures.residuals import plot_residuals, residuals_height
+from service.pages.diagnostics import to_diagnostics
 
 
 def trace(
@@ -31,7 +31,7 @@ def bars(figure: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def test_every_function_is_drawn_over_its_bands_and_lag_0_of_an_autocorrelation_is_not() -> None:
-    figure = residuals([trace(), trace(is_auto=False)])
+    figure = plot_residuals([trace(), trace(is_auto=False)])
     first, second = bars(figure)
     assert first["x"] == list(range(1, 26))
     assert second["x"] == list(range(-25, 26))
@@ -41,7 +41,7 @@ def test_every_function_is_drawn_over_its_bands_and_lag_0_of_an_autocorrelation_
 
 
 def test_a_lag_outside_the_band_has_another_colour_and_stays_in_sight() -> None:
-    figure = residuals([trace(spike=0.4)])
+    figure = plot_residuals([trace(spike=0.4)])
     colours = bars(figure)[0]["marker"]["color"]
     assert len(set(colours)) == 2
     assert colours.count(colours[-3]) == 1
@@ -51,7 +51,7 @@ def test_a_lag_outside_the_band_has_another_colour_and_stays_in_sight() -> None:
 @pytest.mark.parametrize("count", [1, 2, 3, 7])
 @pytest.mark.parametrize("columns", [1, 2])
 def test_the_plots_lie_inside_the_figure_and_apart(count: int, columns: int) -> None:
-    figure = residuals([trace()] * count, columns)
+    figure = plot_residuals([trace()] * count, columns)
     shown = figure["layout"]
     assert shown["height"] == residuals_height(count, columns)
     axes = [str(k) if k > 1 else "" for k in range(1, count + 1)]
@@ -63,26 +63,28 @@ def test_the_plots_lie_inside_the_figure_and_apart(count: int, columns: int) -> 
 
 
 def test_without_functions_there_is_nothing_to_draw() -> None:
-    assert residuals([])["data"] == []
+    assert plot_residuals([])["data"] == []
 
 
 def test_the_axis_says_what_a_lag_is() -> None:
-    title = residuals([trace()])["layout"]["xaxis"]["title"]["text"]
+    title = plot_residuals([trace()])["layout"]["xaxis"]["title"]["text"]
     assert title == "lag [samples of 0.1 s]"
-    assert residuals([trace(period=None)])["layout"]["xaxis"]["title"]["text"] == "lag [samples]"
+    assert (
+        plot_residuals([trace(period=None)])["layout"]["xaxis"]["title"]["text"] == "lag [samples]"
+    )
 
 
 def test_the_figure_is_json_and_its_numbers_are_csv() -> None:
-    figure = residuals([trace(), trace(is_auto=False)])
+    figure = plot_residuals([trace(), trace(is_auto=False)])
     json.dumps(figure, allow_nan=False)
-    rows = figures.as_csv(figure).splitlines()
+    rows = figures.to_csv(figure).splitlines()
     assert rows[0] == "series,x,y"
     assert sum(row.startswith("of y,") for row in rows) == 25 + 51
 
 
 def test_a_run_without_a_result_or_a_test_has_no_findings() -> None:
     for result in ({}, {"residual_tests": {}, "identifiability": {"groups": []}}):
-        found = findings_of(result)
+        found = to_diagnostics(result)
         assert (found.verdict, found.n_figures, found.criteria) == ("", 0, {})
         assert list(found.tests) == list(found.onsets) == list(found.groups) == []
 
@@ -90,7 +92,9 @@ def test_a_run_without_a_result_or_a_test_has_no_findings() -> None:
 def test_a_test_that_was_not_made_says_why() -> None:
     one = {"experiment": 0, "output": "y", "test": "independence", "input": "u",
            "outcome": "not tested", "reason": "the input is constant", "p": None}  # fmt: skip
-    found = findings_of({"residual_tests": {"data": "estimation", "passed": None, "tests": [one]}})
+    found = to_diagnostics(
+        {"residual_tests": {"data": "estimation", "passed": None, "tests": [one]}}
+    )
     assert found.verdict == "not tested"
     assert found.n_figures == 0
     assert found.tests[0].reason == "the input is constant"
@@ -101,7 +105,7 @@ def test_onset_delays_tell_steps_and_spread_or_the_reason() -> None:
     clear = {"experiment": 0, "input": "u", "output": "y", "delay": 0.129, "unit": "s",
              "spread": 0.005, "events": 9, "threshold": 0.02, "reason": ""}  # fmt: skip
     vague = {**clear, "delay": None, "spread": None, "events": 0, "reason": "it does not rest"}
-    known, unknown = findings_of({"onset_delays": [clear, vague]}).onsets
+    known, unknown = to_diagnostics({"onset_delays": [clear, vague]}).onsets
     assert re.fullmatch(r"0\.1290\s*s", known.text)
     assert known.reason.startswith("9 steps, spread 0.0050")
     assert unknown.text == ""

@@ -7,12 +7,12 @@ import pytest
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identifiability.combinations import Group
-from sysid.identifiability.scaling import scalings
+from sysid.identifiability.combinations import IdentifiableCombination
+from sysid.identifiability.scaling import find_scalings
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import Analysis, analyse
+from sysid.uncertainty.analysis import Analysis, analyse_estimate
 
 STEP = 0.05
 
@@ -40,13 +40,13 @@ def posed(written: dict[str, Any], truth: dict[str, float], sd: float = 0.01, n:
     blank = Record((u,), (Channel("y", times, np.zeros(n), "m"),))
     model = parse_model(written)
     problem = Problem.build(model, [blank], **options)
-    theta = np.array([truth[p.name] for p in problem.space])
-    y = problem.predictions(theta[None])[0] + sd * rng.standard_normal(n)
+    theta = np.array([truth[p.name] for p in problem.free_parameters])
+    y = problem.predict(theta[None])[0] + sd * rng.standard_normal(n)
     data = Record((u,), (Channel("y", times, y, "m"),))
     return Problem.build(model, [data], **options), theta
 
 
-def told(analysis: Analysis) -> dict[str, Group]:
+def told(analysis: Analysis) -> dict[str, IdentifiableCombination]:
     assert analysis.uncertainty is not None
     return {group.expression: group for group in analysis.uncertainty.groups}
 
@@ -61,7 +61,7 @@ TRUTH = {"J": 2.0, "A": 3.0, "k": 1.5, "B": 4.0, "c": 5.0}
 
 def test_products_of_powers_are_written_out_with_value_and_standard_error() -> None:
     problem, theta = posed(ARM, TRUTH)
-    analysis = analyse(problem, theta)
+    analysis = analyse_estimate(problem, theta)
     groups = told(analysis)
     assert set(groups) == {"A*k/J", "B/J", "c/J"}
     assert groups["A*k/J"].members == ("J", "A", "k")
@@ -72,10 +72,10 @@ def test_products_of_powers_are_written_out_with_value_and_standard_error() -> N
 
 def test_the_standard_error_of_a_group_is_that_of_the_parameter_in_its_place() -> None:
     problem, theta = posed(ARM, TRUTH)
-    groups = told(analyse(problem, theta))
+    groups = told(analyse_estimate(problem, theta))
     given = {"J": {"fixed": 2.0}, "k": {"fixed": 1.5}}
     known, part = posed(ARM, TRUTH, parameters=given)
-    alone = {e.name: e for e in analyse(known, part).estimates}
+    alone = {e.name: e for e in analyse_estimate(known, part).estimates}
     for name, expression, factor in (("A", "A*k/J", 1.5 / 2), ("B", "B/J", 0.5), ("c", "c/J", 0.5)):
         assert alone[name].status == "identified"
         assert alone[name].stderr is not None
@@ -87,7 +87,7 @@ def test_the_standard_error_of_a_group_is_that_of_the_parameter_in_its_place() -
 def test_a_sum_is_written_as_a_sum() -> None:
     written = document({"x": "(a + b)*u - 2*c*x"}, ("a", "b", "c"))
     problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1})
-    analysis = analyse(problem, theta)
+    analysis = analyse_estimate(problem, theta)
     assert statuses(analysis) == {"a": "group", "b": "group", "c": "identified"}
     assert [(g, v.value) for g, v in told(analysis).items()] == [("a + b", pytest.approx(3.0))]
 
@@ -95,20 +95,20 @@ def test_a_sum_is_written_as_a_sum() -> None:
 def test_a_combination_that_is_neither_is_told_with_numbers() -> None:
     written = document({"x": "(a + sin(b))*u - c*x"}, ("a", "b", "c"))
     problem, theta = posed(written, {"a": 0.7, "b": 0.3, "c": 1.1})
-    (text,) = told(analyse(problem, theta))
+    (text,) = told(analyse_estimate(problem, theta))
     assert text == "a + 0.9553*b"  # cos(0.3)
 
 
 def test_groups_that_have_no_parameter_in_common_are_told_apart() -> None:
     written = document({"x": "a*b*u - c*d*x"}, ("a", "b", "c", "d"))
     problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1, "d": 0.9})
-    assert set(told(analyse(problem, theta))) == {"a*b", "c*d"}
+    assert set(told(analyse_estimate(problem, theta))) == {"a*b", "c*d"}
 
 
 def test_powers_other_than_one_are_written() -> None:
     written = document({"x": "a*sqrt(b)*u - c*x"}, ("a", "b", "c"))
     problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1})
-    assert set(told(analyse(problem, theta))) == {"a**2*b"}
+    assert set(told(analyse_estimate(problem, theta))) == {"a**2*b"}
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_a_power_of_a_negative_estimate_is_written_only_where_it_is_a_number(
     written = document({"x": f"{form}*u - c*x"}, ("a", "b", "c"))
     written["parameters"]["a"] = {"lower": -2, "upper": 2}
     problem, theta = posed(written, {"a": a, "b": 2.3, "c": 1.1})
-    ((found, group),) = told(analyse(problem, theta)).items()
+    ((found, group),) = told(analyse_estimate(problem, theta)).items()
     assert found == text
     assert np.isfinite(group.value)
     assert group.stderr is not None
@@ -136,7 +136,7 @@ def test_a_power_of_a_negative_estimate_is_written_only_where_it_is_a_number(
 def test_a_parameter_without_effect_belongs_to_no_group() -> None:
     written = document({"x": "a*u - c*x + 0*d"}, ("a", "c", "d"))
     problem, theta = posed(written, {"a": 0.7, "c": 1.1, "d": 2.0})
-    analysis = analyse(problem, theta)
+    analysis = analyse_estimate(problem, theta)
     assert statuses(analysis)["d"] == "unidentifiable"
     assert told(analysis) == {}
 
@@ -144,7 +144,7 @@ def test_a_parameter_without_effect_belongs_to_no_group() -> None:
 def test_what_the_data_tell_little_of_is_a_group_with_a_standard_error() -> None:
     written = document({"x": "(a + b)*u + 0.0001*b - c*x"}, ("a", "b", "c"))
     problem, theta = posed(written, {"a": 0.7, "b": 2.3, "c": 1.1})
-    analysis = analyse(problem, theta)
+    analysis = analyse_estimate(problem, theta)
     assert statuses(analysis) == {"a": "group", "b": "group", "c": "identified"}
     (group,) = told(analysis).values()
     assert group.value == pytest.approx(3.0, rel=0.01)
@@ -176,15 +176,15 @@ def test_the_rank_follows_from_the_form_of_the_equation(
     written = document({"x": equation}, tuple(names))
     written["parameters"] = {name: {"lower": 0.1, "upper": 3} for name in names}
     model = parse_model(written)
-    assert len(names) - scalings(model, model.parameters).shape[0] == rank
+    assert len(names) - find_scalings(model, model.parameters).shape[0] == rank
 
 
 def test_a_scaling_leaves_the_output_as_it_is() -> None:
     problem, theta = posed(ARM, TRUTH)
-    for powers in scalings(problem.model, problem.all_parameters):
+    for powers in find_scalings(problem.model, problem.all_parameters):
         scaled = theta * 1.3**powers
         np.testing.assert_allclose(
-            problem.predictions(scaled[None]), problem.predictions(theta[None]), rtol=1e-10
+            problem.predict(scaled[None]), problem.predict(theta[None]), rtol=1e-10
         )
 
 
@@ -192,13 +192,13 @@ def test_a_state_that_starts_elsewhere_than_at_zero_has_its_scale() -> None:
     equations = {"y": "a*z - y", "z": "b*u - z"}
     free = parse_model(document(equations, ("a", "b")))
     bound = parse_model(document(equations, ("a", "b"), initial={"y": 0, "z": 1}))
-    assert scalings(free, free.parameters).tolist() == [[1.0, -1.0]]
-    assert scalings(bound, bound.parameters).size == 0
+    assert find_scalings(free, free.parameters).tolist() == [[1.0, -1.0]]
+    assert find_scalings(bound, bound.parameters).size == 0
 
 
 def test_a_fixed_parameter_is_no_part_of_a_scaling() -> None:
     problem, _ = posed(ARM, TRUTH, parameters={"J": {"fixed": 2.0}})
-    assert scalings(problem.model, problem.all_parameters).tolist() == [[1.0, -1.0, 0.0, 0.0]]
+    assert find_scalings(problem.model, problem.all_parameters).tolist() == [[1.0, -1.0, 0.0, 0.0]]
 
 
 ACTUATOR = {"J": 3.6e-4, "F_c": 1.2317e-2, "F_max": 3.3333e-2, "k_a": 83.089, "k_b": 83.089,
@@ -217,10 +217,10 @@ def test_of_the_eight_parameters_of_the_actuator_six_combinations_can_be_found()
     model = load_model("actuator")
     blank = Record((supply,), (Channel("theta", times, np.zeros(800), "rad"),))
     problem = Problem.build(model, [blank], parameters=FREE)
-    theta = np.array([ACTUATOR[p.name] for p in problem.space])
-    y = problem.predictions(theta[None])[0] + 1e-3 * rng.standard_normal(800)
+    theta = np.array([ACTUATOR[p.name] for p in problem.free_parameters])
+    y = problem.predict(theta[None])[0] + 1e-3 * rng.standard_normal(800)
     measured = replace_output(blank, np.concatenate([[0.0], y[1:]]))
-    analysis = analyse(Problem.build(model, [measured], parameters=FREE), theta)
+    analysis = analyse_estimate(Problem.build(model, [measured], parameters=FREE), theta)
     groups = told(analysis)
     assert set(groups) == {"B/J", "F_c/J", "F_max/J", "k_b*A_m/J", "k_c*A_m/J"}
     assert statuses(analysis)["k_a"] == "identified"
@@ -241,7 +241,7 @@ def test_a_factor_of_a_sum_is_small_or_not_by_what_it_makes_of_it() -> None:
     written = document({"x": "(sin(a) + b/2000)*u - c*x"}, ("a", "b", "c"))
     written["parameters"]["b"] = {"lower": 1, "upper": 5000}
     problem, theta = posed(written, {"a": 0.3, "b": 1000.0, "c": 1.1})
-    (group,) = told(analyse(problem, theta)).values()
+    (group,) = told(analyse_estimate(problem, theta)).values()
     assert group.members == ("a", "b")
     assert group.value == pytest.approx(0.3 + 1000 / 2000 / np.cos(0.3), rel=1e-3)
 
@@ -250,7 +250,7 @@ def test_where_a_factor_is_zero_the_other_has_no_effect_and_it_is_no_group() -> 
     written = document({"x": "a*b*u + 1 - c*x"}, ("a", "b", "c"))
     written["parameters"]["a"] = {"lower": 0, "upper": 2}
     problem, theta = posed(written, {"a": 0.0, "b": 2.3, "c": 1.1})
-    analysis = analyse(problem, theta)
+    analysis = analyse_estimate(problem, theta)
     assert statuses(analysis) == {"a": "at bound", "b": "unidentifiable", "c": "identified"}
     assert told(analysis) == {}
     assert analysis.estimates[0].stderr is not None

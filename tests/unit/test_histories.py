@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.datasets.waveforms import sampled
+from service.datasets.waveforms import interpolate_channel
 from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.settings import GeneticAlgorithm
 from sysid.core.types import FloatArray
-from sysid.data.derivations import derive
-from sysid.data.history import MORE
+from sysid.data.derivations import derive_recording
+from sysid.data.history import INTERPOLATION_MARGIN
 from sysid.data.records import HOLDS, Channel, History, Hold, Record, Recording, Segment
 from sysid.data.splitting import split_record
 from sysid.identification.identify import identify
@@ -36,7 +36,7 @@ def plant(samples: int = 400, hold: Hold = "zero", noise: float = 0.0) -> Record
 
 
 def record_of(recording: Recording) -> Record:
-    return recording.record({"u": "u"}, {"y": "y"})
+    return recording.to_record({"u": "u"}, {"y": "y"})
 
 
 def history(recording: Recording, name: str = "u") -> History:
@@ -57,10 +57,12 @@ def response(record: Record, start: float) -> FloatArray:
 def test_a_part_with_history_goes_on_as_the_whole_recording_does(hold: Hold) -> None:
     whole = plant(hold=hold)
     expected = whole.channel("y").values[CUT:]
-    part = record_of(derive(whole, [{"trim": {"rows": [CUT, 400]}}]))
+    part = record_of(derive_recording(whole, [{"trim": {"rows": [CUT, 400]}}]))
     start = float(expected[0]) - TRUE["y0"]
     np.testing.assert_allclose(response(part, start), expected, atol=1e-9)
-    forgetful = record_of(derive(whole, [{"trim": {"rows": [CUT, 400], "history": False}}]))
+    forgetful = record_of(
+        derive_recording(whole, [{"trim": {"rows": [CUT, 400], "history": False}}])
+    )
     assert np.max(np.abs(response(forgetful, start) - expected)) > 0.1
 
 
@@ -72,38 +74,38 @@ def test_by_rows_by_time_and_by_fraction_the_history_is_the_same() -> None:
         {"trim": {"start": middle}},
         {"split": {"fraction": 0.5, "part": "validation"}},
     ):
-        part = derive(whole, [step])
+        part = derive_recording(whole, [step])
         times, values = history(part)
         np.testing.assert_array_equal(times, whole.channel("u").times[:150])
         np.testing.assert_array_equal(values, whole.channel("u").values[:150])
         assert part.start == middle
         assert part.samples == 150
-        assert part.channel("u").known_samples == 300
+        assert part.channel("u").total_samples == 300
 
 
 def test_a_part_from_the_beginning_has_no_history() -> None:
     for step in ({"trim": {"rows": [0, 50]}}, {"split": {"fraction": 0.5, "part": "estimation"}}):
-        assert all(one.history is None for one in derive(plant(), [step]).channels)
+        assert all(one.history is None for one in derive_recording(plant(), [step]).channels)
 
 
 def test_a_history_is_as_long_as_its_part_and_the_samples_for_interpolation() -> None:
     times = H * np.arange(5000.0)
     whole = Recording((Channel("u", times, times), Channel("y", times, times)))
-    part = derive(whole, [{"trim": {"rows": [4000, 4100]}}])
-    assert history(part).times.size == pytest.approx(99 + MORE, abs=1)
+    part = derive_recording(whole, [{"trim": {"rows": [4000, 4100]}}])
+    assert history(part).times.size == pytest.approx(99 + INTERPOLATION_MARGIN, abs=1)
     assert history(part).times[-1] == times[3999]
 
 
 def test_a_part_of_a_part_has_the_history_of_both() -> None:
     whole = plant()
-    once = derive(whole, [{"trim": {"rows": [200, 400]}}])
-    twice = derive(once, [{"trim": {"rows": [10, 200]}}])
+    once = derive_recording(whole, [{"trim": {"rows": [200, 400]}}])
+    twice = derive_recording(once, [{"trim": {"rows": [10, 200]}}])
     expected = whole.channel("u").times[:210]
     np.testing.assert_array_equal(history(twice).times, expected[-history(twice).times.size :])
     assert history(twice).times.size > 190
-    beginning = derive(once, [{"split": {"fraction": 0.5, "part": "estimation"}}])
+    beginning = derive_recording(once, [{"split": {"fraction": 0.5, "part": "estimation"}}])
     assert history(beginning).times[-1] == pytest.approx(19.9)
-    forgotten = derive(once, [{"trim": {"start": 0, "history": False}}])
+    forgotten = derive_recording(once, [{"trim": {"start": 0, "history": False}}])
     assert forgotten.channel("u").history is None
 
 
@@ -115,8 +117,8 @@ def test_steps_change_a_history_as_they_change_the_samples() -> None:
         {"rename": {"u": "command"}},
         {"hold": {"command": "first"}},
     ]
-    before = derive(derive(whole, steps), [{"trim": {"rows": [CUT, 400]}}])
-    after = derive(derive(whole, [{"trim": {"rows": [CUT, 400]}}]), steps)
+    before = derive_recording(derive_recording(whole, steps), [{"trim": {"rows": [CUT, 400]}}])
+    after = derive_recording(derive_recording(whole, [{"trim": {"rows": [CUT, 400]}}]), steps)
     for one, other in zip(history(before, "command"), history(after, "command"), strict=True):
         np.testing.assert_array_equal(one, other)
     assert history(after, "command").values[-1] in (750.0, -1250.0)
@@ -126,8 +128,8 @@ def test_a_line_is_taken_off_a_history_where_it_goes_on() -> None:
     times = H * np.arange(100.0)
     ramp = Recording((Channel("u", times, 3 + 2 * times), Channel("y", times, times)))
     steps = [{"trim": {"rows": [50, 100]}}, {"detrend": {"kind": "linear"}}]
-    np.testing.assert_allclose(history(derive(ramp, steps)).values, 0.0, atol=1e-9)
-    mean = derive(ramp, [{"trim": {"rows": [50, 100]}}, {"detrend": {"kind": "mean"}}])
+    np.testing.assert_allclose(history(derive_recording(ramp, steps)).values, 0.0, atol=1e-9)
+    mean = derive_recording(ramp, [{"trim": {"rows": [50, 100]}}, {"detrend": {"kind": "mean"}}])
     np.testing.assert_allclose(
         history(mean).values, 3 + 2 * times[:50] - (3 + 2 * np.mean(times[50:])), atol=1e-9
     )
@@ -137,7 +139,7 @@ def test_a_line_is_taken_off_a_history_where_it_goes_on() -> None:
 def test_noise_on_samples_is_the_same_draw_with_a_history_and_without(kind: str) -> None:
     noise = {"noise": {"sigma": 0.3, "seed": 2, "channels": ["u"], "kind": kind}}
     trimmed = [{"trim": {"rows": [CUT, 400], "history": keep}} for keep in (True, False)]
-    known, unknown = (derive(plant(), [one, noise]) for one in trimmed)
+    known, unknown = (derive_recording(plant(), [one, noise]) for one in trimmed)
     np.testing.assert_array_equal(known.channel("u").values, unknown.channel("u").values)
     added = history(known).values - plant().channel("u").values[:CUT]
     assert np.std(added) == pytest.approx(0.3, rel=0.3)
@@ -149,9 +151,9 @@ def test_noise_on_samples_is_the_same_draw_with_a_history_and_without(kind: str)
 @pytest.mark.parametrize("method", ["linear", "mean"])
 def test_a_resampled_part_is_part_of_the_resampled_whole(method: str) -> None:
     resample = {"resample": {"sample_time": 2 * H, "method": method}}
-    whole = derive(plant(), [resample]).channel("u")
-    part = derive(plant(), [{"trim": {"rows": [CUT, 400]}}, resample]).channel("u")
-    joined = part.whole
+    whole = derive_recording(plant(), [resample]).channel("u")
+    part = derive_recording(plant(), [{"trim": {"rows": [CUT, 400]}}, resample]).channel("u")
+    joined = part.history_and_samples
     assert part.times[0] == pytest.approx(CUT * H)
     np.testing.assert_allclose(joined.times, whole.times, atol=1e-9)
     np.testing.assert_allclose(joined.values, whole.values, atol=1e-9)
@@ -160,7 +162,9 @@ def test_a_resampled_part_is_part_of_the_resampled_whole(method: str) -> None:
 def test_resampling_keeps_what_one_channel_recorded_before_the_others_began() -> None:
     times = H * np.arange(100.0)
     late = Channel("y", times[40:], times[40:])
-    made = derive(Recording((Channel("u", times, times), late)), [{"resample": {"sample_time": H}}])
+    made = derive_recording(
+        Recording((Channel("u", times, times), late)), [{"resample": {"sample_time": H}}]
+    )
     np.testing.assert_allclose(history(made).values, times[:40], atol=1e-9)
     assert made.channel("y").history is None
 
@@ -171,7 +175,7 @@ def test_a_held_history_begins_with_what_was_recorded_first_however_times_are_ro
     whole = Recording(tuple(Channel(n, times, np.arange(200.0), hold="zero") for n in "uy"))
     for row in range(20, 60):
         steps = [{"trim": {"rows": [row, 200]}}, {"resample": {"sample_time": 1 / 610.35}}]
-        assert history(derive(whole, steps)).values[0] <= 1.0
+        assert history(derive_recording(whole, steps)).values[0] <= 1.0
 
 
 def segmented() -> Recording:
@@ -183,26 +187,31 @@ def segmented() -> Recording:
 
 
 def test_of_segments_only_the_one_that_is_cut_has_a_history_and_only_its_own() -> None:
-    made = derive(segmented(), [{"trim": {"start": 10.35}}])
-    first, second = made.records({"u": "u"}, {"y": "y"})
+    made = derive_recording(segmented(), [{"trim": {"start": 10.35}}])
+    first, second = made.to_records({"u": "u"}, {"y": "y"})
     found = first.inputs[0].history
     assert found is not None
     np.testing.assert_array_equal(found.values, [10, 11, 12, 13])
     np.testing.assert_allclose(found.times, [5.0, 5.1, 5.2, 5.3])
     np.testing.assert_allclose(first.inputs[0].times[0], 5.4)
     assert second.inputs[0].history is None
-    assert derive(segmented(), [{"trim": {"start": 5.0}}]).channel("u").history is None
+    assert derive_recording(segmented(), [{"trim": {"start": 5.0}}]).channel("u").history is None
 
 
 def test_a_selection_keeps_a_history_with_its_segment() -> None:
-    made = derive(segmented(), [{"trim": {"start": 10.35}}])
-    assert history(derive(made, [{"select": {"n": 1}}])).values.tolist() == [10, 11, 12, 13]
-    assert derive(made, [{"select": {"n": 2}}]).channel("u").history is None
+    made = derive_recording(segmented(), [{"trim": {"start": 10.35}}])
+    assert history(derive_recording(made, [{"select": {"n": 1}}])).values.tolist() == [
+        10,
+        11,
+        12,
+        13,
+    ]
+    assert derive_recording(made, [{"select": {"n": 2}}]).channel("u").history is None
 
 
 def test_a_pooled_input_has_what_the_repeats_recorded_before_the_start() -> None:
     pool = {"input": "u", "outputs": ["y"], "bin": H, "start": 5.35}
-    made = derive(segmented(), [{"pool": pool}])
+    made = derive_recording(segmented(), [{"pool": pool}])
     np.testing.assert_allclose(history(made).times, [5.0, 5.1, 5.2, 5.3])
     np.testing.assert_array_equal(history(made).values, [10, 11, 12, 13])
     assert made.channel("y").history is None
@@ -222,20 +231,20 @@ def test_a_history_ends_at_its_last_missing_value_and_outputs_have_none() -> Non
     values = whole.channel("u").values.copy()
     values[100] = np.nan
     broken = Recording((replace(whole.channel("u"), values=values), whole.channel("y")))
-    part = record_of(derive(broken, [{"trim": {"rows": [CUT, 400]}}]))
+    part = record_of(derive_recording(broken, [{"trim": {"rows": [CUT, 400]}}]))
     found = part.inputs[0].history
     assert found is not None
     assert found.times[0] == pytest.approx(101 * H)
     assert part.outputs[0].history is None
     values[CUT - 1] = np.nan
-    bare = record_of(derive(broken, [{"trim": {"rows": [CUT, 400]}}]))
+    bare = record_of(derive_recording(broken, [{"trim": {"rows": [CUT, 400]}}]))
     assert bare.inputs[0].history is None
 
 
 @pytest.mark.parametrize("hold", HOLDS)
 def test_a_simulation_reads_a_history_from_behind_its_last_missing_value(hold: Hold) -> None:
     """Given as it was recorded, the input's past may have a gap; its record must not suffer."""
-    part = derive(plant(hold=hold), [{"trim": {"rows": [CUT, 400]}}])
+    part = derive_recording(plant(hold=hold), [{"trim": {"rows": [CUT, 400]}}])
     [u] = record_of(part).inputs
     times, values = history(part)
     gap = replace(u, history=History(times, np.where(np.arange(times.size) < 60, np.nan, values)))
@@ -247,14 +256,14 @@ def test_a_simulation_reads_a_history_from_behind_its_last_missing_value(hold: H
     unknown = replace(u, history=History(times, np.full(times.size, np.nan)))
     none = response(replace(record_of(part), inputs=(replace(u, history=None),)), 0.0)
     np.testing.assert_array_equal(response(replace(record_of(part), inputs=(unknown,)), 0.0), none)
-    assert replace(record_of(part), inputs=(unknown,)).known_before == 0.0
+    assert replace(record_of(part), inputs=(unknown,)).history_duration == 0.0
 
 
 @pytest.mark.parametrize("hold", HOLDS)
 def test_an_input_laid_on_times_before_a_gap_has_what_was_first_behind_it(hold: Hold) -> None:
     past = History(np.arange(4.0), np.array([5.0, np.nan, 2.0, 3.0]))
     channel = Channel("u", np.array([4.0, 5.0]), np.array([4.0, 5.0]), "V", hold, past)
-    found = sampled(channel, np.arange(6.0))
+    found = interpolate_channel(channel, np.arange(6.0))
     np.testing.assert_array_equal(found, [2.0, 2.0, 2.0, 3.0, 4.0, 5.0])
 
 
@@ -264,7 +273,7 @@ def test_a_gap_in_the_history_leaves_a_band_limited_record_usable() -> None:
     gap = Recording(
         tuple(replace(c, times=c.times[kept], values=c.values[kept]) for c in whole.channels)
     )
-    part = record_of(derive(gap, [{"trim": {"start": CUT * H - 0.01}}]))
+    part = record_of(derive_recording(gap, [{"trim": {"start": CUT * H - 0.01}}]))
     expected = whole.channel("y").values[CUT:]
     start = float(expected[0]) - TRUE["y0"]
     # The window of the interpolation ends at the gap, which it feels a little.
@@ -286,7 +295,7 @@ def test_a_history_that_is_none_is_refused(times: list[float], values: list[floa
 
 def test_whether_a_history_is_kept_is_true_or_false() -> None:
     with pytest.raises(InvalidSettings, match=r"/steps/0/trim/history: found 'no'; need true or"):
-        derive(plant(), [{"trim": {"start": 1, "history": "no"}}])
+        derive_recording(plant(), [{"trim": {"start": 1, "history": "no"}}])
 
 
 def test_estimates_from_a_part_are_nearer_the_truth_where_its_past_is_known() -> None:
@@ -296,7 +305,7 @@ def test_estimates_from_a_part_are_nearer_the_truth_where_its_past_is_known() ->
     errors: dict[bool, float] = {}
     for keep in (True, False):
         step = {"trim": {"rows": [CUT, CUT + 40], "history": keep}}
-        record = record_of(derive(plant(noise=0.01), [step]))
+        record = record_of(derive_recording(plant(noise=0.01), [step]))
         found = identify(model, record, SHORT, parameters=bounds)
         values = {one.name: one.value for one in found.estimates}
         errors[keep] = abs(values["K"] - TRUE["K"]) + abs(values["T"] - TRUE["T"])

@@ -5,47 +5,56 @@ import pytest
 
 from sysid.core.settings import GeneticAlgorithm, Stop
 from sysid.core.types import FloatArray
-from sysid.islands.archipelago import found, plans
-from sysid.search.basin_hopping import COUNTED, SINGLE, UNCOUNTED, hop
-from sysid.search.slopes import normal_equations
+from sysid.islands.archipelago import create_islands, make_plans
+from sysid.search.basin_hopping import (
+    COUNTED_HOP,
+    SINGLE_PARAMETER_HOP,
+    UNCOUNTED_HOP,
+    hop_from_champion,
+)
+from sysid.search.slopes import build_normal_equations
 from sysid.simulation.evaluator import Evaluator
-from sysid.simulation.scaling import placed
+from sysid.simulation.scaling import to_unit
 from tests.searching import COULOMB, example
 
 ALONE = GeneticAlgorithm(population=12, islands=1, stop=Stop(evaluations=6_000))
 PROBLEM = example("coulomb-eq16")
-(PLAN,) = plans(PROBLEM, ALONE, 3)
-BEGIN = placed(PROBLEM.evaluator, np.array([[COULOMB[p.name] for p in PROBLEM.space]]))[0]
+(PLAN,) = make_plans(PROBLEM, ALONE, 3)
+BEGIN = to_unit(PROBLEM.evaluator, np.array([[COULOMB[p.name] for p in PROBLEM.free_parameters]]))[
+    0
+]
 DRAWN = 400
 
 
 def moved(kind: int, evaluator: Evaluator = PROBLEM.evaluator) -> FloatArray:
     """How far hops of that kind lead (DRAWN, D), each by its own draw."""
-    island = found(PROBLEM, ALONE, 3)[0]
+    island = create_islands(PROBLEM, ALONE, 3)[0]
     search, ends = island.search, np.empty((DRAWN, BEGIN.size))
     search.hop_kind, search.hop_count = kind, 4  # four hops have looked for jumps
     for k in range(DRAWN):
         search.generation, before = k, island.evaluations
         island.point[:] = BEGIN
-        hop(evaluator, PLAN, island.arrays)
+        hop_from_champion(evaluator, PLAN, island.arrays)
         assert island.evaluations - before == BEGIN.size + 1
         ends[k] = island.point
     return ends - BEGIN
 
 
-@pytest.mark.parametrize("kind", [COUNTED + SINGLE, UNCOUNTED + SINGLE])
+@pytest.mark.parametrize(
+    "kind", [COUNTED_HOP + SINGLE_PARAMETER_HOP, UNCOUNTED_HOP + SINGLE_PARAMETER_HOP]
+)
 def test_a_hop_of_one_parameter_moves_each_of_them_in_its_turn_and_no_other(kind: int) -> None:
     moves = moved(kind)
     assert np.all(np.sum(moves != 0.0, axis=1) == 1)
     assert np.all(np.abs(np.sum(moves != 0.0, axis=0) - DRAWN / 4) < 5 * np.sqrt(DRAWN * 3 / 16))
-    assert np.all(np.sum(moved(kind - SINGLE) != 0.0, axis=1) == BEGIN.size)
+    assert np.all(np.sum(moved(kind - SINGLE_PARAMETER_HOP) != 0.0, axis=1) == BEGIN.size)
 
 
 def test_it_leads_3_to_500_standard_errors_of_a_parameter_whose_fellows_are_held() -> None:
-    moves = moved(COUNTED + SINGLE)
-    search = found(PROBLEM, ALONE, 3)[0].search
+    moves = moved(COUNTED_HOP + SINGLE_PARAMETER_HOP)
+    search = create_islands(PROBLEM, ALONE, 3)[0].search
     assert search.wide_differences == 0  # hops take the same derivatives
-    matrix, _, base = normal_equations(PROBLEM.evaluator, PLAN, BEGIN, 1.0, 1e-6)
+    matrix, _, base = build_normal_equations(PROBLEM.evaluator, PLAN, BEGIN, 1.0, 1e-6)
     inside = np.all((moves + BEGIN > 0.0) & (moves + BEGIN < 1.0), axis=1)
     assert np.mean(inside) > 0.8
     errors = np.abs(moves[inside] * np.sqrt(np.diag(matrix)) / base).sum(axis=1)
@@ -58,19 +67,19 @@ def test_it_leads_3_to_500_standard_errors_of_a_parameter_whose_fellows_are_held
 
 def test_a_parameter_that_changes_nothing_stays() -> None:
     blind = PROBLEM.evaluator._replace(weight=np.zeros_like(PROBLEM.evaluator.weight))
-    assert np.all(moved(COUNTED + SINGLE, blind) == 0.0)
+    assert np.all(moved(COUNTED_HOP + SINGLE_PARAMETER_HOP, blind) == 0.0)
 
 
-@pytest.mark.parametrize(("kind", "looks"), [(COUNTED, True), (UNCOUNTED, False)])
+@pytest.mark.parametrize(("kind", "looks"), [(COUNTED_HOP, True), (UNCOUNTED_HOP, False)])
 def test_hops_that_are_evidence_look_for_jumps_whichever_way_they_lead(
     kind: int, looks: bool
 ) -> None:
     """Whether the fitness jumps decides what settles a search: all of the first hops have to."""
-    for one in (0, SINGLE):
-        island = found(PROBLEM, ALONE, 3)[0]
+    for one in (0, SINGLE_PARAMETER_HOP):
+        island = create_islands(PROBLEM, ALONE, 3)[0]
         island.search.hop_kind = kind + one
         island.point[:] = BEGIN
         spent = island.evaluations + BEGIN.size + 1
-        hop(PROBLEM.evaluator, PLAN, island.arrays)
+        hop_from_champion(PROBLEM.evaluator, PLAN, island.arrays)
         assert (island.evaluations > spent) == looks
         assert island.search.champion_discontinuities == 0 or looks

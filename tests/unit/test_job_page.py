@@ -12,8 +12,8 @@ import yaml
 
 from service.datasets.schemas import DeriveIn
 from service.jobs.schemas import JobIn
-from sysid.core.settings import METHODS, TOPOLOGIES
-from sysid.data.derivations import STEPS, derive
+from sysid.core.settings import SEARCH_METHODS, TOPOLOGIES
+from sysid.data.derivations import STEPS, derive_recording
 from sysid.data.noise import NOISE_KINDS
 from sysid.data.records import HOLDS, Channel, Recording, Segment
 
@@ -94,7 +94,7 @@ def test_every_name_that_a_field_of_a_job_takes_is_told_and_no_other(path: str) 
 
 def test_the_fields_that_take_names_are_found() -> None:
     assert set(TOPOLOGIES) == CHOICES["algorithm.migration.topology"]
-    assert set(METHODS) == CHOICES["algorithm.method"] == CHOICES["algorithm.islands.method"]
+    assert set(SEARCH_METHODS) == CHOICES["algorithm.method"] == CHOICES["algorithm.islands.method"]
     assert set(HOLDS) == CHOICES["hold"]
 
 
@@ -131,6 +131,6 @@ def test_the_example_of_steps_takes_every_step() -> None:
     )
     values = 100.0 + np.sin(times)
     made = Recording((Channel("P1", times, values, "kPa"), Channel("P2", times, values)), segments)
-    found = derive(made, steps)
+    found = derive_recording(made, steps)
     assert [(one.name, one.unit) for one in found.channels] == [("u", "Pa"), ("y", "Pa")]
     assert len(JOBS) >= 3

@@ -8,7 +8,7 @@ import pytest
 
 from sysid.core import code_cache as keeping
 from sysid.kernels import build as compiler
-from sysid.kernels.layout import Variant
+from sysid.kernels.layout import KernelVariant
 from sysid.simulation.problem import Problem
 from tests.models import difference, duffing, individuals, record
 
@@ -16,16 +16,16 @@ from tests.models import difference, duffing, individuals, record
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty cache folder, and a process that has loaded no kernel."""
-    loops = os.environ.get("NUMBA_CACHE_DIR") or str(keeping.cache_folder())
+    loops = os.environ.get("NUMBA_CACHE_DIR") or str(keeping.find_cache_folder())
     monkeypatch.setenv("NUMBA_CACHE_DIR", loops)  # these are not what is looked at here
     monkeypatch.setenv("LAGID_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(compiler, "_addresses", {})
+    monkeypatch.setattr(compiler, "_kernel_addresses", {})
     return tmp_path / "cache"
 
 
 def fitness() -> np.ndarray:
     problem = Problem.build(duffing(), [record()])
-    return problem.fitness(individuals(problem, 4))
+    return problem.evaluate_fitness(individuals(problem, 4))
 
 
 def refuse(assembly: str) -> bytes:
@@ -37,8 +37,8 @@ def test_a_kernel_is_compiled_once_and_found_again(
 ) -> None:
     first = fitness()
     assert len(list(folder.glob("*.o"))) == 1
-    monkeypatch.setattr(compiler, "_addresses", {})
-    monkeypatch.setattr(compiler, "object_code_bounded", refuse)
+    monkeypatch.setattr(compiler, "_kernel_addresses", {})
+    monkeypatch.setattr(compiler, "compile_bounded", refuse)
     np.testing.assert_array_equal(fitness(), first)
 
 
@@ -64,11 +64,11 @@ def test_a_damaged_file_is_made_again(
     if damage == "flip":
         content[len(content) // 2] ^= 1
     elif damage == "another kernel":
-        key = compiler.kernel_key(difference({"x": "c*x(k-1)"}, "x"), Variant())
-        keeping.store(key, b"something else")
+        key = compiler.compute_kernel_key(difference({"x": "c*x(k-1)"}, "x"), KernelVariant())
+        keeping.store_code(key, b"something else")
         content = bytearray((folder / f"{key}.o").read_bytes())
     path.write_bytes(bytes({"cut": content[:100], "empty": content[:0]}.get(damage, content)))
-    monkeypatch.setattr(compiler, "_addresses", {})
+    monkeypatch.setattr(compiler, "_kernel_addresses", {})
     np.testing.assert_array_equal(fitness(), first)
     assert path.stat().st_size > 1000
 
@@ -83,13 +83,15 @@ def test_without_a_writable_folder_kernels_still_work(
 
 def test_the_key_tells_models_and_variants_apart_but_not_their_bounds() -> None:
     model = duffing()
-    keys = {compiler.kernel_key(model, Variant(one, soft, grid, weight))
+    keys = {compiler.compute_kernel_key(model, KernelVariant(one, soft, grid, weight))
             for one in (True, False) for soft in (True, False)
             for grid in (True, False) for weight in (True, False)}  # fmt: skip
     assert len(keys) == 16
     narrow = Problem.build(model, [record()], parameters={"c": {"lower": 0.1}}).model
-    assert compiler.kernel_key(narrow, Variant()) in keys
-    assert compiler.kernel_key(difference({"x": "c*x(k-1)"}, "x"), Variant()) not in keys
+    assert compiler.compute_kernel_key(narrow, KernelVariant()) in keys
+    assert (
+        compiler.compute_kernel_key(difference({"x": "c*x(k-1)"}, "x"), KernelVariant()) not in keys
+    )
 
 
 def test_a_stale_temporary_file_is_left_nowhere(folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sysid.language.checker import check
+from sysid.language.checker import check_expression
 from sysid.language.scope import Scope
 
 SCOPE = Scope(
@@ -68,32 +68,32 @@ SCOPE = Scope(
 def test_a_fault_names_its_column_and_what_would_be_right(
     written: str, column: int, part: str
 ) -> None:
-    found = check(written, SCOPE)
+    found = check_expression(written, SCOPE)
     assert found.tree is None
     assert [fault.column for fault in found.faults] == [column]
     assert part in found.faults[0].detail
 
 
 def test_python_is_not_the_language() -> None:
-    found = check("__import__('os').system('ls')", SCOPE)
+    found = check_expression("__import__('os').system('ls')", SCOPE)
     assert found.tree is None
     assert [fault.column for fault in found.faults] == [12, 17, 25]
 
 
 def test_an_unknown_call_and_its_argument_are_both_told() -> None:
-    found = check("__import__('os')", SCOPE)
+    found = check_expression("__import__('os')", SCOPE)
     assert [fault.column for fault in found.faults] == [1, 12]
     assert "no function or signal '__import__'" in found.faults[0].detail
 
 
 def test_every_unknown_name_of_a_text_is_told_in_the_order_of_the_text() -> None:
-    found = check("foo + 2*bar(baz) + x", SCOPE)
+    found = check_expression("foo + 2*bar(baz) + x", SCOPE)
     assert [fault.column for fault in found.faults] == [1, 9, 13]
 
 
 @pytest.mark.parametrize("written", ["(" * 65 + "x" + ")" * 65, "-" * 70 + "x", "x**" * 70 + "x"])
 def test_nesting_deeper_than_64_levels_is_refused(written: str) -> None:
-    [fault] = check(written, SCOPE).faults
+    [fault] = check_expression(written, SCOPE).faults
     assert "deeper than 64" in fault.detail
 
 
@@ -101,17 +101,17 @@ def test_nesting_of_sums_in_sums_is_measured_on_the_tree() -> None:
     written = "x"
     for _ in range(40):
         written = f"({written} + x + x + x)"
-    [fault] = check(written, SCOPE).faults
+    [fault] = check_expression(written, SCOPE).faults
     assert "deeper than 64" in fault.detail
 
 
 def test_a_text_of_more_than_4000_characters_is_refused_unread() -> None:
-    [fault] = check("x" * 4001, SCOPE).faults
+    [fault] = check_expression("x" * 4001, SCOPE).faults
     assert "4001 characters" in fault.detail
 
 
 def test_the_sampling_period_is_not_known_in_the_differential_form() -> None:
-    [fault] = check("h*x", Scope("differential", states=("x",))).faults
+    [fault] = check_expression("h*x", Scope("differential", states=("x",))).faults
     assert "difference form only" in fault.detail
 
 
@@ -120,5 +120,7 @@ def test_the_sampling_period_is_not_known_in_the_differential_form() -> None:
     [("x(t - L)", "smallest value is -0.5 s"), ("x(1)", "write x(t - L)"), ("x(2*t)", "with time")],
 )
 def test_lags_of_the_differential_form_are_checked_in_seconds(written: str, part: str) -> None:
-    [fault] = check(written, Scope("differential", ("x",), (), {"L": (-0.5, 1.0)})).faults
+    [fault] = check_expression(
+        written, Scope("differential", ("x",), (), {"L": (-0.5, 1.0)})
+    ).faults
     assert part in fault.detail

@@ -2,12 +2,12 @@
 
 import pytest
 
-from sysid.language.checker import check
-from sysid.language.printer import text
+from sysid.language.checker import check_expression
+from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
-from sysid.language.tree import Binary, Call, Number, Past, Symbol, Unary
+from sysid.language.tree import Binary, FunctionCall, Number, PastValue, Symbol, Unary
 
-X, Y, Q = Past("x", "state"), Past("y", "state"), Past("q", "input")
+X, Y, Q = PastValue("x", "state"), PastValue("y", "state"), PastValue("q", "input")
 C = Symbol("c", "parameter")
 
 SCOPE = Scope(
@@ -20,7 +20,7 @@ SCOPE = Scope(
 
 
 def tree(written: str) -> object:
-    found = check(written, SCOPE)
+    found = check_expression(written, SCOPE)
     assert found.faults == ()
     return found.tree
 
@@ -62,24 +62,24 @@ def test_powers_bind_tighter_than_the_sign_and_group_to_the_right() -> None:
 def test_conditions_know_not_before_and_before_or() -> None:
     positive, small = Binary(">", X, Number(0.0)), Binary("<=", Y, Number(1.0))
     both = Binary("and", Unary("not", positive), small)
-    expected = Call("where", (Binary("or", positive, both), X, Y))
+    expected = FunctionCall("where", (Binary("or", positive, both), X, Y))
     assert tree("where(x > 0 or not x > 0 and y <= 1, x, y)") == expected
 
 
 def test_min_and_max_of_several_are_taken_two_by_two() -> None:
-    assert tree("min(x, y, q)") == Call("min", (Call("min", (X, Y)), Q))
+    assert tree("min(x, y, q)") == FunctionCall("min", (FunctionCall("min", (X, Y)), Q))
 
 
 def test_a_sum_of_a_thousand_terms_makes_a_shallow_tree() -> None:
-    found = check("+".join(["x"] * 1000), SCOPE)
+    found = check_expression("+".join(["x"] * 1000), SCOPE)
     assert found.faults == ()
     assert len(found.uses) == 1000
 
 
 def test_words_of_the_difference_form_are_free_in_the_differential_form() -> None:
     scope = Scope("differential", states=("h",), parameters={"k": (0.0, 1.0)})
-    found = check("-k*h", scope)
-    assert found.tree == Binary("*", Unary("-", Symbol("k", "parameter")), Past("h", "state"))
+    found = check_expression("-k*h", scope)
+    assert found.tree == Binary("*", Unary("-", Symbol("k", "parameter")), PastValue("h", "state"))
 
 
 @pytest.mark.parametrize(
@@ -94,4 +94,4 @@ def test_words_of_the_difference_form_are_free_in_the_differential_form() -> Non
     ],
 )
 def test_the_printer_keeps_the_parentheses_that_matter(written: str) -> None:
-    assert text(tree(written)) == written  # type: ignore[arg-type]
+    assert format_expression(tree(written)) == written  # type: ignore[arg-type]

@@ -2,10 +2,10 @@
 
 import pytest
 
-from sysid.language.checker import check
-from sysid.language.printer import text
+from sysid.language.checker import check_expression
+from sysid.language.printer import format_expression
 from sysid.language.scope import Scope
-from sysid.language.tree import Binary, Number, Past, Symbol
+from sysid.language.tree import Binary, Number, PastValue, Symbol
 
 L, D, H = Symbol("L", "parameter"), Symbol("d", "parameter"), Symbol("h", "period")
 SAMPLES = Binary("/", L, H)
@@ -22,10 +22,10 @@ CONTINUOUS = Scope(
 )
 
 
-def past(written: str, scope: Scope = DISCRETE) -> Past:
-    found = check(written, scope)
+def past(written: str, scope: Scope = DISCRETE) -> PastValue:
+    found = check_expression(written, scope)
     assert found.faults == ()
-    assert isinstance(found.tree, Past)
+    assert isinstance(found.tree, PastValue)
     return found.tree
 
 
@@ -44,7 +44,7 @@ def past(written: str, scope: Scope = DISCRETE) -> Past:
     ],
 )
 def test_every_arrangement_of_one_index_is_one_past_value(written: str) -> None:
-    assert past(written) == Past("x", "state", 1, SAMPLES)
+    assert past(written) == PastValue("x", "state", 1, SAMPLES)
 
 
 @pytest.mark.parametrize(
@@ -70,9 +70,9 @@ def test_an_index_is_split_into_whole_samples_and_an_unknown_lag(
     found = past(written)
     assert found.offset == offset
     if written != "q(k - 2 + z)":
-        assert found.lag == lag
+        assert found.delay == lag
     else:  # between 0 and 2 samples: nothing of it is fixed
-        assert text(found) == "q(k-2 - -z)"
+        assert format_expression(found) == "q(k-2 - -z)"
 
 
 @pytest.mark.parametrize(
@@ -88,16 +88,16 @@ def test_an_index_is_split_into_whole_samples_and_an_unknown_lag(
     ],
 )
 def test_the_differential_form_keeps_the_whole_lag_in_seconds(written: str, lag: object) -> None:
-    assert past(written, CONTINUOUS) == Past("x", "state", 0, lag)  # type: ignore[arg-type]
+    assert past(written, CONTINUOUS) == PastValue("x", "state", 0, lag)  # type: ignore[arg-type]
 
 
 def test_equal_lags_of_neighbouring_samples_are_equal_trees() -> None:
-    assert past("x(k-1 - L/h)").lag == past("x((k*h - L)/h - 2)").lag
+    assert past("x(k-1 - L/h)").delay == past("x((k*h - L)/h - 2)").delay
 
 
 def test_a_function_of_parameters_may_be_a_lag() -> None:
-    assert past("x(t - sqrt(L*d))", CONTINUOUS).lag is not None
+    assert past("x(t - sqrt(L*d))", CONTINUOUS).delay is not None
 
 
 def test_the_sum_of_two_lags_that_cancel_in_part_is_not_thought_negative() -> None:
-    assert past("x(t - (L + d - L))", CONTINUOUS).lag == D
+    assert past("x(t - (L + d - L))", CONTINUOUS).delay == D

@@ -7,14 +7,19 @@ from scipy.optimize import least_squares
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
-from sysid.search.least_squares import TRIED, Scored, Solution, solve
+from sysid.search.least_squares import (
+    N_TRIED,
+    LeastSquaresSolution,
+    ScoredSamples,
+    solve_least_squares,
+)
 from sysid.simulation.problem import Problem
 
 TIMES = np.linspace(0.0, 4.0, 60)
 DECAY = "2*a*exp(-4*p*t) + 2*b*exp(-0.5*q*t)"
 
 
-def scored(text: str, names: str, measured: FloatArray, times: FloatArray = TIMES) -> Scored:
+def scored(text: str, names: str, measured: FloatArray, times: FloatArray = TIMES) -> ScoredSamples:
     """Residuals of an expression of time, whose parameters are places in [0, 1]."""
     document = {
         "name": "test", "form": "differential", "states": {"x": "1"},
@@ -22,7 +27,7 @@ def scored(text: str, names: str, measured: FloatArray, times: FloatArray = TIME
         "equations": {"x": "0"}, "initial": {"x": 0}, "outputs": {"y": f"x + {text}"},
     }  # fmt: skip
     problem = Problem.build(load_model(document), [Record((), (Channel("y", times, measured),))])
-    return Scored(problem.evaluator, problem.scored, np.ones(measured.size))
+    return ScoredSamples(problem.evaluator, problem.scored_rows, np.ones(measured.size))
 
 
 def decay(place: FloatArray) -> FloatArray:
@@ -32,9 +37,13 @@ def decay(place: FloatArray) -> FloatArray:
 
 
 def found(
-    subject: Scored, start: list[float], scale: float = 0.0, steps: int = 100, at_once: int = 100
-) -> Solution:
-    return solve(subject, np.array(start), scale, steps=steps, at_once=at_once)
+    subject: ScoredSamples,
+    start: list[float],
+    scale: float = 0.0,
+    steps: int = 100,
+    at_once: int = 100,
+) -> LeastSquaresSolution:
+    return solve_least_squares(subject, np.array(start), scale, steps=steps, at_once=at_once)
 
 
 def library(measured: FloatArray, start: list[float], scale: float = 0.0) -> FloatArray:
@@ -80,15 +89,15 @@ def test_the_steps_allowed_bound_the_simulations() -> None:
     subject = scored(DECAY, "abpq", decay(np.array([0.4, 0.3, 0.6, 0.4])))
     ended = found(subject, [0.9] * 4, steps=3)
     assert not ended.is_converged
-    assert ended.evaluations == 1 + 3 * (4 + TRIED)
+    assert ended.evaluations == 1 + 3 * (4 + N_TRIED)
 
 
 def test_the_slopes_of_a_place_are_taken_once_however_often_steps_from_it_are_refused() -> None:
     subject = scored("where(a == 0.5, 0.5*t, 1000)", "a", 0.4 * TIMES)
     ended = found(subject, [0.5], steps=20)
     assert ended.place[0] == 0.5
-    assert ended.evaluations > 1 + 1 + TRIED
-    assert (ended.evaluations - 1 - 1) % TRIED == 0
+    assert ended.evaluations > 1 + 1 + N_TRIED
+    assert (ended.evaluations - 1 - 1) % N_TRIED == 0
 
 
 @pytest.mark.parametrize("start", [1.0, 1.0 - 1e-15])

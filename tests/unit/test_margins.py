@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from sysid.control.controllers import PidControl
-from sysid.control.linear_form import Identified, Value
-from sysid.control.margins import margins
+from sysid.control.linear_form import IdentifiedModel, IdentifiedValue
+from sysid.control.margins import compute_margins
 from sysid.models.parse import parse_model
 
 
-def resonant(delay: float) -> Identified:
+def resonant(delay: float) -> IdentifiedModel:
     """A lag and a weakly damped mode beside it: the loop gain passes 1 three times."""
     model = parse_model({
         "name": "m", "form": "differential", "inputs": {"u": "V"},
@@ -18,15 +18,15 @@ def resonant(delay: float) -> Identified:
         "equations": {"x": "u(t - L) - x", "a": "b", "b": "100*(x - a) - 0.2*b"},
         "outputs": {"y": {"expression": "0.9*x + 0.1*a", "unit": "m"}},
     })  # fmt: skip
-    return Identified(model, (Value("L", delay),))
+    return IdentifiedModel(model, (IdentifiedValue("L", delay),))
 
 
-def first_order(rate: str) -> Identified:
+def first_order(rate: str) -> IdentifiedModel:
     model = parse_model({
         "name": "m", "form": "differential", "inputs": {"u": "V"}, "states": {"x": "m"},
         "equations": {"x": rate}, "outputs": {"y": {"expression": "x", "unit": "m"}},
     })  # fmt: skip
-    return Identified(model, ())
+    return IdentifiedModel(model, ())
 
 
 @pytest.mark.parametrize("delay", [0.02, 0.1, 0.3, 0.5])
@@ -34,11 +34,11 @@ def test_a_loop_is_stable_up_to_its_delay_margin_however_often_its_gain_is_one(
     delay: float,
 ) -> None:
     control = PidControl("u", "y", 2.0)
-    found = margins(resonant(delay), control)
+    found = compute_margins(resonant(delay), control)
     assert found.is_stable
     assert 0.0 < found.phase_margin < 360.0
-    assert margins(resonant(delay + 0.98 * found.delay_margin), control).is_stable
-    assert not margins(resonant(delay + 1.02 * found.delay_margin), control).is_stable
+    assert compute_margins(resonant(delay + 0.98 * found.delay_margin), control).is_stable
+    assert not compute_margins(resonant(delay + 1.02 * found.delay_margin), control).is_stable
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_a_loop_is_stable_up_to_its_delay_margin_however_often_its_gain_is_one(
 )
 def test_a_border_at_rest_is_one_of_the_gain(rate: str, gain: float, factor: float) -> None:
     """Of x' = x + K (r - x) the root is 1 - K: it drifts at K = 1, and never swings."""
-    found = margins(first_order(rate), PidControl("u", "y", gain))
+    found = compute_margins(first_order(rate), PidControl("u", "y", gain))
     assert found.gain_margin == pytest.approx(factor, rel=1e-12)
     assert found.is_stable == (gain > 1 if factor < 1 and gain > 0 else gain > -1)
 
@@ -61,14 +61,16 @@ def test_a_sharp_resonance_is_not_missed(gain: float, delay: float) -> None:
         "equations": {"a": "b", "b": "100*(u(t - L) - a)"},
         "outputs": {"y": {"expression": "a", "unit": "m"}},
     })  # fmt: skip
-    found = margins(Identified(model, (Value("L", delay),)), PidControl("u", "y", gain))
+    found = compute_margins(
+        IdentifiedModel(model, (IdentifiedValue("L", delay),)), PidControl("u", "y", gain)
+    )
     assert found.is_stable == (gain * np.sin(10 * delay) < 0)
     assert found.crossover_frequency == pytest.approx(10.0, rel=abs(gain))
 
 
 def test_the_phase_at_a_crossing_is_that_of_the_loop_there() -> None:
     """At a sharp resonance the phase turns by degrees from one frequency to the next."""
-    found = margins(resonant(0.02), PidControl("u", "y", 2.0))
+    found = compute_margins(resonant(0.02), PidControl("u", "y", 2.0))
     s = 1j * found.crossover_frequency
     loop = 2.0 * np.exp(-0.02 * s) / (s + 1) * (0.9 + 10.0 / (s**2 + 0.2 * s + 100))
     assert abs(loop) == pytest.approx(1.0, rel=1e-6)

@@ -10,7 +10,7 @@ from mcap.writer import CompressionType
 
 from service.formats.errors import InvalidUpload
 from service.formats.limits import DEFAULT_LIMITS
-from service.formats.mcap import read_mcap
+from service.formats.mcap import read_mcap_with_notes
 from sysid.data.records import Recording
 from tests.mcap_files import foreign, json_messages
 
@@ -21,7 +21,7 @@ KINDS = {
 
 
 def read(content: bytes) -> tuple[Recording, tuple[str, ...]]:
-    return read_mcap(content, DEFAULT_LIMITS)
+    return read_mcap_with_notes(content, DEFAULT_LIMITS)
 
 
 def robot() -> FileDescriptorSet:

@@ -13,9 +13,9 @@ from mcap.reader import make_reader
 from service.formats import mcap_writer as mcap_file
 from service.formats.mcap import (
     FittedOutput,
-    read_fit,
+    read_fitted_outputs,
     read_recording,
-    write_fit,
+    write_fitted_outputs,
     write_recording,
 )
 from sysid.data.records import Channel, History, Recording, Segment
@@ -146,8 +146,8 @@ def test_fitted_signals_come_back_and_have_the_residual_as_a_field() -> None:
         FittedOutput("validation", 2, "y", "m", later, np.array([1, np.nan, 2.0]), np.zeros(3)),
     ]
     stream = BytesIO()
-    write_fit("run_1", fits, stream)
-    for fit, back in zip(fits, read_fit(stream.getvalue()), strict=True):
+    write_fitted_outputs("run_1", fits, stream)
+    for fit, back in zip(fits, read_fitted_outputs(stream.getvalue()), strict=True):
         assert (back.experiment, back.name, back.unit) == (fit.experiment, fit.name, fit.unit)
         for part in ("times", "measured", "simulated"):
             np.testing.assert_array_equal(getattr(back, part), getattr(fit, part))

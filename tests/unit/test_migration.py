@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sysid.core.settings import TOPOLOGIES, GeneticAlgorithm, Migration, TopologyName
-from sysid.identification.run import advance, begin
+from sysid.identification.run import advance_run, begin_run
 from sysid.islands.migration import migrate
-from sysid.islands.topology import CONNECTIONS, edges
-from sysid.search.island import sizes
+from sysid.islands.topology import CONNECTIONS, list_edges
+from sysid.search.island import split_population
 from tests.searching import bits, example
 
 ALGORITHM = GeneticAlgorithm(
@@ -17,15 +17,15 @@ ALGORITHM = GeneticAlgorithm(
 
 def islands() -> tuple:  # type: ignore[type-arg]
     problem = example(n=80)
-    return advance(problem, ALGORITHM, begin(problem, ALGORITHM, 4)).islands
+    return advance_run(problem, ALGORITHM, begin_run(problem, ALGORITHM, 4)).islands
 
 
 def test_topologies_connect_as_named() -> None:
-    assert edges("one-way-ring", 3) == ((0, 1), (1, 2), (2, 0))
-    assert edges("ring", 4) == ((0, 1), (0, 3), (1, 0), (1, 2), (2, 1), (2, 3), (3, 0), (3, 2))
-    assert edges("star", 3) == ((0, 1), (0, 2), (1, 0), (2, 0))
-    assert len(edges("fully-connected", 5)) == 20
-    assert edges("unconnected", 5) == ()
+    assert list_edges("one-way-ring", 3) == ((0, 1), (1, 2), (2, 0))
+    assert list_edges("ring", 4) == ((0, 1), (0, 3), (1, 0), (1, 2), (2, 1), (2, 3), (3, 0), (3, 2))
+    assert list_edges("star", 3) == ((0, 1), (0, 2), (1, 0), (2, 0))
+    assert len(list_edges("fully-connected", 5)) == 20
+    assert list_edges("unconnected", 5) == ()
 
 
 def test_every_topology_has_its_connections() -> None:
@@ -34,8 +34,8 @@ def test_every_topology_has_its_connections() -> None:
 
 @pytest.mark.parametrize("name", TOPOLOGIES)
 def test_no_topology_sends_an_island_its_own(name: TopologyName) -> None:
-    assert edges(name, 1) == ()
-    assert all(a != b for a, b in edges(name, 6))
+    assert list_edges(name, 1) == ()
+    assert all(a != b for a, b in list_edges(name, 6))
 
 
 @pytest.mark.parametrize("name", TOPOLOGIES)
@@ -44,10 +44,10 @@ def test_migration_keeps_sizes_and_worsens_nobody(name: TopologyName, migrants: 
     before = islands()
     after, _ = migrate(before, (24,) * 4, Migration(topology=name, migrants=migrants), 0)
     for old, new in zip(before, after, strict=True):
-        assert new.words.shape == old.words.shape
+        assert new.chromosomes.shape == old.words.shape
         assert np.all(new.fitness <= old.fitness)
         assert np.all(np.diff(new.fitness) >= 0)
-        there = any(np.array_equal(old.words[0], word) for word in new.words)
+        there = any(np.array_equal(old.words[0], word) for word in new.chromosomes)
         assert there or new.fitness[-1] <= old.fitness[0]  # all of it are better ones
 
 
@@ -86,5 +86,5 @@ def test_a_migrant_that_is_there_already_does_not_arrive_again() -> None:
 
 
 def test_the_population_is_dealt_as_evenly_as_possible() -> None:
-    assert sizes(GeneticAlgorithm(population=50, islands=4)) == (13, 13, 12, 12)
-    assert sizes(GeneticAlgorithm(method="simple")) == (50,)
+    assert split_population(GeneticAlgorithm(population=50, islands=4)) == (13, 13, 12, 12)
+    assert split_population(GeneticAlgorithm(method="simple")) == (50,)

@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 
 from sysid.core.errors import InvalidModel
-from sysid.language.tree import Past
-from sysid.models.documents import read_yaml
-from sysid.models.model import EstimatedInitial, FixedInitial, MeasuredInitial, Quantity, Solver
-from sysid.models.parameters import Parameter, override
+from sysid.language.tree import PastValue
+from sysid.models.documents import parse_yaml
+from sysid.models.model import EstimatedInitial, FixedInitial, MeasuredInitial, ModelSignal, Solver
+from sysid.models.parameters import Parameter, override_parameters
 from sysid.models.parse import parse_model
 
 CONTINUOUS: dict[str, Any] = {
@@ -49,10 +49,10 @@ def test_a_differential_document_becomes_a_model() -> None:
         "delayed-duffing",
         "differential",
     )
-    assert model.inputs == (Quantity("q", "N"),)
-    assert model.states == (Quantity("x", "m"), Quantity("v", "m/s"))
+    assert model.inputs == (ModelSignal("q", "N"),)
+    assert model.states == (ModelSignal("x", "m"), ModelSignal("v", "m/s"))
     assert model.parameters[1] == Parameter("L", 0.0, 1.0, "s")
-    assert model.equations[0] == Past("v", "state")
+    assert model.equations[0] == PastValue("v", "state")
     assert model.initial == (MeasuredInitial(), EstimatedInitial(-1.0, 1.0))
     assert model.solver == Solver("semi-implicit", 0.01, 2, "zero", "linear")
     assert (model.order, model.memory) == ((0, 1), 0)
@@ -63,7 +63,7 @@ def test_a_difference_document_orders_its_states_and_counts_its_memory() -> None
     assert model.order == (1, 0)
     assert model.memory == 3
     assert model.initial == (FixedInitial(0.0), FixedInitial(0.0))
-    assert model.states == (Quantity("x", "1"), Quantity("w", "1"))
+    assert model.states == (ModelSignal("x", "1"), ModelSignal("w", "1"))
     assert model.parameters[0].fixed == 3.0
 
 
@@ -208,7 +208,7 @@ def test_a_parameter_tied_in_its_document_is_not_free_until_something_else_is_sa
     assert [p.name for p in model.parameters if p.is_free] == ["c"]
     assert parse_model(model.document) == model
     for change in ({"lower": 0, "upper": 0.5}, {"fixed": 0.25}):
-        _, lag = override(model.parameters, {"L": change})
+        _, lag = override_parameters(model.parameters, {"L": change})
         assert lag.tied is None
         assert lag.is_free == ("upper" in change)
 
@@ -291,4 +291,4 @@ def test_a_recursions_lag_in_seconds_is_not_read_in_samples(
 
 def test_a_tab_that_indents_is_called_that() -> None:
     with pytest.raises(InvalidModel, match=r"line 2, column 1: .* indent with spaces, not tabs"):
-        read_yaml("parameters:\n\tK: {lower: 0, upper: 1}\n")
+        parse_yaml("parameters:\n\tK: {lower: 0, upper: 1}\n")

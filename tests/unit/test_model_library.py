@@ -8,10 +8,10 @@ import pytest
 
 from sysid.core.errors import InvalidModel, InvalidSettings, UnknownModel
 from sysid.models import catalogue as folder
-from sysid.models.catalogue.load import catalogue, document, load_model
-from sysid.models.delays import check_lags
-from sysid.models.documents import MAX_CHARACTERS, read_yaml
-from sysid.models.parameters import override
+from sysid.models.catalogue.load import catalogue, copy_catalogue_document, load_model
+from sysid.models.delays import check_delays
+from sysid.models.documents import MAX_DOCUMENT_CHARACTERS, parse_yaml
+from sysid.models.parameters import override_parameters
 from sysid.models.parse import parse_model
 from tests.meaning import simulate
 
@@ -32,14 +32,14 @@ def test_the_catalogue_holds_the_systems_of_the_paper_and_of_the_field() -> None
 def test_a_built_in_model_says_its_name_source_and_units_and_round_trips(name: str) -> None:
     model = load_model(name)
     assert model.name == name
-    assert {"title", "source"} <= set(document(name))
-    assert all("unit" in entry for entry in document(name)["parameters"].values())
-    assert parse_model(model.document) == model == parse_model(document(name))
+    assert {"title", "source"} <= set(copy_catalogue_document(name))
+    assert all("unit" in entry for entry in copy_catalogue_document(name)["parameters"].values())
+    assert parse_model(model.document) == model == parse_model(copy_catalogue_document(name))
 
 
 def test_a_document_of_the_catalogue_can_be_changed_without_changing_the_catalogue() -> None:
-    document("tube")["parameters"]["K"]["upper"] = 9
-    assert document("tube")["parameters"]["K"]["upper"] == 1.5
+    copy_catalogue_document("tube")["parameters"]["K"]["upper"] = 9
+    assert copy_catalogue_document("tube")["parameters"]["K"]["upper"] == 1.5
 
 
 def test_an_unknown_name_suggests_the_nearest_one() -> None:
@@ -55,13 +55,13 @@ def test_a_name_never_opens_a_file(name: str) -> None:
 
 def test_a_yaml_file_and_a_json_file_load_alike(tmp_path: Path) -> None:
     (tmp_path / "m.yaml").write_text((FOLDER / "tube.yaml").read_text("utf-8"), "utf-8")
-    (tmp_path / "m.json").write_text(json.dumps(document("tube")), "utf-8")
+    (tmp_path / "m.json").write_text(json.dumps(copy_catalogue_document("tube")), "utf-8")
     assert load_model(tmp_path / "m.yaml") == load_model(tmp_path / "m.json") == load_model("tube")
 
 
 def test_files_that_cannot_be_read_are_told_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "binary.yaml").write_bytes(b"name: \xff\xfe")
-    (tmp_path / "large.yaml").write_text("#" * (4 * MAX_CHARACTERS + 1))
+    (tmp_path / "large.yaml").write_text("#" * (4 * MAX_DOCUMENT_CHARACTERS + 1))
     for name, part in (("absent", "No such file"), ("binary", "not UTF-8"), ("large", "larger")):
         with pytest.raises(InvalidModel, match=part) as caught:
             load_model(tmp_path / f"{name}.yaml")
@@ -81,21 +81,21 @@ def test_files_that_cannot_be_read_are_told_in_one_line(tmp_path: Path) -> None:
         ("? {a: 1}\n: 2", "unhashable key"),
         ("a: 1\n---\nb: 2", "expected a single document"),
         ("a: \x00", "special characters"),
-        ("#" * (MAX_CHARACTERS + 1), "at most 262144"),
+        ("#" * (MAX_DOCUMENT_CHARACTERS + 1), "at most 262144"),
     ],
 )
 def test_yaml_that_cannot_be_read_or_is_dangerous_is_refused_in_one_line(
     text: str, part: str
 ) -> None:
     with pytest.raises(InvalidModel) as caught:
-        read_yaml(text)
+        parse_yaml(text)
     assert part in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_yaml_numbers_and_truth_values_are_those_of_version_1_2() -> None:
     text = "{a: 1e-3, b: 1., c: .5, d: 010, on: no, e: true, f: ~, g: 2020-01-01, h: 1:30, i: -2}"
-    assert read_yaml(text) == {
+    assert parse_yaml(text) == {
         "a": 1e-3, "b": 1.0, "c": 0.5, "d": 10, "on": "no", "e": True, "f": None,
         "g": "2020-01-01", "h": "1:30", "i": -2,
     }  # fmt: skip
@@ -135,14 +135,16 @@ def test_the_truncated_series_approaches_the_exponential() -> None:
 
 def test_bounds_of_a_request_that_let_a_lag_be_negative_are_refused() -> None:
     tube = load_model("tube")
-    check_lags(tube, tube.parameters)
+    check_delays(tube, tube.parameters)
     with pytest.raises(InvalidSettings, match=r"lag of u\(t - L\) can be as small as -0.5 s"):
-        check_lags(tube, override(tube.parameters, {"L": {"lower": -0.5}}))
+        check_delays(tube, override_parameters(tube.parameters, {"L": {"lower": -0.5}}))
     with pytest.raises(InvalidSettings, match=r"-0\.2 s"):
-        check_lags(tube, override(tube.parameters, {"L": {"fixed": -0.2, "lower": -1}}))
+        check_delays(
+            tube, override_parameters(tube.parameters, {"L": {"fixed": -0.2, "lower": -1}})
+        )
 
 
 def test_lags_in_samples_are_checked_from_the_whole_delay() -> None:
     narx = load_model("narx")
     with pytest.raises(InvalidSettings, match=r"as small as 0\.5 samples"):
-        check_lags(narx, override(narx.parameters, {"dk": {"lower": -0.5}}), 0.1)
+        check_delays(narx, override_parameters(narx.parameters, {"dk": {"lower": -0.5}}), 0.1)

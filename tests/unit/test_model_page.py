@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from sysid.language.functions import FUNCTIONS
-from sysid.models.documents import read_yaml
+from sysid.models.documents import parse_yaml
 from sysid.models.parse import parse_model
 
 PAGE = (Path(__file__).parents[2] / "docs/model.md").read_text(encoding="utf-8")
@@ -17,7 +17,7 @@ FIELDS = ("name", "title", "description", "source", "form", "inputs", "states", 
 
 def test_the_example_of_the_page_is_a_model() -> None:
     [text] = re.findall(r"```yaml\n(.*?)```", PAGE, re.S)
-    assert parse_model(read_yaml(text)).name == "valve-and-oven"
+    assert parse_model(parse_yaml(text)).name == "valve-and-oven"
 
 
 @pytest.mark.parametrize("field", [*FIELDS, *(f"solver.{name}" for name in SOLVER)])

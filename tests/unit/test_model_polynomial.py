@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from sysid.core.errors import InvalidModel
-from sysid.language.delays import past_values
-from sysid.language.tree import Binary, Past, Symbol
+from sysid.language.delays import collect_past_values
+from sysid.language.tree import Binary, PastValue, Symbol
 from sysid.models.model import FixedInitial, MeasuredInitial
 from sysid.models.parse import parse_model
 
@@ -56,8 +56,8 @@ def test_a_coefficient_multiplies_its_term() -> None:
     document = NARX | {"terms": ["y(k-1)*u(k-2)"], "parameters": {}}
     model = parse_model(document)
     coefficient = Symbol("a[y(k-1)*u(k-2)]", "parameter")
-    past = Binary("*", coefficient, Past("y", "state", 1))
-    assert model.equations == (Binary("*", past, Past("u", "input", 2)),)
+    past = Binary("*", coefficient, PastValue("y", "state", 1))
+    assert model.equations == (Binary("*", past, PastValue("u", "input", 2)),)
     assert model.memory == 2
 
 
@@ -70,14 +70,14 @@ def test_a_list_of_terms_replaces_all_and_needs_neither_degree_nor_lags() -> Non
 def test_a_constant_term_is_added_on_request() -> None:
     assert names(constant=True, degree=1)[4] == "a[1]"
     model = parse_model(NARX | {"constant": True, "terms": ["y(k-1)"], "parameters": {}})
-    linear = Binary("*", Symbol("a[y(k-1)]", "parameter"), Past("y", "state", 1))
+    linear = Binary("*", Symbol("a[y(k-1)]", "parameter"), PastValue("y", "state", 1))
     assert model.equations == (Binary("+", linear, Symbol("a[1]", "parameter")),)
 
 
 def test_the_output_is_the_state_and_starts_as_measured() -> None:
     model = parse_model(NARX | {"output": {"y": "bar"}})
     assert model.form == "polynomial"
-    assert model.outputs[0].expression == Past("y", "state")
+    assert model.outputs[0].expression == PastValue("y", "state")
     assert model.outputs[0].unit == "bar"
     assert model.initial == (MeasuredInitial(),)
     assert parse_model(NARX | {"initial": {"y": 2}}).initial == (FixedInitial(2.0),)
@@ -85,7 +85,9 @@ def test_the_output_is_the_state_and_starts_as_measured() -> None:
 
 def test_an_unknown_lag_is_the_same_in_every_term_that_has_it() -> None:
     model = parse_model(NARX)
-    lags = {value.lag for value in past_values(model.equations[0]) if value.lag is not None}
+    lags = {
+        value.delay for value in collect_past_values(model.equations[0]) if value.delay is not None
+    }
     assert lags == {Symbol("dh", "parameter"), Symbol("dk", "parameter")}
 
 

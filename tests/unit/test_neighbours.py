@@ -8,17 +8,22 @@ import pytest
 from scipy.signal import lfilter
 
 from sysid.core.settings import GeneticAlgorithm, Stop
-from sysid.data.noise import Noise, noise_samples
-from sysid.identification.conclude import conclude
+from sysid.data.noise import Noise, draw_noise
+from sysid.identification.conclude import conclude_run
 from sysid.identification.identify import identify
-from sysid.identification.local_minima import Neighbourhood, affordable, neighbourhood, widened
-from sysid.identification.run import advance, begin
+from sysid.identification.local_minima import (
+    LocalMinima,
+    count_affordable_simulations,
+    find_local_minima,
+    widen_intervals,
+)
+from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
-from sysid.uncertainty.linear_model import drawn_along, linear_model, moves_of
+from sysid.uncertainty.linear_model import factor_covariance, linearise_outputs, make_move_generator
 from tests.searching import COULOMB, clean, example, noisy, record
 
 TRUTH = np.array([0.2, 0.5, 5.0, 1.0])  # of Example 1
@@ -30,12 +35,12 @@ def rough(seed: int = 70_043) -> Problem:
     return Problem.build(load_model("coulomb-eq16"), [record(noisy("coulomb-eq16", seed=seed))])
 
 
-def around(problem: Problem, start: np.ndarray, left: int | None = None) -> Neighbourhood:
-    end = refine(problem, [start])[0]
+def around(problem: Problem, start: np.ndarray, left: int | None = None) -> LocalMinima:
+    end = refine_candidates(problem, [start])[0]
     assert end is not None
-    linear = analyse(problem, end.theta).linear
+    linear = analyse_estimate(problem, end.theta).linear_model
     assert linear is not None
-    return neighbourhood(problem, end.theta, end.rms, linear, 1, left)
+    return find_local_minima(problem, end.theta, end.rms, linear, 1, left)
 
 
 def test_beside_the_optimum_of_a_smooth_loss_nothing_more_than_a_look_is_spent() -> None:
@@ -51,7 +56,7 @@ def test_coloured_residuals_do_not_make_a_smooth_loss_rough(pole: float) -> None
     problem = Problem.build(
         load_model("duffing-eq16"), [record(clean() + lfilter([1.0], [1.0, -pole], white))]
     )
-    known = analyse(problem, TRUTH).uncertainty
+    known = analyse_estimate(problem, TRUTH).uncertainty
     assert known is not None
     assert known.noise_colour == "coloured"
     assert around(problem, TRUTH).evaluations == 24
@@ -79,9 +84,9 @@ def test_few_samples_do_not_make_a_linear_regression_rough(n: int, d: int) -> No
         error, one = columns @ theta - measured, np.ones(d)
         inverse = np.asarray(np.linalg.inv(columns.T @ columns), dtype=np.float64)
         root = np.linalg.qr(columns)[1]
-        linear = linear_model(error, columns, one < 0, 0.5 * one, one, one, inverse, root)
+        linear = linearise_outputs(error, columns, one < 0, 0.5 * one, one, one, inverse, root)
         rms = float(np.sqrt(np.mean(error**2)))
-        found = neighbourhood(Regression(), theta, rms, linear, seed)  # type: ignore[arg-type]
+        found = find_local_minima(Regression(), theta, rms, linear, seed)  # type: ignore[arg-type]
         assert found.evaluations == 24
 
 
@@ -92,8 +97,14 @@ def test_moves_cut_off_at_bounds_are_expected_where_they_end() -> None:
 
 
 def test_the_longer_a_simulation_takes_the_fewer_are_spent() -> None:
-    spent = [affordable(lasting(steps), is_late=False) for steps in (300, 100_000, 1_000_000)]
-    late = [affordable(lasting(steps), is_late=True) for steps in (300, 100_000, 1_000_000)]
+    spent = [
+        count_affordable_simulations(lasting(steps), is_late=False)
+        for steps in (300, 100_000, 1_000_000)
+    ]
+    late = [
+        count_affordable_simulations(lasting(steps), is_late=True)
+        for steps in (300, 100_000, 1_000_000)
+    ]
     assert spent == [1800, 500, 50]
     assert late == [1800, 50, 0]
 
@@ -105,13 +116,13 @@ def lasting(steps: int) -> Problem:
 
 
 def test_a_run_out_of_time_says_that_it_has_not_looked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sysid.identification.local_minima._LATE", 0)
+    monkeypatch.setattr("sysid.identification.local_minima._MAX_LATE_WORK", 0)
     problem = example()
     algorithm = GeneticAlgorithm(generations=20, stop=Stop(seconds=1e9))
-    state = advance(problem, algorithm, begin(problem, algorithm, 1))
+    state = advance_run(problem, algorithm, begin_run(problem, algorithm, 1))
     said = "minima beside the estimate were not looked for"
-    in_time = conclude(problem, algorithm, replace(state, seconds=0.0))
-    late = conclude(problem, algorithm, replace(state, seconds=1e9))
+    in_time = conclude_run(problem, algorithm, replace(state, seconds=0.0))
+    late = conclude_run(problem, algorithm, replace(state, seconds=1e9))
     assert not any(said in text for text in in_time.warnings)
     assert any(said in text for text in late.warnings)
     assert late.evaluations == in_time.evaluations - 24
@@ -143,7 +154,7 @@ def test_beside_a_minimum_of_a_rough_loss_others_are_found_inside_bounds_and_bud
     assert np.all(
         (found.values >= problem.evaluator.lower) & (found.values <= problem.evaluator.upper)
     )
-    assert found.rms == pytest.approx(problem.fitness(found.values), rel=1e-12)
+    assert found.rms == pytest.approx(problem.evaluate_fitness(found.values), rel=1e-12)
     if found.best is not None:
         assert found.best.rms == found.rms.min() < found.rms[0]
 
@@ -163,17 +174,17 @@ def test_the_same_seed_finds_the_same_bits() -> None:
 def test_moves_have_the_covariance_they_are_drawn_along_whatever_the_units() -> None:
     correlation = np.array([[1.0, 0.9, -0.5], [0.9, 1.0, -0.3], [-0.5, -0.3, 1.0]])
     deviation = np.array([1e-9, 1.0, 1e9])
-    root = drawn_along(correlation * np.outer(deviation, deviation)) / deviation[:, None]
+    root = factor_covariance(correlation * np.outer(deviation, deviation)) / deviation[:, None]
     assert root @ root.T == pytest.approx(correlation, abs=1e-14)
-    held = drawn_along(np.diag([4.0, 0.0]))  # a parameter on a plateau stays
+    held = factor_covariance(np.diag([4.0, 0.0]))  # a parameter on a plateau stays
     assert held @ held.T == pytest.approx(np.diag([4.0, 0.0]), abs=1e-14)
 
 
 def test_moves_are_not_made_of_the_noise_that_was_added_with_the_same_seed() -> None:
-    moves = moves_of(1).standard_normal(50)
+    moves = make_move_generator(1).standard_normal(50)
     for stream in (0, 1, 1000):
-        assert not np.isin(moves, noise_samples(Noise(1.0, 1), 50, stream)).any()
-    assert moves.tobytes() == moves_of(1).standard_normal(50).tobytes()
+        assert not np.isin(moves, draw_noise(Noise(1.0, 1), 50, stream)).any()
+    assert moves.tobytes() == make_move_generator(1).standard_normal(50).tobytes()
 
 
 def test_without_a_budget_nothing_is_simulated() -> None:
@@ -190,32 +201,34 @@ def test_an_interval_holds_the_values_of_minima_that_the_data_do_not_rule_out(
 ) -> None:
     n = 50
     rms = np.array([1.0, np.exp(ratio / (2 * n))])
-    found = Neighbourhood(None, np.array([[2.0], [1.6]]), rms, 0)
-    wide = widened((ONE,), ("a",), n, found, SAME)[0]
+    found = LocalMinima(None, np.array([[2.0], [1.6]]), rms, 0)
+    wide = widen_intervals((ONE,), ("a",), n, found, SAME)[0]
     assert wide == replace(ONE, interval95=wide.interval95)
     assert wide.interval95 == pytest.approx((low, 2.2))
 
 
 def test_of_coloured_residuals_a_minimum_is_as_likely_as_their_variance_says() -> None:
     n, share = 50, np.array([0.25])  # standard errors twice those of white residuals
-    found = Neighbourhood(None, np.array([[2.0], [1.6]]), np.array([1.0, np.exp(8.0 / (2 * n))]), 0)
-    white = widened((ONE,), ("a",), n, found, SAME)[0]
+    found = LocalMinima(None, np.array([[2.0], [1.6]]), np.array([1.0, np.exp(8.0 / (2 * n))]), 0)
+    white = widen_intervals((ONE,), ("a",), n, found, SAME)[0]
     assert white.interval95 == pytest.approx((1.8, 2.2))
-    wide = widened((ONE,), ("a",), n, found, share)[0]
+    wide = widen_intervals((ONE,), ("a",), n, found, share)[0]
     assert wide.interval95 == pytest.approx((1.6 - 0.1 * np.sqrt(2.0), 2.2))
 
 
 def test_the_interval_of_a_parameter_on_a_plateau_stays_around_its_middle() -> None:
-    found = Neighbourhood(None, np.array([[2.0], [1.6]]), np.array([1.0, 1.0]), 0)
-    assert widened((ONE,), ("a",), 50, found, np.array([np.nan])) == (ONE,)
+    found = LocalMinima(None, np.array([[2.0], [1.6]]), np.array([1.0, 1.0]), 0)
+    assert widen_intervals((ONE,), ("a",), 50, found, np.array([np.nan])) == (ONE,)
 
 
 def test_an_estimate_without_a_standard_error_gets_none_by_its_neighbours() -> None:
     blind = replace(ONE, stderr=None, interval95=None)
-    found = Neighbourhood(None, np.array([[2.0]]), np.array([1.0]), 0)
-    assert widened((blind,), ("a",), 50, found, SAME) == (blind,)
+    found = LocalMinima(None, np.array([[2.0]]), np.array([1.0]), 0)
+    assert widen_intervals((blind,), ("a",), 50, found, SAME) == (blind,)
 
 
 def test_beside_a_perfect_fit_nothing_else_is_likely() -> None:
-    found = Neighbourhood(None, np.array([[2.0], [1.6]]), np.array([0.0, 1e-9]), 0)
-    assert widened((ONE,), ("a",), 50, found, SAME)[0].interval95 == pytest.approx((1.8, 2.2))
+    found = LocalMinima(None, np.array([[2.0], [1.6]]), np.array([0.0, 1e-9]), 0)
+    assert widen_intervals((ONE,), ("a",), 50, found, SAME)[0].interval95 == pytest.approx(
+        (1.8, 2.2)
+    )

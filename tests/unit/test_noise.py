@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 
 from sysid.core.errors import InvalidSettings
-from sysid.data.noise import Noise, noise_samples, with_noise
+from sysid.data.noise import Noise, add_output_noise, draw_noise
 from tests.searching import clean, record
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "uniform-sum"])
 def test_sigma_is_a_standard_deviation(kind: str) -> None:
-    values = noise_samples(Noise(0.3, seed=2, kind=kind, mean=1.0), 100_000)  # type: ignore[arg-type]
+    values = draw_noise(Noise(0.3, seed=2, kind=kind, mean=1.0), 100_000)  # type: ignore[arg-type]
     assert np.mean(values) == pytest.approx(1.0, abs=0.005)
     assert np.std(values) == pytest.approx(0.3, rel=0.01)
 
 
 @pytest.mark.parametrize("terms", [3, 12])
 def test_a_sum_of_uniforms_has_its_excess_kurtosis(terms: int) -> None:
-    values = noise_samples(Noise(1.0, kind="uniform-sum", terms=terms), 400_000)
+    values = draw_noise(Noise(1.0, kind="uniform-sum", terms=terms), 400_000)
     assert np.mean(values**4) / np.var(values) ** 2 - 3 == pytest.approx(-1.2 / terms, abs=0.03)
     assert np.max(np.abs(values)) <= terms / 2 / np.sqrt(terms / 12)
 
@@ -25,17 +25,17 @@ def test_a_sum_of_uniforms_has_its_excess_kurtosis(terms: int) -> None:
 def test_noise_repeats_by_its_seed_and_differs_between_channels_and_experiments() -> None:
     noise = Noise(0.1, seed=5)
     given = record(clean())
-    once, again = with_noise(given, noise), with_noise(given, noise)
-    other = with_noise(given, noise, experiment=1)
+    once, again = add_output_noise(given, noise), add_output_noise(given, noise)
+    other = add_output_noise(given, noise, experiment=1)
     assert np.array_equal(once.outputs[0].values, again.outputs[0].values)
     assert not np.array_equal(once.outputs[0].values, other.outputs[0].values)
-    assert not np.array_equal(noise_samples(noise, 9, 0), noise_samples(noise, 9, 1))
+    assert not np.array_equal(draw_noise(noise, 9, 0), draw_noise(noise, 9, 1))
 
 
 def test_noise_leaves_the_inputs_and_zero_sigma_leaves_all() -> None:
     given = record(clean())
-    assert with_noise(given, Noise(0.1)).inputs == given.inputs
-    assert with_noise(given, Noise()) is given
+    assert add_output_noise(given, Noise(0.1)).inputs == given.inputs
+    assert add_output_noise(given, Noise()) is given
 
 
 @pytest.mark.parametrize(

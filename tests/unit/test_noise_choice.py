@@ -10,12 +10,12 @@ from sysid.core.settings import GeneticAlgorithm, Loss, Stop
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.identification.identify import identify
-from sysid.identification.noise_model_choice import remembering, speaks_for_ar1
+from sysid.identification.noise_model_choice import find_integrating_outputs, is_ar1_indicated
 from sysid.identification.result import Identification
 from sysid.models.catalogue.load import load_model
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import analyse
-from sysid.uncertainty.profile_likelihood import profile
+from sysid.uncertainty.analysis import analyse_estimate
+from sysid.uncertainty.profile_likelihood import compute_profile
 from tests.unit.test_serial import coloured
 
 STEP, N = 0.1, 400
@@ -78,7 +78,7 @@ def same(one: Identification, other: Identification) -> bool:
 def remembers(model: dict[str, Any], theta: tuple[float, ...], n: int = N, **options: Any) -> bool:
     rows = [record(plant(0.0, np.zeros(n)))] * options.pop("experiments", 1)
     problem = Problem.build(load_model(model), rows, **options)
-    return remembering(problem, np.array(theta)) == {"y"}
+    return find_integrating_outputs(problem, np.array(theta)) == {"y"}
 
 
 STARTS: list[tuple[dict[str, Any], tuple[float, ...], dict[str, Any]]] = [
@@ -113,10 +113,13 @@ def test_a_short_experiment_beside_a_long_one_makes_no_lag_an_integrator() -> No
     lag = load_model({**LAG, "constants": {"T": 0.1 * STEP * N}})
     both = [record(plant(0.0, np.zeros(n))) for n in (N, N // 5)]
     theta = np.array([K, OFFSET])
-    assert [remembering(Problem.build(lag, [one]), theta) for one in both] == [set(), {"y"}]
+    assert [find_integrating_outputs(Problem.build(lag, [one]), theta) for one in both] == [
+        set(),
+        {"y"},
+    ]
     for records in (both, both[::-1]):
-        assert remembering(Problem.build(lag, records), theta) == set()
-        assert remembering(Problem.build(load_model(TANK), records), theta) == {"y"}
+        assert find_integrating_outputs(Problem.build(lag, records), theta) == set()
+        assert find_integrating_outputs(Problem.build(load_model(TANK), records), theta) == {"y"}
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
@@ -143,7 +146,7 @@ def test_a_recursion_that_reads_two_samples_remembers_by_its_poles() -> None:
 
 
 def test_a_drive_with_dry_friction_remembers_where_it_is() -> None:
-    assert remembering(
+    assert find_integrating_outputs(
         Problem.build(load_model("emps"), [record(plant(0.0, np.zeros(N)))]),
         np.array([90.0, 200.0, 20.0, -3.0]),
     ) == {"y"}
@@ -204,7 +207,7 @@ def test_too_long_a_step_of_the_integration_is_told_and_not_taken_for_noise() ->
     }  # fmt: skip
     fine = {**stiff, "solver": {"method": "rk4", "step": "sample", "substeps": 40}}
     true = Problem.build(load_model(fine), [record(np.zeros(N))])
-    y = true.predictions(np.array([[K, 3.0, 1.0]]))[0]
+    y = true.predict(np.array([[K, 3.0, 1.0]]))[0]
     auto, white, ar1 = (found(stiff, y, loss) for loss in (AUTO, WHITE, AR1))
     assert 0 < ar1.correlation_times["y"] < STEP * N / 5
     assert same(auto, white)
@@ -228,7 +231,9 @@ def test_a_time_that_leaves_no_room_for_the_look_leaves_squares(
     """Simulations of a long record: of each state eight, and two for the colour."""
     problem = Problem.build(load_model(TANK), [record(disturbed(2))])
     theta = np.array([one.value for one in found(TANK, disturbed(2), WHITE).estimates])
-    assert speaks_for_ar1(problem, theta, analyse(problem, theta), None, most) is expected
+    assert (
+        is_ar1_indicated(problem, theta, analyse_estimate(problem, theta), None, most) is expected
+    )
 
 
 @pytest.mark.parametrize(
@@ -253,7 +258,7 @@ def test_profiles_are_of_squares_whatever_was_chosen() -> None:
     told = []
     for loss in (AUTO, WHITE):
         problem = Problem.build(load_model(TANK), [record(y)], loss=loss)
-        told.append(profile(problem, np.array([K, OFFSET]), "K", 5))
+        told.append(compute_profile(problem, np.array([K, OFFSET]), "K", 5))
     assert told[0].estimate == told[1].estimate
     assert told[0].interval == told[1].interval
 
@@ -261,7 +266,7 @@ def test_profiles_are_of_squares_whatever_was_chosen() -> None:
 @pytest.mark.parametrize(("damping", "period"), [(0.0, 2.0), (0.02, 2.0)])
 def test_an_oscillation_that_goes_on_is_no_drift(damping: float, period: float) -> None:
     pole = np.exp((-damping + 2j * np.pi / period) * STEP)
-    swing = f"{2 * pole.real}*x(k-1) - {abs(pole) ** 2}*x(k-2) + h**2*(K*u(k-1) - o)"
+    swing = f"{2 * pole.write_float}*x(k-1) - {abs(pole) ** 2}*x(k-2) + h**2*(K*u(k-1) - o)"
     assert not remembers({**TANK, "equations": {"x": swing}}, (K, OFFSET))
     both = {
         **TANK, "states": {"w": "1", "x": "1"}, "initial": {"w": 0, "x": 0},

@@ -9,16 +9,19 @@ from sysid.core.errors import InvalidSettings
 from sysid.core.settings import GeneticAlgorithm, Loss, Stop
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identification.conclude import conclude
-from sysid.identification.generalised_least_squares import generalised, whitening
+from sysid.identification.conclude import conclude_run
+from sysid.identification.generalised_least_squares import (
+    fit_generalised_least_squares,
+    make_whitening,
+)
 from sysid.identification.identify import identify
-from sysid.identification.run import advance, begin
+from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
-from sysid.residuals.whitening import Whitening, owed
-from sysid.search.refine import refine
+from sysid.residuals.whitening import Whitening, compute_ar1_coefficient
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import analyse
-from sysid.uncertainty.profile_likelihood import profile
+from sysid.uncertainty.analysis import analyse_estimate
+from sysid.uncertainty.profile_likelihood import compute_profile
 from tests import searching
 from tests.unit.test_serial import coloured
 
@@ -46,34 +49,34 @@ def posed(*records: Record, loss: Loss = AR1) -> Problem:
 
 
 def squares(problem: Problem) -> FloatArray:
-    end = refine(problem, [np.zeros(len(problem.space))])[0]
+    end = refine_candidates(problem, [np.zeros(len(problem.free_parameters))])[0]
     assert end is not None
     return end.theta
 
 
 def regression(problem: Problem, white: Whitening) -> FloatArray:
     """The generalised least-squares estimate of this linear model, in closed form."""
-    base = problem.predictions(np.zeros((1, 2)))[0]
-    columns = (problem.predictions(np.eye(2)) - base).T
+    base = problem.predict(np.zeros((1, 2)))[0]
+    columns = (problem.predict(np.eye(2)) - base).T
     scored = problem.evaluator.weight > 0
-    seen, y = white.of(columns[scored].T).T, white.of(problem.evaluator.measured[scored])
+    seen, y = white.whiten(columns[scored].T).T, white.whiten(problem.evaluator.measured[scored])
     return np.asarray(np.linalg.lstsq(seen, y, rcond=None)[0])
 
 
 def test_whitening_takes_the_correlation_out_of_first_order_noise_at_any_times() -> None:
     times = np.cumsum(np.random.default_rng(1).exponential(1.0, 12))
     noise = np.exp(-np.abs(times[:, None] - times) / 2.5)
-    white = Whitening(owed(times, 2.5))
-    of = white.of(np.eye(12)).T
+    white = Whitening(compute_ar1_coefficient(times, 2.5))
+    of = white.whiten(np.eye(12)).T
     np.testing.assert_allclose(of @ noise @ of.T, np.eye(12), atol=1e-12)
     assert white.log_determinant == pytest.approx(np.linalg.slogdet(noise)[1])
 
 
 def test_estimates_are_those_of_generalised_least_squares_in_closed_form() -> None:
     problem = posed(record(1), record(2))
-    found = generalised(problem, squares(problem), np.zeros((2, 2)), 1)
+    found = fit_generalised_least_squares(problem, squares(problem), np.zeros((2, 2)), 1)
     assert found.is_complete
-    white = whitening(problem, found.correlation_times)
+    white = make_whitening(problem, found.correlation_times)
     np.testing.assert_allclose(found.theta, regression(problem, white), rtol=1e-5)
 
 
@@ -85,7 +88,7 @@ def test_the_correlation_time_is_found_with_and_without_missing_samples() -> Non
         found = []
         for seed in range(20):
             problem = posed(record(seed, 0.8, chosen))
-            end = generalised(problem, squares(problem), np.zeros((2, 2)), 1)
+            end = fit_generalised_least_squares(problem, squares(problem), np.zeros((2, 2)), 1)
             found.append(end.correlation_times["y"])
         assert np.mean(found) == pytest.approx(true, rel=0.15)
 
@@ -110,7 +113,7 @@ def test_under_slow_noise_a_fast_input_tells_more_than_squares_make_of_it() -> N
     for seed in range(20):
         problem = posed(record(seed))
         plain = squares(problem)
-        found = generalised(problem, plain, np.zeros((2, 2)), 1)
+        found = fit_generalised_least_squares(problem, plain, np.zeros((2, 2)), 1)
         errors.append([plain[0] - 2.0, found.theta[0] - 2.0])
     plain_size, size = np.sqrt(np.mean(np.square(errors), axis=0))
     assert size < 0.5 * plain_size
@@ -166,13 +169,15 @@ def test_of_a_rough_loss_intervals_hold_the_minima_that_the_noise_does_not_rule_
     )  # fmt: skip
     problem = Problem.build(load_model("coulomb-eq16"), [data], loss=AR1)
     settings = GeneticAlgorithm(stop=Stop(evaluations=20_000))
-    found = conclude(problem, settings, advance(problem, settings, begin(problem, settings, 1)))
+    found = conclude_run(
+        problem, settings, advance_run(problem, settings, begin_run(problem, settings, 1))
+    )
     assert found.correlation_times["y"] > 0
     theta = np.array([one.value for one in found.estimates])
-    white = whitening(problem, found.correlation_times)
+    white = make_whitening(problem, found.correlation_times)
     wider = []
     for one, alone in zip(
-        found.estimates, analyse(problem, theta, None, white).estimates, strict=True
+        found.estimates, analyse_estimate(problem, theta, None, white).estimates, strict=True
     ):
         assert one.interval95 is not None
         assert alone.interval95 is not None
@@ -194,17 +199,17 @@ def test_a_noise_model_gets_the_time_that_is_left_and_no_more(
 ) -> None:
     problem = posed(record(3))
     timed = replace(SMALL, stop=Stop(seconds=100.0, settled=None))
-    state = advance(problem, timed, begin(problem, timed, 1))
-    whole = conclude(problem, timed, replace(state, seconds=1.0))
-    monkeypatch.setattr("sysid.identification.deadline._LATE", 30 * problem.n_steps)
-    late = conclude(problem, timed, replace(state, seconds=100.0))
-    soon = conclude(problem, timed, replace(state, seconds=99.0))  # time for a hundredth more
+    state = advance_run(problem, timed, begin_run(problem, timed, 1))
+    whole = conclude_run(problem, timed, replace(state, seconds=1.0))
+    monkeypatch.setattr("sysid.identification.deadline._STEPS_AFTER_DEADLINE", 30 * problem.n_steps)
+    late = conclude_run(problem, timed, replace(state, seconds=100.0))
+    soon = conclude_run(problem, timed, replace(state, seconds=99.0))  # time for a hundredth more
     said = "not estimated to its end"
     assert [any(said in one for one in found.warnings) for found in (whole, soon, late)] == [
         False, True, True,
     ]  # fmt: skip
     assert late.evaluations <= whole.evaluations - 50
-    assert conclude(problem, timed, replace(state, seconds=1.0)).estimates == whole.estimates
+    assert conclude_run(problem, timed, replace(state, seconds=1.0)).estimates == whole.estimates
 
 
 def test_what_a_noise_model_cannot_do_is_refused() -> None:
@@ -215,7 +220,7 @@ def test_what_a_noise_model_cannot_do_is_refused() -> None:
     with pytest.raises(InvalidSettings, match="for free runs"):
         Problem.build(load_model(GAIN), [record(1)], loss=AR1, prediction="one-step")
     with pytest.raises(InvalidSettings, match="profiles are of plain squares"):
-        profile(posed(record(1)), np.array([2.0, 1.0]), "g")
+        compute_profile(posed(record(1)), np.array([2.0, 1.0]), "g")
 
 
 def test_every_output_has_a_noise_of_its_own_and_a_kept_part_is_judged() -> None:

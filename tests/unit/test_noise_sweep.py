@@ -3,10 +3,10 @@
 import pytest
 import typer
 
-from service.cli.sweeps import grid, tables_of
-from service.figures.noise import NORMAL_95, noise_keys, noise_sweep
-from service.figures.theme import DASHES
-from service.sweeps.cramer_rao import Floors, at_sigma
+from service.cli.sweeps import build_sweep_tables, parse_sigma_grid
+from service.figures.noise import NORMAL_95, noise_group_keys, plot_noise_sweep
+from service.figures.theme import SERIES_DASHES
+from service.sweeps.cramer_rao import StoredBounds, scale_to_sigma
 from service.sweeps.schemas import GroupOut, ParameterSummaryOut, SummaryOut
 
 SIGMAS = (0.0, 0.5, 1.0)
@@ -48,7 +48,7 @@ def summary(groups):
     ],
 )
 def test_a_grid_has_exactly_the_numbers_that_are_written(text, expected):
-    assert grid(text) == expected
+    assert parse_sigma_grid(text) == expected
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_a_grid_has_exactly_the_numbers_that_are_written(text, expected):
 )  # fmt: skip
 def test_a_grid_that_cannot_be_read_is_one_line_and_exit_code_2(text, capsys):
     with pytest.raises(typer.Exit) as ended:
-        grid(text)
+        parse_sigma_grid(text)
     assert ended.value.exit_code == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
@@ -66,7 +66,9 @@ def test_the_tables_have_a_row_for_each_group_and_at_most_four_parameters_each()
     names = "abcdefghi"
     one = group(0.5, "simple")
     many = [one.parameters[0].model_copy(update={"name": name}) for name in names]
-    found = tables_of(summary([one.model_copy(update={"parameters": many})] * 3).model_dump())
+    found = build_sweep_tables(
+        summary([one.model_copy(update={"parameters": many})] * 3).model_dump()
+    )
     assert [len(rows) for _, rows in found] == [3] * 4
     for headings, rows in found:
         assert all(len(row) == len(headings) for row in rows)
@@ -84,7 +86,7 @@ def test_the_tables_have_a_row_for_each_group_and_at_most_four_parameters_each()
 )  # fmt: skip
 def test_the_noise_and_the_error_of_the_response_have_the_unit_of_the_output(unit, sigma, error):
     told = summary([group(0.5, "simple")]).model_copy(update={"rms_unit": unit})
-    headings, _ = tables_of(told.model_dump())[0]
+    headings, _ = build_sweep_tables(told.model_dump())[0]
     assert headings[0] == sigma
     assert error in headings
 
@@ -95,7 +97,7 @@ def test_of_a_relative_sigma_what_was_typed_stands_beside_what_it_is_in_the_outp
     told = summary([one.model_copy(update={"key": key})]).model_copy(
         update={"by": list(key), "rms_unit": "m"}
     )
-    for headings, rows in tables_of(told.model_dump()):
+    for headings, rows in build_sweep_tables(told.model_dump()):
         assert headings[:3] == [">relative σ", ">σ [m]", "method"]
         assert rows[0][:3] == ["0.1", "0.1698", "simple"]
 
@@ -107,7 +109,7 @@ def test_of_a_relative_sigma_what_was_typed_stands_beside_what_it_is_in_the_outp
 )  # fmt: skip
 def test_a_row_without_noise_is_explained_where_errors_are_told_against_it(reference, is_told):
     problem = {"cell": {}, "reference": reference, "note": ""}
-    notes = list(Floors({"problems": [problem]}).notes())
+    notes = list(StoredBounds({"problems": [problem]}).list_notes())
     assert is_told == any("as it was measured" in one for one in notes)
 
 
@@ -117,7 +119,7 @@ def test_what_is_not_known_is_a_dash():
         0.5, "simple", succeeded=0, failed=0, evaluations=None, rms_noise_free=None,
         rms_floor=None, parameters=[blank],
     )  # fmt: skip
-    first, second = (rows[0] for _, rows in tables_of(summary([waiting]).model_dump()))
+    first, second = (rows[0] for _, rows in build_sweep_tables(summary([waiting]).model_dump()))
     assert first == ["0.5", "simple", "0/10", "–", "–", "–", "–"]
     assert second == ["0.5", "simple", "–", "–"]
 
@@ -131,7 +133,7 @@ def lines(figure, axis, dash=None):
 
 def test_each_plot_has_a_median_and_a_band_for_each_method():
     groups = [group(s, m, 1 + n) for s in SIGMAS for n, m in enumerate(("simple", "improved"))]
-    figure = noise_sweep(summary(groups), "m")
+    figure = plot_noise_sweep(summary(groups), "m")
     for axis in ("x", "x2"):
         medians = [one for one in figure["data"]
                    if one["xaxis"] == axis and one["mode"] == "lines+markers"]  # fmt: skip
@@ -145,8 +147,8 @@ def test_each_plot_has_a_median_and_a_band_for_each_method():
 
 
 def test_the_floor_of_a_parameter_is_drawn_at_the_quantiles_of_the_band():
-    figure = noise_sweep(summary([group(s, "improved") for s in SIGMAS]), "m")
-    assert "dash" in DASHES
+    figure = plot_noise_sweep(summary([group(s, "improved") for s in SIGMAS]), "m")
+    assert "dash" in SERIES_DASHES
     (response,) = lines(figure, "x", "dash")
     assert response["y"] == pytest.approx([0.2 * s for s in SIGMAS])
     below, above = lines(figure, "x2", "dash")
@@ -156,7 +158,7 @@ def test_the_floor_of_a_parameter_is_drawn_at_the_quantiles_of_the_band():
 
 
 def test_groups_are_drawn_in_the_order_of_their_noise():
-    figure = noise_sweep(summary([group(s, "improved") for s in (1.0, 0.0, 0.5)]), "m")
+    figure = plot_noise_sweep(summary([group(s, "improved") for s in (1.0, 0.0, 0.5)]), "m")
     medians = [one for one in figure["data"] if one["mode"] == "lines+markers"]
     assert all(one["x"] == [0.0, 0.5, 1.0] for one in medians)
     assert medians[0]["y"] == pytest.approx([0.0, 0.25, 0.5])
@@ -164,26 +166,26 @@ def test_groups_are_drawn_in_the_order_of_their_noise():
 
 def test_a_sweep_that_has_given_nothing_yet_has_an_empty_figure():
     waiting = [group(0.5, "simple", rms_noise_free=None, parameters=[])]
-    assert noise_sweep(summary(waiting), "m")["data"] == []
+    assert plot_noise_sweep(summary(waiting), "m")["data"] == []
 
 
 def test_only_a_sweep_over_the_deviation_has_the_figure():
-    assert noise_keys([{"path": "/seed"}]) is None
+    assert noise_group_keys([{"path": "/seed"}]) is None
     axes = [{"path": one} for one in ("/noise/sigma", "/noise/seed", "/seed", "/skip")]
-    assert noise_keys(axes) == ["/noise/sigma", "/skip"]
+    assert noise_group_keys(axes) == ["/noise/sigma", "/skip"]
 
 
 def test_a_floor_is_told_where_the_runs_of_a_group_have_one_deviation_and_one_problem():
-    assert at_sigma(2.0, (0.5, 0.5)) == 1.0
-    assert at_sigma(2.0, (0.0, 0.0)) == 0.0
-    assert at_sigma(2.0, (0.0, 0.5)) is None
-    assert at_sigma(None, (0.5, 0.5)) is None
+    assert scale_to_sigma(2.0, (0.5, 0.5)) == 1.0
+    assert scale_to_sigma(2.0, (0.0, 0.0)) == 0.0
+    assert scale_to_sigma(2.0, (0.0, 0.5)) is None
+    assert scale_to_sigma(None, (0.5, 0.5)) is None
     problems = [
         {"cell": {"/datasets": [one]}, "reference": None, "stderr": {}, "rms": None, "note": ""}
         for one in ("ds_1", "ds_2")
     ]
-    several = Floors({"axes": ["/datasets"], "problems": problems})
-    assert several.problem_of({"/datasets": ["ds_2"]}) is problems[1]
-    assert several.problem_of({"/noise/sigma": 0.1}) is None
-    assert Floors({"axes": [], "problems": problems[:1]}).problem_of({}) is problems[0]
-    assert Floors(None).problem_of({}) is None
+    several = StoredBounds({"axes": ["/datasets"], "problems": problems})
+    assert several.find_problem({"/datasets": ["ds_2"]}) is problems[1]
+    assert several.find_problem({"/noise/sigma": 0.1}) is None
+    assert StoredBounds({"axes": [], "problems": problems[:1]}).find_problem({}) is problems[0]
+    assert StoredBounds(None).find_problem({}) is None

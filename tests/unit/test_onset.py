@@ -11,7 +11,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Hold, Record
 from sysid.models.catalogue.load import load_model
 from sysid.residuals import onset_delay as onset
-from sysid.residuals.onset_delay import OnsetDelay, moves_alone, onset_delays
+from sysid.residuals.onset_delay import OnsetDelay, estimate_onset_delays, find_unprompted_output
 
 STEP, HOLD = 0.01, 300
 LEVELS = np.array([0.0, 1.0, 0.4, 0.9, 0.1, 0.6])
@@ -42,7 +42,7 @@ def delays(
 ) -> OnsetDelay:  # fmt: skip
     record = Record((Channel("u", TIMES[: u.size], u, hold=hold), *others),
                     (Channel("y", times, y),))  # fmt: skip
-    return onset_delays(load_model("fopdt"), (record,))[0]
+    return estimate_onset_delays(load_model("fopdt"), (record,))[0]
 
 
 def steps() -> FloatArray:
@@ -118,8 +118,8 @@ def test_steps_at_which_another_input_moves_too_do_not_count() -> None:
     moving = Channel("other", TIMES, np.sin(9 * TIMES))
     record = Record((two, moving), (Channel("y", TIMES, response(TIMES)),))
     # The model has one input only: what else was recorded is no cause.
-    assert onset_delays(model, (record,))[0].delay is not None
-    assert len(onset_delays(model, (record,))) == 1
+    assert estimate_onset_delays(model, (record,))[0].delay is not None
+    assert len(estimate_onset_delays(model, (record,))) == 1
 
 
 @pytest.mark.data
@@ -129,8 +129,8 @@ def test_steps_at_which_another_input_moves_too_do_not_count() -> None:
 def test_of_a_long_tube_it_is_about_3_46_ms_a_metre(length: int, pattern: int) -> None:
     file = DATA / "tube_reference" / f"tube_{length:03d}m_pattern{pattern}.csv"
     recording, _ = read_csv(file)
-    record = recording.record({"u": "P1_meas_Pa"}, {"y": "P2_meas_Pa"})
-    found = onset_delays(load_model("fopdt"), (record,))[0]
+    record = recording.to_record({"u": "P1_meas_Pa"}, {"y": "P2_meas_Pa"})
+    found = estimate_onset_delays(load_model("fopdt"), (record,))[0]
     assert found.delay == pytest.approx(3.46e-3 * length, rel=0.1)
 
 
@@ -138,17 +138,17 @@ def test_a_channel_s_noise_is_taken_as_often_for_many_events_as_for_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     calls: list[int] = []
-    noise = onset._noise
+    noise = onset._estimate_noise
 
     def counted(values: FloatArray) -> float:
         calls.append(values.size)
         return noise(values)
 
-    monkeypatch.setattr(onset, "_noise", counted)
+    monkeypatch.setattr(onset, "_estimate_noise", counted)
     counts = []
     for u in (np.where(steps() > 0, 1.0, 0.0), steps()):
         calls.clear()
-        onset._rests_of.cache_clear()  # of what other tests have looked at
+        onset._find_cached_rests.cache_clear()  # of what other tests have looked at
         other = Channel("v", TIMES, np.zeros(TIMES.size))
         assert delays(u, response(TIMES), others=(other,)).events > 0
         counts.append(len(calls))
@@ -161,23 +161,23 @@ def test_of_many_events_an_even_part_gives_the_same_delay(monkeypatch: pytest.Mo
     lag = 13
     y = np.concatenate([np.zeros(lag), u[:-lag]])
     record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
-    (every,) = onset_delays(load_model("fopdt"), (record,))
-    monkeypatch.setattr(onset, "_MOST", 40)
-    (some,) = onset_delays(load_model("fopdt"), (record,))
+    (every,) = estimate_onset_delays(load_model("fopdt"), (record,))
+    monkeypatch.setattr(onset, "_MOST_EVENTS", 40)
+    (some,) = estimate_onset_delays(load_model("fopdt"), (record,))
     assert every.events > 150
     assert 20 < some.events <= 40
     assert some.delay == pytest.approx(every.delay, abs=1e-9)
 
 
 def test_of_a_square_wave_both_edges_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(onset, "_MOST", 40)
+    monkeypatch.setattr(onset, "_MOST_EVENTS", 40)
     times, falls = 0.1 * np.arange(79 * 30 + 20), np.arange(79) % 2 == 1
     u, y = np.zeros(times.size), np.zeros(times.size)
     for event, does_fall in enumerate(falls):
         at, late = 20 + 30 * event, 8 if does_fall else 3  # samples: it opens faster than it shuts
         u[at:], y[at + late :] = not does_fall, not does_fall
     record = Record((Channel("u", times, u, hold="zero"),), (Channel("y", times, y),))
-    (found,) = onset_delays(load_model("fopdt"), (record,))
+    (found,) = estimate_onset_delays(load_model("fopdt"), (record,))
     assert found.events == 40
     assert found.delay is not None
     assert found.spread == pytest.approx(0.25, abs=0.01)  # half the delays' difference
@@ -198,11 +198,11 @@ def _step_test(rest: float, noise: float = 0.0, creep: float = 0.0) -> Record:
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_a_record_that_begins_with_its_step_is_told_apart(noise: float) -> None:
-    alone = moves_alone(_step_test(0.0, noise))
+    alone = find_unprompted_output(_step_test(0.0, noise))
     assert alone is not None
     assert alone[0] == "y"
     assert alone[1] == pytest.approx(2.0, abs=0.4)
-    assert moves_alone(_step_test(5.0, noise)) is None
+    assert find_unprompted_output(_step_test(5.0, noise)) is None
 
 
 def test_where_both_grow_from_nothing_the_output_does_not_move_alone() -> None:
@@ -210,12 +210,12 @@ def test_where_both_grow_from_nothing_the_output_does_not_move_alone() -> None:
     grown = (times / 40.0) ** 2 * np.sin(5.0 * times)
     before = Channel("u", times, grown)
     earlier = Channel("y", times, np.interp(times + 0.5, times, grown) * 3.0)
-    assert moves_alone(Record((before,), (earlier,))) is None
+    assert find_unprompted_output(Record((before,), (earlier,))) is None
 
 
 def test_what_is_not_at_rest_in_the_beginning_does_not_move_alone() -> None:
-    assert moves_alone(_step_test(0.0, creep=1.0)) is None
-    assert moves_alone(_step_test(5.0, creep=1.0)) is None
+    assert find_unprompted_output(_step_test(0.0, creep=1.0)) is None
+    assert find_unprompted_output(_step_test(5.0, creep=1.0)) is None
 
 
 def test_missing_samples_hide_no_rest_and_no_rest_is_found_without_samples() -> None:
@@ -223,6 +223,9 @@ def test_missing_samples_hide_no_rest_and_no_rest_is_found_without_samples() -> 
     [output] = record.outputs
     values = output.values.copy()
     values[3:6] = np.nan
-    assert moves_alone(Record(record.inputs, (Channel("y", output.times, values),))) is not None
+    assert (
+        find_unprompted_output(Record(record.inputs, (Channel("y", output.times, values),)))
+        is not None
+    )
     short = Channel("y", output.times[:5], output.values[:5])
-    assert moves_alone(Record(record.inputs, (short,))) is None
+    assert find_unprompted_output(Record(record.inputs, (short,))) is None

@@ -7,11 +7,11 @@ from service.datasets.schemas import SimulateIn
 from service.jobs.schemas import JobIn
 from service.paper import figures, noise, oscillators, published, study
 from service.paper import force_noise as forces
-from service.paper.bench import Found, Improvement, champions
-from service.paper.cramer_rao import cramer_rao
-from service.paper.document import Check, Section, Table, markdown
+from service.paper.bench import ArchipelagoImprovement, MethodRun, champion_history
+from service.paper.cramer_rao import cramer_rao_bound
+from service.paper.document import Check, ReportTable, Section, to_markdown
 from sysid.data.records import Channel
-from sysid.models.catalogue.load import document, load_model
+from sysid.models.catalogue.load import copy_catalogue_document, load_model
 from sysid.models.parse import parse_model
 
 
@@ -21,7 +21,7 @@ def point(generation: int, rms: float, value: float) -> dict[str, object]:
 
 def test_the_champion_of_an_archipelago_is_the_best_of_its_islands_so_far() -> None:
     islands = [[point(0, 3.0, 1), point(4, 1.0, 2)], [point(0, 2.0, 3), point(2, 2.5, 4)]]
-    found = champions({"names": ["a"], "islands": islands})
+    found = champion_history({"names": ["a"], "islands": islands})
     assert [(one.generation, one.rms, one.parameters["a"]) for one in found] == [
         (0, 3.0, 1), (0, 2.0, 3), (4, 1.0, 2),
     ]  # fmt: skip
@@ -37,18 +37,18 @@ def test_the_champion_of_an_archipelago_is_the_best_of_its_islands_so_far() -> N
     ],
 )
 def test_parts_are_named_by_table_or_figure(only: str | None, parts: list[str]) -> None:
-    assert study.chosen(only) == parts
+    assert study.choose_parts(only) == parts
 
 
 @pytest.mark.parametrize("only", ["table9", "figure16", ",", "table1,tabel2"])
 def test_an_unknown_part_is_refused_with_those_there_are(only: str) -> None:
     with pytest.raises(study.UnknownPart, match="need some of series, table1, table2, noise"):
-        study.chosen(only)
+        study.choose_parts(only)
 
 
 def test_every_figure_of_the_paper_that_is_to_be_reproduced_belongs_to_a_part() -> None:
     numbers = [2, 3, *range(7, 16), 17, 18, 20, 21]
-    assert all(study.chosen(f"figure{number}") for number in numbers)
+    assert all(study.choose_parts(f"figure{number}") for number in numbers)
 
 
 def test_the_printed_errors_of_the_proposed_search_are_those_of_its_columns() -> None:
@@ -67,29 +67,29 @@ def test_the_bound_of_a_mean_is_the_deviation_over_the_root_of_the_samples() -> 
         "outputs": {"y": "x + p"}, "initial": {"x": 0},
     })  # fmt: skip
     times = np.arange(100, dtype=np.float64)
-    assert cramer_rao(model, [], {"p": 2.0}, 0.5, times)["p"] == pytest.approx(0.05, rel=1e-6)
+    assert cramer_rao_bound(model, [], {"p": 2.0}, 0.5, times)["p"] == pytest.approx(0.05, rel=1e-6)
 
 
 def test_the_bound_of_example_1_is_that_of_the_literature_on_it() -> None:
     times = 0.02 * np.arange(300, dtype=np.float64)
     force = Channel("q", times, 10 * np.cos(5 * times), "N")
     model = load_model("duffing-eq16")
-    found = cramer_rao(model, [force], published.TRUE_1, 0.01, times)
+    found = cramer_rao_bound(model, [force], published.TRUE_1, 0.01, times)
     expected = {"c": 0.00486, "L": 0.00247, "b": 0.01980, "a": 0.02684}
     assert found == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("example", [oscillators.EXAMPLE_1, oscillators.EXAMPLE_2])
 def test_every_reading_gives_bodies_that_the_service_takes(example: oscillators.Example) -> None:
-    for reading in oscillators.readings(example):
-        SimulateIn.model_validate(oscillators.dataset(example, reading))
-        body = JobIn.model_validate(oscillators.job(example, reading, "ds_1"))
+    for reading in oscillators.list_readings(example):
+        SimulateIn.model_validate(oscillators.record_body(example, reading))
+        body = JobIn.model_validate(oscillators.job_body(example, reading, "ds_1"))
         assert body.algorithm.population == 50
         assert set(example.true) == set(example.columns.simple) == set(example.columns.proposed)
 
 
 def test_the_noise_sweep_has_one_cell_for_each_level_draw_and_method() -> None:
-    body = JobIn.model_validate(noise.job("ds_1", "ds_2", 3))
+    body = JobIn.model_validate(noise.job_body("ds_1", "ds_2", 3))
     lengths = {one.path: len(one.values or range(*(one.range or ()))) for one in body.sweep.axes}
     assert lengths == {
         "/noise/sigma": len(noise.SIGMAS), "/noise/seed": 3, "/seed": 3, "/algorithm/method": 3,
@@ -102,15 +102,15 @@ def test_the_spread_of_a_sweep_is_taken_for_each_level_and_method_by_itself() ->
         for weight, method in enumerate(("simple", "improved-paper", "improved"))
         for sigma in noise.SIGMAS for draw in (0.0, 1.0, 2.0)
     ]  # fmt: skip
-    found = noise.spreads(runs, "rms")
+    found = noise.group_replicates(runs, "rms")
     medians = [one.quantiles[1] for one in found["improved"]]
     assert medians == pytest.approx([2 * sigma + 1 for sigma in noise.SIGMAS])
     assert all(len(one.values) == 3 for spread in found.values() for one in spread)
 
 
 def test_a_table_in_the_terminal_has_one_width_and_keeps_its_marks() -> None:
-    table = Table("T", ["name", "x"], [["a|b", "1"], ["longer", "−2.5"]])
-    text = markdown(Section("S", tables=[table], checks=[Check("it is so", holds=False)]))
+    table = ReportTable("T", ["name", "x"], [["a|b", "1"], ["longer", "−2.5"]])
+    text = to_markdown(Section("S", tables=[table], checks=[Check("it is so", holds=False)]))
     rows = [row for row in text.splitlines() if row.startswith("|")]
     assert len(rows) == 4
     assert len({len(row) for row in rows}) == 1
@@ -125,17 +125,20 @@ def test_a_table_in_the_terminal_has_one_width_and_keeps_its_marks() -> None:
 def test_marks_of_a_logarithmic_axis_enclose_what_is_drawn(
     low: float, high: float, marks: list[float]
 ) -> None:
-    assert figures.decades(low, high) == marks
+    assert figures.decade_marks(low, high) == marks
 
 
 def test_many_decades_are_marked_by_their_powers_alone() -> None:
-    assert figures.decades(1e-9, 1.0) == [10.0**n for n in range(-9, 1)]
+    assert figures.decade_marks(1e-9, 1.0) == [10.0**n for n in range(-9, 1)]
 
 
 def test_a_line_of_convergence_reaches_the_last_generation() -> None:
     run = {"generations": 40, "parameters": [{"name": "a", "unit": "s", "value": 2.0}]}
-    progress = [Improvement(0, 3.0, {"a": 1.0}), Improvement(7, 1.0, {"a": 2.0})]
-    figure = figures.convergence({"simple": Found(run, progress, {})}, ["a"], {"a": 2.5})
+    progress = [
+        ArchipelagoImprovement(0, 3.0, {"a": 1.0}),
+        ArchipelagoImprovement(7, 1.0, {"a": 2.0}),
+    ]
+    figure = figures.plot_convergence({"simple": MethodRun(run, progress, {})}, ["a"], {"a": 2.5})
     drawn = {trace["name"]: trace for trace in figure["data"]}
     assert drawn["simple"]["x"] == [0, 7, 40]
     assert drawn["simple"]["y"] == [1, 2, 2]
@@ -144,15 +147,19 @@ def test_a_line_of_convergence_reaches_the_last_generation() -> None:
 
 
 def test_the_noise_enters_the_recursion_as_a_force_or_as_printed() -> None:
-    known = document("duffing-eq16")
-    force, printed = (str(forces.document(known, kind)["equations"]["x"]) for kind in forces.TERMS)
+    known = copy_catalogue_document("duffing-eq16")
+    force, printed = (
+        str(forces.model_document(known, kind)["equations"]["x"]) for kind in forces.NOISE_TERMS
+    )
     assert force.endswith("- q(k-2) - sigma*phi(k-2))/m")  # h² and 1/m stand before the bracket
     assert printed.endswith("- q(k-2))/m + sigma*phi(k-2)")
-    for kind in forces.TERMS:
-        model = parse_model(forces.document(known, kind))
+    for kind in forces.NOISE_TERMS:
+        model = parse_model(forces.model_document(known, kind))
         assert [one.name for one in model.inputs] == ["q", "phi"]
 
 
 def test_a_recursion_without_that_place_for_noise_is_refused() -> None:
     with pytest.raises(ValueError, match="no 'q"):
-        forces.document({**document("duffing-eq16"), "equations": {"x": "x(k-1)"}}, "force")
+        forces.model_document(
+            {**copy_catalogue_document("duffing-eq16"), "equations": {"x": "x(k-1)"}}, "force"
+        )

@@ -9,7 +9,7 @@ from sqlalchemy import text
 from sqlalchemy.exc import IntegrityError, InterfaceError, OperationalError
 
 from service.storage import retry as patience
-from service.storage.sessions import Database, sqlite_url
+from service.storage.sessions import Database, make_sqlite_url
 
 
 def away() -> OperationalError:
@@ -25,18 +25,18 @@ def test_work_is_tried_until_the_database_is_back(monkeypatch: pytest.MonkeyPatc
             raise troubles.pop()
         return "done"
 
-    assert patience.patiently(work) == "done"
+    assert patience.retry_transient(work) == "done"
 
 
 def test_a_database_that_does_not_come_back_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(patience, "PAUSE_SECONDS", 0.0)
-    monkeypatch.setattr(patience, "LONGEST_SECONDS", 0.0)
+    monkeypatch.setattr(patience, "GIVE_UP_SECONDS", 0.0)
 
     def work() -> None:
         raise away()
 
     with pytest.raises(OperationalError):
-        patience.patiently(work)
+        patience.retry_transient(work)
 
 
 def test_a_fault_of_the_statement_is_not_tried_again() -> None:
@@ -47,7 +47,7 @@ def test_a_fault_of_the_statement_is_not_tried_again() -> None:
         raise IntegrityError("INSERT", {}, Exception("duplicate"))
 
     with pytest.raises(IntegrityError):
-        patience.patiently(work)
+        patience.retry_transient(work)
     assert len(tries) == 1
 
 
@@ -55,7 +55,7 @@ def raised(database: Database, statement: str, **values: object) -> OperationalE
     """What a statement that cannot be carried out raises."""
     with (
         pytest.raises((OperationalError, InterfaceError)) as caught,
-        database.write(busy_seconds=0.05) as session,
+        database.write_session(busy_seconds=0.05) as session,
     ):
         session.execute(text(statement), values)
     return caught.value
@@ -63,7 +63,7 @@ def raised(database: Database, statement: str, **values: object) -> OperationalE
 
 @pytest.fixture
 def database(tmp_path: Path):
-    made = Database(sqlite_url(tmp_path / "a.db"))
+    made = Database(make_sqlite_url(tmp_path / "a.db"))
     yield made
     made.dispose()
 
@@ -73,7 +73,7 @@ def test_a_mistake_in_a_statement_is_not_taken_for_a_database_that_is_away(
 ) -> None:
     mistake = raised(database, "SELECT nothing FROM nowhere")
     assert isinstance(mistake, OperationalError)
-    assert not patience.is_passing(mistake)
+    assert not patience.is_transient(mistake)
     tries = []
 
     def work() -> None:
@@ -81,30 +81,30 @@ def test_a_mistake_in_a_statement_is_not_taken_for_a_database_that_is_away(
         raise mistake
 
     with pytest.raises(OperationalError):
-        patience.patiently(work)
+        patience.retry_transient(work)
     assert len(tries) == 1
 
 
 def test_a_locked_file_and_one_that_cannot_be_opened_may_pass(
     database: Database, tmp_path: Path
 ) -> None:
-    with database.write() as session:
+    with database.write_session() as session:
         session.execute(text("SELECT 1"))  # a transaction begins with its first statement
-        assert patience.is_passing(raised(database, "SELECT 1"))
-    other = Database(sqlite_url(tmp_path / "absent" / "a.db"))
-    assert patience.is_passing(raised(other, "SELECT 1"))
+        assert patience.is_transient(raised(database, "SELECT 1"))
+    other = Database(make_sqlite_url(tmp_path / "absent" / "a.db"))
+    assert patience.is_transient(raised(other, "SELECT 1"))
     other.dispose()
 
 
 def test_a_disk_that_is_full_may_pass(database: Database) -> None:
-    with database.write() as session:
+    with database.write_session() as session:
         session.execute(text("CREATE TABLE t (x)"))
-    with database.write() as session:
+    with database.write_session() as session:
         session.execute(text("PRAGMA max_page_count = 3"))
         with pytest.raises(OperationalError) as caught:
             session.execute(text("INSERT INTO t VALUES (zeroblob(100000))"))
         session.rollback()
-    assert patience.is_passing(caught.value)
+    assert patience.is_transient(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -124,9 +124,9 @@ def test_a_disk_that_is_full_may_pass(database: Database) -> None:
 def test_postgresql_tells_by_its_state_whether_an_error_may_pass(
     cause: psycopg.Error, passes: bool
 ) -> None:
-    assert patience.is_passing(OperationalError("SELECT 1", {}, cause)) is passes
+    assert patience.is_transient(OperationalError("SELECT 1", {}, cause)) is passes
 
 
 def test_a_value_that_sqlite_cannot_take_does_not_pass() -> None:
     cause = sqlite3.InterfaceError("Error binding parameter")
-    assert not patience.is_passing(InterfaceError("SELECT ?", {}, cause))
+    assert not patience.is_transient(InterfaceError("SELECT ?", {}, cause))

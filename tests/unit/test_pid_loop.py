@@ -9,12 +9,12 @@ import pytest
 
 from sysid.control.closed_loop import ClosedLoop, close_loop
 from sysid.control.controllers import PidControl, Transport
-from sysid.control.step_response import step_metrics
+from sysid.control.step_response import measure_step_response
 from sysid.core.errors import InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Recording
-from sysid.kernels.build import kernel_key
-from sysid.kernels.layout import Variant
+from sysid.kernels.build import compute_kernel_key
+from sysid.kernels.layout import KernelVariant
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 
@@ -68,8 +68,8 @@ def by_hand(
     h, element = STEP / fine, control.transport or Transport()
     late = round((VALUES["L"] + element.delay) / h) if not element.time_constant else None
     n = (TIMES.size - 1) * fine + 1
-    low, high = (-inf if control.range[0] is None else control.range[0],
-                 inf if control.range[1] is None else control.range[1])  # fmt: skip
+    low, high = (-inf if control.output_limits[0] is None else control.output_limits[0],
+                 inf if control.output_limits[1] is None else control.output_limits[1])  # fmt: skip
     c = float(control.derivative_on == "error")
     y, integral, entered = start, 0.0, 0.0
     z = -start
@@ -78,16 +78,16 @@ def by_hand(
     for k in range(n):
         error = reference - y
         wanted = control.gain * (control.setpoint_weight * reference - y) + integral
-        if control.differentiates:
+        if control.has_derivative_action:
             d = c * reference - y
             wanted += control.gain * control.derivative_filter * (d - z)
             z += (1.0 - exp(-h / control.filter_time)) * (d - z)
         given = min(high, max(low, wanted))
         commands[k], ys[k] = given, y
-        if control.integrates:
+        if control.has_integral_action:
             integral += h * control.gain / float(control.integral_time or inf) * error
-            if control.tracking is not None:
-                integral += h / control.tracking * (given - wanted)
+            if control.active_tracking_time is not None:
+                integral += h / control.active_tracking_time * (given - wanted)
         if late is not None:
             drive = element.gain * (commands[k - late] if k >= late else rest)
         else:
@@ -164,13 +164,13 @@ class Textbook:
             self.action += c.gain * td * n / (td + n * h) * (d - self.before)
         self.before = d
         wanted = c.gain * (c.setpoint_weight * r - y) + self.integral + self.action
-        low, high = c.range
+        low, high = c.output_limits
         given = wanted if high is None else min(high, wanted)
         given = given if low is None else max(low, given)
         if c.integral_time:
             self.integral += c.gain * h / c.integral_time * (r - y)
-            if c.tracking is not None:
-                self.integral += min(1.0, h / c.tracking) * (given - wanted)
+            if c.active_tracking_time is not None:
+                self.integral += min(1.0, h / c.active_tracking_time) * (given - wanted)
         return given
 
 
@@ -215,7 +215,7 @@ def test_where_the_output_answers_at_once_the_textbooks_controller_is_late(delay
             x = 0.95 * x + 0.06 * (commands[-late] + load)
         commands.append(law(1.0, x))
         outputs.append(x)
-    assert loop.steps_late == (delay == 0.0)
+    assert loop.controller_delay_steps == (delay == 0.0)
     np.testing.assert_allclose(found.channel("y").values, outputs, atol=1e-9)
 
 
@@ -277,7 +277,9 @@ def test_back_calculation_bounds_the_overshoot_after_a_long_saturation() -> None
     for control in (wound_up, led_back, replace(led_back, tracking_time=0.05)):
         values = {**VALUES, "L": 0.0}
         _, found = simulated(lag(), control, values, reference=1.0)
-        metrics = step_metrics(TIMES, found.channel("y").values, at=0.0, before=0.0, after=1.0)
+        metrics = measure_step_response(
+            TIMES, found.channel("y").values, at=0.0, before=0.0, after=1.0
+        )
         overshoots.append(metrics.overshoot_percent)
     assert overshoots[0] > 5.0
     assert overshoots[1] < 1.0
@@ -285,7 +287,7 @@ def test_back_calculation_bounds_the_overshoot_after_a_long_saturation() -> None
 
 
 def test_other_numbers_of_a_controller_need_no_other_kernel() -> None:
-    variant = Variant(one_step=False, soft=False, on_grid=True, weighted=False)
+    variant = KernelVariant(one_step=False, soft=False, on_grid=True, weighted=False)
     for plant in (lag(), RECURSION):
         keys = set()
         for size in (1.0, 1.3, 0.8):
@@ -294,7 +296,7 @@ def test_other_numbers_of_a_controller_need_no_other_kernel() -> None:
                 derivative_filter=5.0 * size, upper=size, lower=-size, tracking_time=size,
                 setpoint_weight=0.5 * size, transport=Transport(size, 0.1 * size, 0.1 * size),
             )  # fmt: skip
-            keys.add(kernel_key(close_loop(plant, control, STEP).model, variant))
+            keys.add(compute_kernel_key(close_loop(plant, control, STEP).model, variant))
         assert len(keys) == 1
 
 

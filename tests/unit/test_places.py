@@ -8,7 +8,7 @@ import typer
 
 from service.cli import identify, sweeps
 from service.cli import runs as exporting
-from service.cli.common import Places, in_file, told_at
+from service.cli.common import FieldOrigins, file_origins, report_faults
 from service.client.calls import NotFinite, ProblemError
 from service.client.client import Client
 from service.core.errors import FieldError
@@ -26,25 +26,25 @@ from service.core.errors import FieldError
     ],
 )  # fmt: skip
 def test_a_pointer_is_told_as_the_option_that_gives_it(pointer: str, place: str) -> None:
-    assert sweeps.PLACES.of(pointer) == place
+    assert sweeps.FIELD_ORIGINS.locate(pointer) == place
 
 
 def test_every_field_that_an_option_gives_is_told_at_that_option() -> None:
     from service.sweeps.schemas import NoiseSweepIn
 
-    by_options = {place.split("/")[1] for place in sweeps.PLACES.options}
+    by_options = {place.split("/")[1] for place in sweeps.FIELD_ORIGINS.options}
     by_set = {"hold", "parameters", "prediction", "loss", "weights", "skip", "algorithm",
               "priority", "reuse"}  # fmt: skip
     assert by_options | by_set == set(NoiseSweepIn.model_fields)
 
 
 def test_a_pointer_into_a_file_follows_its_name() -> None:
-    assert in_file("job.yaml").of("/seed") == "job.yaml: /seed"
+    assert file_origins("job.yaml").locate("/seed") == "job.yaml: /seed"
 
 
 def test_where_else_a_field_is_is_told_as_it_would_be_typed() -> None:
     fault = FieldError("/population", "unknown field; there is /algorithm/population")
-    told = Places().told([fault])
+    told = FieldOrigins().describe_faults([fault])
     assert told == "--set population: unknown field; there is --set algorithm.population"
 
 
@@ -59,7 +59,7 @@ def test_all_faults_are_one_line_with_columns_and_without_the_servers_words(
         {"pointer": "/sigma/0", "detail": "found -1"}, {"pointer": "", "detail": "whole"},
         {"pointer": "/truth/inputs/u/expression", "column": 3, "detail": "ends"},
     )  # fmt: skip
-    with pytest.raises(typer.Exit) as ended, told_at(sweeps.PLACES):
+    with pytest.raises(typer.Exit) as ended, report_faults(sweeps.FIELD_ORIGINS):
         raise refusal(422, *entries)
     assert ended.value.exit_code == 1
     line = capsys.readouterr().err
@@ -70,7 +70,7 @@ def test_all_faults_are_one_line_with_columns_and_without_the_servers_words(
     "error", [refusal(409, {"pointer": "/a", "detail": "b"}), refusal(422), refusal(404)]
 )
 def test_what_is_no_fault_of_the_body_goes_on_as_it_is(error: ProblemError) -> None:
-    with pytest.raises(ProblemError) as told, told_at(Places()):
+    with pytest.raises(ProblemError) as told, report_faults(FieldOrigins()):
         raise error
     assert told.value is error
 
@@ -78,7 +78,7 @@ def test_what_is_no_fault_of_the_body_goes_on_as_it_is(error: ProblemError) -> N
 def test_a_number_that_is_none_is_wrong_usage_at_its_option(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    with pytest.raises(typer.Exit) as ended, told_at(sweeps.PLACES):
+    with pytest.raises(typer.Exit) as ended, report_faults(sweeps.FIELD_ORIGINS):
         raise NotFinite("/truth/parameters/K", float("inf"))
     assert ended.value.exit_code == 2
     assert capsys.readouterr().err == "lagid: --true K: found inf; need a finite number\n"
@@ -92,15 +92,17 @@ HELD = "if it was held, use hold: {u: zero}"
 @pytest.mark.parametrize(
     ("places", "note", "end"),
     [
-        (identify.PLACES, WHITE, ", use --noise-model ar1"),
-        (identify.PLACES, HELD, ", use --set hold.u=zero"),
-        (Places(), WHITE, ", use --set loss.noise_model=ar1"),
-        (identify.PLACES, MODEL, "give the model solver: {substeps: 8}"),
-        (Places(), "a set {1: 2} of pairs: {a, b}", "a set {1: 2} of pairs: {a, b}"),
+        (identify.FIELD_ORIGINS, WHITE, ", use --noise-model ar1"),
+        (identify.FIELD_ORIGINS, HELD, ", use --set hold.u=zero"),
+        (FieldOrigins(), WHITE, ", use --set loss.noise_model=ar1"),
+        (identify.FIELD_ORIGINS, MODEL, "give the model solver: {substeps: 8}"),
+        (FieldOrigins(), "a set {1: 2} of pairs: {a, b}", "a set {1: 2} of pairs: {a, b}"),
     ],
 )
-def test_a_note_names_the_option_that_can_be_typed(places: Places, note: str, end: str) -> None:
-    assert places.in_note(note).endswith(end)
+def test_a_note_names_the_option_that_can_be_typed(
+    places: FieldOrigins, note: str, end: str
+) -> None:
+    assert places.rewrite_note(note).endswith(end)
 
 
 def test_a_refused_export_is_told_at_its_option(
@@ -109,7 +111,7 @@ def test_a_refused_export_is_told_at_its_option(
     fault = {"pointer": "?format", "detail": "'control' is not possible: a**3"}
     answer = httpx.Response(422, json={"title": "refused", "errors": [fault]})
     client = Client(transport=httpx.MockTransport(lambda _: answer))
-    monkeypatch.setattr(exporting, "connected", lambda *_: client)
+    monkeypatch.setattr(exporting, "connect_client", lambda *_: client)
     with pytest.raises(typer.Exit):
-        exporting.export("run_1", "control")
+        exporting.export_model("run_1", "control")
     assert capsys.readouterr().err == "lagid: --format: 'control' is not possible: a**3\n"

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from service.core.validation import explained
+from service.core.validation import explain_errors
 from service.jobs.schemas import JobIn
 from sysid.core.errors import join_pointer, split_pointer
 
@@ -14,7 +14,7 @@ def faults(**changes: Any) -> dict[str, str]:
     body = {"model": "m", "datasets": ["d"], **changes}
     with pytest.raises(ValidationError) as refused:
         JobIn.model_validate(body)
-    return {one.pointer: one.detail for one in explained(refused.value.errors(), body, JobIn)}
+    return {one.pointer: one.detail for one in explain_errors(refused.value.errors(), body, JobIn)}
 
 
 def test_the_names_of_unions_are_not_in_a_pointer() -> None:

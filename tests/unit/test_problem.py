@@ -9,42 +9,42 @@ import numpy as np
 import pytest
 
 from sysid.core.errors import InvalidBounds, InvalidRecord, InvalidSettings, RecordTooShort
-from sysid.core.jit import compiled
+from sysid.core.jit import jit_compile
 from sysid.core.settings import FitSettings, Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.simulation.evaluator import Evaluator, population_fitness
-from sysid.simulation.problem import Problem, simulation_problem
+from sysid.simulation.evaluator import Evaluator, evaluate_population
+from sysid.simulation.problem import Problem, build_simulation_problem
 from tests.models import difference, differential, duffing, individuals, lag_element, record
 
 
-@compiled
+@jit_compile
 def least(evaluator: Evaluator, theta: FloatArray) -> float:
     """Stands for a search: compiled, kept on disk, called with the evaluator as it is."""
-    return float(np.min(population_fitness(evaluator, theta)))
+    return float(np.min(evaluate_population(evaluator, theta)))
 
 
 def test_an_evaluator_goes_into_compiled_functions_as_it_is() -> None:
     problem = Problem.build(duffing(), [record()])
     theta = individuals(problem, 20)
-    assert least(problem.evaluator, theta) == problem.fitness(theta).min()
+    assert least(problem.evaluator, theta) == problem.evaluate_fitness(theta).min()
 
 
 def test_a_problem_is_rebuilt_from_a_pickle_and_gives_the_same_bits() -> None:
     problem = Problem.build(duffing(), [record()], parameters={"c": {"fixed": 0.2}}, skip=2)
     again: Problem = pickle.loads(pickle.dumps(problem))
     theta = individuals(problem, 5)
-    assert [p.name for p in again.space] == ["L", "b", "a"]
-    np.testing.assert_array_equal(again.fitness(theta), problem.fitness(theta))
+    assert [p.name for p in again.free_parameters] == ["L", "b", "a"]
+    np.testing.assert_array_equal(again.evaluate_fitness(theta), problem.evaluate_fitness(theta))
 
 
 def test_a_problem_that_only_simulates_is_rebuilt_from_a_pickle() -> None:
     parameters = tuple(replace(p, fixed=p.upper, scale="linear") for p in duffing().parameters)
-    problem = simulation_problem(replace(duffing(), parameters=parameters), record())
+    problem = build_simulation_problem(replace(duffing(), parameters=parameters), record())
     again: Problem = pickle.loads(pickle.dumps(problem))
     assert again.simulates_only
     empty = np.empty((1, 0))
-    np.testing.assert_array_equal(again.predictions(empty), problem.predictions(empty))
+    np.testing.assert_array_equal(again.predict(empty), problem.predict(empty))
 
 
 def test_a_problem_with_changed_settings_keeps_the_others_and_equals_one_built_so() -> None:
@@ -58,7 +58,7 @@ def test_a_problem_with_changed_settings_keeps_the_others_and_equals_one_built_s
     assert changed.settings == alone.settings
     assert changed.free_names == alone.free_names == ("L", "b", "a")
     assert (changed.loss_scale, problem.rebuild(loss=Loss()).loss_scale) == (0.5, 0.0)
-    np.testing.assert_array_equal(changed.fitness(theta), alone.fitness(theta))
+    np.testing.assert_array_equal(changed.evaluate_fitness(theta), alone.evaluate_fitness(theta))
     with pytest.raises(TypeError, match="skips"):
         problem.rebuild(skips=1)
 
@@ -78,11 +78,11 @@ def test_j_is_the_rms_error_over_the_scored_samples() -> None:
     problem = Problem.build(model, [replace(blank, outputs=(Channel("y", blank.outputs[0].times,
                             y),))], skip=5)  # fmt: skip
     theta = individuals(problem, 3)
-    error = (problem.predictions(theta) - y)[:, 5:]
+    error = (problem.predict(theta) - y)[:, 5:]
     expected = np.sqrt(np.nanmean(error**2, axis=1))
-    np.testing.assert_allclose(problem.fitness(theta), expected, rtol=1e-12)
+    np.testing.assert_allclose(problem.evaluate_fitness(theta), expected, rtol=1e-12)
     assert problem.n_scored == 23
-    metrics = problem.metrics(theta[1])
+    metrics = problem.evaluate_metrics(theta[1])
     assert metrics.rms == pytest.approx(expected[1])
     assert metrics.unit == problem.unit == "m"
     assert metrics.channels[0].samples == 23
@@ -93,11 +93,15 @@ def test_soft_l1_is_squares_for_small_errors_and_linear_for_large_ones() -> None
     problem = Problem.build(duffing(), [record()])
     theta = individuals(problem, 3)
     wide = Problem.build(duffing(), [record()], loss=Loss("soft-l1", 1e6))
-    np.testing.assert_allclose(wide.fitness(theta), problem.fitness(theta), rtol=1e-9)
+    np.testing.assert_allclose(
+        wide.evaluate_fitness(theta), problem.evaluate_fitness(theta), rtol=1e-9
+    )
     narrow = Problem.build(duffing(), [record()], loss=Loss("soft-l1", 0.1))
-    error = problem.predictions(theta) - record().outputs[0].values
+    error = problem.predict(theta) - record().outputs[0].values
     cost = 2 * 0.01 * (np.sqrt(1 + (error / 0.1) ** 2) - 1)
-    np.testing.assert_allclose(narrow.fitness(theta), np.sqrt(cost.mean(axis=1)), rtol=1e-12)
+    np.testing.assert_allclose(
+        narrow.evaluate_fitness(theta), np.sqrt(cost.mean(axis=1)), rtol=1e-12
+    )
 
 
 def test_outputs_are_weighted_by_their_deviation_or_as_asked() -> None:
@@ -106,18 +110,18 @@ def test_outputs_are_weighted_by_their_deviation_or_as_asked() -> None:
     data = record(outputs=("y", "z"))
     problem = Problem.build(model, [data])
     deviation = [np.std(channel.values) for channel in data.outputs]
-    parts = problem.split(problem.evaluator.weight)[0]
+    parts = problem.split_by_output(problem.evaluator.weight)[0]
     np.testing.assert_allclose(parts["y"], 1 / deviation[0])
     np.testing.assert_allclose(parts["z"], 1 / deviation[1])
     assert problem.unit == "1"
     assert problem.output_scale == pytest.approx(1.0)
     chosen = Problem.build(model, [data], weights={"y": 3.0, "z": 0.5})
     theta = individuals(chosen, 2)
-    part = chosen.split(chosen.predictions(theta)[0])[0]
+    part = chosen.split_by_output(chosen.predict(theta)[0])[0]
     errors = [(3.0 * (part["y"] - data.outputs[0].values)),
               (0.5 * (part["z"] - data.outputs[1].values))]  # fmt: skip
     expected = np.sqrt(np.mean(np.concatenate(errors) ** 2))
-    assert chosen.fitness(theta)[0] == pytest.approx(expected)
+    assert chosen.evaluate_fitness(theta)[0] == pytest.approx(expected)
 
 
 def test_outputs_of_which_every_sample_is_skipped_are_not_called_constant() -> None:
@@ -132,7 +136,9 @@ def test_channels_are_found_by_name_and_others_are_ignored() -> None:
     extra = Channel("temperature", times, np.full(times.size, np.nan))
     more = Record((extra, *data.inputs), (extra, *data.outputs))
     theta = individuals(Problem.build(duffing(), [data]), 2)
-    first, second = (Problem.build(duffing(), [one]).fitness(theta) for one in (data, more))
+    first, second = (
+        Problem.build(duffing(), [one]).evaluate_fitness(theta) for one in (data, more)
+    )
     np.testing.assert_array_equal(first, second)
 
 
@@ -141,8 +147,8 @@ def test_a_measured_start_takes_the_first_value_and_its_rate_the_first_differenc
     data = record()
     y, times = data.outputs[0].values, data.outputs[0].times
     starts = Problem.build(model, [data]).experiments[0].starts
-    assert starts[0].given[0] == y[0]
-    assert starts[1].given[0] == pytest.approx((y[1] - y[0]) / times[1])
+    assert starts[0].first_values[0] == y[0]
+    assert starts[1].first_values[0] == pytest.approx((y[1] - y[0]) / times[1])
 
 
 def test_times_with_few_digits_are_on_the_grid() -> None:
@@ -155,10 +161,10 @@ def test_times_with_few_digits_are_on_the_grid() -> None:
 
 def test_an_output_that_begins_after_the_input_is_simulated_from_the_input_on() -> None:
     data = record(40)
-    late = replace(data, outputs=(data.outputs[0].between(0.5, 9.0),))
+    late = replace(data, outputs=(data.outputs[0].slice_time(0.5, 9.0),))
     whole, part = (Problem.build(lag_element(), [one]) for one in (data, late))
     theta = individuals(whole, 3)
-    np.testing.assert_allclose(part.predictions(theta), whole.predictions(theta)[:, 10:])
+    np.testing.assert_allclose(part.predict(theta), whole.predict(theta)[:, 10:])
 
 
 def _with(values: FloatArray, role: str, name: str = "") -> Record:
@@ -226,7 +232,7 @@ def test_options_that_cannot_be_used_are_refused() -> None:
     with pytest.raises(InvalidBounds):
         Problem.build(model, data, parameters={"c": {"lower": 2.0}})
     with pytest.raises(InvalidSettings, match=r"need \(P, 4\)"):
-        Problem.build(model, data).fitness(np.zeros((3, 5)))
+        Problem.build(model, data).evaluate_fitness(np.zeros((3, 5)))
     tiny_steps = lag_element(solver={"step": 1e-9})
     with pytest.raises(InvalidSettings, match="may take"):
         Problem.build(tiny_steps, data)
@@ -246,7 +252,7 @@ def test_the_weight_of_a_single_output_changes_nothing(loss: Loss) -> None:
     plain = Problem.build(duffing(), [record()], loss=loss)
     weighted = Problem.build(duffing(), [record()], loss=loss, weights={"y": 100.0})
     theta = individuals(plain, 3)
-    np.testing.assert_array_equal(weighted.fitness(theta), plain.fitness(theta))
+    np.testing.assert_array_equal(weighted.evaluate_fitness(theta), plain.evaluate_fitness(theta))
 
 
 @pytest.mark.parametrize("weight", [1e-300, 1e308, np.inf, np.nan, -1.0])

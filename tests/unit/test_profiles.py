@@ -9,11 +9,11 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
-from sysid.residuals.coloured import QUANTILE
-from sysid.search.refine import refine
+from sysid.residuals.coloured import CHI_SQUARE_95
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import analyse
-from sysid.uncertainty.profile_likelihood import profile
+from sysid.uncertainty.analysis import analyse_estimate
+from sysid.uncertainty.profile_likelihood import compute_profile
 from tests.searching import DUFFING, STEP, example, noisy, record
 
 TRUTH = np.array([DUFFING[name] for name in ("c", "L", "b", "a")])
@@ -43,7 +43,7 @@ def linear(
     y: FloatArray = u + 0.5 * np.sin(np.arange(n)) + 0.5 * u + sd * noise
     data = Record((Channel("u", times, u),), (Channel("y", times, y),))
     problem = Problem.build(model, [data], skip=1)
-    end = refine(problem, [np.array([0.5, 0.5])])[0]
+    end = refine_candidates(problem, [np.array([0.5, 0.5])])[0]
     assert end is not None
     return problem, end.theta
 
@@ -51,8 +51,8 @@ def linear(
 @pytest.mark.parametrize("name", ["p", "q"])
 def test_where_the_model_is_linear_the_interval_is_that_of_the_t_distribution(name: str) -> None:
     problem, theta = linear()
-    found = profile(problem, theta, name)
-    estimate = next(e for e in analyse(problem, theta).estimates if e.name == name)
+    found = compute_profile(problem, theta, name)
+    estimate = next(e for e in analyse_estimate(problem, theta).estimates if e.name == name)
     assert estimate.interval95 is not None
     assert estimate.stderr is not None
     for end, expected in zip(found.interval, estimate.interval95, strict=True):
@@ -64,11 +64,11 @@ def test_where_the_residuals_are_coloured_profile_and_standard_error_mean_the_sa
     name: str,
 ) -> None:
     problem, theta = linear(pole=0.8)
-    analysis = analyse(problem, theta)
+    analysis = analyse_estimate(problem, theta)
     assert analysis.uncertainty is not None
     assert analysis.uncertainty.noise_colour == "coloured"
     [estimate] = [e for e in analysis.estimates if e.name == name]
-    found = profile(problem, theta, name)
+    found = compute_profile(problem, theta, name)
     assert estimate.interval95 is not None
     assert estimate.stderr is not None
     for end, expected in zip(found.interval, estimate.interval95, strict=True):
@@ -77,7 +77,7 @@ def test_where_the_residuals_are_coloured_profile_and_standard_error_mean_the_sa
 
 def test_the_ratio_is_that_of_the_sums_of_squares_with_the_others_at_their_best() -> None:
     problem, theta = linear()
-    found = profile(problem, theta, "p", points=7)
+    found = compute_profile(problem, theta, "p", points=7)
     u = problem.records[0].inputs[0].values[1:]
     y = problem.records[0].outputs[0].values[1:]
     other = np.sin(np.arange(1, y.size + 1)) + u
@@ -86,15 +86,17 @@ def test_the_ratio_is_that_of_the_sums_of_squares_with_the_others_at_their_best(
     sums = np.sum((left - best[:, None] * other) ** 2, axis=1)
     np.testing.assert_allclose(found.others[:, 0], best, rtol=1e-5)
     expected = y.size * np.log(sums / sums.min())
-    np.testing.assert_allclose(found.ratio, expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(found.likelihood_ratio, expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["c", "L", "b", "a"])
 def test_intervals_of_example_1_cover_the_truth(name: str) -> None:
     problem = example()
-    end = refine(problem, [np.array([DUFFING[p.name] for p in problem.space])])[0]
+    end = refine_candidates(
+        problem, [np.array([DUFFING[p.name] for p in problem.free_parameters])]
+    )[0]
     assert end is not None
-    found = profile(problem, end.theta, name, points=11)
+    found = compute_profile(problem, end.theta, name, points=11)
     low, high = found.interval
     assert low is not None
     assert high is not None
@@ -102,13 +104,13 @@ def test_intervals_of_example_1_cover_the_truth(name: str) -> None:
     assert low < found.estimate < high
     assert found.is_complete
     assert np.all(np.diff(found.values) > 0)
-    assert found.ratio.min() == 0.0
-    assert found.ratio[0] > QUANTILE < found.ratio[-1]
+    assert found.likelihood_ratio.min() == 0.0
+    assert found.likelihood_ratio[0] > CHI_SQUARE_95 < found.likelihood_ratio[-1]
 
 
 def test_an_end_beyond_the_bound_is_open() -> None:
     problem, theta = linear(upper=1.001)
-    found = profile(problem, theta, "p")
+    found = compute_profile(problem, theta, "p")
     assert found.interval[0] is not None
     assert found.interval[1] is None
     assert found.values[-1] == pytest.approx(1.001)
@@ -116,7 +118,7 @@ def test_an_end_beyond_the_bound_is_open() -> None:
 
 def test_a_profile_that_is_stopped_says_so() -> None:
     problem, theta = linear()
-    found = profile(problem, theta, "p", should_stop=lambda: True)
+    found = compute_profile(problem, theta, "p", should_stop=lambda: True)
     assert not found.is_complete
     assert found.interval == (None, None)
 
@@ -124,17 +126,17 @@ def test_a_profile_that_is_stopped_says_so() -> None:
 def test_what_cannot_be_profiled_is_refused() -> None:
     problem, theta = linear()
     with pytest.raises(InvalidSettings, match="no free parameter 'r'"):
-        profile(problem, theta, "r")
+        compute_profile(problem, theta, "r")
     with pytest.raises(InvalidSettings, match="need 3 or more"):
-        profile(problem, theta, "p", points=2)
+        compute_profile(problem, theta, "p", points=2)
 
 
 @pytest.mark.parametrize("name", ["c", "L", "b", "a"])
 def test_intervals_of_example_1_are_nearly_those_of_the_covariance(name: str) -> None:
-    found = profile(example(), TRUTH, name)
-    end = refine(example(), [TRUTH])[0]
+    found = compute_profile(example(), TRUTH, name)
+    end = refine_candidates(example(), [TRUTH])[0]
     assert end is not None
-    [error] = [e.stderr for e in analyse(example(), end.theta).estimates if e.name == name]
+    [error] = [e.stderr for e in analyse_estimate(example(), end.theta).estimates if e.name == name]
     assert error is not None
     expected = (found.estimate - 1.96 * error, found.estimate + 1.96 * error)
     assert found.interval == pytest.approx(expected, abs=0.1 * error)
@@ -142,8 +144,8 @@ def test_intervals_of_example_1_are_nearly_those_of_the_covariance(name: str) ->
 
 def test_where_the_profile_is_begun_does_not_matter() -> None:
     problem, theta = linear()
-    beside = profile(problem, theta + np.array([0.3, -0.2]), "p")
-    there = profile(problem, theta, "p")
+    beside = compute_profile(problem, theta + np.array([0.3, -0.2]), "p")
+    there = compute_profile(problem, theta, "p")
     assert beside.interval == pytest.approx(there.interval, rel=1e-4)
     assert beside.estimate == pytest.approx(there.estimate, rel=1e-6)
 
@@ -158,10 +160,10 @@ def test_factors_of_one_product_have_open_ends() -> None:
     })  # fmt: skip
     y = u + 0.1 * np.random.default_rng(1).standard_normal(times.size)
     data = Record((Channel("u", times, u),), (Channel("y", times, y),))
-    found = profile(Problem.build(model, [data], skip=1), np.array([1.0, 1.0]), "g")
+    found = compute_profile(Problem.build(model, [data], skip=1), np.array([1.0, 1.0]), "g")
     assert found.interval == (None, None)
     assert found.values[[0, -1]] == pytest.approx([0.5, 2.0])
-    assert np.all(found.ratio < 1e-6)
+    assert np.all(found.likelihood_ratio < 1e-6)
     assert found.values * found.others[:, 0] == pytest.approx(np.ones(found.values.size), abs=0.1)
 
 
@@ -169,7 +171,7 @@ def test_the_interval_of_a_rounded_lag_holds_its_plateau() -> None:
     solver = {"history": "constant", "interpolation": "nearest"}
     model = load_model({**load_model("duffing-eq16").document, "solver": solver})
     problem = Problem.build(model, [record(noisy())])
-    low, high = profile(problem, TRUTH, "L").interval
+    low, high = compute_profile(problem, TRUTH, "L").interval
     assert low is not None
     assert high is not None
     assert low <= 0.49 + 1e-3
@@ -181,10 +183,10 @@ def test_the_ratio_of_a_robust_loss_is_scaled_to_its_standard_errors() -> None:
     y = noisy()
     y[::20] += 0.2
     problem = Problem.build(load_model("duffing-eq16"), [record(y)], loss=Loss("soft-l1", 0.01))
-    end = refine(problem, [TRUTH])[0]
+    end = refine_candidates(problem, [TRUTH])[0]
     assert end is not None
-    found = profile(problem, end.theta, "b")
-    [error] = [e.stderr for e in analyse(problem, end.theta).estimates if e.name == "b"]
+    found = compute_profile(problem, end.theta, "b")
+    [error] = [e.stderr for e in analyse_estimate(problem, end.theta).estimates if e.name == "b"]
     low, high = found.interval
     assert low is not None
     assert high is not None
@@ -194,10 +196,10 @@ def test_the_ratio_of_a_robust_loss_is_scaled_to_its_standard_errors() -> None:
 
 def test_a_record_without_residuals_has_no_profile() -> None:
     with pytest.raises(InvalidRecord, match="needs residuals"):
-        profile(example(sd=0.0), TRUTH, "b")
+        compute_profile(example(sd=0.0), TRUTH, "b")
 
 
 def test_as_many_samples_as_parameters_have_no_profile() -> None:
     problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], skip=296)
     with pytest.raises(InvalidRecord, match="4 samples are not more than 4"):
-        profile(problem, TRUTH, "b")
+        compute_profile(problem, TRUTH, "b")

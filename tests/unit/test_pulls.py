@@ -7,14 +7,14 @@ import pytest
 
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identifiability.active_bounds import Pull, is_pulled, pulls
-from sysid.identifiability.bound_limits import reach
+from sysid.identifiability.active_bounds import ActiveBound, is_active, rank_active_bounds
+from sysid.identifiability.bound_limits import find_widest_bounds
 from sysid.models.model import Model
 from sysid.models.parameters import Parameter
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
-from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.analysis import analyse_estimate
 
 TIMES = 0.05 * np.arange(400.0)
 ANYWHERE = (-np.inf, np.inf)
@@ -28,12 +28,12 @@ def space(number: int) -> tuple[Parameter, ...]:
 
 def advised(
     columns: FloatArray, truth: FloatArray, place: FloatArray, reaches: Any = None
-) -> tuple[tuple[Pull, ...], list[str]]:
+) -> tuple[tuple[ActiveBound, ...], list[str]]:
     """Advice at the best place inside the bounds for data of a linear model, and who is pulled."""
     one = space(place.size)
     influence = columns @ (place - truth) + 1e-3 * C
-    found = pulls(one, reaches or (ANYWHERE,) * place.size, influence, columns, place)
-    alone = is_pulled(influence, columns, place)
+    found = rank_active_bounds(one, reaches or (ANYWHERE,) * place.size, influence, columns, place)
+    alone = is_active(influence, columns, place)
     return found, [p.name for p, is_out in zip(one, alone, strict=True) if is_out]
 
 
@@ -74,7 +74,7 @@ def test_the_step_goes_no_farther_than_is_possible() -> None:
     [only], _ = advised(columns, np.array([-4.0, 0.5]), np.array([0.0, 0.5]), reaches)
     assert (only.name, only.limit) == ("a", -0.5)
     assert only.share == pytest.approx(1 - (3.5 / 4) ** 2, abs=0.01)
-    assert only.cure == "lower the bound of a, to -0.5 at the least"
+    assert only.advice == "lower the bound of a, to -0.5 at the least"
 
 
 def lag(**bounds: Any) -> Model:
@@ -98,30 +98,30 @@ def problem(model: Model, ahead: float = 0.0, **truth: float) -> Problem:
 
 
 def test_a_lag_at_zero_is_not_to_be_negative() -> None:
-    found = analyse(problem(lag(), ahead=0.25, L=0.0, T=1.0), np.array([2.0, 1.0, 0.0]))
+    found = analyse_estimate(problem(lag(), ahead=0.25, L=0.0, T=1.0), np.array([2.0, 1.0, 0.0]))
     assert found.estimates[2].status == "at bound"
-    assert "L" not in [one.name for one in found.pulls]
+    assert "L" not in [one.name for one in found.active_bounds]
 
 
 def test_a_lag_that_is_held_above_zero_may_go_down_to_it() -> None:
     model = lag(L={"lower": 0.5, "upper": 1.0})
-    found = analyse(problem(model, L=0.1), np.array([2.0, 0.6, 0.5]))
-    [only] = [one for one in found.pulls if one.name == "L"]
+    found = analyse_estimate(problem(model, L=0.1), np.array([2.0, 0.6, 0.5]))
+    [only] = [one for one in found.active_bounds if one.name == "L"]
     assert (only.side, only.limit) == ("lower", 0.0)
-    assert only.cure == "lower the bound of L, to 0 s at the least"
+    assert only.advice == "lower the bound of L, to 0 s at the least"
 
 
 def test_a_time_constant_is_not_to_be_negative_nor_zero_to_be_passed() -> None:
     changed = problem(lag(T={"lower": 0.5}))
-    assert reach(changed, changed.space[1]) == (0.0, np.inf)
+    assert find_widest_bounds(changed, changed.free_parameters[1]) == (0.0, np.inf)
     logarithmic = problem(lag(K={"scale": "log"}))
-    assert reach(logarithmic, logarithmic.space[0]) == (0.0, np.inf)
-    assert reach(changed, changed.space[0]) == (-np.inf, np.inf)
+    assert find_widest_bounds(logarithmic, logarithmic.free_parameters[0]) == (0.0, np.inf)
+    assert find_widest_bounds(changed, changed.free_parameters[0]) == (-np.inf, np.inf)
 
 
 def test_a_lag_is_not_to_reach_as_far_back_as_the_record() -> None:
     short = problem(lag())
-    low, high = reach(short, short.space[2])
+    low, high = find_widest_bounds(short, short.free_parameters[2])
     assert low == 0.0
     assert high == pytest.approx(TIMES[-1], rel=1e-6)
 
@@ -134,7 +134,7 @@ def test_of_two_lags_in_a_row_each_may_take_what_the_other_leaves() -> None:
         "initial": {"x": 0},
     })  # fmt: skip
     made = Problem.build(model, [Record((U,), (Channel("y", TIMES, np.sin(TIMES), "m"),))])
-    first, second = (reach(made, one) for one in made.space)
+    first, second = (find_widest_bounds(made, one) for one in made.free_parameters)
     assert first[0] == pytest.approx(0.1, abs=1e-6)
     assert second[0] == pytest.approx(-0.2, abs=1e-6)
 
@@ -154,4 +154,4 @@ def test_a_base_keeps_its_sign_where_its_power_needs_one(
         "outputs": {"y": "x"}, "initial": {"x": 0},
     })  # fmt: skip
     problem = Problem.build(model, [Record((U,), (Channel("y", TIMES, np.sin(TIMES), "V"),))])
-    assert reach(problem, problem.space[0]) == expected
+    assert find_widest_bounds(problem, problem.free_parameters[0]) == expected

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sysid.core.errors import InvalidRecord, InvalidSettings, nearest
-from sysid.data.records import Channel, Record, Recording, Segment, sampling_of
+from sysid.core.errors import InvalidRecord, InvalidSettings, suggest_name
+from sysid.data.records import Channel, Record, Recording, Segment, measure_sampling
 from sysid.data.splitting import split_record
 
 
@@ -14,37 +14,37 @@ def ramp(name: str, samples: int = 10, period: float = 0.1) -> Channel:
 
 def test_a_record_carries_the_models_names() -> None:
     recording = Recording((ramp("P1"), ramp("P2")))
-    record = recording.record({"u": "P1"}, {"y": "P2"}, "tube")
+    record = recording.to_record({"u": "P1"}, {"y": "P2"}, "tube")
     assert [one.name for one in (*record.inputs, *record.outputs)] == ["u", "y"]
     assert record.duration == pytest.approx(0.9)
 
 
 def test_an_unknown_channel_is_told_with_the_nearest() -> None:
     with pytest.raises(InvalidRecord, match="did you mean 'P1'"):
-        Recording((ramp("P1"),)).record({"u": "P11"}, {"y": "P1"})
+        Recording((ramp("P1"),)).to_record({"u": "P11"}, {"y": "P1"})
 
 
 def test_of_very_many_names_a_message_lists_some() -> None:
-    told = nearest("zzz", (f"dataset {n:03}" for n in range(150)))
+    told = suggest_name("zzz", (f"dataset {n:03}" for n in range(150)))
     assert told.startswith("; known are dataset 000, ")
     assert told.endswith("dataset 029, and 120 more")
-    assert nearest("zzz", ["b", "a"]) == "; known are a, b"
+    assert suggest_name("zzz", ["b", "a"]) == "; known are a, b"
 
 
 def test_an_output_that_is_its_own_input_is_refused() -> None:
     recording = Recording((ramp("P1"), ramp("P2")))
     with pytest.raises(InvalidRecord, match="'P2' is given to input 'u' and to output 'y'"):
-        recording.record({"u": "P2"}, {"y": "P2"})
+        recording.to_record({"u": "P2"}, {"y": "P2"})
 
 
 def test_missing_values_are_an_error_in_an_input_and_none_in_an_output() -> None:
     holes = Channel("x", np.arange(3.0), np.array([1.0, np.nan, 2.0]))
     recording = Recording((holes,))
-    assert recording.record({}, {"y": "x"}).outputs[0].values.size == 3
+    assert recording.to_record({}, {"y": "x"}).outputs[0].values.size == 3
     with pytest.raises(InvalidRecord, match=r"input 'u'.*1 missing.*t = 1 s"):
-        recording.record({"u": "x"}, {})
+        recording.to_record({"u": "x"}, {})
     with pytest.raises(InvalidRecord, match="has no value"):
-        Recording((Channel("x", np.arange(2.0), np.full(2, np.nan)),)).record({}, {"y": "x"})
+        Recording((Channel("x", np.arange(2.0), np.full(2, np.nan)),)).to_record({}, {"y": "x"})
 
 
 def test_several_segments_are_several_experiments_on_their_own_times() -> None:
@@ -52,21 +52,23 @@ def test_several_segments_are_several_experiments_on_their_own_times() -> None:
     segments = (Segment(0, 0.5, 0.0, {"n": 1}), Segment(1, 1.25, 3.0, {"n": 2}))
     recording = Recording((channel,), segments)
     with pytest.raises(InvalidRecord, match="2 segments"):
-        recording.record({}, {"y": "y"})
-    first, second = recording.records({}, {"y": "y"})
+        recording.to_record({}, {"y": "y"})
+    first, second = recording.to_records({}, {"y": "y"})
     np.testing.assert_array_equal(first.outputs[0].times, [0, 0.5])
     np.testing.assert_array_equal(second.outputs[0].times, [3, 3.25])
 
 
 def test_regular_and_irregular_times_are_told_apart() -> None:
-    assert sampling_of(np.arange(5) * 0.1).is_regular
-    assert sampling_of(np.round(np.arange(100) / 610.35, 5)).is_regular  # printed with few digits
-    irregular = sampling_of(np.array([0.0, 1.0, 2.0, 5.0]))
+    assert measure_sampling(np.arange(5) * 0.1).is_regular
+    assert measure_sampling(
+        np.round(np.arange(100) / 610.35, 5)
+    ).is_regular  # printed with few digits
+    irregular = measure_sampling(np.array([0.0, 1.0, 2.0, 5.0]))
     assert not irregular.is_regular
     assert irregular.period == 1.0
     assert "irregular" in str(irregular)
-    assert "every 0.1 s" in str(sampling_of(np.arange(5) * 0.1))
-    assert str(sampling_of(np.zeros(1))) == "one sample"
+    assert "every 0.1 s" in str(measure_sampling(np.arange(5) * 0.1))
+    assert str(measure_sampling(np.zeros(1))) == "one sample"
 
 
 def test_splitting_gives_every_sample_to_one_part() -> None:

@@ -10,7 +10,7 @@ from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
 from sysid.search import least_squares
 from sysid.search import refine as refinement
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from tests.searching import example, force, noisy, record
 
@@ -18,7 +18,7 @@ NEAR = np.array([0.22, 0.52, 5.1, 1.1])
 
 
 def test_refinement_finds_the_optimum_beside_its_start() -> None:
-    end = refine(example(sd=0.0), [NEAR])[0]
+    end = refine_candidates(example(sd=0.0), [NEAR])[0]
     assert end is not None
     assert end.rms < 1e-10
     assert np.allclose(end.theta, [0.2, 0.5, 5.0, 1.0], atol=1e-8)
@@ -27,23 +27,23 @@ def test_refinement_finds_the_optimum_beside_its_start() -> None:
 def test_no_refined_start_is_worse_or_out_of_bounds() -> None:
     problem = example()
     starts = problem.evaluator.upper * np.random.default_rng(1).random((6, 4))
-    before = problem.fitness(starts)
-    for value, end in zip(before, refine(problem, list(starts)), strict=True):
+    before = problem.evaluate_fitness(starts)
+    for value, end in zip(before, refine_candidates(problem, list(starts)), strict=True):
         if end is not None:
             assert end.rms <= value
-            assert end.rms == problem.fitness(end.theta[None])[0]
+            assert end.rms == problem.evaluate_fitness(end.theta[None])[0]
             assert np.all((end.theta >= 0) & (end.theta <= problem.evaluator.upper))
             assert end.evaluations > 0
 
 
 def test_starts_beside_each_other_are_refined_once() -> None:
-    ends = refine(example(), [NEAR, NEAR + 1e-5, NEAR - 1e-5])
+    ends = refine_candidates(example(), [NEAR, NEAR + 1e-5, NEAR - 1e-5])
     assert sum(end is not None for end in ends) == 1
 
 
 def test_a_spent_budget_leaves_the_starts_alone() -> None:
-    assert refine(example(), [NEAR], evaluations=5) == (None,)
-    end = refine(example(), [NEAR], evaluations=30)[0]
+    assert refine_candidates(example(), [NEAR], evaluations=5) == (None,)
+    end = refine_candidates(example(), [NEAR], evaluations=30)[0]
     assert end is not None
     assert end.evaluations <= 32
 
@@ -51,7 +51,7 @@ def test_a_spent_budget_leaves_the_starts_alone() -> None:
 def test_an_optimum_on_the_bound_is_reached_exactly() -> None:
     changes = {"a": {"lower": 1.5, "upper": 5.0}}  # the true value is 1
     problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], parameters=changes)
-    end = refine(problem, [np.array([0.2, 0.5, 5.0, 2.0])])[0]
+    end = refine_candidates(problem, [np.array([0.2, 0.5, 5.0, 2.0])])[0]
     assert end is not None
     assert end.theta[3] == 1.5
 
@@ -61,7 +61,7 @@ def test_robust_refinement_withstands_outliers() -> None:
     y[::20] += 2.0
     model = load_model("duffing-eq16")
     robust = Problem.build(model, [record(y)], loss=Loss("soft-l1", 0.02))
-    end = refine(robust, [NEAR])[0]
+    end = refine_candidates(robust, [NEAR])[0]
     assert end is not None
     assert end.theta[1] == pytest.approx(0.5, abs=0.02)
 
@@ -79,7 +79,7 @@ def test_refinement_does_not_depend_on_the_unit_of_the_data(unit: float) -> None
     for k in range(1, 100):
         y[k] = 2.0 * source.values[k - 1] + 0.5 * y[k - 1]
     data = Record((source,), (Channel("y", source.times, y, "m"),))
-    end = refine(Problem.build(load_model(document), [data]), [np.array([7.0, 0.2])])[0]
+    end = refine_candidates(Problem.build(load_model(document), [data]), [np.array([7.0, 0.2])])[0]
     assert end is not None
     assert end.theta == pytest.approx([2.0, 0.5], rel=1e-9)
 
@@ -89,17 +89,21 @@ def test_on_long_records_a_compiled_call_makes_few_steps_and_the_bits_are_the_sa
 ) -> None:
     calls: list[int] = []
 
-    def noted(*arguments: object, at_once: int, **settings: object) -> least_squares.Solution:
+    def noted(
+        *arguments: object, at_once: int, **settings: object
+    ) -> least_squares.LeastSquaresSolution:
         calls.append(at_once)
-        return least_squares.solve(*arguments, at_once=at_once, **settings)  # type: ignore[arg-type]
+        return least_squares.solve_least_squares(*arguments, at_once=at_once, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(refinement, "solve", noted)
+    monkeypatch.setattr(refinement, "solve_least_squares", noted)
     problem = example()
-    whole = refine(problem, [NEAR])[0]
-    monkeypatch.setattr(least_squares, "_AT_ONCE", 2 * problem.n_steps * (4 + least_squares.TRIED))
-    cut = refine(problem, [NEAR])[0]
-    monkeypatch.setattr(least_squares, "_AT_ONCE", 1)  # a record longer than any
-    single = refine(problem, [NEAR])[0]
+    whole = refine_candidates(problem, [NEAR])[0]
+    monkeypatch.setattr(
+        least_squares, "_STEPS_PER_CALL", 2 * problem.n_steps * (4 + least_squares.N_TRIED)
+    )
+    cut = refine_candidates(problem, [NEAR])[0]
+    monkeypatch.setattr(least_squares, "_STEPS_PER_CALL", 1)  # a record longer than any
+    single = refine_candidates(problem, [NEAR])[0]
     assert calls[0] > 60
     assert calls[1:] == [2, 1]
     assert whole is not None

@@ -10,15 +10,15 @@ from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
-from sysid.models.parameters import override
-from sysid.residuals.past_outputs import coefficients_on_past_outputs
+from sysid.models.parameters import override_parameters
+from sysid.residuals.past_outputs import count_past_output_coefficients
 from sysid.residuals.residual_tests import (
-    Correlation,
+    CorrelationFunction,
     ResidualTests,
-    correlations,
-    residual_tests,
-    series,
-    verdict,
+    compute_correlations,
+    judge_tests,
+    make_residual_series,
+    run_residual_tests,
 )
 from sysid.simulation.problem import Problem
 
@@ -44,12 +44,12 @@ def coloured(draw: np.random.Generator, pole: float, n: int = N) -> FloatArray:
 
 def found(
     residual: FloatArray, u: FloatArray, *, times: FloatArray = TIMES, **more: Any
-) -> list[Correlation]:
+) -> list[CorrelationFunction]:
     n = residual.size
     scored = more.pop("scored", np.ones(n, dtype=bool))
     channel = Channel("u", TIMES[: u.size], u, hold=more.pop("hold", "zero"))
-    one = series(0, "y", times, residual, np.zeros(n), scored, (channel,), **more)
-    return correlations([one])
+    one = make_residual_series(0, "y", times, residual, np.zeros(n), scored, (channel,), **more)
+    return compute_correlations([one])
 
 
 def outcomes(residual: FloatArray, u: FloatArray, **more: Any) -> list[str]:
@@ -66,7 +66,7 @@ def test_white_noise_passes_both_tests_together_in_about_95_of_100_draws() -> No
     for seed in range(200):
         draw = draws(seed)
         u = held(draw)
-        whole = verdict(found(draw.normal(size=N), u), "validation")
+        whole = judge_tests(found(draw.normal(size=N), u), "validation")
         passed.append(whole.passed is True)
     assert 0.91 <= share_passed(passed) <= 0.99
 
@@ -127,9 +127,9 @@ def test_neither_test_depends_on_the_units_of_time_residual_and_input() -> None:
     draw = draws(3)
     residual, u = draw.normal(size=N), held(draw)
     first = found(residual, u)
-    one = series(0, "y", 60 * TIMES, 1e-3 * residual, np.zeros(N), np.ones(N, dtype=bool),
+    one = make_residual_series(0, "y", 60 * TIMES, 1e-3 * residual, np.zeros(N), np.ones(N, dtype=bool),
                  (Channel("u", 60 * TIMES, 1e5 * u + 3e5, hold="zero"),))  # fmt: skip
-    for here, there in zip(first, correlations([one]), strict=True):
+    for here, there in zip(first, compute_correlations([one]), strict=True):
         np.testing.assert_allclose(here.values, there.values, rtol=1e-9, atol=1e-10)
         np.testing.assert_allclose(here.band95, there.band95, rtol=1e-7)
 
@@ -154,11 +154,13 @@ def test_white_noise_with_gaps_or_at_irregular_times_passes_as_often() -> None:
     for seed in range(120):
         draw = draws(seed)
         residual, u = draw.normal(size=N), held(draw)
-        gaps.append(verdict(found(residual, u, scored=draw.random(N) > 0.3), "validation").passed)
+        gaps.append(
+            judge_tests(found(residual, u, scored=draw.random(N) > 0.3), "validation").passed
+        )
         times = np.sort(draw.uniform(0, TIMES[-1], N // 2))
         curves = found(residual[: N // 2], u, times=times)
         assert curves[0].period is None
-        irregular.append(verdict(curves, "validation").passed)
+        irregular.append(judge_tests(curves, "validation").passed)
     assert share_passed([one is True for one in gaps]) >= 0.9
     assert share_passed([one is True for one in irregular]) >= 0.9
 
@@ -174,12 +176,12 @@ def test_a_missed_response_is_found_at_irregular_times_too() -> None:
 def test_residuals_that_are_rounding_are_not_tested() -> None:
     measured = 1e5 + 1e4 * np.sin(TIMES)
     rounding = 1e-11 * draws(1).normal(size=N) * measured
-    one = series(0, "y", TIMES, measured, measured - rounding, np.ones(N, dtype=bool),
+    one = make_residual_series(0, "y", TIMES, measured, measured - rounding, np.ones(N, dtype=bool),
                  (Channel("u", TIMES, held(draws(1))),))  # fmt: skip
-    curves = correlations([one])
+    curves = compute_correlations([one])
     assert {curve.test.outcome for curve in curves} == {"not tested"}
     assert all("rounding" in curve.test.reason for curve in curves)
-    assert verdict(curves, "estimation").passed is None
+    assert judge_tests(curves, "estimation").passed is None
 
 
 @pytest.mark.parametrize(
@@ -210,12 +212,14 @@ def test_with_a_robust_loss_outliers_do_not_decide() -> None:
 
 def test_the_share_of_each_test_is_the_level_by_their_number() -> None:
     draw = draws(9)
-    one = series(0, "y", TIMES, draw.normal(size=N), np.zeros(N), np.ones(N, dtype=bool), ())
-    p = correlations([one])[0].test.p
+    one = make_residual_series(
+        0, "y", TIMES, draw.normal(size=N), np.zeros(N), np.ones(N, dtype=bool), ()
+    )
+    p = compute_correlations([one])[0].test.p
     assert p is not None
     many = [replace_experiment(one, k) for k in range(10)]
-    assert correlations([one], level=1.01 * p)[0].test.outcome == "failed"
-    assert correlations(many, level=1.01 * p)[0].test.outcome == "passed"
+    assert compute_correlations([one], level=1.01 * p)[0].test.outcome == "failed"
+    assert compute_correlations(many, level=1.01 * p)[0].test.outcome == "passed"
 
 
 def replace_experiment(one: Any, number: int) -> Any:
@@ -228,7 +232,7 @@ def problem(draw: np.random.Generator, noise: float, **more: Any) -> tuple[Probl
     record = Record((Channel("u", TIMES, u, hold="zero"),), (Channel("y", TIMES, np.zeros(N)),))
     true = {name: {"fixed": value} for name, value in TRUE.items()}
     bare = Problem.build(load_model("fopdt"), (record,), parameters=true, **more)
-    clean = bare.predictions(np.zeros((1, 0)))[0]
+    clean = bare.predict(np.zeros((1, 0)))[0]
     measured = clean + noise * draw.normal(size=N)
     noisy = replace(record, outputs=(replace(record.outputs[0], values=measured),))
     return Problem.build(load_model("fopdt"), (noisy,), parameters=true, **more), clean
@@ -236,14 +240,14 @@ def problem(draw: np.random.Generator, noise: float, **more: Any) -> tuple[Probl
 
 def test_the_true_model_passes_and_one_with_another_lag_fails() -> None:
     true, clean = problem(draws(11), 0.05)
-    whole = residual_tests(true, clean, "estimation")
+    whole = run_residual_tests(true, clean, "estimation")
     assert isinstance(whole, ResidualTests)
     assert whole.passed is True
     assert [(one.kind, one.input) for one in whole.tests] == [
         ("whiteness", None), ("independence", "u"),
     ]  # fmt: skip
     late = np.concatenate([np.zeros(4), clean[:-4]])
-    assert residual_tests(true, late, "estimation").passed is False
+    assert run_residual_tests(true, late, "estimation").passed is False
 
 
 def test_a_problem_hands_its_skipped_samples_and_its_loss_on() -> None:
@@ -251,21 +255,23 @@ def test_a_problem_hands_its_skipped_samples_and_its_loss_on() -> None:
     clean = clean.copy()
     clean[:40] = 1e3
     clean[200:202] += 30.0
-    whole = residual_tests(true, clean, "validation")
+    whole = run_residual_tests(true, clean, "validation")
     assert whole.passed is True
     assert whole.tests[0].samples == N - 40
 
 
 def test_a_true_model_without_noise_is_not_tested() -> None:
     true, clean = problem(draws(13), 0.0)
-    assert residual_tests(true, clean, "estimation").passed is None
+    assert run_residual_tests(true, clean, "estimation").passed is None
 
 
 def whiteness(residual: FloatArray, coefficients: int = 0) -> tuple[float, float]:
     """Statistic and degrees of freedom."""
     n = residual.size
-    one = series(0, "y", STEP * np.arange(n), residual, np.zeros(n), np.ones(n, dtype=bool), ())
-    test = correlations([one._replace(coefficients=coefficients)])[0].test
+    one = make_residual_series(
+        0, "y", STEP * np.arange(n), residual, np.zeros(n), np.ones(n, dtype=bool), ()
+    )
+    test = compute_correlations([one._replace(coefficients=coefficients)])[0].test
     assert test.statistic is not None
     assert test.degrees is not None
     return test.statistic, test.degrees
@@ -292,9 +298,11 @@ def test_one_step_ahead_the_statistic_loses_a_degree_for_each_coefficient_on_the
 
 def test_a_degree_of_freedom_is_always_left_and_records_share_the_loss() -> None:
     assert whiteness(draws(1).normal(size=40), 30)[1] == 1.0
-    one = series(0, "y", TIMES, draws(1).normal(size=N), np.zeros(N), np.ones(N, dtype=bool), ())
+    one = make_residual_series(
+        0, "y", TIMES, draws(1).normal(size=N), np.zeros(N), np.ones(N, dtype=bool), ()
+    )
     pair = [one._replace(experiment=k, coefficients=4) for k in (0, 1)]
-    assert [curve.test.degrees for curve in correlations(pair)] == [23.0, 23.0]
+    assert [curve.test.degrees for curve in compute_correlations(pair)] == [23.0, 23.0]
 
 
 @pytest.mark.parametrize(
@@ -307,7 +315,7 @@ def test_coefficients_on_past_outputs_are_those_that_multiply_a_state(
 ) -> None:
     model = load_model(name)
     given = {one: {"fixed": 1.0} for one in fixed}
-    found = coefficients_on_past_outputs(model, override(model.parameters, given))
+    found = count_past_output_coefficients(model, override_parameters(model.parameters, given))
     assert found == {"y": count}
 
 
@@ -321,7 +329,7 @@ def test_only_predictions_one_step_ahead_of_the_estimation_data_lose_degrees() -
         ("one-step", "estimation", 24.0),
     ):  # fmt: skip
         one = Problem.build(load_model("fopdt"), (record,), prediction=prediction)  # type: ignore[arg-type]
-        tests = residual_tests(one, np.zeros(N), data).tests  # type: ignore[arg-type]
+        tests = run_residual_tests(one, np.zeros(N), data).tests  # type: ignore[arg-type]
         assert tests[0].degrees == degrees
 
 

@@ -7,9 +7,15 @@ from scipy.signal import lfilter
 from scipy.special import chdtrc
 
 from sysid.core.types import FloatArray
-from sysid.residuals.autocorrelation import Laid, laid_out, whiteness
-from sysid.residuals.coloured import _is_coloured
-from sysid.residuals.restricted_likelihood import _deviance, _meant, _middle, _Series, modelled
+from sysid.residuals.autocorrelation import SpacedResiduals, compute_whiteness, space_residuals
+from sysid.residuals.coloured import _are_spaced_coloured
+from sysid.residuals.restricted_likelihood import (
+    _compute_deviance,
+    _compute_middle,
+    _ObservedSeries,
+    _to_pole_and_share,
+    fit_noise_colour,
+)
 
 PLACES = [(0.5, -1.0), (1.3, 0.4), (-0.6, -3.0)]
 
@@ -31,16 +37,16 @@ def residuals(values: FloatArray, columns: FloatArray) -> FloatArray:
     return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
 
 
-def with_gaps(n: int = 60) -> tuple[Laid, FloatArray, FloatArray]:
+def with_gaps(n: int = 60) -> tuple[SpacedResiduals, FloatArray, FloatArray]:
     """A series with samples missing, its sensitivities, and the times of the others."""
     kept = np.sort(np.random.default_rng(2).permutation(n)[: n - 12])
     columns = regressors(n)[kept]
     values = residuals(slow(n, 0.7, 1)[kept], columns)
-    return laid_out(kept.astype(np.float64), values), columns, kept.astype(np.float64)
+    return space_residuals(kept.astype(np.float64), values), columns, kept.astype(np.float64)
 
 
 def dense(place: tuple[float, float], times: FloatArray) -> FloatArray:
-    a, w = _meant(np.array(place))
+    a, w = _to_pole_and_share(np.array(place))
     gaps = np.abs(times[:, None] - times).astype(int)
     return np.asarray(np.where(gaps == 0, 1.0, (1 - w) * a**gaps))
 
@@ -52,7 +58,7 @@ def test_the_likelihood_is_that_of_combinations_without_the_parameters(
     laid, columns, times = with_gaps()
     basis = np.linalg.svd(columns, full_matrices=False)[0]
     values = laid.values[laid.present]
-    series = _Series(values, basis, np.diff(times).astype(np.int64))
+    series = _ObservedSeries(values, basis, np.diff(times).astype(np.int64))
     free = np.linalg.svd(columns)[0][:, 3:]  # orthogonal to all sensitivities
 
     def expected(at: tuple[float, float]) -> float:
@@ -62,9 +68,9 @@ def test_the_likelihood_is_that_of_combinations_without_the_parameters(
         return float(free.shape[1] * np.log(power) + np.linalg.slogdet(inner)[1])
 
     other = PLACES[1]
-    assert _deviance(np.array(place), series) - _deviance(np.array(other), series) == pytest.approx(
-        expected(place) - expected(other), abs=1e-8
-    )
+    assert _compute_deviance(np.array(place), series) - _compute_deviance(
+        np.array(other), series
+    ) == pytest.approx(expected(place) - expected(other), abs=1e-8)
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -72,14 +78,14 @@ def test_the_middle_is_that_of_the_whole_matrix_over_gaps_too(place: tuple[float
     laid, columns, times = with_gaps()
     basis = np.linalg.svd(columns, full_matrices=False)[0]
     values = laid.values[laid.present]
-    series = _Series(values, basis, np.diff(times).astype(np.int64))
+    series = _ObservedSeries(values, basis, np.diff(times).astype(np.int64))
     matrix = dense(place, times)
     inverse = np.linalg.inv(matrix)
     gram = columns.T @ inverse @ columns
     left = values - columns @ np.linalg.solve(gram, columns.T @ inverse @ values)
     variance = float(left @ inverse @ left) / (values.size - 3)
     np.testing.assert_allclose(
-        _middle(np.array(place), laid, columns, series),
+        _compute_middle(np.array(place), laid, columns, series),
         variance * columns.T @ matrix @ columns, rtol=1e-8, atol=1e-10,
     )  # fmt: skip
 
@@ -92,7 +98,7 @@ def test_variances_are_on_average_those_of_the_noise_though_residuals_are_less()
     found, plain = [], []
     for seed in range(150):
         left = residuals(slow(n, pole, seed), columns)
-        known = modelled(laid_out(times, left), columns)
+        known = fit_noise_colour(space_residuals(times, left), columns)
         if known is not None:
             found.append(np.diag(known.middle) / truth)
         sums = np.correlate(left, left, "full")[n - 1 :] / n
@@ -107,19 +113,21 @@ def test_what_is_no_first_order_noise_is_not_taken_for_one() -> None:
     white = np.random.default_rng(0).standard_normal(400)
     ringing = lfilter([1.0], [1.0, -1.4, 0.85], white)[200:]
     columns = regressors(200)
-    laid = laid_out(np.arange(200.0), residuals(ringing, columns))
-    assert modelled(laid, columns) is None
-    assert modelled(laid_out(np.arange(4.0), slow(4, 0.5, 0)), regressors(4)) is None
+    laid = space_residuals(np.arange(200.0), residuals(ringing, columns))
+    assert fit_noise_colour(laid, columns) is None
+    assert fit_noise_colour(space_residuals(np.arange(4.0), slow(4, 0.5, 0)), regressors(4)) is None
 
 
 def test_the_slower_the_noise_the_fewer_degrees_of_freedom() -> None:
     columns, times = regressors(100), np.arange(100.0)
     degrees = []
     for pole in (0.3, 0.8):
-        each = [modelled(laid_out(times, residuals(slow(100, pole, s), columns)), columns)
+        each = [fit_noise_colour(space_residuals(times, residuals(slow(100, pole, s), columns)), columns)
                 for s in range(30)]  # fmt: skip
         level = np.array([1.0, 0.0, 0.0])
-        degrees.append(np.median([2 / one.variation(level) for one in each if one is not None]))
+        degrees.append(
+            np.median([2 / one.compute_variation(level) for one in each if one is not None])
+        )
     assert degrees[1] < 0.5 * degrees[0] < 50
 
 
@@ -127,9 +135,9 @@ def test_short_slow_noise_is_recognised_by_its_neighbours_and_white_noise_no_mor
     columns, times = regressors(100), np.arange(100.0)
     counts = []
     for pole in (0.5, 0.0):
-        every = [laid_out(times, residuals(slow(100, pole, s), columns)) for s in range(200)]
-        by_all = sum(chdtrc(one.lags, whiteness(one).statistic) < 1e-3 for one in every)
-        counts.append((sum(_is_coloured(one, 1.0) for one in every), by_all))
+        every = [space_residuals(times, residuals(slow(100, pole, s), columns)) for s in range(200)]
+        by_all = sum(chdtrc(one.n_lags, compute_whiteness(one).statistic) < 1e-3 for one in every)
+        counts.append((sum(_are_spaced_coloured(one, 1.0) for one in every), by_all))
     (slow_seen, slow_by_all), (white_seen, white_by_all) = counts
     assert slow_seen > 160 > slow_by_all
     assert white_seen <= white_by_all + 1

@@ -6,23 +6,23 @@ from itertools import combinations, product
 import numpy as np
 import pytest
 
-from service.models.models import resolved
-from service.pages.diagnostics import findings_of
+from service.models.models import apply_selection
+from service.pages.diagnostics import to_diagnostics
 from sysid.core.errors import InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.model import TermRule
 from sysid.models.parse import parse_model
-from sysid.selection.frols import exchanged, forward, merit, solved
-from sysid.selection.lag_search import search
+from sysid.selection.frols import exchange_terms, rate_terms, select_forward, solve_coefficients
+from sysid.selection.lag_search import search_lags
 from sysid.selection.regression import Regression
-from sysid.selection.select import selected
+from sysid.selection.select import select_model_terms
 from sysid.simulation.problem import Problem
 from tests.polynomials import LAGGED, TRUTH, document, frols, lagged, record_of
 
 
 def chosen(terms: object, *records: Record, **changes: object) -> dict[str, float]:
-    model, _ = selected(parse_model(document(terms, **changes)), records)
+    model, _ = select_model_terms(parse_model(document(terms, **changes)), records)
     assert model.selection is not None
     return {one.term: one.coefficient for one in model.selection.terms}
 
@@ -46,7 +46,7 @@ def random_regression(seed: int, terms: int = 7) -> tuple[FloatArray, FloatArray
 @pytest.mark.parametrize("seed", range(5))
 def test_each_step_takes_the_term_that_leaves_least(seed: int) -> None:
     columns, target = random_regression(seed)
-    found = forward(triangle(columns, target), 5)
+    found = select_forward(triangle(columns, target), 5)
     whole = float(target @ target)
     for step, term in enumerate(found.order):
         before = list(found.order[:step])
@@ -54,20 +54,20 @@ def test_each_step_takes_the_term_that_leaves_least(seed: int) -> None:
             (left_over(columns[:, [*before, i]], target), i) for i in range(7) if i not in before
         )
         assert least[1] == term
-        assert found.left[step] == pytest.approx(least[0] / whole)
+        assert found.unexplained_shares[step] == pytest.approx(least[0] / whole)
 
 
 def test_error_reduction_ratios_and_what_is_left_make_one() -> None:
     columns, target = random_regression(1)
-    found = forward(triangle(columns, target), 6)
-    assert sum(found.ratios) + found.left[-1] == pytest.approx(1.0)
+    found = select_forward(triangle(columns, target), 6)
+    assert sum(found.ratios) + found.unexplained_shares[-1] == pytest.approx(1.0)
     assert all(ratio >= 0 for ratio in found.ratios)
 
 
 def test_the_scale_of_a_term_does_not_matter() -> None:
     columns, target = random_regression(2)
     scaled = columns * 10.0 ** np.arange(-6, 8, 2)
-    one, other = (forward(triangle(c, target), 5) for c in (columns, scaled))
+    one, other = (select_forward(triangle(c, target), 5) for c in (columns, scaled))
     assert one.order == other.order
     assert one.ratios == pytest.approx(other.ratios)
 
@@ -75,8 +75,8 @@ def test_the_scale_of_a_term_does_not_matter() -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_an_exchange_never_explains_less_and_no_single_one_would_explain_more(seed: int) -> None:
     columns, target = random_regression(seed, terms=9)
-    found = forward(triangle(columns, target), 4)
-    better = exchanged(triangle(columns, target), found.order)
+    found = select_forward(triangle(columns, target), 4)
+    better = exchange_terms(triangle(columns, target), found.order)
     least = left_over(columns[:, list(better)], target)
     assert least <= left_over(columns[:, list(found.order)], target) * (1 + 1e-12)
     for place, term in product(range(4), set(range(9)) - set(better)):
@@ -91,21 +91,21 @@ def test_what_a_forward_choice_hides_an_exchange_finds() -> None:
     decoy = target + 0.3 * rng.standard_normal(200)  # nearer to the output than either true term
     noise = 0.3 * rng.standard_normal((200, 3))
     given = triangle(np.column_stack([true, decoy, noise]), target)
-    assert forward(given, 2).order[0] == 2
-    assert sorted(exchanged(given, forward(given, 2).order)) == [0, 1]
+    assert select_forward(given, 2).order[0] == 2
+    assert sorted(exchange_terms(given, select_forward(given, 2).order)) == [0, 1]
 
 
 def test_terms_that_depend_on_each_other_are_taken_once() -> None:
     columns, target = random_regression(3, terms=3)
     doubled = np.column_stack([columns, columns @ [1.0, 2.0, 3.0], columns[:, 0]])
-    found = forward(triangle(doubled, target), 5)
+    found = select_forward(triangle(doubled, target), 5)
     assert len(found.order) == 3
 
 
 def test_coefficients_solve_the_least_squares_problem() -> None:
     columns, target = random_regression(4)
     expected = np.linalg.lstsq(columns[:, [5, 1]], target, rcond=None)[0]
-    found = solved(triangle(columns, target), [5, 1])
+    found = solve_coefficients(triangle(columns, target), [5, 1])
     assert found[[5, 1]] == pytest.approx(expected)
     assert np.count_nonzero(found) == 2
 
@@ -123,7 +123,9 @@ def test_the_constant_is_a_candidate_as_any_other() -> None:
     assert chosen(frols(6), record_of(truth), constant=True) == pytest.approx(truth)
     few = chosen(frols(5), record_of(TRUTH, noise=0.01), constant=True)
     assert "1" not in few
-    model, _ = selected(parse_model(document(frols(6), constant=True)), [record_of(truth)])
+    model, _ = select_model_terms(
+        parse_model(document(frols(6), constant=True)), [record_of(truth)]
+    )
     assert "a[1]" in {one.name for one in model.parameters}
 
 
@@ -145,7 +147,7 @@ def test_the_criterion_of_bayes_leaves_out_what_noise_alone_would_explain() -> N
 def test_a_share_that_may_stay_unexplained_ends_the_selection() -> None:
     record = record_of(TRUTH)
     model = parse_model(document({"select": "frols", "err": 0.05, "exchange": False}))
-    found, _ = selected(model, [record])
+    found, _ = select_model_terms(model, [record])
     assert found.selection is not None
     shares = [1.0 - one.cumulated for one in found.selection.terms]
     assert shares[-1] < 0.05
@@ -155,9 +157,11 @@ def test_a_share_that_may_stay_unexplained_ends_the_selection() -> None:
 def test_several_records_are_explained_together_without_rows_across_their_ends() -> None:
     model = parse_model(document("all"))
     records = [record_of(TRUTH, seed=seed, samples=50) for seed in (1, 2)]
-    whole, count = Regression.of(model, records, model.parameters).triangle(model.terms, {})
-    parts = [Regression.of(model, [one], model.parameters) for one in records]
-    single = [part.triangle(model.terms, {}) for part in parts]
+    whole, count = Regression.from_records(model, records, model.parameters).factor_terms(
+        model.terms, {}
+    )
+    parts = [Regression.from_records(model, [one], model.parameters) for one in records]
+    single = [part.factor_terms(model.terms, {}) for part in parts]
     assert count == sum(rows for _, rows in single) == 2 * (50 - 2)
     assert whole.T @ whole == pytest.approx(sum(r.T @ r for r, _ in single))
 
@@ -168,8 +172,8 @@ def test_rows_with_a_missing_sample_and_those_not_scored_are_left_out() -> None:
     values[[30, 31, 50]] = np.nan
     gappy = replace(record, outputs=(replace(record.outputs[0], values=values),))
     model = parse_model(document(["y(k-1)", "y(k-2)", "u(k-1)"]))
-    regression = Regression.of(model, [gappy], model.parameters, skip=10)
-    folded, count = regression.triangle(model.terms, {})
+    regression = Regression.from_records(model, [gappy], model.parameters, skip=10)
+    folded, count = regression.factor_terms(model.terms, {})
     u = record.inputs[0].values
     rows = [
         [values[k - 1], values[k - 2], u[k - 1], values[k]]
@@ -194,16 +198,16 @@ def test_the_regression_reads_past_values_as_the_kernels_do(hold: str) -> None:
     record = record_of(LAGGED, lags=lags, hold=hold)  # type: ignore[arg-type]
     model = parse_model(lagged(list(LAGGED)))
     problem = Problem.build(model, [record])
-    regression = Regression.laid(model, [record], problem.experiments, model.parameters)
-    folded, _ = regression.triangle(model.terms, lags)
-    found = solved(folded, range(len(model.terms)))
+    regression = Regression.from_experiments(model, [record], problem.experiments, model.parameters)
+    folded, _ = regression.factor_terms(model.terms, lags)
+    found = solve_coefficients(folded, range(len(model.terms)))
     assert found == pytest.approx(list(LAGGED.values()), abs=1e-9)
 
 
 def test_unknown_lags_are_chosen_with_the_terms_and_stay_unknown() -> None:
     lags = {"dh": 2.0, "dk": 5.0}
     record = record_of(LAGGED, lags=lags)
-    model, _ = selected(parse_model(lagged(frols(5))), [record])
+    model, _ = select_model_terms(parse_model(lagged(frols(5))), [record])
     assert model.selection is not None
     assert {one.term for one in model.selection.terms} == set(LAGGED)
     assert model.selection.lags == pytest.approx(lags)
@@ -213,7 +217,7 @@ def test_unknown_lags_are_chosen_with_the_terms_and_stay_unknown() -> None:
 def test_lags_are_tried_inside_the_bounds_of_the_request() -> None:
     record = record_of(LAGGED, lags={"dh": 2.0, "dk": 5.0})
     changes = {"dh": {"fixed": 2}, "dk": {"lower": 0, "upper": 3}}
-    model, kept = selected(parse_model(lagged(frols(5))), [record], changes)
+    model, kept = select_model_terms(parse_model(lagged(frols(5))), [record], changes)
     assert model.selection is not None
     assert model.selection.lags["dh"] == 2.0
     assert model.selection.lags["dk"] <= 3.0
@@ -223,14 +227,14 @@ def test_lags_are_tried_inside_the_bounds_of_the_request() -> None:
 def test_many_combinations_of_lags_are_searched_coarsely_and_then_finely() -> None:
     axes = {name: [float(i) for i in range(200)] for name in "abc"}
     truth = {"a": 117.0, "b": 3.0, "c": 158.0}
-    tried = search(axes, lambda lags: sum(abs(lags[name] - truth[name]) for name in axes))
+    tried = search_lags(axes, lambda lags: sum(abs(lags[name] - truth[name]) for name in axes))
     assert tried[0].lags == truth
     assert len(tried) < 5000
 
 
 def test_a_change_of_a_term_that_was_not_selected_is_let_go() -> None:
     changes = {"a[y(k-1)]": {"lower": 0.0}, "a[y(k-2)**2]": {"upper": 1.0}}
-    model, kept = selected(parse_model(document(frols(5))), [record_of(TRUTH)], changes)
+    model, kept = select_model_terms(parse_model(document(frols(5))), [record_of(TRUTH)], changes)
     assert kept == {"a[y(k-1)]": {"lower": 0.0}}
     Problem.build(model, [record_of(TRUTH)], parameters=kept)
 
@@ -240,12 +244,12 @@ def test_terms_selected_by_the_free_run_explain_it_no_worse() -> None:
     reached = {}
     for error in ("one-step", "simulation"):
         rule = frols(4, error=error)
-        model, _ = selected(parse_model(document(rule)), [record])
+        model, _ = select_model_terms(parse_model(document(rule)), [record])
         assert model.selection is not None
         problem = Problem.build(model, [record])
         known = {f"a[{one.term}]": one.coefficient for one in model.selection.terms}
-        theta = np.array([[known[one.name] for one in problem.space]])
-        reached[error] = float(problem.fitness(theta)[0])
+        theta = np.array([[known[one.name] for one in problem.free_parameters]])
+        reached[error] = float(problem.evaluate_fitness(theta)[0])
     assert reached["simulation"] <= reached["one-step"]
 
 
@@ -260,27 +264,31 @@ def test_the_criterion_of_bayes_holds_for_the_free_run_too(seed: int) -> None:
 def test_sets_of_terms_are_ranked_by_the_rule() -> None:
     bic = TermRule(9, criterion="bic")
     for factor, less in ((0.99, False), (0.90, True)):  # ln n / n is 0.046 at 100 samples
-        assert (merit(bic, factor * 0.1, 6, 100) < merit(bic, 0.1, 5, 100)) is less
+        assert (rate_terms(bic, factor * 0.1, 6, 100) < rate_terms(bic, 0.1, 5, 100)) is less
     kept = TermRule(9)
-    assert merit(kept, 0.099, 9, 100) < merit(kept, 0.1, 5, 100)
+    assert rate_terms(kept, 0.099, 9, 100) < rate_terms(kept, 0.1, 5, 100)
     enough = TermRule(9, err=0.05)
-    assert merit(enough, 0.049, 4, 100) < merit(enough, 0.01, 5, 100) < merit(enough, 0.06, 3, 100)
+    assert (
+        rate_terms(enough, 0.049, 4, 100)
+        < rate_terms(enough, 0.01, 5, 100)
+        < rate_terms(enough, 0.06, 3, 100)
+    )
 
 
 def test_the_resolved_model_can_be_built_again_from_its_document_and_from_a_result() -> None:
     asked = parse_model(lagged(frols(5)))
-    model, _ = selected(asked, [record_of(LAGGED, lags={"dh": 2.0, "dk": 5.0})])
+    model, _ = select_model_terms(asked, [record_of(LAGGED, lags={"dh": 2.0, "dk": 5.0})])
     assert parse_model(model.document) == model
     assert model.rule is None
     assert model.selection is not None
     result = {"selection": [one._asdict() for one in model.selection.terms]}
-    assert resolved(asked, result) == model
-    assert resolved(asked, None) == asked
+    assert apply_selection(asked, result) == model
+    assert apply_selection(asked, None) == asked
 
 
 def test_a_model_without_a_rule_stays_as_it_is() -> None:
     model = parse_model(document("all"))
-    assert selected(model, [record_of(TRUTH)], {"a[y(k-1)]": {"fixed": 1}}) == (
+    assert select_model_terms(model, [record_of(TRUTH)], {"a[y(k-1)]": {"fixed": 1}}) == (
         model,
         {"a[y(k-1)]": {"fixed": 1}},
     )
@@ -288,7 +296,7 @@ def test_a_model_without_a_rule_stays_as_it_is() -> None:
 
 def test_more_candidates_than_samples_are_refused() -> None:
     with pytest.raises(InvalidSettings, match="14 candidates cannot be told apart by 9 samples"):
-        selected(parse_model(document(frols(3))), [record_of(TRUTH, samples=11)])
+        select_model_terms(parse_model(document(frols(3))), [record_of(TRUTH, samples=11)])
 
 
 def test_a_problem_needs_terms_that_are_selected() -> None:
@@ -300,7 +308,7 @@ def test_an_output_that_is_zero_everywhere_selects_nothing_and_says_so() -> None
     record = record_of(TRUTH)
     flat = replace(record, outputs=(Channel("y", record.outputs[0].times, np.zeros(400)),))
     with pytest.raises(InvalidSettings, match="nothing to explain"):
-        selected(parse_model(document(frols(3))), [flat])
+        select_model_terms(parse_model(document(frols(3))), [flat])
 
 
 def test_every_pair_of_terms_can_be_asked_for_as_candidates() -> None:
@@ -312,9 +320,9 @@ def test_every_pair_of_terms_can_be_asked_for_as_candidates() -> None:
 def test_pages_show_the_selected_terms_in_their_order() -> None:
     first = {"term": "y(k-1)", "err": 0.583, "cumulated": 0.583, "coefficient": 1.5}
     second = {"term": "u(k-1)", "err": 0.417, "cumulated": 1.0 + 1e-16, "coefficient": 0.5}
-    found = findings_of({"selection": [first, second]}).selection
-    assert [(one.term, one.err, one.left) for one in found] == [
+    found = to_diagnostics({"selection": [first, second]}).selection
+    assert [(one.term, one.err, one.unexplained) for one in found] == [
         ("y(k-1)", "0.5830", "0.4170"),
         ("u(k-1)", "0.4170", "0"),
     ]
-    assert findings_of({}).selection == []
+    assert to_diagnostics({}).selection == []

@@ -7,14 +7,14 @@ import pytest
 from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core._pydantic_core import list_all_errors
 
-from service.core.validation import OWN_KINDS, detail_of, explained
+from service.core.validation import PYDANTIC_KINDS, describe_error, explain_errors
 from service.jobs.schemas import JobIn
 
 
 def told(kind: Any, value: Any) -> str:
     with pytest.raises(ValidationError) as refused:
         TypeAdapter(kind).validate_python(value)
-    return detail_of(refused.value.errors()[0], ())
+    return describe_error(refused.value.errors()[0], ())
 
 
 @pytest.mark.parametrize(
@@ -60,14 +60,14 @@ def test_no_sentence_of_pydantic_is_told(error: Any) -> None:
     entry = {"type": error["type"], "loc": ("field",), "input": 3, "ctx": context,
              "msg": error["message_template_python"]}  # fmt: skip
     longest = max(re.split(r"{\w+}", error["message_template_python"]), key=len)
-    assert error["type"] in OWN_KINDS
-    assert longest not in detail_of(entry, ["other"])
+    assert error["type"] in PYDANTIC_KINDS
+    assert longest not in describe_error(entry, ["other"])
 
 
 def test_an_unknown_field_that_is_one_elsewhere_is_told_with_its_place() -> None:
     body = {"model": "m", "datasets": ["d"], "population": 50, "sigm": 1, "algoritm": {}}
     with pytest.raises(ValidationError) as refused:
         JobIn.model_validate(body)
-    found = {one.pointer: one.detail for one in explained(refused.value.errors(), body, JobIn)}
+    found = {one.pointer: one.detail for one in explain_errors(refused.value.errors(), body, JobIn)}
     assert found["/population"] == "unknown field 'population'; there is /algorithm/population"
     assert "did you mean 'algorithm'?" in found["/algoritm"]

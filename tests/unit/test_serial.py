@@ -10,11 +10,11 @@ from sysid.core.settings import Loss
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
-from sysid.residuals.autocorrelation import laid_out
-from sysid.residuals.coloured import spectrum_root
-from sysid.search.refine import refine
+from sysid.residuals.autocorrelation import space_residuals
+from sysid.residuals.coloured import estimate_spectrum_root
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import Analysis, analyse
+from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from tests.searching import DUFFING, noisy, record
 
 STEADY = {
@@ -39,7 +39,7 @@ def level(noise: FloatArray, **settings: object) -> Analysis:
     times = 0.1 * np.arange(noise.size)
     data = Record((Channel("u", times, times),), (Channel("y", times, noise),))
     problem = Problem.build(load_model(STEADY), [data], skip=1, **settings)
-    return analyse(problem, np.array([np.mean(noise[1:])]))
+    return analyse_estimate(problem, np.array([np.mean(noise[1:])]))
 
 
 def standard_error(analysis: Analysis) -> float:
@@ -81,7 +81,7 @@ def test_two_equal_halves_give_what_the_halves_say_together() -> None:
     times = 0.1 * np.arange(N)
     one = Record((Channel("u", times, times),), (Channel("y", times, noise),))
     both = Problem.build(load_model(STEADY), [one, replace(one)], skip=1)
-    joint = standard_error(analyse(both, np.array([np.mean(noise[1:])])))
+    joint = standard_error(analyse_estimate(both, np.array([np.mean(noise[1:])])))
     assert joint == pytest.approx(standard_error(level(noise)) / np.sqrt(2), rel=5e-3)
 
 
@@ -106,13 +106,15 @@ def test_the_interval_of_a_mean_holds_it_in_short_records(pole: float, n: int) -
 @pytest.mark.slow
 def test_intervals_hold_the_truth_where_the_noise_is_coloured() -> None:
     model, clean = load_model("duffing-eq16"), noisy(sd=0.0)
-    truth = np.array([DUFFING[p.name] for p in Problem.build(model, [record(clean)]).space])
+    truth = np.array(
+        [DUFFING[p.name] for p in Problem.build(model, [record(clean)]).free_parameters]
+    )
     held = []
     for seed in range(100):
         problem = Problem.build(model, [record(clean + 0.01 * coloured(clean.size, 0.7, seed))])
-        end = refine(problem, [truth])[0]
+        end = refine_candidates(problem, [truth])[0]
         assert end is not None
-        found = analyse(problem, end.theta).uncertainty
+        found = analyse_estimate(problem, end.theta).uncertainty
         assert found is not None
         held.append(np.abs(end.theta - truth) <= 1.97 * np.sqrt(np.diag(found.covariance)))
     assert np.mean(held) > 0.87  # about 0.92; without R about 0.6
@@ -125,7 +127,7 @@ def test_slow_noise_beside_white_is_as_slow_as_it_is() -> None:
     for seed in range(draws):
         white, own = np.random.default_rng(seed).standard_normal((2, n))
         slow = lfilter([np.sqrt(1 - pole**2)], [1, -pole], white)
-        root, _ = spectrum_root(laid_out(np.arange(float(n)), slow + own))
+        root, _ = estimate_spectrum_root(space_residuals(np.arange(float(n)), slow + own))
         powers.append(root[0] ** 2 * 2 * (root.size - 1))
     assert np.mean(powers) == pytest.approx((1 + pole) / (1 - pole) + 1.0, rel=0.2)
 
@@ -134,10 +136,12 @@ def test_a_drift_has_a_recursion_of_first_order(monkeypatch: pytest.MonkeyPatch)
     """A long one takes what a model misses for oscillations, and says little lies between them."""
     times, random = np.arange(400.0), np.random.default_rng(0)
     wander, slow = (
-        laid_out(times, lfilter([1.0], [1.0, -pole], random.standard_normal(400)))
+        space_residuals(times, lfilter([1.0], [1.0, -pole], random.standard_normal(400)))
         for pole in (0.999, 0.9)
     )
-    before = spectrum_root(wander)[0], spectrum_root(slow)[0]
-    monkeypatch.setattr("sysid.residuals.coloured._recursion", lambda values: np.array([0.5, 0.2]))
-    np.testing.assert_array_equal(spectrum_root(wander)[0], before[0])
-    assert np.max(np.abs(spectrum_root(slow)[0] - before[1])) > 0
+    before = estimate_spectrum_root(wander)[0], estimate_spectrum_root(slow)[0]
+    monkeypatch.setattr(
+        "sysid.residuals.coloured._fit_recursion", lambda values: np.array([0.5, 0.2])
+    )
+    np.testing.assert_array_equal(estimate_spectrum_root(wander)[0], before[0])
+    assert np.max(np.abs(estimate_spectrum_root(slow)[0] - before[1])) > 0

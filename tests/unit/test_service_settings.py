@@ -11,16 +11,16 @@ from pydantic import ValidationError
 from service.core.errors import Misconfigured
 from service.core.settings import Settings, is_loopback
 from service.jobs.schemas import JobIn
-from service.jobs.to_core import algorithm_of, loss_of
+from service.jobs.to_core import to_algorithm, to_loss
 from service.pages.choices import DEFAULTS, NAMES, TEXTS, list_choices
 from sysid.core.errors import InvalidSettings
 from sysid.core.settings import (
     LOSS_KINDS,
     MAX_BITS,
-    METHODS,
     MIN_POPULATION,
     NOISE_MODELS,
     PREDICTION_KINDS,
+    SEARCH_METHODS,
     SEQUENCE_KINDS,
     TOPOLOGIES,
     GeneticAlgorithm,
@@ -53,14 +53,14 @@ def test_a_number_that_the_compiled_search_cannot_count_is_refused(
 
 
 def test_the_defaults_of_the_job_body_are_those_of_the_core() -> None:
-    document = JobIn.model_validate({"model": "m", "datasets": ["d"]}).normal_form()
-    assert algorithm_of(document["algorithm"]) == GeneticAlgorithm()
-    assert loss_of(document["loss"]) == Loss()
+    document = JobIn.model_validate({"model": "m", "datasets": ["d"]}).to_normal_form()
+    assert to_algorithm(document["algorithm"]) == GeneticAlgorithm()
+    assert to_loss(document["loss"]) == Loss()
 
 
 def test_the_wire_types_take_every_name_of_the_core_and_its_bounds() -> None:
     every = [{"algorithm": {"migration": {"topology": name}}} for name in TOPOLOGIES] + [
-        {"algorithm": {"method": name}} for name in METHODS
+        {"algorithm": {"method": name}} for name in SEARCH_METHODS
     ]
     every += [{"algorithm": {"sequence": {"kind": name}}} for name in SEQUENCE_KINDS]
     every += [{"loss": {"kind": name}} for name in LOSS_KINDS]
@@ -69,9 +69,9 @@ def test_the_wire_types_take_every_name_of_the_core_and_its_bounds() -> None:
     every += [{"hold": {"u": name}} for name in HOLDS]
     every += [{"algorithm": {"population": MIN_POPULATION}}, {"algorithm": {"bits": MAX_BITS}}]
     for body in every:
-        document = JobIn.model_validate({"model": "m", "datasets": ["d"], **body}).normal_form()
-        assert algorithm_of(document["algorithm"])
-        assert loss_of(document["loss"])
+        document = JobIn.model_validate({"model": "m", "datasets": ["d"], **body}).to_normal_form()
+        assert to_algorithm(document["algorithm"])
+        assert to_loss(document["loss"])
     for field, value in (("population", MIN_POPULATION - 1), ("bits", MAX_BITS + 1)):
         body = {"model": "m", "datasets": ["d"], "algorithm": {field: value}}
         with pytest.raises(ValidationError, match=field):
@@ -88,7 +88,7 @@ def test_the_form_has_a_choice_for_every_name_and_no_text_without_a_name() -> No
 def test_changes_of_single_islands_reach_the_core() -> None:
     algorithm = {"islands": [{"method": "simple"}, {"bits": 12, "mutation": [[0, 0.5]]}]}
     body = JobIn.model_validate({"model": "m", "datasets": ["d"], "algorithm": algorithm})
-    assert algorithm_of(body.normal_form()["algorithm"]).islands == (
+    assert to_algorithm(body.to_normal_form()["algorithm"]).islands == (
         IslandChange(method="simple"),
         IslandChange(bits=12, mutation=((0, 0.5),)),
     )
@@ -101,7 +101,7 @@ def test_the_client_loads_neither_numpy_nor_ray_nor_the_core() -> None:
 
 
 def test_the_web_application_loads_neither_ray_nor_the_compiler() -> None:
-    heavy = "{'ray', 'workers.tasks', 'workers.cluster', 'numba', 'llvmlite'}"
+    heavy = "{'ray', 'workers.tasks', 'workers.ray_executor', 'numba', 'llvmlite'}"
     code = f"import sys, service.api.app; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
@@ -127,12 +127,12 @@ def test_a_data_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("not a folder")
     with pytest.raises(Misconfigured, match="not writable") as refused:
-        Settings(data_dir=file / "data").prepare_folder()
+        Settings(data_dir=file / "data").prepare_data_folder()
     assert str(file) in str(refused.value)
 
 
 def test_database_and_store_lie_in_the_data_folder_unless_named(tmp_path: Path) -> None:
     settings = Settings(data_dir=tmp_path)
-    assert settings.database == f"sqlite:///{tmp_path / 'lagid.db'}"
-    assert settings.store == (tmp_path / "objects").as_uri()
-    assert Settings(store_url="s3://bucket").store == "s3://bucket"
+    assert settings.resolved_database_url == f"sqlite:///{tmp_path / 'lagid.db'}"
+    assert settings.resolved_store_url == (tmp_path / "objects").as_uri()
+    assert Settings(store_url="s3://bucket").resolved_store_url == "s3://bucket"

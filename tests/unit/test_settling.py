@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sysid.core.settings import GeneticAlgorithm, Migration, Stop
-from sysid.identification.conclude import conclude
-from sysid.identification.run import advance, begin, exchange
+from sysid.identification.conclude import conclude_run
+from sysid.identification.run import advance_run, begin_run, exchange_migrants
 from sysid.islands.state import RunState
 from sysid.models.catalogue.load import load_model
 from sysid.simulation.problem import Problem
@@ -18,13 +18,13 @@ ALONE = GeneticAlgorithm(islands=1, migration=Migration(every=1))
 
 def found(again: int, tried: int, returned: int, hops: int, *, is_warm: bool = False) -> RunState:
     """A run at its second border, its searches as told."""
-    start = begin(example(), ALONE, 1)
-    state = advance(example(), replace(ALONE, generations=1), start)
+    start = begin_run(example(), ALONE, 1)
+    state = advance_run(example(), replace(ALONE, generations=1), start)
     search = state.islands[0].search.copy()
     search.generation, search.confirmed_starts, search.random_starts = 2, again, tried
     search.returned_hops, search.hop_count = returned, hops
     island = replace(state.islands[0], search=search)
-    return exchange(ALONE, replace(state, ended=False, is_warm=is_warm), [island])
+    return exchange_migrants(ALONE, replace(state, has_ended=False, is_warm=is_warm), [island])
 
 
 @pytest.mark.parametrize(
@@ -43,12 +43,12 @@ def found(again: int, tried: int, returned: int, hops: int, *, is_warm: bool = F
 def test_where_searches_from_anywhere_disagree_more_of_them_are_needed(
     again: int, tried: int, returned: int, hops: int, ends: bool
 ) -> None:
-    assert found(again, tried, returned, hops).ended is ends
+    assert found(again, tried, returned, hops).has_ended is ends
 
 
 def test_behind_an_earlier_result_few_searches_are_enough() -> None:
-    assert not found(3, 7, 1, 1).ended
-    assert found(3, 7, 1, 1, is_warm=True).ended
+    assert not found(3, 7, 1, 1).has_ended
+    assert found(3, 7, 1, 1, is_warm=True).has_ended
 
 
 def test_a_false_optimum_that_a_third_of_the_searches_find_does_not_end_a_run() -> None:
@@ -57,8 +57,8 @@ def test_a_false_optimum_that_a_third_of_the_searches_find_does_not_end_a_run() 
         load_model("duffing-eq16"), [record(noisy(seed=55))], parameters={"L": {"upper": 5.0}}
     )
     settings = GeneticAlgorithm(stop=Stop(evaluations=20_000))
-    truth = np.array([[DUFFING[p.name] for p in problem.space]])
-    result = conclude(
-        problem, settings, advance(problem, settings, begin(problem, settings, 135_022))
+    truth = np.array([[DUFFING[p.name] for p in problem.free_parameters]])
+    result = conclude_run(
+        problem, settings, advance_run(problem, settings, begin_run(problem, settings, 135_022))
     )
-    assert result.rms <= float(problem.fitness(truth)[0])
+    assert result.rms <= float(problem.evaluate_fitness(truth)[0])

@@ -5,14 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.simulated_crew import Theatre
-from workers.packing import PACK_SECONDS, PACKS_PER_CPU
-from workers.sharing import (
+from workers.fair_share import (
     HEADSTART_SECONDS,
-    MOST_ABSENT,
-    MOST_SAVED_SECONDS,
-    PATIENT_TURN,
-    Shares,
+    LONGEST_WAIT_INTERVAL,
+    MAX_ABSENT_PROJECTS,
+    MAX_SAVED_SECONDS,
+    FairShare,
 )  # fmt: skip
+from workers.packing import PACK_SECONDS, PACKS_PER_CPU
 
 DELAY_SECONDS = 2.0
 """A single identification is delayed by no more than this."""
@@ -33,7 +33,7 @@ def test_sweeps_delay_a_single_identification_by_two_seconds_at_most(
     theatre.play((HEADSTART_SECONDS + 5.0) * sweeps / slots)
     theatre.add("single", 1, seconds)
     # One core alone gives every sixteenth pack to the patient; more cores lose nothing by it.
-    patient = seconds / (PATIENT_TURN - 1) if slots == 1 else 0.0
+    patient = seconds / (LONGEST_WAIT_INTERVAL - 1) if slots == 1 else 0.0
     assert theatre.until("single") <= seconds + patient + DELAY_SECONDS
 
 
@@ -113,28 +113,28 @@ def test_a_project_cannot_get_more_by_sending_short_jobs_one_after_another(
 
 
 def test_what_a_project_had_is_forgotten_when_the_others_have_caught_up() -> None:
-    shares: Shares[str] = Shares()
-    shares.enter("sweep", project="sweep")
-    shares.enter("short", project="short")
-    shares.charge("short", 29.0)
-    shares.leave("short")
+    shares: FairShare[str] = FairShare()
+    shares.open_account("sweep", project="sweep")
+    shares.open_account("short", project="short")
+    shares.charge_seconds("short", 29.0)
+    shares.close_account("short")
     assert len(shares._projects) == 2
-    shares.charge("sweep", 30.0)
-    shares.enter("other", project="other")
-    shares.leave("other")
+    shares.charge_seconds("sweep", 30.0)
+    shares.open_account("other", project="other")
+    shares.close_account("other")
     assert len(shares._projects) == 1
-    shares.leave("sweep")
+    shares.close_account("sweep")
     assert len(shares._projects) == 0
 
 
 def test_accounts_of_projects_without_jobs_are_bounded_in_number() -> None:
-    shares: Shares[int] = Shares()
-    shares.enter(-1, project="sweep")
-    for number in range(3 * MOST_ABSENT):
-        shares.enter(number, project=f"p{number}")
-        shares.charge(number, 1.0 + number % 7)
-        shares.leave(number)
-    assert len(shares._projects) == MOST_ABSENT + 1
+    shares: FairShare[int] = FairShare()
+    shares.open_account(-1, project="sweep")
+    for number in range(3 * MAX_ABSENT_PROJECTS):
+        shares.open_account(number, project=f"p{number}")
+        shares.charge_seconds(number, 1.0 + number % 7)
+        shares.close_account(number)
+    assert len(shares._projects) == MAX_ABSENT_PROJECTS + 1
 
 
 def test_a_project_that_asked_for_little_cannot_save_the_rest_for_later() -> None:
@@ -147,7 +147,7 @@ def test_a_project_that_asked_for_little_cannot_save_the_rest_for_later() -> Non
     before = theatre.had("greedy")
     theatre.play(200.0)
     gained = theatre.had("greedy") - before
-    assert gained >= (400.0 - MOST_SAVED_SECONDS - HEADSTART_SECONDS) / 2 - 5 * PACK_SECONDS
+    assert gained >= (400.0 - MAX_SAVED_SECONDS - HEADSTART_SECONDS) / 2 - 5 * PACK_SECONDS
 
 
 def test_a_higher_priority_goes_first_and_the_lower_one_still_gets_its_sixteenth() -> None:
@@ -158,7 +158,7 @@ def test_a_higher_priority_goes_first_and_the_lower_one_still_gets_its_sixteenth
     before = theatre.had("low")
     theatre.play(160.0)
     part = (theatre.had("low") - before) / 320.0
-    assert part == pytest.approx(1 / PATIENT_TURN, rel=0.25)
+    assert part == pytest.approx(1 / LONGEST_WAIT_INTERVAL, rel=0.25)
 
 
 def test_a_priority_beats_even_a_new_identification_of_a_lower_one() -> None:
@@ -181,7 +181,7 @@ def test_nobody_starves_under_a_stream_of_new_jobs() -> None:
             number += 1
             theatre.add(f"new{number}", 1, 1.0)
         theatre.step()
-    assert theatre.had("sweep") - before >= 0.8 * 160.0 / PATIENT_TURN
+    assert theatre.had("sweep") - before >= 0.8 * 160.0 / LONGEST_WAIT_INTERVAL
 
 
 def test_a_project_takes_no_more_cores_than_it_may() -> None:
@@ -233,10 +233,10 @@ def test_no_core_is_idle_while_work_waits_and_every_job_ends(
 
 @given(st.lists(st.floats(0.0, 100.0), max_size=20), st.sampled_from("abc"))
 def test_the_order_holds_every_job_once(charges: list[float], project: str) -> None:
-    shares: Shares[str] = Shares()
+    shares: FairShare[str] = FairShare()
     for number, name in enumerate("abc"):
-        shares.enter(name, priority=number % 2, project=name)
+        shares.open_account(name, priority=number % 2, project=name)
     for seconds in charges:
-        shares.serve(project)
-        shares.charge(project, seconds)
-        assert sorted(shares.order(dict.fromkeys("abc", 1))) == ["a", "b", "c"]
+        shares.record_pack(project)
+        shares.charge_seconds(project, seconds)
+        assert sorted(shares.order_jobs(dict.fromkeys("abc", 1))) == ["a", "b", "c"]

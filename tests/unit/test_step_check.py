@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from sysid.data.records import Record
-from sysid.identification.integration_step import step_notes
+from sysid.identification.integration_step import warn_integration_step
 from sysid.models.catalogue.load import load_model
 from sysid.models.model import Model
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import Analysis, analyse
+from sysid.uncertainty.analysis import Analysis, analyse_estimate
 from tests.catalogue_cases import CASES, made
 
 FINE = 16
@@ -38,11 +38,13 @@ def fitted(model: Model, name: str, record: Record) -> tuple[Analysis, list[str]
     """The estimate from the truth on, and what is told of its step."""
     problem, case = Problem.build(model, [record]), CASES[name]
     truth = {**case.truth, **case.initial}
-    (end,) = refine(problem, [np.array([truth[one.name] for one in problem.space])])
+    (end,) = refine_candidates(
+        problem, [np.array([truth[one.name] for one in problem.free_parameters])]
+    )
     assert end is not None
-    found = analyse(problem, end.theta)
-    simulated = problem.predictions(end.theta[None])[0]
-    return found, step_notes(problem, end.theta, found.estimates, simulated)
+    found = analyse_estimate(problem, end.theta)
+    simulated = problem.predict(end.theta[None])[0]
+    return found, warn_integration_step(problem, end.theta, found.estimates, simulated)
 
 
 def test_a_small_error_of_the_step_is_told_where_the_noise_is_smaller() -> None:

@@ -6,8 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.core.json_pointer import body_of
-from service.jobs.axes import Cell, axis_faults, count, expand, grouped, steps_of
+from service.core.json_pointer import build_run_body
+from service.jobs.axes import (
+    SweepCell,
+    build_axis_groups,
+    count_runs,
+    find_axis_faults,
+    group_axes,
+    iterate_cells,
+)
 from service.jobs.schemas import JobIn
 
 
@@ -16,15 +23,17 @@ def job(*axes: dict[str, Any], **fields: Any) -> JobIn:
     return JobIn.model_validate({**body, **fields})
 
 
-def cells(body: JobIn) -> list[Cell]:
-    return list(expand(steps_of(body.sweep.axes, grouped(body.sweep.axes))))
+def cells(body: JobIn) -> list[SweepCell]:
+    return list(iterate_cells(build_axis_groups(body.sweep.axes, group_axes(body.sweep.axes))))
 
 
 def test_without_axes_there_is_one_cell_that_changes_nothing() -> None:
     body = job()
-    assert cells(body) == [Cell()]
-    whole = body.normal_form()
-    assert body_of(whole, {}) == {name: value for name, value in whole.items() if name != "sweep"}
+    assert cells(body) == [SweepCell()]
+    whole = body.to_normal_form()
+    assert build_run_body(whole, {}) == {
+        name: value for name, value in whole.items() if name != "sweep"
+    }
 
 
 @given(st.lists(st.integers(1, 4), max_size=3))
@@ -33,18 +42,20 @@ def test_the_number_of_cells_is_the_product_of_the_axes(lengths: list[int]) -> N
     body = job(*({"path": path, "values": list(range(1, n + 1))}
                  for path, n in zip(paths, lengths, strict=False)))  # fmt: skip
     found = cells(body)
-    assert len(found) == count(body, grouped(body.sweep.axes))
+    assert len(found) == count_runs(body, group_axes(body.sweep.axes))
     assert len({tuple(cell.values.items()) for cell in found}) == len(found)
 
 
 def test_a_cell_changes_its_fields_and_nothing_else() -> None:
-    whole = job().normal_form()
-    changed = body_of(whole, {"/noise/sigma": 0.5, "/parameters/L/upper": 2.0, "/datasets/1": "x"})
+    whole = job().to_normal_form()
+    changed = build_run_body(
+        whole, {"/noise/sigma": 0.5, "/parameters/L/upper": 2.0, "/datasets/1": "x"}
+    )
     assert changed["noise"] == {"sigma": 0.5, "seed": 0}
     assert changed["parameters"] == {"L": {"upper": 2.0}}
     assert changed["datasets"] == ["ds_1", "x"]
-    assert whole == job().normal_form()
-    assert body_of(whole, {"/datasets": "ds_9"})["datasets"] == ["ds_9"]
+    assert whole == job().to_normal_form()
+    assert build_run_body(whole, {"/datasets": "ds_9"})["datasets"] == ["ds_9"]
 
 
 def test_a_logarithmic_axis_has_both_ends_and_equal_ratios() -> None:
@@ -55,17 +66,17 @@ def test_a_logarithmic_axis_has_both_ends_and_equal_ratios() -> None:
 
 
 def test_a_pointer_with_a_slash_in_a_name_is_read_as_written() -> None:
-    changed = body_of(job().normal_form(), {"/parameters/a~1b/fixed": 1.0})
+    changed = build_run_body(job().to_normal_form(), {"/parameters/a~1b/fixed": 1.0})
     assert changed["parameters"] == {"a/b": {"fixed": 1.0}}
 
 
 def test_zipped_axes_of_different_lengths_are_refused_at_the_second() -> None:
     body = job({"path": "/seed", "range": [0, 3], "zip": "z"},
                {"path": "/noise/seed", "range": [0, 2], "zip": "z"})  # fmt: skip
-    assert [fault.pointer for fault in axis_faults(body)] == ["/sweep/axes/1/zip"]
+    assert [fault.pointer for fault in find_axis_faults(body)] == ["/sweep/axes/1/zip"]
 
 
 def test_an_axis_that_is_there_twice_is_refused() -> None:
     body = job({"path": "/seed", "range": [0, 3]}, {"path": "/seed", "values": [7]})
-    [fault] = axis_faults(body)
+    [fault] = find_axis_faults(body)
     assert "already an axis" in fault.detail

@@ -13,19 +13,19 @@ import workers.tasks
 from sysid.core.settings import FitSettings, GeneticAlgorithm, Loss
 from sysid.data.noise import Noise
 from sysid.identification.identify import identify
-from sysid.models.catalogue.load import document
+from sysid.models.catalogue.load import copy_catalogue_document
 from sysid.models.parse import parse_model
 from sysid.simulation.problem import Problem
 from tests.polynomials import frols, lagged
 from tests.runs import RECORDS, bits, carry_out, spec
-from workers.inline import InlineCrew
-from workers.ports import Advance, Concluded, Failure, ProblemSpec, RunSpec
+from workers.inline_executor import InlineExecutor
+from workers.protocol import AdvanceRun, ProblemSpec, RunConclusion, RunFailure, RunSpec
 
 FAULTY_SEED = 13
 
 
 def test_a_programming_error_in_one_run_fails_it_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    sound = workers.tasks.begin
+    sound = workers.tasks.begin_run
 
     def begin(problem, algorithm, seed, warm):
         if seed == FAULTY_SEED:
@@ -34,25 +34,25 @@ def test_a_programming_error_in_one_run_fails_it_alone(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(workers.tasks, "begin", begin)
     monkeypatch.setattr(workers.tasks, "PACK_LIMIT_SECONDS", 1000.0)
-    pack = [Advance(f"r{seed}", spec(seed, generations=5), None, 100.0) for seed in (1, 13, 2)]
-    first, faulty, last = workers.tasks.advance(pack, ["short"], RECORDS["short"])
-    assert isinstance(first.outcome, Concluded)
-    assert isinstance(last.outcome, Concluded)
-    assert faulty.outcome == Failure(
+    pack = [AdvanceRun(f"r{seed}", spec(seed, generations=5), None, 100.0) for seed in (1, 13, 2)]
+    first, faulty, last = workers.tasks.process_pack(pack, ["short"], RECORDS["short"])
+    assert isinstance(first.outcome, RunConclusion)
+    assert isinstance(last.outcome, RunConclusion)
+    assert faulty.outcome == RunFailure(
         "internal error: OverflowError: too large", "InternalError"
     )  # fmt: skip
 
 
 def test_a_result_that_travels_arrives_whole() -> None:
-    pack = [Advance("r", spec(2, generations=60), None, 100.0)]
-    (done,) = workers.tasks.advance(pack, ["short"], RECORDS["short"])
-    assert isinstance(done.outcome, Concluded)
+    pack = [AdvanceRun("r", spec(2, generations=60), None, 100.0)]
+    (done,) = workers.tasks.process_pack(pack, ["short"], RECORDS["short"])
+    assert isinstance(done.outcome, RunConclusion)
     sent, back = done.outcome, pickle.loads(pickle.dumps(done.outcome))
     assert bits(back.identification) == bits(sent.identification)
     assert back.identification.history == sent.identification.history
     assert back.identification.migrations == sent.identification.migrations != ()
     assert back.identification.history[0][0].phase == "start"  # by name, as it was
-    noisy = pickle.loads(pickle.dumps(Concluded(sent.identification, 0.5)))
+    noisy = pickle.loads(pickle.dumps(RunConclusion(sent.identification, 0.5)))
     assert (back.rms_noise_free, noisy.rms_noise_free) == (sent.rms_noise_free, 0.5)
 
 
@@ -69,9 +69,9 @@ def test_a_run_whose_model_diverges_everywhere_fails_with_that_message() -> None
         "initial": {"x": 1},
     }
     problem = replace(whole.problem, model=wild, settings=FitSettings())
-    item = Advance("r1", replace(whole, problem=problem), None, 100.0)
-    (done,) = workers.tasks.advance([item], ["short"], RECORDS["short"])
-    assert isinstance(done.outcome, Failure)
+    item = AdvanceRun("r1", replace(whole, problem=problem), None, 100.0)
+    (done,) = workers.tasks.process_pack([item], ["short"], RECORDS["short"])
+    assert isinstance(done.outcome, RunFailure)
     assert "the model diverged for every one of" in done.outcome.reason
     assert "narrow the bounds" in done.outcome.reason
 
@@ -80,7 +80,7 @@ def test_a_run_that_selects_terms_gives_the_bits_of_the_library_call() -> None:
     asked = lagged(frols(4))
     problem = ProblemSpec(model=asked, records="short", settings=FitSettings(skip=3))
     settings = GeneticAlgorithm(generations=10)
-    (result,) = carry_out(InlineCrew(), {"r": RunSpec(problem, settings, 4)}).results["r"]
+    (result,) = carry_out(InlineExecutor(), {"r": RunSpec(problem, settings, 4)}).results["r"]
     alone = identify(parse_model(asked), RECORDS["short"], settings, seed=4, skip=3)
     assert len(alone.selection) == 4
     assert result.selection == alone.selection
@@ -107,7 +107,9 @@ def laid_out(problem: Problem | None) -> tuple[object, ...]:
 
 
 @pytest.mark.parametrize("fraction", [None, 0.3])
-@pytest.mark.parametrize("model", [document("fopdt"), TWO_OUTPUTS], ids=["one", "two outputs"])
+@pytest.mark.parametrize(
+    "model", [copy_catalogue_document("fopdt"), TWO_OUTPUTS], ids=["one", "two outputs"]
+)
 def test_runs_that_differ_in_noise_only_see_the_bits_they_would_see_alone(
     model: Mapping[str, object], fraction: float | None
 ) -> None:
@@ -115,13 +117,13 @@ def test_runs_that_differ_in_noise_only_see_the_bits_they_would_see_alone(
     other = replace(short.outputs[0], name="w", values=2.0 * short.outputs[0].values)
     records = {"r": (replace(short, outputs=(*short.outputs, other)),)}
     quiet = ProblemSpec(model, "r", validation_fraction=fraction, settings=FitSettings(skip=2))
-    alike = workers.tasks.build(quiet, records)
+    alike = workers.tasks.build_pack_problems(quiet, records)
     for seed in (1, 2):
         noisy = replace(quiet, noise=Noise(0.1, seed))
-        assert noisy.family == quiet.family
-        assert noisy.key != quiet.key
-        alone = workers.tasks.build(noisy, records)
-        beside = workers.tasks.build(noisy, records, alike)
+        assert noisy.noise_free_key == quiet.noise_free_key
+        assert noisy.cache_key != quiet.cache_key
+        alone = workers.tasks.build_pack_problems(noisy, records)
+        beside = workers.tasks.build_pack_problems(noisy, records, alike)
         for one, same in zip(alone, beside, strict=True):
             assert laid_out(one) == laid_out(same)
         alike = beside
@@ -129,7 +131,7 @@ def test_runs_that_differ_in_noise_only_see_the_bits_they_would_see_alone(
 
 def test_what_a_worker_did_before_changes_no_bit_of_a_run() -> None:
     """Nor does the same model with its parameters in another order, which are other genes."""
-    model = document("fopdt")
+    model = copy_catalogue_document("fopdt")
     turned = {**model, "parameters": dict(reversed([*model["parameters"].items()]))}
     first = replace(spec(generations=5), problem=ProblemSpec(model, "short"))
     runs = [first]
@@ -139,27 +141,29 @@ def test_what_a_worker_did_before_changes_no_bit_of_a_run() -> None:
             runs.append(replace(first, problem=problem))
     alone = []
     for run in runs:
-        workers.tasks._problems.clear()
+        workers.tasks._problem_cache.clear()
         alone.append(result_of(run))
     for order in (runs, runs[::-1]):
-        after = {run.key: result_of(run) for run in order}
-        assert [after[run.key] for run in runs] == alone
+        after = {run.reuse_key: result_of(run) for run in order}
+        assert [after[run.reuse_key] for run in runs] == alone
     assert len(set(alone)) == 6
 
 
 def result_of(run: RunSpec) -> tuple[object, ...]:
     """The bits of what a worker makes of a run."""
-    pack = [Advance("r", run, None, 100.0)]
-    (done,) = workers.tasks.advance(pack, ["short"], RECORDS["short"])
-    assert isinstance(done.outcome, Concluded)
+    pack = [AdvanceRun("r", run, None, 100.0)]
+    (done,) = workers.tasks.process_pack(pack, ["short"], RECORDS["short"])
+    assert isinstance(done.outcome, RunConclusion)
     return bits(done.outcome.identification)
 
 
 def test_terms_are_selected_anew_for_other_noise() -> None:
     quiet = ProblemSpec(model=lagged(frols(4)), records="short", settings=FitSettings(skip=3))
     noisy = replace(quiet, noise=Noise(2.0, 1))
-    alone = workers.tasks.build(noisy, RECORDS)[0]
-    beside = workers.tasks.build(noisy, RECORDS, workers.tasks.build(quiet, RECORDS))[0]
+    alone = workers.tasks.build_pack_problems(noisy, RECORDS)[0]
+    beside = workers.tasks.build_pack_problems(
+        noisy, RECORDS, workers.tasks.build_pack_problems(quiet, RECORDS)
+    )[0]
     assert beside.model.selection == alone.model.selection
 
 
@@ -194,8 +198,8 @@ def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_l
     run = spec(generations=5, records="drifting")
     fit = replace(run.problem.settings, loss=Loss(noise_model="ar1"))
     problem = replace(run.problem, settings=fit)
-    pack = [Advance("r", replace(run, problem=problem), None, 100.0)]
-    (whole,) = workers.tasks.advance(pack, ["drifting"], records)
+    pack = [AdvanceRun("r", replace(run, problem=problem), None, 100.0)]
+    (whole,) = workers.tasks.process_pack(pack, ["drifting"], records)
 
     def cancelled(*arguments: object, **_: object) -> None:
         os.kill(os.getpid(), signal.SIGINT)  # as Ray does to a worker
@@ -203,8 +207,8 @@ def test_a_cancel_between_the_parts_of_a_conclusion_ends_the_pack_and_harms_no_l
     with monkeypatch.context() as patched:
         patched.setattr(f"sysid.identification.{part}", cancelled)
         with pytest.raises(KeyboardInterrupt):
-            workers.tasks.advance(pack, ["drifting"], records)
-    (again,) = workers.tasks.advance(pack, ["drifting"], records)
-    assert isinstance(whole.outcome, Concluded)
-    assert isinstance(again.outcome, Concluded)
+            workers.tasks.process_pack(pack, ["drifting"], records)
+    (again,) = workers.tasks.process_pack(pack, ["drifting"], records)
+    assert isinstance(whole.outcome, RunConclusion)
+    assert isinstance(again.outcome, RunConclusion)
     assert bits(again.outcome.identification) == bits(whole.outcome.identification)

@@ -31,15 +31,15 @@ def ended() -> int:
 def test_what_a_dead_process_left_goes_and_what_a_living_one_has_stays(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "-c", LEAVE, f"{tmp_path}/"], check=True, timeout=60)
     assert len(list(tmp_path.iterdir())) == 1
-    mine = tmp_path / f"{temporary.prefix()}file"
+    mine = tmp_path / f"{temporary.make_temporary_prefix()}file"
     mine.touch()
     other = tmp_path / "lagid-tmp-another-host-1-file"
     other.touch()
-    temporary.clear(tmp_path)
+    temporary.remove_leftovers(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {mine.name, other.name}
     old = 2 * temporary.STALE_SECONDS
     os.utime(other, (other.stat().st_mtime - old, other.stat().st_mtime - old))
-    temporary.clear(tmp_path)
+    temporary.remove_leftovers(tmp_path)
     assert list(tmp_path.iterdir()) == [mine]
 
 
@@ -48,7 +48,7 @@ def test_a_file_that_goes_while_it_is_looked_at_is_no_fault(
 ) -> None:
     gone = tmp_path / "lagid-tmp-another-host-1-file"
     monkeypatch.setattr(Path, "glob", lambda *_: [gone])
-    temporary.clear(tmp_path)
+    temporary.remove_leftovers(tmp_path)
 
 
 def test_a_living_process_of_another_pid_namespace_keeps_its_files_and_rays_folder(
@@ -58,12 +58,15 @@ def test_a_living_process_of_another_pid_namespace_keeps_its_files_and_rays_fold
     with monkeypatch.context() as there:  # its number is there one that has ended here
         there.setattr(machine, "read_machine_id", lambda: ELSEWHERE)
         there.setattr(os, "getpid", lambda: ended)
-        theirs = [tmp_path / f"{temporary.prefix()}file", ray_folders.get_ray_folder(ended)]
+        theirs = [
+            tmp_path / f"{temporary.make_temporary_prefix()}file",
+            ray_folders.get_ray_folder(ended),
+        ]
     for path in theirs:
         path.mkdir()
     gone = ray_folders.get_ray_folder(ended)
     gone.mkdir()
-    temporary.clear(tmp_path)
+    temporary.remove_leftovers(tmp_path)
     ray_folders.clear_dead_dispatchers()
     assert set(tmp_path.iterdir()) == set(theirs)
 
@@ -72,7 +75,7 @@ def test_files_of_a_process_whose_number_another_has_by_now_go(tmp_path: Path) -
     number = os.getpid()
     former = tmp_path / f"lagid-tmp-{machine.make_machine_tag()}-{number}-1-file"
     former.touch()
-    temporary.clear(tmp_path)
+    temporary.remove_leftovers(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -84,9 +87,9 @@ def test_rays_folder_is_not_one_that_somebody_else_has_made(
     target.mkdir()
     folder.symlink_to(target)  # as what another has made, it cannot be removed as a folder is
     with pytest.raises(ClusterUnavailable, match="cannot be made"):
-        local_ray.fresh_folder()
+        local_ray.make_folder()
     folder.unlink()
-    made = local_ray.fresh_folder()
+    made = local_ray.make_folder()
     assert made == folder
     assert made.stat().st_mode & 0o077 == 0
 

@@ -11,7 +11,7 @@ from sysid.core.settings import GeneticAlgorithm
 from sysid.identification.identify import identify
 from sysid.models.catalogue.load import load_model
 from sysid.simulation.problem import Problem
-from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 from tests.models import difference, differential, individuals, lag_element, record
 from tests.searching import DUFFING, noisy
@@ -26,9 +26,9 @@ def test_a_tie_is_the_same_as_its_expression_in_the_equations() -> None:
     changes = {"c": {"tied": "2*b + 1"}, "L": {"tied": "b/40"}}
     tied = Problem.build(model, [record()], parameters=changes)
     other = Problem.build(plain, [record()], parameters={"c": {"fixed": 0.5}, "L": {"fixed": 0.1}})
-    assert [p.name for p in tied.space] == ["b"]
+    assert [p.name for p in tied.free_parameters] == ["b"]
     theta = individuals(tied, 5)
-    np.testing.assert_array_equal(tied.fitness(theta), other.fitness(theta))
+    np.testing.assert_array_equal(tied.evaluate_fitness(theta), other.evaluate_fitness(theta))
 
 
 def test_ties_of_ties_and_of_fixed_parameters_are_resolved() -> None:
@@ -42,7 +42,7 @@ def test_ties_of_ties_and_of_fixed_parameters_are_resolved() -> None:
         "a": {"lower": 0, "upper": 1}}, initial={"x": 0})  # fmt: skip
     theta = np.array([[0.3]])
     np.testing.assert_allclose(
-        problem.predictions(theta), Problem.build(plain, [record()]).predictions(theta), rtol=1e-13
+        problem.predict(theta), Problem.build(plain, [record()]).predict(theta), rtol=1e-13
     )
 
 
@@ -55,7 +55,9 @@ def test_a_tied_estimate_has_the_standard_error_of_its_expression() -> None:
     problem = Problem.build(
         load_model("duffing-eq16"), [duffing_record(noisy())], parameters=changes
     )
-    analysis = analyse(problem, np.array([DUFFING[p.name] for p in problem.space]))
+    analysis = analyse_estimate(
+        problem, np.array([DUFFING[p.name] for p in problem.free_parameters])
+    )
     found = by_name(analysis.estimates)
     assert found["a"].status == "tied"
     assert found["a"].value == pytest.approx(found["b"].value / 5)
@@ -70,10 +72,10 @@ def test_the_error_of_a_product_has_the_covariance_in_it() -> None:
     problem = Problem.build(
         load_model("duffing-eq16"), [duffing_record(noisy())], parameters=changes
     )
-    theta = np.array([DUFFING[p.name] for p in problem.space])
-    analysis = analyse(problem, theta)
+    theta = np.array([DUFFING[p.name] for p in problem.free_parameters])
+    analysis = analyse_estimate(problem, theta)
     assert analysis.uncertainty is not None
-    names = [p.name for p in problem.space]
+    names = [p.name for p in problem.free_parameters]
     slope = np.zeros(3)
     slope[names.index("c")], slope[names.index("b")] = DUFFING["b"], DUFFING["c"]
     expected = np.sqrt(slope @ analysis.uncertainty.covariance @ slope)
@@ -124,7 +126,7 @@ def test_an_initial_state_cannot_be_tied() -> None:
 def test_a_lag_inside_its_bounds_by_its_tie_is_taken() -> None:
     changes = {"L": {"tied": "b/10"}}
     problem = Problem.build(lag_element(), [record()], parameters=changes)
-    assert np.all(np.isfinite(problem.fitness(individuals(problem, 5))))
+    assert np.all(np.isfinite(problem.evaluate_fitness(individuals(problem, 5))))
 
 
 def test_a_value_fixed_outside_its_bounds_needs_bounds_that_hold_it() -> None:
@@ -132,13 +134,13 @@ def test_a_value_fixed_outside_its_bounds_needs_bounds_that_hold_it() -> None:
         Problem.build(lag_element(), [record()], parameters={"c": {"fixed": 3}})
     changes = {"c": {"fixed": 3, "upper": 4}}
     problem = Problem.build(lag_element(), [record()], parameters=changes)
-    assert [p.name for p in problem.space] == ["L", "b"]
+    assert [p.name for p in problem.free_parameters] == ["L", "b"]
 
 
 def test_both_bounds_free_a_parameter_that_the_model_gives() -> None:
     given = {"c": {"lower": 0, "upper": 2, "fixed": 1}, "L": {"lower": 0, "upper": 0.4},
              "b": {"lower": 0.1, "upper": 2}}  # fmt: skip
     model = lag_element(parameters=given)
-    assert "c" not in {p.name for p in Problem.build(model, [record()]).space}
+    assert "c" not in {p.name for p in Problem.build(model, [record()]).free_parameters}
     freed = Problem.build(model, [record()], parameters={"c": {"lower": 0, "upper": 3}})
-    assert "c" in {p.name for p in freed.space}
+    assert "c" in {p.name for p in freed.free_parameters}

@@ -11,7 +11,7 @@ from sysid.identification.identify import identify
 from sysid.models.catalogue.load import catalogue, load_model
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.models.units import time_unit_notes
+from sysid.models.units import list_time_unit_warnings
 
 
 def model(equation: str, unit: str, **fields: Any) -> Model:
@@ -28,11 +28,11 @@ def model(equation: str, unit: str, **fields: Any) -> Model:
     "(K*u - x)/T", "K*u/T - x/(60*T)", "(K*u - x)/(T + 1)", "K*u*exp(-T) - x", "(K*u - x)/-T",
 ])  # fmt: skip
 def test_a_time_constant_in_minutes_that_is_read_as_it_stands_is_told(equation: str) -> None:
-    [note] = time_unit_notes(model(equation, "min"))
+    [note] = list_time_unit_warnings(model(equation, "min"))
     assert note.startswith("T has the unit min, but the equations read it as it stands")
     assert note.endswith("give it in s, or write 60*T")
-    assert time_unit_notes(model(equation, "s")) == []
-    assert time_unit_notes(model(equation, "V")) == []
+    assert list_time_unit_warnings(model(equation, "s")) == []
+    assert list_time_unit_warnings(model(equation, "V")) == []
 
 
 @pytest.mark.parametrize("equation", [
@@ -40,7 +40,7 @@ def test_a_time_constant_in_minutes_that_is_read_as_it_stands_is_told(equation: 
     "(K*u - x)/(60*(T + 1))", "(K*u - x)/(60*(T + K*(T - 1)))",
 ])  # fmt: skip
 def test_one_that_is_converted_is_not(equation: str) -> None:
-    assert time_unit_notes(model(equation, "min")) == []
+    assert list_time_unit_warnings(model(equation, "min")) == []
 
 
 @pytest.mark.parametrize(("equation", "other", "told"), [
@@ -55,17 +55,19 @@ def test_of_a_ratio_of_two_times_nothing_is_to_be_converted(
 ) -> None:
     span = {"lower": 0.01, "upper": 5}
     both = {"T": span | {"unit": "min"}, "S": span | {"unit": other}, "K": span}
-    notes = time_unit_notes(model(equation, "min", parameters=both))
+    notes = list_time_unit_warnings(model(equation, "min", parameters=both))
     assert [note.partition(" ")[0] for note in notes] == told
 
 
 def test_a_recursion_may_count_in_what_it_likes() -> None:
     recursion = model("x(k-1)*T + K*u", "min", form="difference")
-    assert time_unit_notes(recursion) == []
+    assert list_time_unit_warnings(recursion) == []
 
 
 def test_no_model_of_the_catalogue_is_told() -> None:
-    assert [time_unit_notes(load_model(name)) for name in catalogue()] == [[]] * len(catalogue())
+    assert [list_time_unit_warnings(load_model(name)) for name in catalogue()] == [[]] * len(
+        catalogue()
+    )
 
 
 def test_a_result_tells_it() -> None:

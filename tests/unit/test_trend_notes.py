@@ -4,9 +4,9 @@ from math import inf
 
 import pytest
 
-from service.trends.notes import quantity_notes
-from service.trends.points import Point, Quantity
-from sysid.trends.trend import Estimate, fit_trend
+from service.trends.notes import describe_quantity
+from service.trends.points import TrendPoint, TrendQuantity
+from sysid.trends.trend import TrendEstimate, fit_trend
 
 BOUNDS = (0.0, 1.0)
 
@@ -16,11 +16,11 @@ def noted(
 ) -> str:
     errors = [0.001] * len(x)
     points = tuple(
-        Point(at, ("run_1",), "identified", Estimate(value, 0.001), value)
+        TrendPoint(at, ("run_1",), "identified", TrendEstimate(value, 0.001), value)
         for at, value in zip(x, y, strict=True)
     )
-    one = Quantity("L", "s", "parameter", points, None, bounds)
-    return "; ".join(quantity_notes(one, fit_trend(x, y, errors, predict)))
+    one = TrendQuantity("L", "s", "parameter", points, None, bounds)
+    return "; ".join(describe_quantity(one, fit_trend(x, y, errors, predict)))
 
 
 LINE = ([5.0, 10.0, 20.0, 40.0], [0.011, 0.021, 0.041, 0.081])

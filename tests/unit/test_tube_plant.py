@@ -10,15 +10,15 @@ from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel
 from sysid.plants.tube import (
-    GAMMA,
-    GAS,
+    GAS_CONSTANT,
+    HEAT_CAPACITY_RATIO,
     PRANDTL,
     VISCOSITY,
     Tube,
-    excitation,
-    measured,
+    add_gauge_errors,
+    build_excitation,
     simulate_tube,
-    tube_record,
+    simulate_tube_record,
 )
 
 PERIOD = 1e-3
@@ -33,17 +33,23 @@ def linear(tube: Tube, inlet: FloatArray) -> FloatArray:
     """
     s = 2j * np.pi * np.fft.rfftfreq(inlet.size, PERIOD)
     s[0] = 1e-9
-    density, radius = AMBIENT / (GAS * tube.temperature), tube.bore_m / 2
-    area, speed = np.pi * radius**2, np.sqrt(GAMMA * GAS * tube.temperature)
+    density, radius = AMBIENT / (GAS_CONSTANT * tube.temperature), tube.bore_m / 2
+    area, speed = np.pi * radius**2, np.sqrt(HEAT_CAPACITY_RATIO * GAS_CONSTANT * tube.temperature)
     z = radius * np.sqrt(s * density / VISCOSITY)
     warm = z * np.sqrt(PRANDTL)
     series = density * s / area * ive(0, z) / ive(2, z)
     shunt = area * s / (density * speed**2)
-    shunt = shunt * (1 + (GAMMA - 1) * 2 * ive(1, warm) / (warm * ive(0, warm)))
+    shunt = shunt * (1 + (HEAT_CAPACITY_RATIO - 1) * 2 * ive(1, warm) / (warm * ive(0, warm)))
     along, impedance = tube.length_m * np.sqrt(series * shunt), np.sqrt(series / shunt)
     volume = tube.volume_m3
-    loss = 20 * 4.84 * volume ** (2 / 3) * (GAMMA - 1) / (density * volume * GAS)
-    exponent = (GAMMA * s + loss) / (s + loss)
+    loss = (
+        20
+        * 4.84
+        * volume ** (2 / 3)
+        * (HEAT_CAPACITY_RATIO - 1)
+        / (density * volume * GAS_CONSTANT)
+    )
+    exponent = (HEAT_CAPACITY_RATIO * s + loss) / (s + loss)
     end = impedance * s * volume / (exponent * AMBIENT)
     return np.fft.irfft(np.fft.rfft(inlet) / (np.cosh(along) + end * np.sinh(along)), inlet.size)
 
@@ -77,7 +83,7 @@ def test_what_flows_in_is_in_the_volume_at_the_end() -> None:
 
 def test_a_tube_of_half_the_cells_gives_nearly_the_same() -> None:
     coarse, fine = (
-        tube_record(Tube(length_m=10.0, cells=cells), 1, 600, 0.01).channel("P2").values
+        simulate_tube_record(Tube(length_m=10.0, cells=cells), 1, 600, 0.01).channel("P2").values
         for cells in (40, 80)
     )
     assert float(np.sqrt(np.mean((coarse - fine) ** 2))) < 500.0
@@ -96,22 +102,22 @@ def test_a_longer_tube_answers_later() -> None:
 
 def test_both_patterns_are_those_of_the_specification_and_stretch_above_40_m() -> None:
     times = np.arange(0.0, 30.0, 0.01)
-    holds = excitation(1, 40.0, times)
+    holds = build_excitation(1, 40.0, times)
     assert list(dict.fromkeys(holds)) == pytest.approx(
         [1e5, 3e5, 4.8e5, 2e5, 4e5, 0.5e5, 3.5e5, 2.5e5, 4.5e5, 1.5e5]
     )
-    mixed = excitation(2, 40.0, times)
+    mixed = build_excitation(2, 40.0, times)
     assert (mixed[0], mixed[60], mixed[420]) == (2.5e5, 4e5, 1e5)
     chirp = mixed[times >= 18.0]
     assert np.count_nonzero(np.diff(np.sign(chirp - 2.5e5)) != 0) == pytest.approx(6.5, abs=1.5)
-    np.testing.assert_allclose(excitation(2, 80.0, 2 * times), mixed)
+    np.testing.assert_allclose(build_excitation(2, 80.0, 2 * times), mixed)
     with pytest.raises(InvalidSettings, match="need 1 or 2"):
-        excitation(3, 40.0, times)
+        build_excitation(3, 40.0, times)
 
 
 def test_gauges_tell_whole_digits_with_noise() -> None:
-    record = tube_record(Tube(length_m=5.0), 1, 300, 0.01)
-    told, again = (measured(record, 7) for _ in range(2))
+    record = simulate_tube_record(Tube(length_m=5.0), 1, 300, 0.01)
+    told, again = (add_gauge_errors(record, 7) for _ in range(2))
     values = told.channel("P2").values
     np.testing.assert_array_equal(values, again.channel("P2").values)
     digits = values / (1e6 / 4096)
@@ -143,6 +149,6 @@ def test_inlets_that_cannot_be_and_simulations_that_take_too_long_are_told() -> 
 
 def test_a_record_s_memory_is_bounded_and_no_period_is_too_long_to_be_told() -> None:
     with pytest.raises(InvalidSettings, match="need at most 500000 at a sample_time"):
-        tube_record(Tube(length_m=5.0, cells=1), 1, 10_000_000, 0.005)
+        simulate_tube_record(Tube(length_m=5.0, cells=1), 1, 10_000_000, 0.005)
     with pytest.raises(InvalidSettings, match="ask for fewer samples"):
-        tube_record(Tube(length_m=5.0), 1, 2, 1e308)
+        simulate_tube_record(Tube(length_m=5.0), 1, 2, 1e308)

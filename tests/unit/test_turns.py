@@ -6,8 +6,8 @@ from threading import BoundedSemaphore, Event, Semaphore
 import pytest
 
 from service.core import concurrency as module
-from service.core.concurrency import Turns
-from service.core.errors import Busy
+from service.core.concurrency import ConcurrencyLimit
+from service.core.errors import ServiceBusy
 
 
 def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused(
@@ -24,10 +24,14 @@ def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused(
             return super().acquire(blocking, timeout)
 
     monkeypatch.setattr(module, "BoundedSemaphore", Told)
-    turns, begun, ended = Turns(at_once=2, waiting=1), [Event(), Event(), Event()], Event()
+    turns, begun, ended = (
+        ConcurrencyLimit(at_once=2, waiting=1),
+        [Event(), Event(), Event()],
+        Event(),
+    )
 
     def work(number: int) -> int:
-        with turns.one():
+        with turns.acquire():
             begun[number].set()
             assert ended.wait(30)
         return number
@@ -38,28 +42,28 @@ def test_so_many_go_on_at_once_some_wait_and_the_others_are_refused(
         third = pool.submit(work, 2)
         assert all(asked.acquire(timeout=30) for _ in range(3))
         assert not begun[2].is_set()
-        with pytest.raises(Busy, match="too many"), turns.one():
+        with pytest.raises(ServiceBusy, match="too many"), turns.acquire():
             pass
         ended.set()
         assert [one.result() for one in (*first, third)] == [0, 1, 2]
-    with turns.one():
+    with turns.acquire():
         pass
 
 
 def test_who_waits_too_long_is_told_and_leaves_its_place() -> None:
-    turns = Turns(at_once=1, waiting=1, seconds=0.01)
-    with turns.one():
+    turns = ConcurrencyLimit(at_once=1, waiting=1, seconds=0.01)
+    with turns.acquire():
         for _ in range(3):
-            with pytest.raises(Busy, match=r"0\.01 s"), turns.one():
+            with pytest.raises(ServiceBusy, match=r"0\.01 s"), turns.acquire():
                 pass
-    with turns.one():
+    with turns.acquire():
         pass
 
 
 def test_a_fault_gives_the_turn_back() -> None:
-    turns = Turns(at_once=1, waiting=0)
+    turns = ConcurrencyLimit(at_once=1, waiting=0)
 
-    @turns.one()
+    @turns.acquire()
     def fails() -> None:
         raise KeyError
 

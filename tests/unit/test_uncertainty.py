@@ -8,10 +8,10 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.models.catalogue.load import load_model
 from sysid.models.parse import parse_model
-from sysid.search.refine import refine
+from sysid.search.refine import refine_candidates
 from sysid.simulation.problem import Problem
 from sysid.simulation.simulate import simulate
-from sysid.uncertainty.analysis import analyse
+from sysid.uncertainty.analysis import analyse_estimate
 from sysid.uncertainty.estimates import Estimate
 from tests.searching import COULOMB, DUFFING, example, force, noisy, record
 
@@ -20,7 +20,7 @@ BOUND = {"c": 0.0049, "L": 0.0025, "b": 0.0198, "a": 0.0268}
 
 
 def truth(problem: Problem) -> FloatArray:
-    return np.array([DUFFING[p.name] for p in problem.space])
+    return np.array([DUFFING[p.name] for p in problem.free_parameters])
 
 
 def by_name(estimates: tuple[Estimate, ...]) -> dict[str, Estimate]:
@@ -29,9 +29,9 @@ def by_name(estimates: tuple[Estimate, ...]) -> dict[str, Estimate]:
 
 def test_standard_errors_of_example_1_are_the_cramer_rao_bound() -> None:
     problem = example()
-    start = refine(problem, [truth(problem)])[0]
+    start = refine_candidates(problem, [truth(problem)])[0]
     assert start is not None
-    for estimate in analyse(problem, start.theta).estimates:
+    for estimate in analyse_estimate(problem, start.theta).estimates:
         assert estimate.stderr == pytest.approx(BOUND[estimate.name], rel=0.15)
         assert estimate.status == "identified"
 
@@ -40,9 +40,9 @@ def test_estimates_scatter_as_their_standard_errors_say() -> None:
     scores = []
     for seed in range(40):
         problem = Problem.build(load_model("duffing-eq16"), [record(noisy(seed=seed))])
-        end = refine(problem, [truth(problem)])[0]
+        end = refine_candidates(problem, [truth(problem)])[0]
         assert end is not None
-        for estimate in analyse(problem, end.theta).estimates:
+        for estimate in analyse_estimate(problem, end.theta).estimates:
             assert estimate.stderr is not None
             scores.append((estimate.value - DUFFING[estimate.name]) / estimate.stderr)
     assert np.mean(np.square(scores)) == pytest.approx(1.0, abs=0.35)
@@ -53,16 +53,16 @@ def test_records_of_unequal_noise_each_count_with_their_own() -> None:
     # freedom the estimates leave it.
     exact, vague = record(noisy(seed=1)), record(noisy(n=80, sd=0.06, seed=2))
     problem = Problem.build(load_model("duffing-eq16"), [exact, vague])
-    end = refine(problem, [truth(problem)])[0]
+    end = refine_candidates(problem, [truth(problem)])[0]
     assert end is not None
-    found = analyse(problem, end.theta)
+    found = analyse_estimate(problem, end.theta)
     assert found.uncertainty is not None
     assert found.uncertainty.noise_colour == "white"
     step = 1e-5 * np.eye(end.theta.size)
     slopes = (
-        problem.predictions(end.theta + step) - problem.predictions(end.theta - step)
+        problem.predict(end.theta + step) - problem.predict(end.theta - step)
     ).T / 2e-5  # fmt: skip
-    error = problem.evaluator.measured - problem.predictions(end.theta[None])[0]
+    error = problem.evaluator.measured - problem.predict(end.theta[None])[0]
     bread = np.linalg.inv(slopes.T @ slopes)
     inner = 0.0
     for rows in (slice(0, 300), slice(300, 380)):
@@ -96,9 +96,9 @@ def test_intervals_that_a_short_exact_output_tells_cover_the_truth() -> None:
             Channel("z", times, z + random.normal(0, 0.2, 1000), "m"),
         )
         problem = Problem.build(model, [Record((u,), data)], weights={"y": 1.0, "z": 1.0})
-        end = refine(problem, [truth_])[0]
+        end = refine_candidates(problem, [truth_])[0]
         assert end is not None
-        found = [one.interval95 for one in analyse(problem, end.theta).estimates]
+        found = [one.interval95 for one in analyse_estimate(problem, end.theta).estimates]
         covered += [a <= v <= b for (a, b), v in zip(filter(None, found), truth_, strict=True)]
     assert np.min(covered) >= 0.91 * draws  # 88 to 91 % with one s² and one t for all
     assert np.sum(covered[:3]) >= 0.93 * 3 * draws
@@ -115,7 +115,7 @@ def test_what_has_a_small_part_in_an_unknown_direction_is_not_identified() -> No
     noise = np.random.default_rng(3).normal(0, 0.1, 3)
     data = tuple(Channel(name, times, np.sin(times) + noise, "m") for name in "yz")
     problem = Problem.build(model, [Record((Channel("u", times, np.sin(1.3 * times)),), data)])
-    for one in analyse(problem, np.array([5.0, 5.0, 0.635])).estimates:
+    for one in analyse_estimate(problem, np.array([5.0, 5.0, 0.635])).estimates:
         assert one.stderr is not None
         assert one.stderr > one.upper - one.lower
         assert one.status in ("group", "unidentifiable"), one
@@ -127,10 +127,12 @@ def test_standard_errors_beside_the_jumps_of_coulomb_friction_are_those_of_repet
         problem = Problem.build(
             load_model("coulomb-eq16"), [record(noisy("coulomb-eq16", seed=seed))]
         )
-        end = refine(problem, [np.array([COULOMB[p.name] for p in problem.space])])[0]
+        end = refine_candidates(
+            problem, [np.array([COULOMB[p.name] for p in problem.free_parameters])]
+        )[0]
         assert end is not None
         values.append([end.theta])
-        errors.append([e.stderr for e in analyse(problem, end.theta).estimates])
+        errors.append([e.stderr for e in analyse_estimate(problem, end.theta).estimates])
     spread = np.std(np.concatenate(values), axis=0, ddof=1)
     found = np.array(errors, dtype=float)
     assert np.all(found > spread / 2)
@@ -139,7 +141,7 @@ def test_standard_errors_beside_the_jumps_of_coulomb_friction_are_those_of_repet
 
 def test_intervals_are_of_the_t_distribution() -> None:
     problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], skip=288)
-    analysis = analyse(problem, truth(problem))
+    analysis = analyse_estimate(problem, truth(problem))
     estimate = analysis.estimates[0]
     assert estimate.stderr is not None
     assert estimate.interval95 is not None
@@ -149,13 +151,13 @@ def test_intervals_are_of_the_t_distribution() -> None:
 
 def test_without_noise_the_standard_errors_vanish() -> None:
     problem = example(sd=0.0)
-    analysis = analyse(problem, truth(problem))
+    analysis = analyse_estimate(problem, truth(problem))
     assert all(e.stderr is not None and e.stderr < 1e-9 for e in analysis.estimates)
     assert all(e.status == "identified" for e in analysis.estimates)
 
 
 def test_the_correlation_matrix_is_one_of_correlations() -> None:
-    uncertainty = analyse(example(), truth(example())).uncertainty
+    uncertainty = analyse_estimate(example(), truth(example())).uncertainty
     assert uncertainty is not None
     assert np.allclose(uncertainty.correlation, uncertainty.correlation.T)
     assert np.allclose(np.diag(uncertainty.correlation), 1.0)
@@ -182,7 +184,7 @@ def analysed(equation: str, theta: list[float]) -> dict[str, Estimate]:
     y = y + 0.1 * np.random.default_rng(0).standard_normal(50)
     output = record(y).outputs
     problem = Problem.build(model, [Record((input_,), output)])
-    return by_name(analyse(problem, np.array(theta)).estimates)
+    return by_name(analyse_estimate(problem, np.array(theta)).estimates)
 
 
 def test_a_parameter_without_effect_is_unidentifiable_and_says_so() -> None:
@@ -210,7 +212,7 @@ def test_an_estimate_at_its_bound_has_a_standard_error() -> None:
 def test_as_many_samples_as_parameters_give_no_standard_error() -> None:
     model = load_model("duffing-eq16")
     problem = Problem.build(model, [record(noisy())], skip=296)
-    analysis = analyse(problem, truth(problem))
+    analysis = analyse_estimate(problem, truth(problem))
     assert analysis.uncertainty is None
     assert all(e.stderr is None and "4 samples" in e.reason for e in analysis.estimates)
 
@@ -218,7 +220,7 @@ def test_as_many_samples_as_parameters_give_no_standard_error() -> None:
 def test_fixed_parameters_are_reported_as_given() -> None:
     changes = {"b": {"fixed": 5.0}}
     problem = Problem.build(load_model("duffing-eq16"), [record(noisy())], parameters=changes)
-    found = by_name(analyse(problem, np.array([0.2, 0.5, 1.0])).estimates)
+    found = by_name(analyse_estimate(problem, np.array([0.2, 0.5, 1.0])).estimates)
     assert found["b"].status == "fixed"
     assert found["b"].value == 5.0
     assert found["b"].stderr is None
@@ -232,9 +234,11 @@ def test_outliers_widen_robust_standard_errors_little() -> None:
 
     def errors(values: FloatArray, loss: Loss) -> FloatArray:
         problem = Problem.build(load_model("duffing-eq16"), [record(values)], loss=loss)
-        end = refine(problem, [truth(problem)])[0]
+        end = refine_candidates(problem, [truth(problem)])[0]
         assert end is not None
-        return np.array([e.stderr for e in analyse(problem, end.theta).estimates], dtype=float)
+        return np.array(
+            [e.stderr for e in analyse_estimate(problem, end.theta).estimates], dtype=float
+        )
 
     plain, robust = errors(y, Loss()), errors(outliers, loss)
     assert np.all(robust < 2 * plain)
@@ -252,7 +256,7 @@ def test_a_rounded_lag_is_no_surer_than_its_plateau() -> None:
     problem = rounded()
     errors = []
     for lag in (0.4912, 0.4951, 0.5, 0.5049, 0.5088, 0.5099, 0.50999):  # all the same samples
-        analysis = analyse(problem, np.array([0.2, lag, 5.0, 1.0]))
+        analysis = analyse_estimate(problem, np.array([0.2, lag, 5.0, 1.0]))
         found = by_name(analysis.estimates)["L"]
         assert found.status == "identified"
         assert found.stderr is not None
@@ -264,7 +268,7 @@ def test_a_rounded_lag_is_no_surer_than_its_plateau() -> None:
 def test_the_interval_of_a_rounded_lag_does_not_depend_on_where_the_search_ended() -> None:
     problem = rounded()
     for lag in (0.4901, 0.4912, 0.5, 0.5088, 0.5099):  # all the same samples
-        found = by_name(analyse(problem, np.array([0.2, lag, 5.0, 1.0])).estimates)["L"]
+        found = by_name(analyse_estimate(problem, np.array([0.2, lag, 5.0, 1.0])).estimates)["L"]
         assert found.value == pytest.approx(lag)
         assert found.interval95 is not None
         lower, upper = found.interval95
@@ -274,7 +278,7 @@ def test_the_interval_of_a_rounded_lag_does_not_depend_on_where_the_search_ended
 
 
 def test_a_rounded_lag_leaves_the_other_standard_errors_alone() -> None:
-    found = by_name(analyse(rounded(), np.array([0.2, 0.5, 5.0, 1.0])).estimates)
+    found = by_name(analyse_estimate(rounded(), np.array([0.2, 0.5, 5.0, 1.0])).estimates)
     for name in ("c", "b", "a"):
         assert found[name].stderr == pytest.approx(BOUND[name], rel=0.25)
 
@@ -284,7 +288,7 @@ def test_a_rounded_lag_at_its_bound_has_no_standard_error_and_says_why() -> None
     model = load_model({**load_model("duffing-eq16").document,
                         "solver": {"history": "constant", "interpolation": "nearest"}})  # fmt: skip
     problem = Problem.build(model, [record(noisy())], parameters=changes)
-    found = by_name(analyse(problem, np.array([0.2, 0.5, 5.0, 1.0])).estimates)["L"]
+    found = by_name(analyse_estimate(problem, np.array([0.2, 0.5, 5.0, 1.0])).estimates)["L"]
     assert found.stderr is None
     assert found.interval95 is None
     assert "jumps" in found.reason
@@ -295,16 +299,16 @@ def test_of_a_budget_that_does_not_suffice_is_told_what_was_simulated(
     monkeypatch: pytest.MonkeyPatch, most: int
 ) -> None:
     theta, simulated = np.array([0.2, 0.5, 5.0, 1.0]), []
-    problem, inner = example(), Problem.predictions
+    problem, inner = example(), Problem.predict
 
     def counted(self: Problem, places: FloatArray) -> FloatArray:
         simulated.append(len(places))
         return inner(self, places)
 
-    monkeypatch.setattr(Problem, "predictions", counted)
-    short = analyse(problem, theta, most)
+    monkeypatch.setattr(Problem, "predict", counted)
+    short = analyse_estimate(problem, theta, most)
     assert short.uncertainty is None
     assert short.evaluations <= most
     shown = 1 if most == 0 else 0  # what every result shows, which no budget counts
     assert sum(simulated) - shown == short.evaluations
-    assert short.criteria == analyse(problem, theta).criteria
+    assert short.criteria == analyse_estimate(problem, theta).criteria

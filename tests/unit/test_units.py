@@ -9,13 +9,18 @@ from hypothesis import strategies as st
 
 from sysid.core.errors import InvalidRecord, InvalidSettings
 from sysid.core.settings import GeneticAlgorithm
-from sysid.core.units import difference, factor, is_read, suggestion
-from sysid.data.derivations import derive
+from sysid.core.units import (
+    describe_difference,
+    find_conversion_factor,
+    is_readable_unit,
+    suggest_unit,
+)
+from sysid.data.derivations import derive_recording
 from sysid.data.records import Channel, Record, Recording
 from sysid.identification.identify import identify
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
-from sysid.models.units import mixed_units, unknown_units
+from sysid.models.units import list_mixed_unit_warnings, list_unknown_unit_warnings
 
 TINY = GeneticAlgorithm(population=8, generations=2, islands=1)
 
@@ -42,12 +47,14 @@ TINY = GeneticAlgorithm(population=8, generations=2, islands=1)
 def test_units_differ_by_a_factor_or_by_their_kind(
     unit: str, other: str, times: float | None
 ) -> None:
-    assert factor(unit, other) == (None if times is None else pytest.approx(times, rel=1e-12))
+    assert find_conversion_factor(unit, other) == (
+        None if times is None else pytest.approx(times, rel=1e-12)
+    )
 
 
 @given(st.text(max_size=90), st.text(max_size=90))
 def test_no_text_breaks_the_comparison_and_a_factor_turns_round(unit: str, other: str) -> None:
-    there, back = factor(unit, other), factor(other, unit)
+    there, back = find_conversion_factor(unit, other), find_conversion_factor(other, unit)
     assert (there is None) == (back is None)
     if there is not None and back is not None:
         assert there * back == pytest.approx(1.0)
@@ -59,7 +66,7 @@ def test_no_text_breaks_the_comparison_and_a_factor_turns_round(unit: str, other
      ("°C/s", "K/s"), ("2 m", "m")],
 )  # fmt: skip
 def test_of_a_unit_that_cannot_be_read_nothing_is_asserted(unit: str, other: str) -> None:
-    assert not difference(unit, other)
+    assert not describe_difference(unit, other)
 
 
 @pytest.mark.parametrize(
@@ -71,13 +78,13 @@ def test_of_a_unit_that_cannot_be_read_nothing_is_asserted(unit: str, other: str
 def test_units_that_are_known_to_differ_are_told_with_both_names_and_no_number(
     unit: str, other: str, said: str
 ) -> None:
-    assert said in difference(unit, other)
-    assert not any(char.isdigit() for char in difference(unit, other))
+    assert said in describe_difference(unit, other)
+    assert not any(char.isdigit() for char in describe_difference(unit, other))
 
 
 @given(st.sampled_from(["", " ", "1", "-", None]), st.text(max_size=10))
 def test_a_blank_unit_goes_with_every_unit(blank: str | None, unit: str) -> None:
-    assert difference(blank, unit) == difference(unit, blank) == ""
+    assert describe_difference(blank, unit) == describe_difference(unit, blank) == ""
 
 
 def model(u: str = "Pa", y: str = "1") -> Model:
@@ -139,21 +146,21 @@ def test_one_unit_written_in_two_ways_or_left_out_is_accepted() -> None:
 def test_a_derivation_converts_exactly_and_writes_down_a_unit_that_is_missing() -> None:
     times = np.arange(4.0)
     made = Recording((Channel("p", times, times, "kPa"), Channel("q", times, times)))
-    found = derive(made, [{"unit": {"p": "Pa", "q": "V"}}])
+    found = derive_recording(made, [{"unit": {"p": "Pa", "q": "V"}}])
     assert [one.unit for one in found.channels] == ["Pa", "V"]
     np.testing.assert_array_equal(found.channel("p").values, 1000.0 * times)
     np.testing.assert_array_equal(found.channel("q").values, times)
     with pytest.raises(InvalidSettings, match=r"/steps/0/unit/p: kPa is not V"):
-        derive(made, [{"unit": {"p": "V"}}])
+        derive_recording(made, [{"unit": {"p": "V"}}])
     spinning = Recording((Channel("f", times, times, "rpm"), Channel("c", times, times, "counts")))
-    turned = derive(spinning, [{"unit": {"f": "Hz"}}])
+    turned = derive_recording(spinning, [{"unit": {"f": "Hz"}}])
     np.testing.assert_allclose(turned.channel("f").values, times / 60)
     with pytest.raises(InvalidSettings, match=r"between Hz and rad/s it is open"):
-        derive(turned, [{"unit": {"f": "rad/s"}}])
+        derive_recording(turned, [{"unit": {"f": "rad/s"}}])
     with pytest.raises(InvalidSettings, match=r"/steps/0/unit/c: 'counts' cannot be read"):
-        derive(spinning, [{"unit": {"c": "V"}}])
+        derive_recording(spinning, [{"unit": {"c": "V"}}])
     with pytest.raises(InvalidSettings, match="no channel 'z'"):
-        derive(made, [{"unit": {"z": "V"}}])
+        derive_recording(made, [{"unit": {"z": "V"}}])
 
 
 @pytest.mark.parametrize(
@@ -165,33 +172,35 @@ def test_a_derivation_converts_exactly_and_writes_down_a_unit_that_is_missing() 
 def test_for_a_unit_that_nobody_knows_the_one_written_most_alike_is_suggested(
     unit: str, meant: str
 ) -> None:
-    assert suggestion(unit) == f"; did you mean {meant!r}?"
-    assert not suggestion(meant)
+    assert suggest_unit(unit) == f"; did you mean {meant!r}?"
+    assert not suggest_unit(meant)
 
 
 @given(st.text(max_size=90))
 @example("1\rM")
 def test_what_is_suggested_can_be_read_and_nothing_is_for_what_can_be(unit: str) -> None:
-    told = suggestion(unit)
+    told = suggest_unit(unit)
     if told:
-        assert not is_read(unit)
-        assert is_read(literal_eval(told.removeprefix("; did you mean ").removesuffix("?")))
+        assert not is_readable_unit(unit)
+        assert is_readable_unit(
+            literal_eval(told.removeprefix("; did you mean ").removesuffix("?"))
+        )
 
 
 def test_channels_in_units_that_nobody_knows_are_told_and_others_are_not() -> None:
     times = np.arange(3.0)
     known = [Channel("k", times, times, unit) for unit in ("kPa", "1", "", "dB", "m/s²", "°C")]
-    assert unknown_units(known) == []
-    (told,) = unknown_units([*known, Channel("p", times, times, "bat")])
+    assert list_unknown_unit_warnings(known) == []
+    (told,) = list_unknown_unit_warnings([*known, Channel("p", times, times, "bat")])
     assert told.startswith("channel 'p': 'bat' is no known unit")
     assert told.endswith("did you mean 'bar'?")
-    (long,) = unknown_units([Channel("p", times, times, "x" * 1000)])
+    (long,) = list_unknown_unit_warnings([Channel("p", times, times, "x" * 1000)])
     assert len(long) < 200
 
 
 def test_two_units_of_one_quantity_are_told_where_the_model_does_not_give_both() -> None:
-    assert mixed_units(model("Pa", "1"), [record("Pa", "kPa")])
-    (told,) = mixed_units(model("1", "1"), [record("kPa", "Pa")])
+    assert list_mixed_unit_warnings(model("Pa", "1"), [record("Pa", "kPa")])
+    (told,) = list_mixed_unit_warnings(model("1", "1"), [record("kPa", "Pa")])
     assert "'u' is in kPa and 'y' in Pa" in told
     assert "1 kPa is 1000 Pa" in told
     assert '{"unit": {"u": "Pa"}}' in told
@@ -200,8 +209,8 @@ def test_two_units_of_one_quantity_are_told_where_the_model_does_not_give_both()
 
 @pytest.mark.parametrize(("u", "y"), [("Pa", "Pa"), ("Pa", "m"), ("1", "Pa"), ("bat", "Pa")])
 def test_of_one_unit_two_quantities_or_a_plain_number_nothing_is_told(u: str, y: str) -> None:
-    assert mixed_units(model("1", "1"), [record(u, y)]) == []
+    assert list_mixed_unit_warnings(model("1", "1"), [record(u, y)]) == []
 
 
 def test_units_that_the_model_gives_are_not_told_of_its_channels() -> None:
-    assert mixed_units(model("kPa", "Pa"), [record("kPa", "Pa")]) == []
+    assert list_mixed_unit_warnings(model("kPa", "Pa"), [record("kPa", "Pa")]) == []

@@ -8,7 +8,7 @@ from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
 from sysid.kernels import machine_code as machine
 from sysid.kernels import vectors as lanes
-from sysid.kernels.vectors import VectorFunctions, vector_functions
+from sysid.kernels.vectors import VectorFunctions, load_vector_functions
 from sysid.simulation.problem import Problem
 
 FUNCTIONS = {
@@ -30,7 +30,7 @@ def values_of(expression: str, candidates: FloatArray) -> FloatArray:
     )  # fmt: skip
     times = np.arange(2.0)
     record = Record((), (Channel("y", times, times, "1"),))
-    return np.asarray(Problem.build(model, [record]).predictions(candidates)[:, 1])
+    return np.asarray(Problem.build(model, [record]).predict(candidates)[:, 1])
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -61,18 +61,18 @@ def test_a_lane_does_not_depend_on_its_neighbours() -> None:
 def test_a_machine_without_the_library_computes_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     candidates = np.column_stack([PLACES, PLACES])
     with_library = values_of("tanh(p) + sin(q) + 0*x(k-1)", candidates)
-    monkeypatch.setattr(lanes, "vector_functions", lambda: VectorFunctions(1, {}))
-    monkeypatch.setattr(machine, "vector_functions", lambda: VectorFunctions(1, {}))
-    machine.machine_name.cache_clear()
+    monkeypatch.setattr(lanes, "load_vector_functions", lambda: VectorFunctions(1, {}))
+    monkeypatch.setattr(machine, "load_vector_functions", lambda: VectorFunctions(1, {}))
+    machine.describe_machine.cache_clear()
     try:
         without = values_of("tanh(p) + sin(q) + 0*x(k-1)", candidates)
     finally:
-        machine.machine_name.cache_clear()
+        machine.describe_machine.cache_clear()
     np.testing.assert_allclose(without, with_library, rtol=1e-13)
 
 
 def test_each_symbol_names_its_lanes_and_arguments() -> None:
-    offered = vector_functions()
+    offered = load_vector_functions()
     for name, symbol in offered.symbols.items():
         arguments = "vv" if name == "pow" else "v"
         assert symbol[5:] == f"N{offered.lanes}{arguments}_{name}"

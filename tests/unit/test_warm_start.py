@@ -9,7 +9,7 @@ import pytest
 from sysid import Identification, identify, load_model
 from sysid.core.settings import GeneticAlgorithm
 from sysid.data.records import Record
-from sysid.identification.run import advance, begin, border, exchange
+from sysid.identification.run import advance_run, begin_run, exchange_migrants, find_next_border
 from tests.runs import step_record
 from tests.searching import DUFFING, bits, example, noisy, record
 
@@ -72,14 +72,14 @@ def test_beside_a_false_start_of_a_rough_loss_the_result_is_the_same(seed: int) 
 
 @pytest.mark.parametrize("given", [{}, [{}], {"c": 0.2}, [{}, {"c": 0.2, "L": 0.5}]])
 def test_less_than_all_free_parameters_is_no_earlier_result(given: Given) -> None:
-    assert not begin(example(), GeneticAlgorithm(), 1, given).is_warm
+    assert not begin_run(example(), GeneticAlgorithm(), 1, given).is_warm
     full = [given] if isinstance(given, Mapping) else list(given)
-    assert begin(example(), GeneticAlgorithm(), 1, [*full, DUFFING]).is_warm
+    assert begin_run(example(), GeneticAlgorithm(), 1, [*full, DUFFING]).is_warm
 
 
 def test_an_empty_warm_start_is_a_cold_one() -> None:
-    cold = begin(example(), GeneticAlgorithm(), 1)
-    assert bits(begin(example(), GeneticAlgorithm(), 1, {})) == bits(cold)
+    cold = begin_run(example(), GeneticAlgorithm(), 1)
+    assert bits(begin_run(example(), GeneticAlgorithm(), 1, {})) == bits(cold)
 
 
 @pytest.mark.parametrize(
@@ -89,12 +89,14 @@ def test_searches_from_beside_a_warm_start_alone_do_not_end_it(
     random: int, beside: int, ends: bool
 ) -> None:
     algorithm = GeneticAlgorithm(islands=1)
-    state = advance(example(), replace(algorithm, generations=5), begin(example(), algorithm, 1))
+    state = advance_run(
+        example(), replace(algorithm, generations=5), begin_run(example(), algorithm, 1)
+    )
     (island,) = state.islands
     search, first = island.search.copy(), island.history[-1]._replace(generation=1)
     search.random_starts, search.confirmed_starts = random, 0
     search.hop_count = search.returned_hops = beside
-    search.generation = border(algorithm, state)
+    search.generation = find_next_border(algorithm, state)
     there = replace(island, search=search, history=(first,))
-    state = replace(state, islands=(there,), is_warm=True, ended=False)
-    assert exchange(algorithm, state, state.islands).ended is ends
+    state = replace(state, islands=(there,), is_warm=True, has_ended=False)
+    assert exchange_migrants(algorithm, state, state.islands).has_ended is ends

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from service.cli.tables import MOST_KINDS, print_many, tell_reused
-from service.cli.watch import EVERY_S, Lines, Many
+from service.cli.tables import MAX_WARNING_KINDS, print_reuse_note, print_run_summary
+from service.cli.watch import LOG_INTERVAL_SECONDS, ProgressLog, RunsProgress
 
 
 def job(state: str, finished: int = 0, **progress: Any) -> dict[str, Any]:
@@ -27,7 +27,9 @@ class Log:
         self.now = 0.0
         self.asked = 0
         self._run = newest
-        self._lines = Lines(self.told.append, Many(self._newest, unit, lambda: self.now))
+        self._lines = ProgressLog(
+            self.told.append, RunsProgress(self._newest, unit, lambda: self.now)
+        )
 
     def _newest(self) -> dict[str, Any] | None:
         self.asked += 1
@@ -35,7 +37,7 @@ class Log:
 
     def show(self, now: float, seen: dict[str, Any]) -> None:
         self.now = now
-        self._lines.show(seen)
+        self._lines.log_progress(seen)
 
 
 def test_a_line_is_told_at_a_change_of_state_and_every_ten_seconds_at_most():
@@ -73,12 +75,12 @@ def test_a_last_run_that_failed_has_no_rms():
 
 def test_the_last_run_is_not_asked_for_at_every_look():
     log = Log(None, run(0))
-    many = Many(log._newest, None, lambda: log.now)
+    many = RunsProgress(log._newest, None, lambda: log.now)
     for tick in range(100):  # 10 s, ten runs a second
         log.now = tick / 10
-        many.told(job("running", tick))
+        many.describe_progress(job("running", tick))
     assert log.asked <= 11
-    many.told(job("running", 99))
+    many.describe_progress(job("running", 99))
     assert log.asked <= 11
 
 
@@ -98,7 +100,7 @@ def test_one_run_is_told_with_its_rms():
 def test_nothing_new_is_not_told_again():
     log = Log()
     for tick in range(10):
-        log.show(tick * EVERY_S, job("queued"))
+        log.show(tick * LOG_INTERVAL_SECONDS, job("queued"))
     assert log.told == ["job_1 queued, 0/40 runs"]
 
 
@@ -114,7 +116,7 @@ def test_nothing_new_is_not_told_again():
 )  # fmt: skip
 def test_a_result_that_was_taken_over_is_said_to_be(capsys, runs: int, reused: int, said: str):
     ended = job("succeeded", runs, runs=runs, reused=reused)
-    tell_reused(ended, [{"reused_from": "run_0"}], "reuse: false in the job")
+    print_reuse_note(ended, [{"reused_from": "run_0"}], "reuse: false in the job")
     assert capsys.readouterr().out.strip() == said
 
 
@@ -137,12 +139,12 @@ def group(sigma: float) -> dict[str, Any]:
 
 def test_many_runs_end_in_a_summary_whose_length_does_not_grow_with_them(capsys):
     warnings = [f"parameter T is at {number}.5" for number in range(800)]
-    kinds = [f"kind {chr(97 + number)}" for number in range(2 * MOST_KINDS)]
+    kinds = [f"kind {chr(97 + number)}" for number in range(2 * MAX_WARNING_KINDS)]
     runs = [
         {"state": "succeeded" if number % 2 else "failed", "warnings": [text, *kinds]}
         for number, text in enumerate(warnings)
     ]
-    print_many(Summarised([group(0.1), group(0.2)]), {"id": "job_1"}, runs)  # type: ignore[arg-type]
+    print_run_summary(Summarised([group(0.1), group(0.2)]), {"id": "job_1"}, runs)  # type: ignore[arg-type]
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) < 20
     assert "800 runs" in lines[0]

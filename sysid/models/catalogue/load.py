@@ -7,20 +7,20 @@ from pathlib import Path
 from typing import Any
 
 from sysid.core.errors import Fault, InvalidModel, UnknownModel
-from sysid.models.documents import MAX_CHARACTERS, read_yaml
+from sysid.models.documents import MAX_DOCUMENT_CHARACTERS, parse_yaml
 from sysid.models.model import Model
 from sysid.models.parse import parse_model
 
-_FOLDER = Path(__file__).parent
+_CATALOGUE_FOLDER = Path(__file__).parent
 
 
 @cache
 def catalogue() -> tuple[str, ...]:
     """Names of the built-in models, in alphabetical order."""
-    return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
+    return tuple(sorted(path.stem for path in _CATALOGUE_FOLDER.glob("*.yaml")))
 
 
-def document(name: str) -> dict[str, Any]:
+def copy_catalogue_document(name: str) -> dict[str, Any]:
     """The document of a built-in model, to read or to change.
 
     Raises
@@ -28,7 +28,7 @@ def document(name: str) -> dict[str, Any]:
     UnknownModel
         With the nearest known name.
     """
-    return deepcopy(_document(name))
+    return deepcopy(_load_catalogue_document(name))
 
 
 def load_model(source: str | Mapping[str, Any] | Path) -> Model:
@@ -47,7 +47,7 @@ def load_model(source: str | Mapping[str, Any] | Path) -> Model:
     if isinstance(source, Path):
         return parse_model(read_document(source))
     if isinstance(source, str):
-        return _built_in(source)
+        return _load_catalogue_model(source)
     return parse_model(source)
 
 
@@ -60,9 +60,11 @@ def read_document(path: Path) -> Any:
         If the file cannot be read as such.
     """
     try:
-        if path.stat().st_size > 4 * MAX_CHARACTERS:
-            raise InvalidModel([Fault("", f"{path} is larger than {4 * MAX_CHARACTERS} bytes")])
-        return read_yaml(path.read_text(encoding="utf-8"))
+        if path.stat().st_size > 4 * MAX_DOCUMENT_CHARACTERS:
+            raise InvalidModel(
+                [Fault("", f"{path} is larger than {4 * MAX_DOCUMENT_CHARACTERS} bytes")]
+            )
+        return parse_yaml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InvalidModel([Fault("", f"{path} cannot be read: {error.strerror}")]) from None
     except UnicodeDecodeError as error:
@@ -71,13 +73,13 @@ def read_document(path: Path) -> Any:
 
 
 @cache
-def _built_in(name: str) -> Model:
-    return parse_model(_document(name))
+def _load_catalogue_model(name: str) -> Model:
+    return parse_model(_load_catalogue_document(name))
 
 
 @cache
-def _document(name: str) -> dict[str, Any]:
+def _load_catalogue_document(name: str) -> dict[str, Any]:
     if name not in catalogue():
         raise UnknownModel(name, catalogue())
-    found: dict[str, Any] = read_document(_FOLDER / f"{name}.yaml")
+    found: dict[str, Any] = read_document(_CATALOGUE_FOLDER / f"{name}.yaml")
     return found

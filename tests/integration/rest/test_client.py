@@ -150,4 +150,4 @@ def test_a_number_that_json_cannot_tell_is_named_and_not_sent(
     with pytest.raises(NotFinite, match=r"^/parameters/L/upper: found -?(nan|inf); need a finite"):
         client.submit(job_of(dataset, parameters=bounds))
     with pytest.raises(NotFinite, match=r"^/0/noise/sigma: "):
-        calls.Call("POST", "/v1/x", json=[{"noise": {"sigma": value}}])
+        calls.RestCall("POST", "/v1/x", json=[{"noise": {"sigma": value}}])

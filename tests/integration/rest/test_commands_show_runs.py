@@ -11,7 +11,7 @@ from starlette.testclient import TestClient
 from typer.testing import CliRunner, Result
 
 from service.api.app import create_app
-from service.cli.common import Places
+from service.cli.common import FieldOrigins
 from service.cli.main import app as program
 from service.cli.tables import print_trend
 from service.client.calls import ProblemError
@@ -135,7 +135,7 @@ def test_a_unit_in_a_heading_is_no_markup(capsys: pytest.CaptureFixture[str]) ->
     place = {"x": 5.0, "runs": [], "evaluations": 1, "spans": [], "warnings": []}
     print_trend({"x": "length_m", "reference": None, "reference_x": None, "reference_names": [],
                  "places": [place], "quantities": [one], "missing": 0,
-                 "notes": ["use loss: {noise_model: ar1}"]}, Places())  # fmt: skip
+                 "notes": ["use loss: {noise_model: ar1}"]}, FieldOrigins())  # fmt: skip
     told = capsys.readouterr().out
     assert "T [s]" in told
     assert "note: use --set loss.noise_model=ar1" in told

@@ -162,7 +162,7 @@ def test_a_run_that_cannot_be_accepted_is_told_before_anything_is_sent(
     def connected(*_: object) -> None:
         raise AssertionError("sent before it was checked")
 
-    monkeypatch.setattr("service.cli.reidentify.connected", connected)
+    monkeypatch.setattr("service.cli.reidentify.connect_client", connected)
     told = CliRunner().invoke(
         lagid, ["reidentify", "--model", "tube", "--label", "length_m", *words]
     )  # fmt: skip

@@ -151,7 +151,7 @@ def test_the_command_writes_a_file_or_to_stdout(
     served: Served, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     client = Client("http://testserver", transport=Through(served.server))
-    monkeypatch.setattr("service.cli.runs.connected", lambda *_: nullcontext(client))
+    monkeypatch.setattr("service.cli.runs.connect_client", lambda *_: nullcontext(client))
     told = export(served, served.run, format="python").text
     run = CliRunner().invoke
     shown = run(commands, ["export", served.run, "--format", "python"])

@@ -5,10 +5,10 @@ from typing import Any
 from starlette.testclient import TestClient
 
 from service.api.dependencies import Parts
-from service.queue.leases import Queue
-from service.queue.run_writes import RunLedger
+from service.core.states import JobState
+from service.queue.leases import LeaseQueue
+from service.queue.run_writes import RunWriter
 from service.repositories.history import HistoryPoint
-from service.storage.tables import State
 from tests.rest import CSV, recording, refused
 
 
@@ -128,12 +128,12 @@ def test_events_resume_after_the_last_one_known_and_end_with_the_job(
     })  # fmt: skip
     job = submit(own, answer.json()["id"])["id"]
     parts: Parts = own.app.state.parts  # type: ignore[attr-defined]
-    with parts.database.write() as session:
-        claim = Queue(session).claim("test")
+    with parts.database.write_session() as session:
+        claim = LeaseQueue(session).claim_job("test")
         assert claim is not None
-    with parts.database.write() as session:
-        Queue(session).tell(claim.lease, "log", {"text": "half way"})
-        Queue(session).finish(claim.lease, State.FAILED, "no candidate was finite")
+    with parts.database.write_session() as session:
+        LeaseQueue(session).append_event(claim.lease, "log", {"text": "half way"})
+        LeaseQueue(session).finish_job(claim.lease, JobState.FAILED, "no candidate was finite")
     assert events(own, job) == ["state", "state", "log", "state", "end"]
     assert events(own, job, **{"Last-Event-ID": "3"}) == ["state", "end"]
     assert events(own, job, **{"Last-Event-ID": "5"}) == []
@@ -173,15 +173,15 @@ def test_a_cancelled_run_keeps_the_best_it_had_found(own: TestClient) -> None:
     (run,) = own.get(f"/v1/jobs/{job}/runs").json()["items"]
     names = own.get(f"/v1/runs/{run['id']}/history").json()["names"]
     assert names == ["K", "T", "L", "y0", "x(0)"]
-    with parts.database.write() as session:
-        lease = Queue(session).claim("d1").lease
-        ledger = RunLedger(session, lease)
-        ledger.start([run["id"]])
+    with parts.database.write_session() as session:
+        lease = LeaseQueue(session).claim_job("d1").lease
+        ledger = RunWriter(session, lease)
+        ledger.start_runs([run["id"]])
         for number, rms in enumerate((0.5, 0.25)):
             values = [2.0 + number, 1.0, 0.5, 0.0, 0.0]
             point = HistoryPoint(run["id"], 0, number, number, 50 * number, rms, "genetic", values)
-            ledger.append([point])
-        Queue(session).finish(lease, State.CANCELLED)
+            ledger.append_history([point])
+        LeaseQueue(session).finish_job(lease, JobState.CANCELLED)
     told = own.get(f"/v1/runs/{run['id']}").json()
     assert told["state"] == "cancelled"
     assert told["rms"] == 0.25

@@ -9,7 +9,7 @@ from starlette.testclient import TestClient
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
-from service.datasets.recordings import recording_of
+from service.datasets.recordings import load_recording
 from tests.identified import carried_out
 from tests.rest import CSV, recording, refused, settings_of
 
@@ -125,8 +125,8 @@ def test_a_relative_deviation_reads_no_more_than_a_request_may(
     body = {**BODY, "truth": None, "datasets": [dataset], "relative": True}
     assert server.post(URL, json=body).status_code == 202
     # 300 samples of two channels
-    monkeypatch.setattr("service.sweeps.output_spread.MOST_VALUES", 599)
-    monkeypatch.setattr("service.sweeps.output_spread.recording_of", None)
+    monkeypatch.setattr("service.sweeps.output_spread.MOST_READ_VALUES", 599)
+    monkeypatch.setattr("service.sweeps.output_spread.load_recording", None)
     (fault,) = refused(server.post(URL, json=body), 422, "invalid")
     assert fault["pointer"] == "/relative"
     assert "600 values in all" in fault["detail"]
@@ -139,9 +139,9 @@ def test_recordings_are_read_while_no_session_is_open(
 
     def noted(*given: Any) -> Any:
         seen.append(parts.database.engine.pool.checkedout())
-        return recording_of(*given)
+        return load_recording(*given)
 
-    monkeypatch.setattr("service.sweeps.output_spread.recording_of", noted)
+    monkeypatch.setattr("service.sweeps.output_spread.load_recording", noted)
     body = {**BODY, "truth": None, "datasets": [dataset], "relative": True}
     assert server.post(URL, json=body).status_code == 202
     assert seen == [0]

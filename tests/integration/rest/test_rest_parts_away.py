@@ -31,7 +31,7 @@ def test_a_full_disk_is_a_part_that_is_down(
     def full(*_args: Any, **_options: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("service.api.content._save", full)
+    monkeypatch.setattr("service.api.content._save_body", full)
     answer = server.post("/v1/datasets", content=recording(), headers=CSV)
     refused(answer, 503, "unavailable")
     assert "no space left" in answer.json()["detail"]

@@ -243,7 +243,7 @@ def test_the_command_line_tells_controller_rule_and_margins(
     def connected(url: str, key: str | None) -> Client:
         return Client("http://testserver", transport=Through(served.server))
 
-    monkeypatch.setattr(program, "connected", connected)
+    monkeypatch.setattr(program, "connect_client", connected)
     file = tmp_path / "loop.json"
 
     def told(**control: Any) -> str:

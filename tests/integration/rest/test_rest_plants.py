@@ -126,7 +126,7 @@ def test_the_command_line_makes_a_tube_from_its_length(
     server: TestClient, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     client = Client("http://testserver", transport=Through(server))
-    monkeypatch.setattr(program, "connected", lambda url, key: client)
+    monkeypatch.setattr(program, "connect_client", lambda url, key: client)
     run = CliRunner().invoke
     file = tmp_path / "short.yaml"
     file.write_text("{samples: 100, parameters: {length_m: 10}}")

@@ -5,9 +5,10 @@ from typing import Any
 import pytest
 from starlette.testclient import TestClient
 
+from service.core.states import JobState
 from service.jobs.stored_run import StoredRun
-from service.storage.tables import Job, Run, State
-from sysid.models.parse import parse_model, with_terms
+from service.storage.tables import Job, Run
+from sysid.models.parse import keep_terms, parse_model
 from tests.polynomials import document, frols
 from tests.rest import CSV, recording, refused
 
@@ -58,10 +59,10 @@ def test_more_candidates_than_samples_are_refused_when_the_job_is_sent(server: T
 
 def test_the_model_of_a_run_has_the_terms_that_were_selected_on_its_data() -> None:
     asked = document(frols(2))
-    stored = Job(id="job", spec={"model": asked}, state=State.SUCCEEDED)
-    run = Run(id="run", job_id="job", number=0, cell={}, state=State.SUCCEEDED)
+    stored = Job(id="job", spec={"model": asked}, state=JobState.SUCCEEDED)
+    run = Run(id="run", job_id="job", number=0, cell={}, state=JobState.SUCCEEDED)
     run.result = {"selection": [{"term": "u(k-1)"}, {"term": "y(k-1)"}]}
-    assert StoredRun.from_rows(stored, run).model == with_terms(
+    assert StoredRun.from_rows(stored, run).model == keep_terms(
         parse_model(asked), ["u(k-1)", "y(k-1)"]
     )
     run.result = None

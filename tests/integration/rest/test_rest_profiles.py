@@ -111,7 +111,7 @@ def test_a_profile_that_cannot_be_had_is_refused(
 
 def test_the_command_tells_intervals(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "service.cli.runs.connected",
+        "service.cli.runs.connect_client",
         lambda *_: Client("http://testserver", transport=Through(served.server)),
     )
     told = CliRunner().invoke(runs_app, ["profile", served.run, "L", "--points", "7"])

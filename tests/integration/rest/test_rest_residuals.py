@@ -205,7 +205,7 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
     def lost(store: ObjectStore, sha256: str) -> Recording:
         raise ObjectMissing(sha256)
 
-    monkeypatch.setattr("service.datasets.recordings.recording_of", lost)
+    monkeypatch.setattr("service.datasets.recordings.load_recording", lost)
     asked = served.server.get(f"/v1/runs/{served.runs[0]}/residuals").json()
     assert [one["test"] for one in asked["tests"]] == ["whiteness"]
     assert "not to be had any more" in asked["note"]
@@ -214,7 +214,7 @@ def test_where_the_inputs_are_lost_whiteness_is_told_all_the_same(
 def command(served: Served, monkeypatch: pytest.MonkeyPatch, *words: str, ends: int = 0) -> str:
     """What a command under ``lagid runs`` prints."""
     client = Client("http://testserver", transport=Through(served.server))
-    monkeypatch.setattr("service.cli.runs.connected", lambda url, key: nullcontext(client))
+    monkeypatch.setattr("service.cli.runs.connect_client", lambda url, key: nullcontext(client))
     done = CliRunner().invoke(runs_app, list(words))
     assert done.exit_code == ends, done.output
     return done.output

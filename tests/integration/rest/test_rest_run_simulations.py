@@ -284,7 +284,7 @@ def test_the_command_line_tells_the_measures_of_the_step(
     def connected(url: str, key: str | None) -> Client:
         return Client("http://testserver", transport=Through(served.server))
 
-    monkeypatch.setattr(program, "connected", connected)
+    monkeypatch.setattr(program, "connect_client", connected)
     file = tmp_path / "loop.json"
     file.write_text(json.dumps({**LOOP, "store": True}))
     done = CliRunner().invoke(program.app, ["simulate", served.arm, str(file)])

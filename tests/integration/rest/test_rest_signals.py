@@ -9,7 +9,7 @@ from starlette.testclient import TestClient
 
 from service.api.app import create_app
 from service.api.dependencies import Parts
-from service.formats.mcap import read_fit
+from service.formats.mcap import read_fitted_outputs
 from service.repositories.runs import RunRepository
 from service.storage.errors import ObjectStoreFailed
 from service.storage.tables import Run
@@ -41,7 +41,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def rows(served: Served, runs: list[str]) -> list[Run]:
-    with served.parts.database.read() as session:
+    with served.parts.database.read_session() as session:
         return [RunRepository(session).get(run) for run in runs]
 
 
@@ -49,9 +49,11 @@ def test_each_run_has_a_file_of_its_own_in_one_object(served: Served) -> None:
     found = [served.server.get(f"/v1/runs/{run}/signals.mcap") for run in served.runs]
     assert len({row.signals_sha256 for row in rows(served, served.runs)}) == 1
     assert len({one.headers["etag"] for one in found}) == len(found)
-    assert len({read_fit(one.content)[0].measured.tobytes() for one in found}) == len(SIGMAS)
+    assert len({read_fitted_outputs(one.content)[0].measured.tobytes() for one in found}) == len(
+        SIGMAS
+    )
     for answer, run in zip(found, served.runs, strict=True):
-        (fit,) = read_fit(answer.content)
+        (fit,) = read_fitted_outputs(answer.content)
         shown = served.server.get(f"/v1/runs/{run}/response?max_points=10000").json()
         (experiment,) = shown["experiments"]
         assert experiment["simulated"][0]["values"] == fit.simulated.tolist()

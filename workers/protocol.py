@@ -11,16 +11,16 @@ from typing import Any, Protocol, TypeAlias
 from sysid.core.settings import FitSettings, GeneticAlgorithm
 from sysid.data.noise import Noise
 from sysid.data.records import Record
-from sysid.identification.fingerprint import program
+from sysid.identification.fingerprint import compute_fingerprint
 from sysid.identification.result import Identification
 from sysid.islands.state import RunState
 from sysid.search.island import Island
 from sysid.search.state import Improvement, Migrant
 
 Records: TypeAlias = tuple[Record, ...]
-Warm: TypeAlias = tuple[Mapping[str, float], ...]
+WarmStartValues: TypeAlias = tuple[Mapping[str, float], ...]
 """Parameter vectors of earlier results, to seed part of a population with."""
-Handle: TypeAlias = Any
+PackHandle: TypeAlias = Any
 """Names a pack in flight; only the crew that gave it knows more."""
 
 
@@ -50,28 +50,28 @@ class ProblemSpec:
     noise: Noise = field(default_factory=Noise)
 
     @cached_property
-    def key(self) -> str:
+    def cache_key(self) -> str:
         """Equal for equal specifications; names a built problem in a worker's cache."""
-        return blake2b(f"{self.family}{self.noise}".encode(), digest_size=16).hexdigest()
+        return blake2b(f"{self.noise_free_key}{self.noise}".encode(), digest_size=16).hexdigest()
 
     @cached_property
-    def family(self) -> str:
+    def noise_free_key(self) -> str:
         """Equal for specifications that differ in their noise only.
 
         What is written in another order is another one: the parameters' order is that in which a
         search draws them.
         """
         parts = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "noise"}
-        text = json.dumps(parts, default=_plain)
+        text = json.dumps(parts, default=_to_json_value)
         return blake2b(text.encode(), digest_size=16).hexdigest()
 
     @property
-    def needs(self) -> tuple[str, ...]:
+    def record_keys(self) -> tuple[str, ...]:
         """Keys of the shared records."""
         return (self.records,) if self.validation is None else (self.records, self.validation)
 
 
-def _plain(value: Any) -> dict[str, Any]:
+def _to_json_value(value: Any) -> dict[str, Any]:
     """A part that JSON does not know."""
     return dict(value) if isinstance(value, Mapping) else asdict(value)
 
@@ -83,20 +83,25 @@ class RunSpec:
     problem: ProblemSpec
     algorithm: GeneticAlgorithm
     seed: int = 1
-    warm: Warm = ()
+    warm_starts: WarmStartValues = ()
 
     @property
-    def key(self) -> str | None:
+    def reuse_key(self) -> str | None:
         """Equal for runs of equal results; None where the clock has a say in the result."""
         if self.algorithm.stop.seconds is not None:
             return None
-        parts = (self.problem.key, repr(self.algorithm), self.seed, [*map(dict, self.warm)])
-        known = program(Path(__file__).parent)  # workers split records and add noise
+        parts = (
+            self.problem.cache_key,
+            repr(self.algorithm),
+            self.seed,
+            [*map(dict, self.warm_starts)],
+        )
+        known = compute_fingerprint(Path(__file__).parent)  # workers split records and add noise
         return blake2b(f"{parts}{known}".encode(), digest_size=16).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)
-class Advance:
+class AdvanceRun:
     """Work on a whole run for about `seconds`; from the start if `state` is None."""
 
     run: str
@@ -106,7 +111,7 @@ class Advance:
 
 
 @dataclass(frozen=True, slots=True)
-class Evolve:
+class EvolveIsland:
     """Work on one island of a run, up to the generation `target` of its next border."""
 
     run: str
@@ -115,18 +120,18 @@ class Evolve:
     target: int
 
 
-Item: TypeAlias = Advance | Evolve
+WorkItem: TypeAlias = AdvanceRun | EvolveIsland
 
 
 @dataclass(frozen=True, slots=True)
-class Advanced:
+class RunProgress:
     """The run goes on from here."""
 
     state: RunState
 
 
 @dataclass(frozen=True, slots=True)
-class Evolved:
+class IslandProgress:
     """The island has got to the border `target`, or rests before it."""
 
     island: Island
@@ -134,7 +139,7 @@ class Evolved:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Concluded:
+class RunConclusion:
     """The run is complete; `rms_noise_free` is its RMS against the records without noise."""
 
     identification: Identification
@@ -146,20 +151,20 @@ class Concluded:
         histories = [[tuple(one) for one in island] for island in found.history]
         migrants = [tuple(one) for one in found.migrations]
         rest = replace(found, history=(), migrations=())
-        return _concluded, (rest, histories, migrants, self.rms_noise_free)
+        return _rebuild_conclusion, (rest, histories, migrants, self.rms_noise_free)
 
 
-def _concluded(
+def _rebuild_conclusion(
     rest: Identification, histories: list[list[Any]], migrants: list[Any],
     rms_noise_free: float | None,
-) -> Concluded:  # fmt: skip
+) -> RunConclusion:  # fmt: skip
     history = tuple(tuple(map(Improvement._make, island)) for island in histories)
     found = replace(rest, history=history, migrations=tuple(map(Migrant._make, migrants)))
-    return Concluded(found, rms_noise_free)
+    return RunConclusion(found, rms_noise_free)
 
 
 @dataclass(frozen=True, slots=True)
-class Failure:
+class RunFailure:
     """The run cannot be carried out; `reason` is a sentence for its user.
 
     `evaluations` are those of a search that was carried out to its end.
@@ -170,11 +175,11 @@ class Failure:
     evaluations: int = 0
 
 
-Outcome: TypeAlias = Advanced | Evolved | Concluded | Failure
+Outcome: TypeAlias = RunProgress | IslandProgress | RunConclusion | RunFailure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Done:
+class ItemResult:
     """What became of one item, and the compute time it took; None: its turn did not come."""
 
     run: str
@@ -182,27 +187,29 @@ class Done:
     seconds: float
 
 
-class Crew(Protocol):
+class Executor(Protocol):
     """Those who compute packs: a Ray cluster, or this process."""
 
     slots: int
 
-    def share(self, records: Records) -> Any:
+    def share_records(self, records: Records) -> Any:
         """Make records known once; the reference travels instead of them."""
 
-    def submit(self, pack: Sequence[Item], keys: Sequence[str], shared: Sequence[Any]) -> Handle:
+    def submit_pack(
+        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+    ) -> PackHandle:
         """Send a pack; `keys` name the shared records in order."""
 
-    def finished(self, timeout: float) -> tuple[Handle, ...]:
+    def wait_for_packs(self, timeout: float) -> tuple[PackHandle, ...]:
         """Handles of packs that ended, waiting at most `timeout` seconds for the first."""
 
-    def fetch(self, handle: Handle) -> tuple[Done, ...]:
+    def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
         """What a finished pack gave; raises `PackLost`."""
 
-    def cancel(self, handle: Handle, *, force: bool) -> None:
+    def cancel_pack(self, handle: PackHandle, *, force: bool) -> None:
         """Interrupt a pack, or kill its worker."""
 
-    def check(self) -> None:
+    def check_cluster_alive(self) -> None:
         """Raise `ClusterLost` if the crew shows no sign of life; never waits."""
 
     def close(self) -> None:
@@ -212,22 +219,22 @@ class Crew(Protocol):
 class RunObserver(Protocol):
     """Who is told about the runs of one job."""
 
-    def started(self, run: str) -> None:
+    def record_start(self, run: str) -> None:
         """The run was given to a worker for the first time, from its checkpoint or the start."""
 
-    def blamed(self, run: str, kills: int) -> None:
+    def record_worker_death(self, run: str, kills: int) -> None:
         """The worker died over this run alone, `kills` times by now; 0: it has gone on since."""
 
-    def progress(self, run: str, state: RunState, seconds: float) -> None:
+    def record_progress(self, run: str, state: RunState, seconds: float) -> None:
         """The run can go on from `state` after `seconds` of compute time."""
 
-    def result(self, run: str, concluded: Concluded, seconds: float) -> None:
+    def record_result(self, run: str, concluded: RunConclusion, seconds: float) -> None:
         """The run is complete."""
 
-    def failure(self, run: str, failure: Failure) -> None:
+    def record_failure(self, run: str, failure: RunFailure) -> None:
         """The run cannot be carried out."""
 
-    def known(self, run: str, source: str) -> None:
+    def record_reuse(self, run: str, source: str) -> None:
         """The run need not be computed: it is what the run `source` was."""
 
     def should_stop(self) -> bool:
@@ -249,15 +256,15 @@ class QueuedRun:
 
 
 @dataclass(frozen=True, slots=True)
-class RefusedRun:
+class InvalidRun:
     """A run whose specification cannot be used."""
 
     run: str
-    failure: Failure
+    failure: RunFailure
 
 
 @dataclass(frozen=True, slots=True)
-class KnownRun:
+class ReusedRun:
     """A run whose specification has been carried out before, by the run `source`."""
 
     run: str
@@ -265,18 +272,18 @@ class KnownRun:
 
 
 @dataclass(frozen=True, slots=True)
-class NotYet:
+class RunNotReady:
     """The next run waits for the result of one that is not over; ask again."""
 
 
-Coming: TypeAlias = QueuedRun | RefusedRun | KnownRun | NotYet
+JobEntry: TypeAlias = QueuedRun | InvalidRun | ReusedRun | RunNotReady
 
 
 class JobSource(Protocol):
     """Where a job's runs and records come from, asked for as they are needed."""
 
-    def runs(self) -> Iterable[Coming]:
+    def iterate_runs(self) -> Iterable[JobEntry]:
         """The runs, in order; the iterable is read lazily."""
 
-    def records(self, key: str) -> Records:
+    def load_records(self, key: str) -> Records:
         """Return the records of that key, or raise `RecordsUnavailable`."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from workers.errors import ClusterUnavailable
 
-REACH_SECONDS = 5.0
+CONNECT_SECONDS = 5.0
 """A cluster that cannot be connected to within that time is not there."""
 
 TOKEN_HINT = (
@@ -41,7 +41,7 @@ def check_address(address: str) -> None:
             "10.0.0.5:6379, or auto for the cluster of this machine"
         )
     try:
-        socket.create_connection((host.strip("[]"), int(port)), REACH_SECONDS).close()
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
     except OSError as error:
         raise ClusterUnavailable(
             f"no Ray cluster answers at {address} ({error.strerror or error}); is its head "
@@ -63,7 +63,7 @@ def has_token() -> bool:
     return (Path(path) if path else Path.home() / ".ray" / "auth_token").is_file()
 
 
-def reason(address: str | None, error: BaseException) -> str:
+def explain_failure(address: str | None, error: BaseException) -> str:
     """Why Ray could not be started (`address` None) or joined, in one line."""
     text = " ".join(str(error).split())
     if address is None:

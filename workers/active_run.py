@@ -2,11 +2,19 @@
 
 from dataclasses import dataclass, field, replace
 
-from sysid.identification.run import border, exchange, is_finished
+from sysid.identification.run import exchange_migrants, find_next_border, is_finished
 from sysid.islands.state import RunState
 from sysid.search.island import Island
-from workers.packing import Cost, is_worth_spreading, slice_seconds
-from workers.ports import Advance, Evolve, Evolved, Handle, Item, QueuedRun, RunSpec
+from workers.packing import MeanCost, choose_slice_seconds, is_worth_spreading
+from workers.protocol import (
+    AdvanceRun,
+    EvolveIsland,
+    IslandProgress,
+    PackHandle,
+    QueuedRun,
+    RunSpec,
+    WorkItem,
+)
 
 MAX_KILLS = 2
 """A run over which workers died so often, and which did not go on between, is given up."""
@@ -42,23 +50,23 @@ class ActiveRun:
     run: str
     spec: RunSpec
     state: RunState | None
-    is_begun: bool = False
+    has_begun: bool = False
     slices: int = 0
     kills: int = 0
     is_suspect: bool = False
     seconds: float = 0.0
     generation_seconds: float = 0.0
     islands: dict[int, Island] = field(default_factory=dict)
-    awaited: set[int] = field(default_factory=set)
-    packs: set[Handle] = field(default_factory=set)
+    awaited_islands: set[int] = field(default_factory=set)
+    pack_handles: set[PackHandle] = field(default_factory=set)
 
     @classmethod
-    def of(cls, queued: QueuedRun) -> "ActiveRun":
+    def from_queue(cls, queued: QueuedRun) -> "ActiveRun":
         """The run as it waits in the queue."""
         return cls(queued.run, queued.spec, queued.state, kills=queued.kills)
 
     @property
-    def goes_alone(self) -> bool:
+    def needs_own_pack(self) -> bool:
         """Whether it shares no pack: it is long, or may be what kills workers."""
         return self.slices > 0 or self.kills > 0 or self.is_suspect
 
@@ -70,47 +78,47 @@ class ActiveRun:
         epoch = self.generation_seconds * algorithm.n_islands * algorithm.migration.every
         return is_worth_spreading(epoch, algorithm.n_islands, idle)
 
-    def whole(self, cost: Cost | None = None) -> Item:
+    def make_slice(self, cost: MeanCost | None = None) -> WorkItem:
         """The next time slice of the whole run; `cost` is that of a run of its job."""
-        return Advance(self.run, self.spec, self.state, slice_seconds(self.slices, cost))
+        return AdvanceRun(self.run, self.spec, self.state, choose_slice_seconds(self.slices, cost))
 
-    def split(self) -> list[Evolve]:
+    def split_islands(self) -> list[EvolveIsland]:
         """The islands that have not got to the next border, one item each; at least one."""
         assert self.state is not None
-        target = border(self.spec.algorithm, self.state)
+        target = find_next_border(self.spec.algorithm, self.state)
         self.islands = dict(enumerate(self.state.islands))
         behind = [i for i, island in self.islands.items() if island.generation < target]
-        self.awaited = set(behind)
-        return [Evolve(self.run, self.spec, self.islands[i], target) for i in behind]
+        self.awaited_islands = set(behind)
+        return [EvolveIsland(self.run, self.spec, self.islands[i], target) for i in behind]
 
-    def advance(self, state: RunState, seconds: float) -> None:
+    def absorb_slice(self, state: RunState, seconds: float) -> None:
         """Take in a time slice of the whole run."""
-        before = 0 if self.state is None else _generations(self.state)
-        done = _generations(state) - before
+        before = 0 if self.state is None else _count_generations(self.state)
+        done = _count_generations(state) - before
         if done > 0:
             self.generation_seconds = seconds / done
         self.state = state
         self.slices += 1
 
-    def gather(self, evolved: Evolved, seconds: float) -> bool:
+    def absorb_island(self, evolved: IslandProgress, seconds: float) -> bool:
         """Take in an island; whether it was the last, so that the run stands at its border."""
         assert self.state is not None
         index = evolved.island.index
         spent = self.state.seconds + seconds / len(self.islands)  # as if all were beside another
         self.state = replace(self.state, seconds=spent)
         self.islands[index] = evolved.island
-        self.awaited.discard(index)
-        if self.awaited:
+        self.awaited_islands.discard(index)
+        if self.awaited_islands:
             return False
         islands = [self.islands[i] for i in range(len(self.islands))]
-        self.state = exchange(self.spec.algorithm, self.state, islands)
+        self.state = exchange_migrants(self.spec.algorithm, self.state, islands)
         self.islands = {}
         return True
 
-    def gather_again(self) -> None:
+    def restart_epoch(self) -> None:
         """Forget the islands that are with the workers: the epoch begins anew."""
-        self.islands, self.awaited, self.packs = {}, set(), set()
+        self.islands, self.awaited_islands, self.pack_handles = {}, set(), set()
 
 
-def _generations(state: RunState) -> int:
+def _count_generations(state: RunState) -> int:
     return sum(island.generation for island in state.islands)

@@ -17,14 +17,20 @@ from typing import Any
 
 import psutil
 
-from sysid.identification.fingerprint import program
+from sysid.identification.fingerprint import compute_fingerprint
+from workers.cluster_address import check_address, explain_failure
 from workers.errors import ClusterLost, ClusterUnavailable, PackCancelled, PackFailed, WorkerDied
-from workers.joining import check_address, reason
-from workers.limits import advance_within, memory_for_each
-from workers.local_ray import COMMON, ENVIRONMENT, ONE_THREAD, REFUSALS, LocalRay
-from workers.ports import Done, Handle, Item, Records
+from workers.local_ray import (
+    INIT_ARGUMENTS,
+    INIT_ERRORS,
+    ONE_THREAD_ENVIRONMENT,
+    RAY_ENVIRONMENT,
+    LocalRay,
+)
+from workers.memory_limit import compute_worker_memory, process_pack_within
+from workers.protocol import ItemResult, PackHandle, Records, WorkItem
 from workers.ray_folders import find_folder_processes, kill_processes
-from workers.warming import warm
+from workers.warmup import warm_up_worker
 
 _log = logging.getLogger(__name__)
 
@@ -33,13 +39,13 @@ FETCH_SECONDS = 20.0
 SILENCE_SECONDS = 5.0
 """After so long without a finished task a no-op task asks whether Ray is alive."""
 ANSWER_SECONDS = 15.0
-LATE_SECONDS = 30.0
+LATE_WORKER_SECONDS = 30.0
 """Workers that have not come up so long after the first are left to come up later."""
-COUNT_SECONDS = 2.0
+SLOT_COUNT_SECONDS = 2.0
 """How often the cores of a joined cluster are counted."""
-PULSE_SECONDS = 0.1
+LIVENESS_SECONDS = 0.1
 """Between two looks at the processes of a local Ray."""
-VITAL = ("gcs_server", "raylet")
+VITAL_PROGRAMS = ("gcs_server", "raylet")
 """Programs without which a local Ray is lost."""
 
 
@@ -56,8 +62,8 @@ class ClusterSettings:
     memory_bytes: int | None = None
 
 
-class RayCrew:
-    """The workers of a Ray cluster; implements `workers.ports.Crew`.
+class RayExecutor:
+    """The workers of a Ray cluster; implements `workers.protocol.Executor`.
 
     Parameters
     ----------
@@ -71,7 +77,7 @@ class RayCrew:
     """
 
     def __init__(self, settings: ClusterSettings, local: LocalRay | None = None) -> None:
-        os.environ.update(ENVIRONMENT)
+        os.environ.update(RAY_ENVIRONMENT)
         self._local = None
         if settings.address is None:
             self._local = local or LocalRay(settings.cpus)
@@ -81,23 +87,23 @@ class RayCrew:
 
         self._ray: Any = ray
         if settings.address is not None:
-            _join(ray, settings.address)
-        self._advance = ray.remote(num_cpus=1, max_retries=0)(advance_within)
-        self._noop = ray.remote(num_cpus=0, max_retries=0)(_answer)
-        self._flying: set[Any] = set()
+            _join_cluster(ray, settings.address)
+        self._advance = ray.remote(num_cpus=1, max_retries=0)(process_pack_within)
+        self._noop = ray.remote(num_cpus=0, max_retries=0)(_answer_probe)
+        self._in_flight: set[Any] = set()
         self._probe: Any = None
-        self._heard = self._felt = time.monotonic()
-        self._vital = () if settings.address else _find_vital_processes()
+        self._last_answer = self._last_process_check = time.monotonic()
+        self._vital_pids = () if settings.address else _find_vital_processes()
         self._most_slots = settings.cpus
         self.slots = self._count_slots()
         self._memory = settings.memory_bytes
         if self._memory is None and settings.address is None:
-            self._memory = memory_for_each(self.slots)
-        self._left = threading.Event()
+            self._memory = compute_worker_memory(self.slots)
+        self._closing = threading.Event()
         if settings.address is not None:  # nodes come and go
-            threading.Thread(target=self._keep_counting, name="slots", daemon=True).start()
+            threading.Thread(target=self._watch_slot_count, name="slots", daemon=True).start()
 
-    def warm(self) -> None:
+    def warm_up_workers(self) -> None:
         """Load the compiled loops in every worker, so that the first run need not.
 
         Cores of a joined cluster that others are using are not waited for, once one has come up.
@@ -107,12 +113,14 @@ class RayCrew:
         ClusterUnavailable
             If the workers do not come up, or have another version of this program.
         """
-        task = self._ray.remote(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")(warm)
+        task = self._ray.remote(num_cpus=1, max_retries=0, scheduling_strategy="SPREAD")(
+            warm_up_worker
+        )
         tasks = [task.remote() for _ in range(self.slots)]
         limit = time.monotonic() + START_SECONDS
         ready, late = self._ray.wait(tasks, timeout=START_SECONDS)
         if late and ready:
-            left = min(LATE_SECONDS, limit - time.monotonic())
+            left = min(LATE_WORKER_SECONDS, limit - time.monotonic())
             ready, late = self._ray.wait(tasks, num_returns=len(tasks), timeout=max(0.0, left))
         if not ready:
             raise ClusterUnavailable(f"no worker of Ray came up within {START_SECONDS:.0f} s")
@@ -124,32 +132,34 @@ class RayCrew:
         for one in late:
             self._ray.cancel(one, force=False)
         if self._local is None:
-            _require_one_program(found)
-        self._heard = time.monotonic()
+            _require_same_program(found)
+        self._last_answer = time.monotonic()
 
-    def share(self, records: Records) -> Any:
+    def share_records(self, records: Records) -> Any:
         """Put records into the object store; the reference travels instead of them."""
         return self._ray.put(records)
 
-    def submit(self, pack: Sequence[Item], keys: Sequence[str], shared: Sequence[Any]) -> Handle:
+    def submit_pack(
+        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+    ) -> PackHandle:
         """Send a pack; `keys` name the shared records in order."""
         handle = self._advance.remote(self._memory, tuple(pack), tuple(keys), *shared)
-        self._flying.add(handle)
+        self._in_flight.add(handle)
         return handle
 
-    def finished(self, timeout: float) -> tuple[Handle, ...]:
+    def wait_for_packs(self, timeout: float) -> tuple[PackHandle, ...]:
         """Handles of packs that ended, waiting at most `timeout` seconds for the first."""
-        if not self._flying:
+        if not self._in_flight:
             time.sleep(timeout)
             return ()
-        flying = list(self._flying)
+        flying = list(self._in_flight)
         ready, _ = self._ray.wait(flying, num_returns=1, timeout=timeout, fetch_local=False)
         if ready:  # whatever else has ended by now comes along
             ready, _ = self._ray.wait(flying, num_returns=len(flying), timeout=0, fetch_local=False)
-            self._heard = time.monotonic()
+            self._last_answer = time.monotonic()
         return tuple(ready)
 
-    def fetch(self, handle: Handle) -> tuple[Done, ...]:
+    def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
         """What a finished pack gave.
 
         Raises
@@ -160,10 +170,10 @@ class RayCrew:
             If Ray does not hand it out.
         """
         errors = self._ray.exceptions
-        self._flying.discard(handle)
-        self._feel()
+        self._in_flight.discard(handle)
+        self._check_processes_alive()
         try:
-            done: tuple[Done, ...] = self._ray.get(handle, timeout=FETCH_SECONDS)
+            done: tuple[ItemResult, ...] = self._ray.get(handle, timeout=FETCH_SECONDS)
         except errors.TaskCancelledError as error:
             raise PackCancelled("cancelled") from error
         except errors.GetTimeoutError as error:
@@ -171,15 +181,15 @@ class RayCrew:
         except errors.RayTaskError as error:
             raise PackFailed(str(error)) from error
         except errors.RayError as error:  # crashed, out of memory, node or object lost
-            self._feel(at_once=True)  # where the raylet died, no run is to blame
+            self._check_processes_alive(at_once=True)  # where the raylet died, no run is to blame
             raise WorkerDied(str(error).splitlines()[0]) from error
         return done
 
-    def cancel(self, handle: Handle, *, force: bool) -> None:
+    def cancel_pack(self, handle: PackHandle, *, force: bool) -> None:
         """Interrupt a pack between two kernel calls, or kill its worker."""
         self._ray.cancel(handle, force=force, recursive=False)
 
-    def check(self) -> None:
+    def check_cluster_alive(self) -> None:
         """Ask Ray for a sign of life when none was seen for a while; never waits.
 
         Raises
@@ -187,39 +197,39 @@ class RayCrew:
         ClusterLost
             If a process of a local Ray is gone, or a no-op task has not been answered in time.
         """
-        self._feel()
-        silence = time.monotonic() - self._heard
+        self._check_processes_alive()
+        silence = time.monotonic() - self._last_answer
         if self._probe is None:
             if silence > SILENCE_SECONDS:
                 self._probe = self._noop.remote()
             return
         answered, _ = self._ray.wait([self._probe], timeout=0)
         if answered:
-            self._probe, self._heard = None, time.monotonic()
+            self._probe, self._last_answer = None, time.monotonic()
         elif silence > SILENCE_SECONDS + ANSWER_SECONDS:
             raise ClusterLost(f"Ray has not answered for {silence:.0f} s")
 
     def is_alive(self) -> bool:
         """Whether the processes of a local Ray are there; of a joined one nothing is known."""
-        return all(map(_is_running, self._vital))
+        return all(map(_is_running, self._vital_pids))
 
     def close(self) -> None:
         """Leave the cluster; a local one ends with it."""
-        self._left.set()
+        self._closing.set()
         self._ray.shutdown()
-        self._forget_folder()
+        self._remove_folder()
 
-    def abandon(self) -> None:
+    def abandon_cluster(self) -> None:
         """Let go of a cluster that is lost, without asking it anything."""
         if self._local is not None:
             kill_processes(find_folder_processes(os.getpid()))
-            self._forget_folder()
+            self._remove_folder()
 
-    def _feel(self, *, at_once: bool = False) -> None:
+    def _check_processes_alive(self, *, at_once: bool = False) -> None:
         """Look at the processes of a local Ray: without them calls hang, or end this process."""
         now = time.monotonic()
-        if at_once or now - self._felt > PULSE_SECONDS:
-            self._felt = now
+        if at_once or now - self._last_process_check > LIVENESS_SECONDS:
+            self._last_process_check = now
             if not self.is_alive():
                 raise ClusterLost("a process of the local Ray is gone")
 
@@ -227,9 +237,9 @@ class RayCrew:
         there = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
         return there if self._most_slots is None else min(there, self._most_slots)
 
-    def _keep_counting(self) -> None:
+    def _watch_slot_count(self) -> None:
         """In a thread, as the call may hang; the feeder sees the new number at its next step."""
-        while not self._left.wait(COUNT_SECONDS):
+        while not self._closing.wait(SLOT_COUNT_SECONDS):
             try:
                 there = self._count_slots()
             except (self._ray.exceptions.RayError, RuntimeError, ConnectionError) as error:
@@ -239,16 +249,16 @@ class RayCrew:
                 _log.info("the cluster has %d cores now, before %d", there, self.slots)
                 self.slots = there
 
-    def _forget_folder(self) -> None:
+    def _remove_folder(self) -> None:
         if self._local is not None:
-            self._local.forget_folder()
+            self._local.remove_folder()
 
 
 def _find_vital_processes() -> tuple[psutil.Process, ...]:
     vital = []
     for child in psutil.Process().children():
         with suppress(psutil.NoSuchProcess):
-            if child.name() in VITAL:
+            if child.name() in VITAL_PROGRAMS:
                 vital.append(child)
     return tuple(vital)
 
@@ -260,15 +270,17 @@ def _is_running(process: psutil.Process) -> bool:
         return False
 
 
-def _join(ray: Any, address: str) -> None:
+def _join_cluster(ray: Any, address: str) -> None:
     try:
-        ray.init(address=address, runtime_env={"env_vars": ONE_THREAD}, **COMMON)
-    except REFUSALS as error:
-        raise ClusterUnavailable(reason(address, error)) from error
+        ray.init(
+            address=address, runtime_env={"env_vars": ONE_THREAD_ENVIRONMENT}, **INIT_ARGUMENTS
+        )
+    except INIT_ERRORS as error:
+        raise ClusterUnavailable(explain_failure(address, error)) from error
 
 
-def _require_one_program(found: Sequence[str]) -> None:
-    others = set(found) - {program(Path(__file__).parent)}
+def _require_same_program(found: Sequence[str]) -> None:
+    others = set(found) - {compute_fingerprint(Path(__file__).parent)}
     if others:
         raise ClusterUnavailable(
             "some of the Ray workers have another version of lagid or its libraries than the "
@@ -276,5 +288,5 @@ def _require_one_program(found: Sequence[str]) -> None:
         )
 
 
-def _answer() -> bool:
+def _answer_probe() -> bool:
     return True

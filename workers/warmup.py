@@ -4,17 +4,17 @@ from pathlib import Path
 
 import numpy as np
 
-from sysid.core.settings import METHODS, GeneticAlgorithm
+from sysid.core.settings import SEARCH_METHODS, GeneticAlgorithm
 from sysid.core.types import FloatArray
 from sysid.data.records import Channel, Record
-from sysid.identification.conclude import conclude
-from sysid.identification.fingerprint import program
-from sysid.identification.run import advance, begin
+from sysid.identification.conclude import conclude_run
+from sysid.identification.fingerprint import compute_fingerprint
+from sysid.identification.run import advance_run, begin_run
 from sysid.models.catalogue.load import load_model
 from sysid.simulation.problem import Problem
 
 
-def warm() -> str:
+def warm_up_worker() -> str:
     """A run of a few generations by each method, on a record of a few samples.
 
     Returns
@@ -26,8 +26,8 @@ def warm() -> str:
     values = 1.0 - np.exp(-times)
     record = Record((Channel("u", times, np.ones_like(times)),), (Channel("y", times, values),))
     problem = Problem.build(load_model("fopdt"), (record,))
-    for method in METHODS:
+    for method in SEARCH_METHODS:
         algorithm = GeneticAlgorithm(method=method, population=16, generations=4)
-        state = advance(problem, algorithm, begin(problem, algorithm, 1))
-        conclude(problem, algorithm, state)
-    return program(Path(__file__).parent)
+        state = advance_run(problem, algorithm, begin_run(problem, algorithm, 1))
+        conclude_run(problem, algorithm, state)
+    return compute_fingerprint(Path(__file__).parent)

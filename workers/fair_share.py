@@ -21,13 +21,13 @@ from workers.packing import PACK_SECONDS
 HEADSTART_SECONDS = 30.0
 """Compute time that a new job gets before those that had as much."""
 
-MOST_SAVED_SECONDS = 2 * HEADSTART_SECONDS
+MAX_SAVED_SECONDS = 2 * HEADSTART_SECONDS
 """Nobody falls further behind than this: unused time is not saved for later."""
 
-MOST_ABSENT = 256
+MAX_ABSENT_PROJECTS = 256
 """Projects without jobs whose accounts are kept: those that are furthest ahead."""
 
-PATIENT_TURN = 16
+LONGEST_WAIT_INTERVAL = 16
 """Each so many packs, one goes to who has waited longest."""
 
 Key = TypeVar("Key", bound=Hashable)
@@ -46,76 +46,76 @@ class _Account:
 
 
 @dataclass(slots=True, eq=False)
-class _Member(_Account):
+class _JobAccount(_Account):
     """A job's account; `served` is the number of the last pack it was given."""
 
-    received: float = 0.0
+    received_seconds: float = 0.0
     priority: int = 0
     project: str = ""
-    served: int = 0
+    last_pack: int = 0
 
 
 @dataclass(slots=True)
-class Shares(Generic[Key]):
+class FairShare(Generic[Key]):
     """The accounts of the jobs that a crew works on."""
 
-    _jobs: dict[Key, _Member] = field(default_factory=dict)
+    _jobs: dict[Key, _JobAccount] = field(default_factory=dict)
     _projects: dict[str, _Account] = field(default_factory=dict)
-    _packs: int = 0
+    _n_packs: int = 0
 
-    def enter(self, job: Key, *, priority: int = 0, project: str = "") -> None:
+    def open_account(self, job: Key, *, priority: int = 0, project: str = "") -> None:
         """Open an account: nobody begins ahead of those who are here, or behind them.
 
         A project that comes back goes on with its own: else one job after another, each within
         its head start, would always begin anew.
         """
-        floor = self._floor()
+        floor = self._find_lowest_level()
         account = self._projects.setdefault(project, _Account(floor))
         account.level = max(account.level, floor)
-        self._jobs[job] = _Member(priority=priority, project=project, served=self._packs)
+        self._jobs[job] = _JobAccount(priority=priority, project=project, last_pack=self._n_packs)
 
-    def leave(self, job: Key) -> None:
+    def close_account(self, job: Key) -> None:
         """Close the account of a job that has ended.
 
         That of its project stays while it is ahead of a project with jobs.
         """
         del self._jobs[job]
-        active, floor = self._active(), self._floor()
+        active, floor = self._list_active_projects(), self._find_lowest_level()
         ahead = sorted(
             (name for name in self._projects.keys() - active if self._projects[name].level > floor),
             key=lambda name: (-self._projects[name].level, name),
         )
-        kept = active | set(ahead[:MOST_ABSENT]) if active else set()
+        kept = active | set(ahead[:MAX_ABSENT_PROJECTS]) if active else set()
         self._projects = {name: one for name, one in self._projects.items() if name in kept}
 
-    def project_of(self, job: Key) -> str:
+    def get_project(self, job: Key) -> str:
         """The project that a job belongs to."""
         return self._jobs[job].project
 
-    def serve(self, job: Key) -> None:
+    def record_pack(self, job: Key) -> None:
         """A pack of this job was sent."""
-        self._packs += 1
-        self._jobs[job].served = self._packs
+        self._n_packs += 1
+        self._jobs[job].last_pack = self._n_packs
 
-    def charge(self, job: Key, seconds: float) -> None:
+    def charge_seconds(self, job: Key, seconds: float) -> None:
         """A pack of this job has taken `seconds` of compute time."""
         one = self._jobs[job]
-        was_fresh = one.received < HEADSTART_SECONDS
-        one.received += seconds
+        was_fresh = one.received_seconds < HEADSTART_SECONDS
+        one.received_seconds += seconds
         one.level += seconds
-        mates = [self._jobs[mate] for mate in self._settled(one.project) if mate != job]
-        if was_fresh and one.received >= HEADSTART_SECONDS:
+        mates = [self._jobs[mate] for mate in self._list_past_headstart(one.project) if mate != job]
+        if was_fresh and one.received_seconds >= HEADSTART_SECONDS:
             one.level = max(one.level, min((mate.level for mate in mates), default=0.0))
-        _pull_up(one, mates)
+        _raise_levels(one, mates)
         project = self._projects[one.project]
         project.level += seconds
-        _pull_up(project, self._projects.values())
+        _raise_levels(project, self._projects.values())
 
-    def rank(self, job: Key) -> Rank:
+    def compute_rank(self, job: Key) -> Rank:
         """Which jobs it goes before, whatever each has had."""
-        return self._rank(self._jobs[job], self._floor())
+        return self._rank_account(self._jobs[job], self._find_lowest_level())
 
-    def order(self, in_flight: Mapping[Key, int]) -> list[Key]:
+    def order_jobs(self, in_flight: Mapping[Key, int]) -> list[Key]:
         """The jobs of `in_flight`, the one that should have the next place first.
 
         Parameters
@@ -126,41 +126,43 @@ class Shares(Generic[Key]):
         of_project: dict[str, int] = dict.fromkeys(self._projects, 0)
         for job, count in in_flight.items():
             of_project[self._jobs[job].project] += count
-        floor = self._floor()
+        floor = self._find_lowest_level()
 
         def turn(job: Key) -> tuple[Rank, float, float]:
             one = self._jobs[job]
             of_all = self._projects[one.project].level + PACK_SECONDS * of_project[one.project]
-            return self._rank(one, floor), of_all, one.level + PACK_SECONDS * in_flight[job]
+            return self._rank_account(one, floor), of_all, one.level + PACK_SECONDS * in_flight[job]
 
         ordered = sorted(in_flight, key=turn)
-        if ordered and self._packs % PATIENT_TURN == PATIENT_TURN - 1:
-            patient = min(ordered, key=lambda job: self._jobs[job].served)
+        if ordered and self._n_packs % LONGEST_WAIT_INTERVAL == LONGEST_WAIT_INTERVAL - 1:
+            patient = min(ordered, key=lambda job: self._jobs[job].last_pack)
             ordered.remove(patient)
             ordered.insert(0, patient)
         return ordered
 
-    def _active(self) -> set[str]:
+    def _list_active_projects(self) -> set[str]:
         """Projects with jobs."""
         return {one.project for one in self._jobs.values()}
 
-    def _floor(self) -> float:
+    def _find_lowest_level(self) -> float:
         """The least that a project with jobs has had."""
-        return min((self._projects[name].level for name in self._active()), default=0.0)
+        return min(
+            (self._projects[name].level for name in self._list_active_projects()), default=0.0
+        )
 
-    def _rank(self, one: _Member, floor: float) -> Rank:
+    def _rank_account(self, one: _JobAccount, floor: float) -> Rank:
         privileged = self._projects[one.project].level - floor < HEADSTART_SECONDS
-        return -one.priority, not (privileged and one.received < HEADSTART_SECONDS)
+        return -one.priority, not (privileged and one.received_seconds < HEADSTART_SECONDS)
 
-    def _settled(self, project: str) -> list[Key]:
+    def _list_past_headstart(self, project: str) -> list[Key]:
         """Jobs of a project that have had their head start."""
         return [
             job
             for job, one in self._jobs.items()
-            if one.project == project and one.received >= HEADSTART_SECONDS
+            if one.project == project and one.received_seconds >= HEADSTART_SECONDS
         ]
 
 
-def _pull_up(ahead: _Account, others: Iterable[_Account]) -> None:
+def _raise_levels(ahead: _Account, others: Iterable[_Account]) -> None:
     for one in others:
-        one.level = max(one.level, ahead.level - MOST_SAVED_SECONDS)
+        one.level = max(one.level, ahead.level - MAX_SAVED_SECONDS)

@@ -11,40 +11,40 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-from workers.ports import Done, Item, Records
-from workers.tasks import advance
+from workers.protocol import ItemResult, Records, WorkItem
+from workers.tasks import process_pack
 
-SHARE = 0.8
+MEMORY_SHARE = 0.8
 """Of the machine's memory, for all workers together."""
 
 
-def memory_for_each(workers: int) -> int:
+def compute_worker_memory(workers: int) -> int:
     """What each of so many workers on this machine may use, in bytes."""
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
         total = min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return int(SHARE * total / workers)
+    return int(MEMORY_SHARE * total / workers)
 
 
-def advance_within(
-    limit: int | None, pack: Sequence[Item], keys: Sequence[str], *shared: Records
-) -> tuple[Done, ...]:
-    """`workers.tasks.advance`, in a process that may use `limit` bytes beyond its program."""
+def process_pack_within(
+    limit: int | None, pack: Sequence[WorkItem], keys: Sequence[str], *shared: Records
+) -> tuple[ItemResult, ...]:
+    """`workers.tasks.process_pack`, in a process that may use `limit` bytes beyond its program."""
     if limit is not None:
-        _bound(limit)
-    return advance(pack, keys, *shared)
+        _limit_memory(limit)
+    return process_pack(pack, keys, *shared)
 
 
 @cache
-def _bound(limit: int) -> None:
+def _limit_memory(limit: int) -> None:
     """Once in a process: what it holds already is Ray's and the program's."""
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    allowed = _held() + limit
+    allowed = _read_used_memory() + limit
     if hard == resource.RLIM_INFINITY or allowed < hard:
         resource.setrlimit(resource.RLIMIT_DATA, (allowed, hard))
 
 
-def _held() -> int:
+def _read_used_memory() -> int:
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:

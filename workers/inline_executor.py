@@ -5,42 +5,46 @@ from collections.abc import Sequence
 from typing import Any
 
 from workers.errors import PackCancelled
-from workers.ports import Done, Handle, Item, Records
-from workers.tasks import advance
+from workers.protocol import ItemResult, PackHandle, Records, WorkItem
+from workers.tasks import process_pack
 
 
-class InlineCrew:
-    """Computes each pack when it is waited for; implements `workers.ports.Crew`."""
+class InlineExecutor:
+    """Computes each pack when it is waited for; implements `workers.protocol.Executor`."""
 
     def __init__(self, slots: int = 1) -> None:
         self.slots = slots
         self._waiting: deque[int] = deque()
-        self._packs: dict[int, tuple[tuple[Item, ...], tuple[str, ...], tuple[Records, ...]]] = {}
-        self._results: dict[int, tuple[Done, ...]] = {}
+        self._packs: dict[
+            int, tuple[tuple[WorkItem, ...], tuple[str, ...], tuple[Records, ...]]
+        ] = {}
+        self._results: dict[int, tuple[ItemResult, ...]] = {}
         self._next = 0
 
-    def share(self, records: Records) -> Records:
+    def share_records(self, records: Records) -> Records:
         """Nothing to do: everybody is here."""
         return records
 
-    def submit(self, pack: Sequence[Item], keys: Sequence[str], shared: Sequence[Any]) -> Handle:
+    def submit_pack(
+        self, pack: Sequence[WorkItem], keys: Sequence[str], shared: Sequence[Any]
+    ) -> PackHandle:
         """Put a pack at the end of the queue."""
         self._next += 1
         self._packs[self._next] = (tuple(pack), tuple(keys), tuple(shared))
         self._waiting.append(self._next)
         return self._next
 
-    def finished(self, timeout: float) -> tuple[Handle, ...]:
+    def wait_for_packs(self, timeout: float) -> tuple[PackHandle, ...]:
         """Compute the next pack, whatever time it takes."""
         if not self._waiting:
             return ()
         handle = self._waiting.popleft()
         pack, keys, shared = self._packs[handle]
         if pack:
-            self._results[handle] = advance(pack, keys, *shared)
+            self._results[handle] = process_pack(pack, keys, *shared)
         return (handle,)
 
-    def fetch(self, handle: Handle) -> tuple[Done, ...]:
+    def fetch_results(self, handle: PackHandle) -> tuple[ItemResult, ...]:
         """What the pack gave.
 
         Raises
@@ -53,11 +57,11 @@ class InlineCrew:
             raise PackCancelled("cancelled")
         return self._results.pop(handle)
 
-    def cancel(self, handle: Handle, *, force: bool) -> None:
+    def cancel_pack(self, handle: PackHandle, *, force: bool) -> None:
         """Compute nothing of that pack."""
         self._packs[handle] = ((), (), ())
 
-    def check(self) -> None:
+    def check_cluster_alive(self) -> None:
         """Nothing to do: this process lives."""
 
     def close(self) -> None:

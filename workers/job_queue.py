@@ -1,0 +1,255 @@
+"""The runs of one job on the driver's side: which items come next, what became of them."""
+
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from workers.active_run import MAX_KILLS, ActiveRun
+from workers.errors import RecordsUnavailable
+from workers.packing import MeanCost, balance_packs, choose_pack_size
+from workers.protocol import (
+    EvolveIsland,
+    Executor,
+    InvalidRun,
+    IslandProgress,
+    ItemResult,
+    JobEntry,
+    JobSource,
+    PackHandle,
+    ReusedRun,
+    RunConclusion,
+    RunFailure,
+    RunNotReady,
+    RunObserver,
+    RunProgress,
+    WorkItem,
+)  # fmt: skip
+
+MAX_SHARED_RECORDS = 16
+"""Sets of records that a job keeps with the crew."""
+
+
+class JobQueue:
+    """One job's runs: waiting, with the workers, or done.
+
+    Attributes
+    ----------
+    flying : dict
+        Items of each pack in flight.
+    """
+
+    def __init__(self, source: JobSource, observer: RunObserver, crew: Executor) -> None:
+        self.observer = observer
+        self.in_flight: dict[PackHandle, tuple[WorkItem, ...]] = {}
+        self._source, self._executor = source, crew
+        self._entries: Iterator[JobEntry] = iter(source.iterate_runs())
+        self._ready: deque[ActiveRun] = deque()
+        self._active: dict[str, ActiveRun] = {}
+        self._shared: dict[str, Any] = {}
+        self._unreported: deque[tuple[str, RunConclusion, float]] = deque()
+        self._cost = MeanCost()
+        self._exhausted = False
+        self._has_no_more = False  # at present: what follows waits for runs that are not over
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all runs were read and told of; nothing waits or is with the workers."""
+        return self._exhausted and not (self.in_flight or self._ready or self._unreported)
+
+    @property
+    def has_unreported(self) -> bool:
+        """Whether there are results that the observer has not been told of."""
+        return bool(self._unreported)
+
+    @property
+    def unreported_seconds(self) -> float:
+        """Compute time of the results that the observer has not been told of."""
+        return sum(seconds for _, _, seconds in self._unreported)
+
+    @property
+    def has_waiting_runs(self) -> bool:
+        """Whether a run that was read waits for a worker."""
+        return bool(self._ready)
+
+    def read_ahead(self, wanted: int, deadline: float) -> bool:
+        """Ask the source until `wanted` runs wait or the time is up; whether a run waits now.
+
+        One is asked for in any case.
+        """
+        while not self._exhausted and len(self._ready) < wanted:
+            queued = next(self._entries, None)
+            self._has_no_more = queued is None or isinstance(queued, RunNotReady)
+            if queued is None:
+                self._exhausted = True
+            elif isinstance(queued, RunNotReady):
+                break
+            elif isinstance(queued, InvalidRun):
+                self.observer.record_failure(queued.run, queued.failure)
+            elif isinstance(queued, ReusedRun):
+                self.observer.record_reuse(queued.run, queued.source)
+            else:
+                run = ActiveRun.from_queue(queued)
+                self._active[run.run] = run
+                self._ready.append(run)
+            if time.monotonic() > deadline:
+                break
+        return bool(self._ready)
+
+    def send_next_pack(self, idle: int) -> None:
+        """Send the next pack, or one run's islands as several packs if `idle` cores allow."""
+        run = self._ready[0]
+        if run.should_spread(idle if len(self._ready) == 1 else 0):
+            self._ready.popleft()
+            self._spread_islands(run)
+        elif run.needs_own_pack:
+            self._submit_items([self._ready.popleft().make_slice()])
+        else:
+            shared_by = self._executor.slots if self._has_no_more else 1  # else more follow
+            size = choose_pack_size(self._cost, len(self._ready), shared_by)
+            self._submit_items([run.make_slice(self._cost) for run in self._take_unstarted(size)])
+
+    def absorb_pack(self, handle: PackHandle, done: tuple[ItemResult, ...]) -> None:
+        """Take in what a pack gave; islands whose turn did not come are sent again."""
+        items = self.in_flight.pop(handle)
+        waiting = self._release_runs(handle, items)
+        again: list[WorkItem] = []
+        for item, one in zip(items, done, strict=True):
+            run = self._active.get(one.run)
+            if run is None:
+                continue  # it failed while another of its islands was still out
+            run.seconds += one.seconds
+            if run not in waiting:
+                continue
+            if one.outcome is not None:
+                self._take_result(run, one)
+            elif isinstance(item, EvolveIsland):
+                again.append(item)
+            else:
+                self._ready.appendleft(run)
+        again = [item for item in again if item.run in self._active]
+        if again:
+            self._submit_items(again)
+
+    def report_next(self) -> bool:
+        """Tell the observer of the next result, which takes it a while; whether there was one."""
+        if self._unreported:
+            self.observer.record_result(*self._unreported.popleft())
+            return True
+        return False
+
+    def requeue_lost_pack(self, handle: PackHandle, reason: str) -> None:
+        """A worker died: its runs go on from where they were, each alone.
+
+        Only a run that was alone is blamed, and not for what came of it elsewhere: two packs of
+        its islands that are lost at once are one death.
+        """
+        items = self.in_flight.pop(handle)
+        are_several = len({item.run for item in items}) > 1
+        for run in self._release_runs(handle, items):
+            run.restart_epoch()
+            run.is_suspect = True
+            if are_several or self._retry_or_fail(run, reason):
+                self._ready.append(run)
+
+    def fail_pack(self, handle: PackHandle, reason: str) -> None:
+        """A programming error: the runs of the pack fail with it."""
+        for run in self._release_runs(handle, self.in_flight.pop(handle)):
+            self._fail_run(run.run, RunFailure(reason, "InternalError"))
+
+    def stop_sending(self) -> None:
+        """Begin nothing more."""
+        self._ready.clear()
+        self._exhausted = True
+
+    def _take_unstarted(self, size: int) -> list[ActiveRun]:
+        """The next `size` runs that have not been begun and see the same records."""
+        chosen = [self._ready.popleft()]
+        while self._ready and len(chosen) < size:
+            following = self._ready[0]
+            if (
+                following.needs_own_pack
+                or following.spec.problem.record_keys != chosen[0].spec.problem.record_keys
+            ):
+                break
+            chosen.append(self._ready.popleft())
+        return chosen
+
+    def _spread_islands(self, run: ActiveRun) -> None:
+        items = run.split_islands()
+        costs = [float(item.island.chromosomes.size) for item in items]
+        for bundle in balance_packs(costs, self._executor.slots):
+            self._submit_items([items[index] for index in bundle])
+
+    def _submit_items(self, items: list[WorkItem]) -> None:
+        keys = items[0].spec.problem.record_keys
+        try:
+            shared = [self._share_records(key) for key in keys]
+        except RecordsUnavailable as error:
+            for name in {item.run for item in items}:
+                self._fail_run(name, RunFailure(str(error), type(error).__name__))
+            return
+        for name in dict.fromkeys(item.run for item in items):
+            self._report_start(self._active[name])
+        handle = self._executor.submit_pack(items, keys, shared)
+        self.in_flight[handle] = tuple(items)
+        for item in items:
+            self._active[item.run].pack_handles.add(handle)
+
+    def _release_runs(self, handle: PackHandle, items: Sequence[WorkItem]) -> list[ActiveRun]:
+        """The runs that wait for this pack, which is back; not those that go on without it."""
+        names = dict.fromkeys(item.run for item in items)
+        found = [self._active[name] for name in names if name in self._active]
+        found = [run for run in found if handle in run.pack_handles]
+        for run in found:
+            run.pack_handles.discard(handle)
+        return found
+
+    def _report_start(self, run: ActiveRun) -> None:
+        if not run.has_begun:
+            run.has_begun = True
+            self.observer.record_start(run.run)
+
+    def _share_records(self, key: str) -> Any:
+        if key not in self._shared:
+            while len(self._shared) >= MAX_SHARED_RECORDS:
+                self._shared.pop(next(iter(self._shared)))
+            self._shared[key] = self._executor.share_records(self._source.load_records(key))
+        return self._shared[key]
+
+    def _take_result(self, run: ActiveRun, one: ItemResult) -> None:
+        match one.outcome:
+            case RunFailure() as failure:
+                self._cost = self._cost.add_measurement(one.seconds)
+                self._fail_run(run.run, failure)
+            case RunConclusion() as concluded:
+                self._cost = self._cost.add_measurement(run.seconds)
+                del self._active[run.run]
+                self._unreported.append((run.run, concluded, run.seconds))
+            case RunProgress(state):
+                run.absorb_slice(state, one.seconds)
+                self._continue_run(run)
+            case IslandProgress() as evolved:
+                if run.absorb_island(evolved, one.seconds):
+                    self._continue_run(run)
+
+    def _retry_or_fail(self, run: ActiveRun, reason: str) -> bool:
+        """Whether a run over which its worker died is tried once more; else it fails."""
+        run.kills += 1
+        self.observer.record_worker_death(run.run, run.kills)
+        if run.kills >= MAX_KILLS:
+            text = f"its worker process died {run.kills} times; the last time: {reason}"
+            self._fail_run(run.run, RunFailure(text, "WorkerDied"))
+        return run.kills < MAX_KILLS
+
+    def _continue_run(self, run: ActiveRun) -> None:
+        assert run.state is not None
+        if run.kills:
+            run.kills = 0
+            self.observer.record_worker_death(run.run, 0)
+        self.observer.record_progress(run.run, run.state, run.seconds)
+        self._ready.appendleft(run)  # what was begun is ended first: few runs are under way
+
+    def _fail_run(self, name: str, failure: RunFailure) -> None:
+        if self._active.pop(name, None) is not None:
+            self.observer.record_failure(name, failure)
